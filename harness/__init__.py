@@ -1,0 +1,1 @@
+"""The harness: scenarios, the orchestrator, the checker, the report and the command line."""
