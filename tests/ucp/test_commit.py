@@ -1,0 +1,199 @@
+"""Algorithms 1-6, handler by handler."""
+
+from random import Random
+
+import pytest
+
+from tests.ucp.air import Air, uniform_latency
+from ucp.block import next_chain_hash
+from ucp.events import LoggableEvent, decode_events
+from ucp.messages import BlockAddRequest, BlockAddResponse, CommitBlock, Message
+from ucp.settings import Settings
+
+
+def without(dropped: type[Message]):
+    latency = uniform_latency(Random(1))
+    return lambda sender, receiver, message: [] if isinstance(message, dropped) else latency(sender, receiver, message)
+
+
+def test_a_block_is_full_when_the_largest_event_might_not_fit_any_more() -> None:
+    air = Air([1])
+    agent = air.agents[1]
+    for _ in range(2):
+        air.log(1, bytes(256))
+    assert not agent.completed  # 2 * 267 + 267 < 1024
+    air.now = 3.5
+    air.log(1, bytes(256))  # 3 * 267 + 267 >= 1024
+    (block,) = agent.blocks_to_be_committed
+    assert [len(event.data) for event in decode_events(block.event_data)] == [256] * 3
+    assert block.timestamp_us == 3_500_000  # the newest event's
+    assert agent.current_block == b""
+
+
+def test_blocks_completed_in_the_same_microsecond_still_differ() -> None:
+    air = Air([1])
+    assert air.fill_block(1) != air.fill_block(1)
+
+
+def test_an_event_larger_than_the_mission_s_largest_is_refused() -> None:
+    agent = Air([1]).agents[1]
+    with pytest.raises(ValueError, match="max_event_bytes 267"):
+        agent.add_event(LoggableEvent(0, 1, bytes(257)), 0.0)
+
+
+def test_an_agent_alone_commits_its_own_blocks_after_the_vote() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    block_hash = air.fill_block(1)
+    air.run_until(9.99)
+    assert block_hash not in air.agents[1].chain
+    air.run_until(10.0)
+    assert block_hash in air.agents[1].chain
+    assert air.agents[1].idle
+
+
+def test_an_approved_block_is_committed_by_everybody() -> None:
+    air = Air(range(1, 6))
+    block_hash = air.fill_block(3)
+    air.settle()
+    assert air.chains() == [(block_hash,)] * 5
+    assert all(agent.reconciles == 0 for agent in air.agents.values())
+
+
+def test_a_responder_counts_once_per_round() -> None:
+    air = Air([1, 2, 3], fate=lambda *_: [])
+    block_hash = air.fill_block(1)
+    agent = air.agents[1]
+    for _ in range(3):
+        agent.receive_message(2, 0, BlockAddResponse(block_hash, approve=False), 1.0)
+    agent.receive_message(3, 0, BlockAddResponse(bytes(32), approve=False), 1.0)
+    assert agent.vote_count == {"yes": 1, "no": 1}
+    air.flush(1)
+    assert air.branches(1, "receive_vote_add_block") == ["no", "counted already", "counted already", "another block"]
+
+
+def test_a_vote_after_the_timer_does_not_count() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    block_hash = air.fill_block(1)
+    air.settle()
+    air.agents[1].receive_message(2, 0, BlockAddResponse(block_hash, approve=True), air.now)
+    air.flush(1)
+    assert air.branches(1, "receive_vote_add_block") == ["no vote running"]
+
+
+def test_a_tied_vote_is_not_approved() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    block_hash = air.fill_block(1)
+    air.agents[1].receive_message(2, 0, BlockAddResponse(block_hash, approve=False), 1.0)
+    air.run_until(10.0)
+    assert air.branches(1, "vote_timer_expiration") == ["not approved"]
+    assert air.agents[1].reconcile_in_progress
+
+
+def test_an_approved_vote_is_repeated_when_the_chain_changed_meanwhile() -> None:
+    """Without it an agent would go idle with a block in its deque (characteristic 2)."""
+    air = Air([1, 2, 3])
+    first = air.fill_block(1)
+    air.run_until(5.0)
+    second = air.fill_block(2)
+    air.settle()
+    assert air.branches(2, "vote_timer_expiration") == ["chain changed", "approved"]
+    assert air.chains() == [(first, second)] * 3
+    assert air.agents[2].reconciles == 0
+
+
+@pytest.mark.parametrize(("changed_before_tally", "expected"), [(False, "not approved"), (True, "chain changed")])
+def test_the_order_of_algorithm_5_s_tests_is_a_setting(changed_before_tally: bool, expected: str) -> None:
+    settings = Settings(changed_before_tally=changed_before_tally)
+    air = Air([1, 2], fate=lambda *_: [], settings=settings)
+    block_hash = air.fill_block(1)
+    agent = air.agents[1]
+    agent.receive_message(2, 0, BlockAddResponse(block_hash, approve=False), 1.0)
+    other = Air([1, 2])
+    other.fill_block(2)
+    other.settle()
+    (committed,) = other.agents[2].chain
+    agent.receive_message(2, 1, CommitBlock(committed, other.agents[2].chain.top_chain_hash), 2.0)
+    air.run_until(10.0)
+    assert air.branches(1, "vote_timer_expiration") == [expected]
+
+
+@pytest.mark.parametrize(("names_chain", "yes"), [(False, 2), (True, 1)])
+def test_a_late_vote_of_an_earlier_round_counts_unless_votes_name_the_chain(names_chain: bool, yes: int) -> None:
+    air = Air([1, 2, 3], fate=lambda *_: [], settings=Settings(vote_names_chain=names_chain))
+    block_hash = air.fill_block(1)
+    earlier_round = BlockAddResponse(block_hash, True, b"\1" * 32)
+    air.agents[1].receive_message(2, 0, earlier_round, 1.0)
+    assert air.agents[1].vote_count["yes"] == yes
+
+
+def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:
+    latency = uniform_latency(Random(1))
+    lose_first_commit_to_3 = lambda s, r, m: [] if isinstance(m, CommitBlock) and r == 3 else latency(s, r, m)  # noqa: E731
+    air = Air([1, 2, 3], fate=lose_first_commit_to_3)
+    air.fill_block(1)
+    air.settle()
+    air.fate = latency
+    air.fill_block(1)
+    air.run_until(air.now + 11)
+    assert air.branches(3, "receive_commit_block") == ["does not succeed"]
+    assert len(air.agents[3].chain) == 0
+
+
+def test_a_second_copy_of_a_block_is_never_committed() -> None:
+    """No agent in good faith sends one; characteristic 3 holds all the same."""
+    air = Air([1, 2])
+    air.fill_block(2)
+    air.settle()
+    agent = air.agents[1]
+    (block,) = agent.chain
+    again = CommitBlock(block, next_chain_hash(agent.chain.top_chain_hash, block.block_hash))
+    agent.receive_message(2, 9, again, air.now)
+    air.flush(1)
+    assert air.branches(1, "receive_commit_block") == ["committed", "held already"]
+    assert len(agent.chain) == 1
+
+
+def test_the_ignore_commit_quirk_misses_commits() -> None:
+    air = Air([1, 2])
+    air.agents[2].quirks.set("ignore_commit", 1.0)
+    air.fill_block(1)
+    air.settle()
+    assert air.branches(2, "receive_commit_block") == ["ignored by quirk"]
+    assert [len(chain) for chain in air.chains()] == [1, 0]
+
+
+def test_a_reconciling_agent_neither_votes_nor_commits_nor_proposes() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    agent = air.agents[1]
+    agent.begin_reconcile(0.0)
+    air.fill_block(1)
+    agent.messages_to_send()
+    agent.receive_message(2, 0, BlockAddRequest(bytes(32), agent.chain.top_chain_hash), 1.0)
+    air.flush(1)
+    assert air.branches(1, "receive_request_add_block") == ["reconcile in progress"]
+    assert air.branches(1, "process_next_deque_block") == ["reconcile in progress"]
+    assert not agent.messages_to_send()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("ignore_commit", 1.5), ("ignore_commit", True), ("crash_on_tie", 1), ("fly", True)]
+)
+def test_an_impossible_quirk_is_refused(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=name):
+        Air([1]).agents[1].quirks.set(name, value)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"vote_timeout_s": 0},
+        {"phase2_timeout_s": float("nan")},
+        {"finalize_gap_s": -1},
+        {"max_block_bytes": 1025},
+        {"max_event_bytes": 0},
+        {"phase1_tie": "coin"},
+    ],
+)
+def test_impossible_settings_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Settings(**wrong)

@@ -1,0 +1,42 @@
+"""Loggable events and Algorithm 21."""
+
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ucp.events import EVENT_DATA_BYTES, LoggableEvent, MalformedEventsError, RandomEvents, decode_events
+
+loggable_events = st.builds(LoggableEvent, st.integers(0, 2**64 - 1), st.integers(1, 254), st.binary(max_size=256))
+
+
+@given(st.lists(loggable_events, max_size=8))
+def test_a_run_of_events_is_read_back(events: list[LoggableEvent]) -> None:
+    assert decode_events(b"".join(event.encode() for event in events)) == events
+
+
+@given(st.binary(max_size=300))
+def test_random_event_data_is_read_or_malformed_and_nothing_worse(data: bytes) -> None:
+    try:
+        events = decode_events(data)
+    except MalformedEventsError:
+        return
+    assert b"".join(event.encode() for event in events) == data
+
+
+@pytest.mark.parametrize("event_id", [0, 255, -1])
+def test_event_ids_are_1_to_254(event_id: int) -> None:
+    with pytest.raises(ValueError, match=r"1\.\.254"):
+        LoggableEvent(0, event_id, b"")
+
+
+def test_random_events_come_every_30_seconds_on_average_with_the_thesis_s_sizes() -> None:
+    source = RandomEvents(Random(1))
+    first = source.due
+    events = [event for _ in range(100_000) if (event := source.trial()) is not None]
+    assert 0 <= first < 1
+    assert source.due == pytest.approx(first + 100_000)
+    assert len(events) == pytest.approx(100_000 / 30, rel=0.1)
+    assert {len(data) for _, data in events} == set(EVENT_DATA_BYTES)
+    assert {event_id for event_id, _ in events} == set(range(1, 255))

@@ -1,0 +1,48 @@
+"""Whole missions of the thesis (Section 4.3), five agents for 20 minutes, in virtual time."""
+
+from random import Random
+
+import pytest
+
+from tests.ucp.air import Air, uniform_latency
+
+
+def mission(loss: float, seed: int) -> Air:
+    air = Air(range(1, 6), uniform_latency(Random(seed), loss=loss))
+    air.generate_events(seed)
+    air.run_until(1200)
+    air.stop_events()
+    air.settle()
+    return air
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_without_loss_one_uniform_chain_emerges(seed: int) -> None:
+    air = mission(0.0, seed)
+    completed = {block_hash for agent in air.agents.values() for block_hash in agent.completed}
+    assert len(completed) > 20
+    assert len(set(air.chains())) == 1
+    assert set(air.chains()[0]) == completed
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_disconnected_agents_hold_their_own_blocks_only(seed: int) -> None:
+    air = mission(1.0, seed)
+    for agent in air.agents.values():
+        assert [block.block_hash for block in agent.chain] == agent.completed
+        assert agent.reconciles == 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_at_15_percent_loss_no_block_is_lost_and_a_final_reconcile_makes_one_chain(seed: int) -> None:
+    air = mission(0.15, seed)
+    completed = {block_hash for agent in air.agents.values() for block_hash in agent.completed}
+    assert completed <= {block_hash for chain in air.chains() for block_hash in chain}
+    air.fate = uniform_latency(Random(seed))
+    for _ in range(3):
+        for agent_id, agent in air.agents.items():
+            agent.begin_reconcile(air.now)
+            air.flush(agent_id)
+            air.settle()
+    assert len(set(air.chains())) == 1
+    assert set(air.chains()[0]) == completed

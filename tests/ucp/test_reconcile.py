@@ -1,0 +1,309 @@
+"""Algorithms 7-20, handler by handler, with divergences and ties that the thesis could not force."""
+
+from itertools import pairwise
+from random import Random
+
+import pytest
+
+from tests.ucp.air import Air, uniform_latency
+from ucp.block import Block
+from ucp.messages import (
+    BlockResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    ChainHashSuccessorQuery,
+    CommitBlock,
+    NextInSequenceResponse,
+    RequestForBlock,
+)
+from ucp.settings import Settings
+
+
+def part(*groups: set[int]):
+    """Groups hear only themselves."""
+    latency = uniform_latency(Random(2))
+    return lambda sender, receiver, message: (
+        latency(sender, receiver, message) if any({sender, receiver} <= group for group in groups) else []
+    )
+
+
+def diverged(blocks_on_2: int = 1, **settings: object) -> Air:
+    """Three agents; 2 and 3 have a chain of their own, 1 has one block of its own."""
+    air = Air([1, 2, 3], fate=part({1}, {2, 3}), settings=Settings(**settings))
+    air.fill_block(1)
+    for _ in range(blocks_on_2):
+        air.fill_block(2)
+        air.settle()
+    air.fate = uniform_latency(Random(3))
+    return air
+
+
+def test_an_outvoted_agent_rebuilds_on_the_majority_s_chain_and_gives_back_its_own_block() -> None:
+    air = diverged(blocks_on_2=2)
+    (own,) = air.agents[1].completed
+    theirs = tuple(air.agents[2].completed)
+    air.agents[1].begin_reconcile(air.now)
+    air.flush(1)
+    air.settle()
+    assert air.chains() == [(*theirs, own)] * 3
+    assert air.branches(1, "reconcile_phase_1_timer_expiration") == ["not contained", "contained"]
+    assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["block", "block", "top of chain"]
+    assert air.branches(1, "reconcile_phase_3") == ["asked", "asked"]
+    assert air.branches(1, "receive_response_block_for_hash")[0] == "committed"
+
+
+def test_a_vote_against_a_diverged_chain_starts_the_reconcile() -> None:
+    air = diverged()
+    air.fill_block(1)
+    air.settle()
+    assert air.branches(1, "reconcile_begin") == ["begun"]
+    assert len(set(air.chains())) == 1
+    assert len(air.agents[1].chain) == 3
+
+
+def test_blocks_popped_in_phase_1_are_taken_from_the_stack_and_not_asked_for() -> None:
+    """2 and 3 hold 1's first block on top of theirs: phase 3 finds it on 1's stack."""
+    air = diverged()
+    own = next(iter(air.agents[1].chain))
+    for agent_id in (2, 3):
+        air.agents[agent_id].commit(own)
+    air.agents[1].begin_reconcile(air.now)
+    air.flush(1)
+    air.settle()
+    assert air.branches(1, "reconcile_phase_3") == ["asked", "from the stack"]
+    assert len(set(air.chains())) == 1
+
+
+def test_a_queried_agent_that_does_not_have_the_chain_reconciles_too() -> None:
+    """Agent 3 missed a block; agent 1's phase 2 tells it so (Algorithm 13)."""
+    air = Air([1, 2, 3], fate=part({1, 2}, {3}))
+    air.fill_block(1)
+    air.settle()
+    air.fate = uniform_latency(Random(3))
+    air.agents[1].begin_reconcile(air.now)
+    air.flush(1)
+    air.settle()
+    assert "diverged" in air.branches(3, "receive_request_next_in_sequence")
+    assert len(set(air.chains())) == 1
+
+
+def test_nobody_answers_phase_1() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    air.agents[1].begin_reconcile(0.0)
+    air.flush(1)
+    air.settle()
+    assert air.now == 5.0
+    assert air.branches(1, "reconcile_phase_1_timer_expiration") == ["no response"]
+    assert air.agents[1].idle
+
+
+def test_nobody_answers_phase_2() -> None:
+    air = diverged()
+    latency = air.fate
+    air.fate = lambda s, r, m: [] if isinstance(m, NextInSequenceResponse) else latency(s, r, m)
+    air.agents[1].begin_reconcile(air.now)
+    air.flush(1)
+    air.settle()
+    assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["no response"]
+    assert len(air.agents[1].chain) == 1  # its own block went back on top
+
+
+def test_no_block_comes_in_phase_3_and_the_rest_of_the_stack_goes_back() -> None:
+    air = diverged()
+    latency = air.fate
+    air.fate = lambda s, r, m: [] if isinstance(m, BlockResponse) else latency(s, r, m)
+    air.agents[1].begin_reconcile(air.now)
+    air.flush(1)
+    air.settle()
+    assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
+    assert len(air.agents[1].chain) == 1
+    assert air.agents[1].majority_response_block_hash is None
+
+
+def test_the_inception_block_is_never_popped() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    agent = air.agents[1]
+    agent.begin_reconcile(0.0)
+    agent.receive_message(2, 0, ChainContainResponse(agent.chain.top_chain_hash, False), 1.0)
+    air.flush(1)
+    air.settle()
+    assert air.branches(1, "reconcile_phase_1_timer_expiration") == ["at inception"]
+    assert agent.idle
+
+
+@pytest.mark.parametrize(("phase1_tie", "expected"), [("phase2", "contained"), ("pop", "not contained")])
+def test_a_tie_in_phase_1(phase1_tie: str, expected: str) -> None:
+    air = Air([1, 2, 3], fate=lambda *_: [], settings=Settings(phase1_tie=phase1_tie))
+    air.fill_block(1)
+    air.settle()
+    agent = air.agents[1]
+    agent.begin_reconcile(air.now)
+    agent.receive_message(2, 0, ChainContainResponse(agent.chain.top_chain_hash, True), air.now)
+    agent.receive_message(3, 0, ChainContainResponse(agent.chain.top_chain_hash, False), air.now)
+    agent.receive_message(3, 1, ChainContainResponse(agent.chain.top_chain_hash, False), air.now)
+    agent.receive_message(3, 1, ChainContainResponse(bytes(32), False), air.now)
+    air.run_until(air.now + 5)
+    assert air.branches(1, "reconcile_phase_1_timer_expiration") == [expected]
+    assert air.branches(1, "receive_phase_1_response") == ["yes", "no", "counted already", "another chain"]
+
+
+def phase_2(answers: list[tuple[bytes | None, int]], **settings: object) -> tuple[Air, str]:
+    """Agent 1 in phase 2 at inception gets one answer (block hash, timestamp) from each of 2, 3, ..."""
+    air = Air(range(1, len(answers) + 2), fate=lambda *_: [], settings=Settings(**settings))
+    agent = air.agents[1]
+    top = agent.chain.top_chain_hash
+    agent.begin_reconcile(0.0)
+    agent.receive_message(2, 0, ChainContainResponse(top, True), 1.0)
+    air.run_until(5.0)
+    for sender, (block_hash, timestamp_us) in enumerate(answers, start=2):
+        agent.receive_message(sender, 1, NextInSequenceResponse(top, block_hash, timestamp_us), 6.0)
+    air.run_until(10.0)
+    (branch,) = air.branches(1, "reconcile_phase_2_timer_expiration")
+    return air, branch
+
+
+A, B = b"\xaa" * 32, b"\xbb" * 32
+
+
+def test_phase_2_follows_the_plurality() -> None:
+    air, branch = phase_2([(A, 9), (A, 9), (B, 1), (None, 0)])
+    assert branch == "block"
+    assert air.agents[1].majority_response_block_hash == A
+    assert air.branches(1, "receive_response_next_in_sequence") == [
+        "new candidate",
+        "counted",
+        "new candidate",
+        "new candidate",
+    ]
+
+
+def test_a_tie_in_phase_2_goes_to_the_oldest_block() -> None:
+    air, branch = phase_2([(A, 9), (B, 1)])
+    assert branch == "tie: block"
+    assert air.agents[1].majority_response_block_hash == B
+
+
+def test_a_tie_of_equal_timestamps_goes_to_the_lowest_hash() -> None:
+    air, _ = phase_2([(B, 5), (A, 5)])
+    assert air.agents[1].majority_response_block_hash == A
+
+
+def test_a_tie_with_top_of_chain_ends_the_search_as_the_mutual_block_is_older() -> None:
+    _, branch = phase_2([(A, 5), (None, 0)])
+    assert branch == "tie: top of chain"
+
+
+def test_a_tie_never_ends_the_search_while_a_block_is_on_offer_if_so_set() -> None:
+    air, branch = phase_2([(A, 5), (None, 0)], phase2_tie="block")
+    assert branch == "tie: block"
+    assert air.agents[1].majority_response_block_hash == A
+
+
+def test_a_responder_of_phase_2_counts_once_and_only_for_the_chain_asked_about() -> None:
+    air, _ = phase_2([(A, 5)])
+    agent = air.agents[1]
+    agent.receive_message(2, 3, BlockResponse(Block(2, 1, b"other")), 11.0)
+    air.flush(1)
+    assert air.branches(1, "receive_response_block_for_hash") == ["another block"]
+    assert agent.phase_three_timer.active
+    agent.receive_message(2, 3, NextInSequenceResponse(agent.chain.top_chain_hash, A, 5), 11.0)
+    air.flush(1)
+    assert air.branches(1, "receive_response_next_in_sequence")[-1] == "not in phase 2"
+
+
+def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever() -> None:
+    air = Air([1, 2, 3], fate=lambda *_: [])
+    agent = air.agents[1]
+    agent.quirks.set("crash_on_tie", True)
+    top = agent.chain.top_chain_hash
+    agent.begin_reconcile(0.0)
+    agent.receive_message(2, 0, ChainContainResponse(top, True), 1.0)
+    air.run_until(5.0)
+    agent.receive_message(2, 1, NextInSequenceResponse(top, A, 5), 6.0)
+    agent.receive_message(2, 1, NextInSequenceResponse(top, A, 5), 6.0)
+    agent.receive_message(3, 1, NextInSequenceResponse(top, None, 0), 6.0)
+    agent.receive_message(3, 1, NextInSequenceResponse(bytes(32), None, 0), 6.0)
+    air.settle()
+    assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["tie: crashed by quirk"]
+    assert agent.reconcile_in_progress
+    assert agent.next_timer() is None
+
+
+def test_a_block_that_is_held_already_is_not_asked_for() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    air.fill_block(1)
+    air.settle()
+    agent = air.agents[1]
+    (own,) = agent.completed
+    agent.begin_reconcile(air.now)
+    agent.receive_message(2, 0, ChainContainResponse(agent.chain.top_chain_hash, True), air.now)
+    air.run_until(air.now + 5)
+    agent.receive_message(2, 1, NextInSequenceResponse(agent.chain.top_chain_hash, own, 1), air.now)
+    air.settle()
+    assert air.branches(1, "reconcile_phase_3") == ["held already"]
+    assert agent.idle
+
+
+def test_finalize_pauses_between_commits_and_the_others_follow() -> None:
+    air = Air([1, 2, 3], fate=part({1}, {2, 3}))
+    for _ in range(3):
+        air.fill_block(1)
+        air.settle()
+    air.fill_block(2)
+    air.settle()
+    air.fate = uniform_latency(Random(3))
+    air.agents[1].begin_reconcile(air.now)
+    air.flush(1)
+    air.settle()
+    assert air.branches(1, "reconcile_finalize") == ["recommitted, more to come", "recommitted, more to come", "done"]
+    recommits = [
+        run.t
+        for run in air.runs[1]
+        if run.handler == "reconcile_finalize" and any(sent["message"] == "Commit Block" for sent in run.sent)
+    ]
+    assert [later - earlier for earlier, later in pairwise(recommits)] == pytest.approx([0.1, 0.1])
+    assert len(set(air.chains())) == 1
+    assert len(air.agents[2].chain) == 4
+
+
+def test_without_a_gap_finalize_commits_all_at_once() -> None:
+    air = diverged(finalize_gap_s=0.0)
+    air.agents[1].begin_reconcile(air.now)
+    air.flush(1)
+    air.settle()
+    assert air.branches(1, "reconcile_finalize") == ["done"]
+
+
+def test_a_reconciling_agent_answers_nobody() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    agent = air.agents[1]
+    agent.begin_reconcile(0.0)
+    agent.messages_to_send()
+    top = agent.chain.top_chain_hash
+    for message in (ChainContainQuery(top), ChainHashSuccessorQuery(top), RequestForBlock(top)):
+        agent.receive_message(2, 0, message, 1.0)
+    agent.receive_message(2, 0, CommitBlock(Block(2, 1, b"x"), bytes(32)), 1.0)
+    agent.begin_reconcile(1.0)
+    assert not agent.messages_to_send()
+    assert {run.branch for run in agent.trace()[-5:]} == {"reconcile in progress", "already in progress"}
+
+
+def test_an_agent_that_does_not_hold_a_block_says_nothing() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    air.agents[1].receive_message(2, 0, RequestForBlock(bytes(32)), 0.0)
+    air.flush(1)
+    assert air.branches(1, "receive_request_block_for_hash") == ["not held"]
+
+
+def test_a_divergence_of_50_blocks_is_reconciled() -> None:
+    air = Air([1, 2, 3], fate=part({1}, {2, 3}))
+    for _ in range(50):
+        air.fill_block(1)
+        air.fill_block(2)
+        air.settle()
+    air.fate = uniform_latency(Random(3))
+    air.agents[1].begin_reconcile(air.now)
+    air.flush(1)
+    air.settle()
+    assert len(set(air.chains())) == 1
+    assert len(air.agents[1].chain) == 100

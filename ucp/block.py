@@ -1,0 +1,56 @@
+"""Blocks and their hashes (Section 3.4, eq. 3.1-3.5).
+
+A block is what its agent made and nothing else: the chain hash (eq. 3.2) belongs to a position in a chain, not to
+the block, so it lives in `ucp.chain`. A block therefore never changes when it is popped and committed again.
+"""
+
+import hashlib
+import struct
+from dataclasses import dataclass, field
+
+HASH_BYTES = 32
+MAX_EVENT_DATA_BYTES = 1024
+MAX_AGENT_ID = 0xFFFF
+
+_BLOCK_DATA_HEADER = struct.Struct("!IQ")
+
+
+def hash_digest(data: bytes) -> bytes:
+    """The protocol's cryptographic hash function H: SHA-256, 32 bytes."""
+    return hashlib.sha256(data).digest()
+
+
+def next_chain_hash(chain_hash: bytes, block_hash: bytes) -> bytes:
+    """CH_n = H(CH_{n-1} || BH_n) over the raw digests (eq. 3.2)."""
+    return hashlib.sha256(chain_hash + block_hash).digest()
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One completed block; `block_hash` is computed (eq. 3.1 over eq. 3.5).
+
+    `timestamp_us` is that of the newest event (Section 4.2); `event_data` is a run of loggable events.
+    """
+
+    agent_id: int
+    timestamp_us: int
+    event_data: bytes = field(repr=False)
+    block_hash: bytes = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        block_data = _BLOCK_DATA_HEADER.pack(self.agent_id, self.timestamp_us) + self.event_data
+        object.__setattr__(self, "block_hash", hash_digest(block_data))
+
+
+@dataclass(frozen=True, slots=True)
+class InceptionBlock:
+    """Block 0, the same on every agent before the mission begins (Section 3.4.1)."""
+
+    block_data: bytes
+    block_hash: bytes = field(init=False, compare=False)
+    chain_hash: bytes = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        block_hash = hash_digest(self.block_data)
+        object.__setattr__(self, "block_hash", block_hash)  # eq. 3.3
+        object.__setattr__(self, "chain_hash", hash_digest(block_hash))  # eq. 3.4

@@ -1,0 +1,70 @@
+"""The local chain: a stack of blocks over the inception block, indexed by block hash and by chain hash.
+
+Every question that a handler asks is one dictionary look-up, however long the mission has run.
+"""
+
+from collections.abc import Iterator
+
+from ucp.block import Block, InceptionBlock, next_chain_hash
+
+
+class Chain:
+    """`len(chain)` and iteration count the blocks above the inception block, oldest first."""
+
+    def __init__(self, inception: InceptionBlock) -> None:
+        self.inception = inception
+        self.top_chain_hash = inception.chain_hash
+        self._blocks: list[Block] = []
+        self._chain_hashes: list[bytes] = [inception.chain_hash]
+        self._height_of_chain_hash: dict[bytes, int] = {inception.chain_hash: 0}
+        self._block_of_hash: dict[bytes, Block] = {}
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    def __iter__(self) -> Iterator[Block]:
+        return iter(self._blocks)
+
+    def __contains__(self, block_hash: bytes) -> bool:
+        return block_hash in self._block_of_hash
+
+    def with_chain_hashes(self) -> Iterator[tuple[Block, bytes]]:
+        """Each block above the inception block with its chain hash, oldest first."""
+        return zip(self._blocks, self._chain_hashes[1:], strict=True)
+
+    @property
+    def top_timestamp_us(self) -> int:
+        """Timestamp of the top block; 0 for the inception block."""
+        return self._blocks[-1].timestamp_us if self._blocks else 0
+
+    def get(self, block_hash: bytes) -> Block | None:
+        return self._block_of_hash.get(block_hash)
+
+    def contains_chain_hash(self, chain_hash: bytes) -> bool:
+        return chain_hash in self._height_of_chain_hash
+
+    def successor(self, chain_hash: bytes) -> Block | None:
+        """The block on top of the one with `chain_hash`; None at the top of the chain. KeyError if not contained."""
+        height = self._height_of_chain_hash[chain_hash]
+        return self._blocks[height] if height < len(self._blocks) else None
+
+    def append(self, block: Block) -> None:
+        """Commit `block` on top (eq. 3.2). ValueError if the chain holds it already."""
+        if block.block_hash in self._block_of_hash:
+            raise ValueError(f"block {block.block_hash.hex()} is in the chain already")
+        chain_hash = next_chain_hash(self.top_chain_hash, block.block_hash)
+        self._blocks.append(block)
+        self._chain_hashes.append(chain_hash)
+        self._height_of_chain_hash[chain_hash] = len(self._blocks)
+        self._block_of_hash[block.block_hash] = block
+        self.top_chain_hash = chain_hash
+
+    def pop(self) -> Block:
+        """Remove and return the top block. IndexError at the inception block, which is never popped."""
+        if not self._blocks:
+            raise IndexError("the inception block is never popped")
+        block = self._blocks.pop()
+        del self._block_of_hash[block.block_hash]
+        del self._height_of_chain_hash[self._chain_hashes.pop()]
+        self.top_chain_hash = self._chain_hashes[-1]
+        return block

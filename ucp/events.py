@@ -1,0 +1,74 @@
+"""Loggable events: their encoding inside a block, and the generator of Algorithm 21.
+
+`event_data` of a block is a run of events, each `timestamp_us (u64) || event_id (u8, 1..254) || length (u16) || data`,
+big-endian (Section 4.1).
+"""
+
+import struct
+from dataclasses import dataclass
+from random import Random
+
+_HEADER = struct.Struct("!QBH")
+EVENT_HEADER_BYTES = _HEADER.size
+MAX_EVENT_BYTES = EVENT_HEADER_BYTES + 256
+"""The largest event of the thesis: 256 bytes of data and its header."""
+
+MEAN_TIME_BETWEEN_EVENTS_S = 30.0
+TRIAL_PERIOD_S = 1.0
+EVENT_DATA_BYTES = (32, 64, 128, 256)
+
+
+class MalformedEventsError(ValueError):
+    """Event data that is not a run of whole events."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoggableEvent:
+    timestamp_us: int
+    event_id: int
+    data: bytes
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.event_id <= 254:
+            raise ValueError(f"event_id {self.event_id} is not in 1..254")
+
+    def encode(self) -> bytes:
+        return _HEADER.pack(self.timestamp_us, self.event_id, len(self.data)) + self.data
+
+
+def decode_events(event_data: bytes) -> list[LoggableEvent]:
+    """The events of a block, oldest first. Raises MalformedEventsError, naming the offset, for anything else."""
+    events = []
+    offset = 0
+    while offset < len(event_data):
+        body = offset + EVENT_HEADER_BYTES
+        if body > len(event_data):
+            raise MalformedEventsError(f"event header at byte {offset} is cut off")
+        timestamp_us, event_id, length = _HEADER.unpack_from(event_data, offset)
+        if body + length > len(event_data):
+            raise MalformedEventsError(f"event at byte {offset} claims {length} bytes, more than are left")
+        if not 1 <= event_id <= 254:
+            raise MalformedEventsError(f"event at byte {offset} has event_id {event_id}, not in 1..254")
+        events.append(LoggableEvent(timestamp_us, event_id, event_data[body : body + length]))
+        offset = body + length
+    return events
+
+
+class RandomEvents:
+    """Algorithm 21: each second, with probability 1/mean, an event with a random ID and random data.
+
+    The thesis gives no loop period: one trial per second, each agent with a random phase. `due` is the time of the
+    next trial in mission seconds.
+    """
+
+    def __init__(self, rng: Random, mean_s: float = MEAN_TIME_BETWEEN_EVENTS_S) -> None:
+        self._rng = rng
+        self._probability = TRIAL_PERIOD_S / mean_s
+        self.due = rng.random() * TRIAL_PERIOD_S
+
+    def trial(self) -> tuple[int, bytes] | None:
+        """Run the trial that is due: (event_id, data), or None if nothing happened."""
+        self.due += TRIAL_PERIOD_S
+        if self._rng.random() > self._probability:
+            return None
+        return self._rng.randint(1, 254), self._rng.randbytes(self._rng.choice(EVENT_DATA_BYTES))

@@ -1,0 +1,270 @@
+"""The nine network messages and their wire format.
+
+Every datagram is broadcast and begins with one header, big-endian:
+
+    magic "UC" | version u8 | type u8 | sender u32 | sequence u32 | body length u16
+
+The sender's sequence number identifies a datagram in traces and captures; the protocol does not use it. A datagram
+that is not exactly one well-formed message is refused with MalformedDatagramError: a radio delivers anything.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
+
+MAGIC = b"UC"
+VERSION = 1
+HEADER = struct.Struct("!2sBBIIH")
+MAX_DATAGRAM_BYTES = 1472
+"""One UDP datagram without IP fragmentation at MTU 1500."""
+
+_BLOCK_HEADER = struct.Struct("!IQ")
+
+
+class MalformedDatagramError(ValueError):
+    """Not one well-formed message. `reason` is one of a few fixed words, for counting."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class BlockAddRequest:
+    """May the block with this hash go on top of the chain with this chain hash? (Algorithms 2 and 3)"""
+
+    NAME: ClassVar[str] = "Block Add Request"
+    block_hash: bytes
+    chain_hash: bytes
+
+    def body(self) -> bytes:
+        return self.block_hash + self.chain_hash
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "BlockAddRequest":
+        return cls(*_hashes(body, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class BlockAddResponse:
+    """A vote on a proposed block (Algorithms 3 and 4).
+
+    `chain_hash` is the proposer's, repeated when the setting `vote_names_chain` is on.
+    """
+
+    NAME: ClassVar[str] = "Block Add Response"
+    block_hash: bytes
+    approve: bool
+    chain_hash: bytes | None = None
+
+    def body(self) -> bytes:
+        return bytes([self.approve]) + self.block_hash + (self.chain_hash or b"")
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "BlockAddResponse":
+        approve = _flag(body)
+        if len(body) == 1 + HASH_BYTES:
+            return cls(body[1:], approve)
+        block_hash, chain_hash = _hashes(body[1:], 2)
+        return cls(block_hash, approve, chain_hash)
+
+
+@dataclass(frozen=True, slots=True)
+class CommitBlock:
+    """Commit this block; `chain_hash` is its own at its place in the sender's chain (Algorithms 5, 6 and 20)."""
+
+    NAME: ClassVar[str] = "Commit Block"
+    block: Block
+    chain_hash: bytes
+
+    def body(self) -> bytes:
+        return self.chain_hash + _pack_block(self.block)
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "CommitBlock":
+        (chain_hash,) = _hashes(body[:HASH_BYTES], 1)
+        return cls(_unpack_block(body[HASH_BYTES:]), chain_hash)
+
+
+@dataclass(frozen=True, slots=True)
+class ChainContainQuery:
+    """Does your chain contain this chain hash? (Algorithms 8 and 9)"""
+
+    NAME: ClassVar[str] = "Chain Contain Query"
+    chain_hash: bytes
+
+    def body(self) -> bytes:
+        return self.chain_hash
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "ChainContainQuery":
+        return cls(*_hashes(body, 1))
+
+
+@dataclass(frozen=True, slots=True)
+class ChainContainResponse:
+    """Yes or no to a Chain Contain Query (Algorithms 9 and 10)."""
+
+    NAME: ClassVar[str] = "Chain Contain Response"
+    chain_hash: bytes
+    contained: bool
+
+    def body(self) -> bytes:
+        return bytes([self.contained]) + self.chain_hash
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "ChainContainResponse":
+        contained = _flag(body)
+        (chain_hash,) = _hashes(body[1:], 1)
+        return cls(chain_hash, contained)
+
+
+@dataclass(frozen=True, slots=True)
+class ChainHashSuccessorQuery:
+    """Which block follows this chain hash in your chain? (Algorithms 12 and 13)"""
+
+    NAME: ClassVar[str] = "Chain Hash Successor Query"
+    chain_hash: bytes
+
+    def body(self) -> bytes:
+        return self.chain_hash
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "ChainHashSuccessorQuery":
+        return cls(*_hashes(body, 1))
+
+
+@dataclass(frozen=True, slots=True)
+class NextInSequenceResponse:
+    """The successor's block hash and timestamp (Algorithms 13 and 14).
+
+    `block_hash` None is the reserved "Is Top Of Chain"; the timestamp is then that of the responder's top block.
+    """
+
+    NAME: ClassVar[str] = "Next in Sequence Response"
+    chain_hash: bytes
+    block_hash: bytes | None
+    timestamp_us: int
+
+    def body(self) -> bytes:
+        return self.timestamp_us.to_bytes(8, "big") + self.chain_hash + (self.block_hash or b"")
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "NextInSequenceResponse":
+        timestamp_us = int.from_bytes(body[:8], "big")
+        if len(body) == 8 + HASH_BYTES:
+            return cls(body[8:], None, timestamp_us)
+        chain_hash, block_hash = _hashes(body[8:], 2)
+        return cls(chain_hash, block_hash, timestamp_us)
+
+
+@dataclass(frozen=True, slots=True)
+class RequestForBlock:
+    """Send me the block with this hash (Algorithms 16 and 17)."""
+
+    NAME: ClassVar[str] = "Request for Block"
+    block_hash: bytes
+
+    def body(self) -> bytes:
+        return self.block_hash
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "RequestForBlock":
+        return cls(*_hashes(body, 1))
+
+
+@dataclass(frozen=True, slots=True)
+class BlockResponse:
+    """The block that was asked for (Algorithms 17 and 18)."""
+
+    NAME: ClassVar[str] = "Block Response"
+    block: Block
+
+    def body(self) -> bytes:
+        return _pack_block(self.block)
+
+    @classmethod
+    def from_body(cls, body: bytes) -> "BlockResponse":
+        return cls(_unpack_block(body))
+
+
+Message = (
+    BlockAddRequest
+    | BlockAddResponse
+    | CommitBlock
+    | ChainContainQuery
+    | ChainContainResponse
+    | ChainHashSuccessorQuery
+    | NextInSequenceResponse
+    | RequestForBlock
+    | BlockResponse
+)
+
+TYPE_CODES: dict[type[Message], int] = {
+    BlockAddRequest: 1,
+    BlockAddResponse: 2,
+    CommitBlock: 3,
+    ChainContainQuery: 4,
+    ChainContainResponse: 5,
+    ChainHashSuccessorQuery: 6,
+    NextInSequenceResponse: 7,
+    RequestForBlock: 8,
+    BlockResponse: 9,
+}
+_FROM_BODY: dict[int, Callable[[bytes], Message]] = {code: message.from_body for message, code in TYPE_CODES.items()}
+
+
+def encode(sender: int, sequence: int, message: Message) -> bytes:
+    """One datagram, at most MAX_DATAGRAM_BYTES long. `sequence` wraps at 2**32."""
+    body = message.body()
+    code = TYPE_CODES[type(message)]
+    return HEADER.pack(MAGIC, VERSION, code, sender, sequence & 0xFFFFFFFF, len(body)) + body
+
+
+def decode(datagram: bytes) -> tuple[int, int, Message]:
+    """(sender, sequence, message) of one datagram. Raises MalformedDatagramError for anything else."""
+    if len(datagram) < HEADER.size:
+        raise MalformedDatagramError("truncated")
+    if len(datagram) > MAX_DATAGRAM_BYTES:
+        raise MalformedDatagramError("oversized")
+    magic, version, code, sender, sequence, length = HEADER.unpack_from(datagram)
+    if magic != MAGIC:
+        raise MalformedDatagramError("wrong magic")
+    if version != VERSION:
+        raise MalformedDatagramError("wrong version")
+    if not 1 <= sender <= MAX_AGENT_ID:
+        raise MalformedDatagramError("impossible sender")
+    if length != len(datagram) - HEADER.size:
+        raise MalformedDatagramError("wrong length")
+    from_body = _FROM_BODY.get(code)
+    if from_body is None:
+        raise MalformedDatagramError("unknown type")
+    return sender, sequence, from_body(datagram[HEADER.size :])
+
+
+def _hashes(body: bytes, count: int) -> list[bytes]:
+    if len(body) != count * HASH_BYTES:
+        raise MalformedDatagramError("wrong length")
+    return [body[start : start + HASH_BYTES] for start in range(0, len(body), HASH_BYTES)]
+
+
+def _flag(body: bytes) -> bool:
+    if body[:1] not in (b"\0", b"\1"):
+        raise MalformedDatagramError("bad vote")
+    return body[0] == 1
+
+
+def _pack_block(block: Block) -> bytes:
+    return _BLOCK_HEADER.pack(block.agent_id, block.timestamp_us) + block.event_data
+
+
+def _unpack_block(body: bytes) -> Block:
+    if not _BLOCK_HEADER.size < len(body) <= _BLOCK_HEADER.size + MAX_EVENT_DATA_BYTES:
+        raise MalformedDatagramError("wrong length")
+    agent_id, timestamp_us = _BLOCK_HEADER.unpack_from(body)
+    if not 1 <= agent_id <= MAX_AGENT_ID:
+        raise MalformedDatagramError("impossible agent")
+    return Block(agent_id, timestamp_us, body[_BLOCK_HEADER.size :])

@@ -1,0 +1,69 @@
+"""What an agent can be told: timers, sizes, the readings of an ambiguous thesis, and the field test's bugs."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal, get_args, get_type_hints
+
+from ucp.block import MAX_EVENT_DATA_BYTES
+from ucp.events import MAX_EVENT_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Durations in mission seconds, sizes in bytes. Raises ValueError for impossible values."""
+
+    vote_timeout_s: float = 10.0
+    phase1_timeout_s: float = 5.0
+    phase2_timeout_s: float = 5.0
+    phase3_timeout_s: float = 5.0
+    finalize_gap_s: float = 0.1
+    """Pause between the commits of Algorithm 20, so that others can follow (Section 4.2)."""
+
+    max_block_bytes: int = MAX_EVENT_DATA_BYTES
+    max_event_bytes: int = MAX_EVENT_BYTES
+
+    vote_names_chain: bool = False
+    """A vote also names the proposer's chain, so that a late vote of an earlier round cannot count."""
+    changed_before_tally: bool = False
+    """Algorithm 5 looks for a changed chain before it tallies, instead of after."""
+    phase1_tie: Literal["phase2", "pop"] = "phase2"
+    """Algorithm 11 on a tie: go on to phase 2 as printed, or pop another block."""
+    phase2_tie: Literal["oldest", "block"] = "oldest"
+    """Algorithm 15 on a tie: the oldest timestamp, or never "Is Top Of Chain" while a block is on offer."""
+
+    def __post_init__(self) -> None:
+        for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"{name} must be more than 0 seconds, not {getattr(self, name)}")
+        if not 0 <= self.finalize_gap_s < float("inf"):
+            raise ValueError(f"finalize_gap_s must not be negative, not {self.finalize_gap_s}")
+        if not 0 < self.max_block_bytes <= MAX_EVENT_DATA_BYTES:
+            raise ValueError(f"max_block_bytes must be 1..{MAX_EVENT_DATA_BYTES}, not {self.max_block_bytes}")
+        if not 0 < self.max_event_bytes <= self.max_block_bytes:
+            raise ValueError(f"max_event_bytes must be 1..max_block_bytes, not {self.max_event_bytes}")
+        for name in ("phase1_tie", "phase2_tie"):
+            allowed = get_args(get_type_hints(Settings)[name])
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {getattr(self, name)!r}")
+
+
+@dataclass(slots=True)
+class Quirks:
+    """Faults that an agent can be told to have while it runs."""
+
+    ignore_commit: float = 0.0
+    """Probability 0..1 that Algorithm 6 ignores a Commit Block (Section 4.2's second stage of testing)."""
+    crash_on_tie: bool = False
+    """Algorithm 15 dies on a tied vote and the reconcile never ends (Section 4.3, second field test)."""
+
+    def set(self, name: str, value: Any) -> None:
+        """Set one quirk by name. ValueError says which names there are and what the value may be."""
+        known = [field.name for field in dataclasses.fields(self)]
+        if name not in known:
+            raise ValueError(f"unknown quirk {name!r}: there are {', '.join(known)}")
+        if name == "ignore_commit":
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+                raise ValueError(f"ignore_commit is a probability 0..1, not {value!r}")
+        elif not isinstance(value, bool):
+            raise ValueError(f"{name} is true or false, not {value!r}")
+        setattr(self, name, value)
