@@ -1,0 +1,29 @@
+"""Errors that a user meets: one clear sentence with the way out, and the exit status of the command line."""
+
+VIOLATED, WRONG_REQUEST, CANNOT_HERE, INTERRUPTED = 1, 2, 3, 130
+"""Exit statuses besides 0. 1: a characteristic is violated, or an agent failed; 2: scenario, arguments or exports are
+wrong; 3: this machine cannot do it; 130: interrupted."""
+
+
+class HarnessError(Exception):
+    """The base of all errors that the harness reports; never shown with a traceback."""
+
+    exit_status = WRONG_REQUEST
+
+
+class ScenarioError(HarnessError):
+    """The scenario file is not one that can be run."""
+
+
+class ExportError(HarnessError):
+    """A chain export that cannot be used."""
+
+
+class RunDirectoryError(HarnessError):
+    """The run directory cannot be written or read."""
+
+
+class MachineError(HarnessError):
+    """This machine cannot do what was asked."""
+
+    exit_status = CANNOT_HERE

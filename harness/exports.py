@@ -1,0 +1,193 @@
+"""Reading chain exports (`ucp-chain-export/1`), from a run or from the field.
+
+Exports come back truncated, edited, twice, or from another mission. Each gets one clear sentence; the rest are read.
+Only the shape is judged here: whether the hashes recompute is characteristic 4, and the checker's to say.
+"""
+
+import base64
+import binascii
+import json
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from harness.errors import ExportError
+from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
+from ucp.export import SCHEMA
+
+SUFFIX = ".chain.json"
+MAX_EXPORT_BYTES = 256 * 1024 * 1024
+
+Hash = Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * HASH_BYTES}}}$")]
+AgentId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]
+
+
+def _decodable(text: str) -> str:
+    try:
+        base64.b64decode(text, validate=True)
+    except binascii.Error as error:
+        raise ValueError(f"not base64: {error}") from None
+    return text
+
+
+Base64 = Annotated[str, AfterValidator(_decodable)]
+EventData = Annotated[Base64, Field(max_length=4 * (MAX_EVENT_DATA_BYTES // 3 + 1))]
+
+
+class ExportedBlock(BaseModel):
+    """A block as exported; `chain_hash` is null outside the chain."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    agent_id: AgentId
+    timestamp_us: Annotated[int, Field(ge=0, lt=2**64, strict=True)]
+    event_data: EventData
+    block_hash: Hash
+    chain_hash: Hash | None
+
+    @property
+    def event_bytes(self) -> bytes:
+        return base64.b64decode(self.event_data)
+
+
+class ExportedInception(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    block_data: Base64
+    block_hash: Hash
+    chain_hash: Hash
+
+
+class CurrentBlock(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    event_data: EventData
+
+
+class Export(BaseModel):
+    """One agent's export; fields that this version does not know are ignored."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    schema_: Annotated[Literal["ucp-chain-export/1"], Field(alias="schema")]
+    agent_id: AgentId
+    exported_at_us: Annotated[int, Field(ge=0, strict=True)]
+    inception: ExportedInception
+    chain: list[ExportedBlock]
+    blocks_to_be_committed: list[ExportedBlock]
+    reconcile_stack: list[ExportedBlock]
+    current_block: CurrentBlock
+    reconcile_in_progress: bool
+    idle: bool
+    completed: list[Hash]
+
+    @property
+    def top_chain_hash(self) -> str:
+        top = self.chain[-1].chain_hash if self.chain else None
+        return top or self.inception.chain_hash
+
+    @property
+    def chain_of_block_hashes(self) -> tuple[str, ...]:
+        return tuple(block.block_hash for block in self.chain)
+
+    def blocks(self) -> Iterable[ExportedBlock]:
+        """Every block that the agent holds, wherever it holds it."""
+        yield from self.chain
+        yield from self.blocks_to_be_committed
+        yield from self.reconcile_stack
+
+
+@dataclass
+class Exports:
+    """The exports of one mission by agent, and a sentence for each file that could not be used."""
+
+    by_agent: dict[int, Export] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+
+
+def read_export(path: Path) -> Export:
+    """Raises ExportError: one sentence that names the file, what is wrong with it and where."""
+    try:
+        if path.stat().st_size > MAX_EXPORT_BYTES:
+            raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which no mission's export is")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ExportError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ExportError(f"{path}: not a chain export (not UTF-8 text)") from None
+    try:
+        document = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "its nesting"
+        raise ExportError(f"{path}: truncated or damaged: not JSON at {where}; export it again") from None
+    if not isinstance(document, dict) or "schema" not in document:
+        raise ExportError(f"{path}: not a chain export (it has no `schema`)")
+    if document["schema"] != SCHEMA:
+        raise ExportError(f"{path}: its schema is {document['schema']!r}, and this version reads {SCHEMA!r}")
+    try:
+        return Export.model_validate(document)
+    except ValidationError as error:
+        raise ExportError(f"{path}: {_first_problem(error)}") from None
+
+
+def read_exports(paths: Iterable[Path]) -> Exports:
+    """Read the exports of one mission; what cannot be used is told in `errors`.
+
+    Of exports of several missions those of the mission with the most exports are used, or of the first file if
+    missions tie. Of two different exports of one agent neither can be believed over the other: the later one is used
+    and the other is told.
+    """
+    exports = Exports()
+    read: list[tuple[Path, Export]] = []
+    for path in paths:
+        try:
+            read.append((path, read_export(path)))
+        except ExportError as error:
+            exports.errors.append(str(error))
+    if not read:
+        return exports
+    missions = Counter(export.inception.block_hash for _, export in read)
+    mission = max(missions, key=lambda block_hash: missions[block_hash])
+    source: dict[int, Path] = {}
+    for path, export in read:
+        if export.inception.block_hash != mission:
+            exports.errors.append(
+                f"{path}: agent {export.agent_id} flew another mission (inception block "
+                f"{export.inception.block_hash[:12]}, not {mission[:12]}); check each mission by itself"
+            )
+            continue
+        other = exports.by_agent.get(export.agent_id)
+        if other == export:
+            exports.errors.append(f"{path}: the same export as {source[export.agent_id]}, counted once")
+            continue
+        if other is not None:
+            later, earlier = (path, source[export.agent_id])
+            if other.exported_at_us > export.exported_at_us:
+                later, earlier = earlier, later
+            exports.errors.append(
+                f"{earlier}: another export of agent {export.agent_id} than {later}, which is later and is used"
+            )
+            if later != path:
+                continue
+        exports.by_agent[export.agent_id] = export
+        source[export.agent_id] = path
+    exports.by_agent = dict(sorted(exports.by_agent.items()))
+    return exports
+
+
+def export_paths(directory: Path) -> list[Path]:
+    """The exports of a run directory, or of a directory that holds exports; by agent ID where the name has one."""
+    agents = directory / "agents"
+    paths = list((agents if agents.is_dir() else directory).glob(f"*{SUFFIX}"))
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem: Any = error.errors()[0]
+    where = ".".join(str(part) for part in problem["loc"])
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    return f"`{where}` is wrong: {problem['msg'].lower()}{more}; the export was edited or damaged"
