@@ -1,0 +1,183 @@
+"""The mission file: all that one agent is told before it starts (schema `ucp-mission/1`, see CONTRACT.md)."""
+
+import base64
+import binascii
+import dataclasses
+import ipaddress
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from ucp.block import MAX_AGENT_ID
+from ucp.events import MEAN_TIME_BETWEEN_EVENTS_S
+from ucp.settings import Quirks, Settings
+
+SCHEMA = "ucp-mission/1"
+MAX_MISSION_BYTES = 4 * 1024 * 1024
+
+
+class MissionError(Exception):
+    """A mission file that cannot be used: one sentence with the file, the key and what is allowed."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """Where to broadcast. `address` is the agent's own IPv4 address: what comes back from it is its own echo."""
+
+    address: str
+    broadcast: str
+    port: int
+
+
+@dataclass(frozen=True)
+class EventSource:
+    """Algorithm 21 ("random"), the vehicle's telemetry ("mavlink"), or silence ("none")."""
+
+    source: Literal["random", "mavlink", "none"] = "random"
+    mean_s: float = MEAN_TIME_BETWEEN_EVENTS_S
+    position_interval_s: float = 10.0
+    vehicle_host: str = "127.0.0.1"
+    vehicle_port: int = 5762
+
+
+@dataclass(frozen=True)
+class Mission:
+    """`epoch_us` is the mission's start, microseconds since the Unix epoch; None waits for the command `start`.
+
+    `speedup` is how many mission seconds pass in one second of wall time.
+    """
+
+    agent_id: int
+    roster: tuple[int, ...]
+    initial_data: bytes
+    network: Network
+    events: EventSource
+    settings: Settings
+    quirks: Quirks
+    seed: int
+    speedup: float
+    epoch_us: int | None
+
+
+def load_mission(path: Path) -> Mission:
+    """Raises MissionError."""
+    try:
+        if path.stat().st_size > MAX_MISSION_BYTES:
+            raise MissionError(f"{path}: larger than {MAX_MISSION_BYTES} bytes, which no mission file is")
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MissionError(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise MissionError(f"{path}: not JSON: {error}") from None
+    try:
+        return parse_mission(document)
+    except MissionError as error:
+        raise MissionError(f"{path}: {error}") from None
+
+
+def parse_mission(document: Any) -> Mission:
+    """Raises MissionError."""
+    if not isinstance(document, dict):
+        raise MissionError("not a mission: a JSON object is needed")
+    if document.get("schema") != SCHEMA:
+        raise MissionError(f"`schema` is {document.get('schema')!r}, and this agent reads {SCHEMA!r}")
+    agent_id = _integer(document, "agent_id", 1, MAX_AGENT_ID)
+    roster = _get(document, "roster", list)
+    if not roster or not all(isinstance(member, int) and 1 <= member <= MAX_AGENT_ID for member in roster):
+        raise MissionError(f"`roster` must list agent IDs 1..{MAX_AGENT_ID}")
+    if agent_id not in roster:
+        raise MissionError(f"`agent_id` {agent_id} is not on the `roster`")
+    epoch_us = document.get("epoch_us")
+    if epoch_us is not None and (not isinstance(epoch_us, int) or epoch_us < 0):
+        raise MissionError("`epoch_us` must be microseconds since the Unix epoch, or null to wait for `start`")
+    return Mission(
+        agent_id=agent_id,
+        roster=tuple(roster),
+        initial_data=_initial_data(document),
+        network=_network(_get(document, "network", dict)),
+        events=_event_source(_get(document, "events", dict)),
+        settings=_settings(document.get("settings", {})),
+        quirks=_quirks(document.get("quirks", {})),
+        seed=_integer(document, "seed", 0, 2**64 - 1),
+        speedup=_positive(document, "speedup"),
+        epoch_us=epoch_us,
+    )
+
+
+def _get(document: dict[str, Any], key: str, kind: type) -> Any:
+    value = document.get(key)
+    if not isinstance(value, kind):
+        raise MissionError(f"`{key}` is missing or not a JSON {'object' if kind is dict else kind.__name__}")
+    return value
+
+
+def _integer(document: dict[str, Any], key: str, low: int, high: int) -> int:
+    value = document.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise MissionError(f"`{key}` must be a whole number {low}..{high}, not {value!r}")
+    return value
+
+
+def _positive(document: dict[str, Any], key: str) -> float:
+    value = document.get(key)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < math.inf:
+        raise MissionError(f"`{key}` must be a number above 0, not {value!r}")
+    return float(value)
+
+
+def _initial_data(document: dict[str, Any]) -> bytes:
+    try:
+        return base64.b64decode(_get(document, "initial_data", str), validate=True)
+    except binascii.Error as error:
+        raise MissionError(f"`initial_data` is not base64: {error}") from None
+
+
+def _network(document: dict[str, Any]) -> Network:
+    for key in ("address", "broadcast"):
+        try:
+            ipaddress.IPv4Address(document.get(key))
+        except ValueError:
+            raise MissionError(f"`network.{key}` must be an IPv4 address, not {document.get(key)!r}") from None
+    return Network(document["address"], document["broadcast"], _integer(document, "port", 1, 65535))
+
+
+def _event_source(document: dict[str, Any]) -> EventSource:
+    document = {**dataclasses.asdict(EventSource()), **_known(document, "events", EventSource)}
+    if document["source"] not in ("random", "mavlink", "none"):
+        raise MissionError(f"`events.source` must be random, mavlink or none, not {document['source']!r}")
+    return EventSource(
+        document["source"],
+        max(1.0, _positive(document, "mean_s")),
+        _positive(document, "position_interval_s"),
+        _get(document, "vehicle_host", str),
+        _integer(document, "vehicle_port", 1, 65535),
+    )
+
+
+def _settings(document: Any) -> Settings:
+    try:
+        return Settings(**_known(document, "settings", Settings))
+    except (TypeError, ValueError) as error:
+        raise MissionError(f"`settings`: {error}") from None
+
+
+def _quirks(document: Any) -> Quirks:
+    quirks = Quirks()
+    try:
+        for name, value in _known(document, "quirks", Quirks).items():
+            quirks.set(name, value)
+    except ValueError as error:
+        raise MissionError(f"`quirks`: {error}") from None
+    return quirks
+
+
+def _known(document: Any, key: str, kind: type) -> dict[str, Any]:
+    if not isinstance(document, dict):
+        raise MissionError(f"`{key}` must be a JSON object")
+    names = [field.name for field in dataclasses.fields(kind)]
+    for name in document:
+        if name not in names:
+            raise MissionError(f"`{key}.{name}` is unknown: there are {', '.join(names)}")
+    return document

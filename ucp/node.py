@@ -1,0 +1,302 @@
+"""One agent as a process: `python -m ucp.node MISSION_FILE`.
+
+It drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source, and leaves its files beside
+the mission file: `<id>.chain.json`, `<id>.trace.jsonl`, `<id>.log`, and the control socket `<id>.control` while it
+runs. SIGTERM exports the chain and ends it. CONTRACT.md says what any agent under test must do; this is the default.
+"""
+
+import asyncio
+import contextlib
+import dataclasses
+import logging
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from ucp.agent import Agent
+from ucp.clock import MissionClock
+from ucp.control import CommandError, ControlServer
+from ucp.events import LoggableEvent, RandomEvents
+from ucp.export import export_chain
+from ucp.files import TraceFile, write_atomically
+from ucp.mission import Mission, MissionError, load_mission
+from ucp.trace import header_line
+
+MAX_READ_BYTES = 65536
+DATAGRAMS_PER_TURN = 64
+WRONG_MISSION = 2
+
+log = logging.getLogger("ucp.node")
+
+
+class Node:
+    """Files go to `directory`. Raises OSError if the port or a file cannot be had."""
+
+    def __init__(self, mission: Mission, directory: Path) -> None:
+        self.mission = mission
+        self.clock = MissionClock(mission.speedup)
+        self.agent = Agent(mission.agent_id, mission.roster, mission.initial_data, mission.settings, seed=mission.seed)
+        self.agent.quirks = mission.quirks
+        self.generating = False
+        self.handled = 0
+        self.bytes_sent = 0
+        self.send_failures = 0
+        self._directory = directory
+        self._trace = TraceFile(directory / f"{mission.agent_id}.trace.jsonl")
+        self._trace_problem_told = False
+        self._socket = _broadcast_socket(mission)
+        self._timer: asyncio.TimerHandle | None = None
+        self._source: asyncio.Task[None] | None = None
+        self._ended = asyncio.Event()
+        self._control = ControlServer(
+            directory / f"{mission.agent_id}.control",
+            {
+                "status": self._status,
+                "start": self._start,
+                "stop_events": self._stop_events,
+                "export": self._export_command,
+                "quirk": self._quirk,
+                "reconcile": self._reconcile,
+            },
+        )
+
+    async def run(self) -> int:
+        """Serve until SIGTERM or SIGINT; the exit status, 1 if the chain could not be exported."""
+        loop = asyncio.get_running_loop()
+        for signal_number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(signal_number, self._ended.set)
+        loop.add_reader(self._socket, self._receive)
+        await self._control.start()
+        log.info("agent %d of %s ready", self.mission.agent_id, list(self.mission.roster))
+        if self.mission.epoch_us is not None:
+            self._begin(self.mission.epoch_us)
+        await self._ended.wait()
+        self._stop_source()
+        loop.remove_reader(self._socket)
+        self._socket.close()
+        status = 0
+        try:
+            self.export()
+        except OSError as error:
+            log.error("could not export the chain: %s", error.strerror)
+            status = 1
+        self._trace.close()
+        self._control.close()
+        log.info("agent %d ended", self.mission.agent_id)
+        return status
+
+    def export(self) -> Path:
+        """Write the chain export whole or not at all. Raises OSError."""
+        path = self._directory / f"{self.mission.agent_id}.chain.json"
+        now = self.clock.now()
+        write_atomically(path, export_chain(self.agent, self.clock.timestamp_us(now)))
+        return path
+
+    # Inputs of the agent
+
+    def _receive(self) -> None:
+        for _ in range(DATAGRAMS_PER_TURN):
+            try:
+                data, (address, _) = self._socket.recvfrom(MAX_READ_BYTES)
+            except BlockingIOError:
+                return
+            if address == self.mission.network.address or not self.clock.running:
+                continue  # the echo of our own broadcast
+            self._drive(partial(self.agent.receive_datagram, data))
+
+    def _log_event(self, event_id: int, data: bytes) -> None:
+        if not self.generating:
+            return
+        event = LoggableEvent(self.clock.timestamp_us(self.clock.now()), event_id, data)
+        try:
+            self._drive(partial(self.agent.add_event, event))
+        except ValueError as error:  # larger than this mission allows
+            log.warning("event %d not logged: %s", event_id, error)
+
+    def _handle_timer(self) -> None:
+        self._timer = None
+        self._drive(self.agent.handle_timer)
+
+    def _drive(self, feed: Callable[[float], None]) -> None:
+        """Give the agent one input, then do what it says: broadcast, trace, and arm its next timer."""
+        feed(self.clock.now())
+        for datagram in self.agent.datagrams_to_send():
+            try:
+                self._socket.sendto(datagram, (self.mission.network.broadcast, self.mission.network.port))
+                self.bytes_sent += len(datagram)
+            except OSError as error:  # a radio that cannot send loses the message, as radios do
+                self.send_failures += 1
+                log.warning("could not broadcast: %s", error.strerror)
+        runs = self.agent.trace()
+        self.handled += len(runs)
+        self._trace.write("".join(run.to_line() for run in runs))
+        if self._trace.problem and not self._trace_problem_told:
+            self._trace_problem_told = True
+            log.error("the trace ends here: %s", self._trace.problem)
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        deadline = self.agent.next_timer()
+        if deadline is not None:
+            delay = self.clock.wall_s(deadline - self.clock.now())
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, delay), self._handle_timer)
+
+    # Event sources
+
+    def _begin(self, epoch_us: int) -> None:
+        self.clock.start(epoch_us)
+        self._trace.write(
+            header_line(
+                self.mission.agent_id,
+                list(self.mission.roster),
+                dataclasses.asdict(self.mission.settings),
+                {"epoch_us": epoch_us, "speedup": self.mission.speedup},
+            )
+        )
+        if self.mission.events.source != "none":
+            self.generating = True
+            source = self._random_events if self.mission.events.source == "random" else self._vehicle_events
+            self._source = asyncio.create_task(source())
+            self._source.add_done_callback(self._source_ended)
+        log.info("mission started, events from %s", self.mission.events.source)
+
+    async def _random_events(self) -> None:
+        source = RandomEvents(Random(self.mission.seed), self.mission.events.mean_s)
+        while True:
+            await asyncio.sleep(self.clock.wall_s(source.due - self.clock.now()))
+            event = source.trial()
+            if event is not None:
+                self._log_event(*event)
+
+    async def _vehicle_events(self) -> None:
+        from ucp import telemetry  # pymavlink: only where a vehicle is
+
+        events = telemetry.TelemetryEvents(self.mission.events.position_interval_s, Random(self.mission.seed))
+
+        def sink(data: bytes) -> None:
+            for event_id, event_data in events.receive(data, self.clock.now()):
+                self._log_event(event_id, event_data)
+
+        await telemetry.follow(self.mission.events.vehicle_host, self.mission.events.vehicle_port, sink)
+
+    def _source_ended(self, task: "asyncio.Task[None]") -> None:
+        if not task.cancelled() and task.exception() is not None:
+            log.error("the event source failed", exc_info=task.exception())
+            self.generating = False
+
+    def _stop_source(self) -> None:
+        self.generating = False
+        if self._source is not None:
+            self._source.cancel()
+
+    # Commands of the control socket
+
+    def _status(self, request: dict[str, Any]) -> dict[str, Any]:
+        agent = self.agent
+        return {
+            "agent_id": agent.agent_id,
+            "started": self.clock.running,
+            "mission_s": round(self.clock.now(), 3),
+            "generating": self.generating,
+            "idle": agent.idle,
+            "reconcile_in_progress": agent.reconcile_in_progress,
+            "chain": len(agent.chain),
+            "deque": len(agent.blocks_to_be_committed),
+            "stack": len(agent.reconcile_stack),
+            "top_chain_hash": agent.chain.top_chain_hash.hex(),
+            "completed": len(agent.completed),
+            "reconciles": agent.reconciles,
+            "handled": self.handled,
+            "sent": dict(agent.sent),
+            "received": dict(agent.received),
+            "dropped": dict(agent.dropped),
+            "bytes_sent": self.bytes_sent,
+            "send_failures": self.send_failures,
+            "trace_problem": self._trace.problem,
+        }
+
+    def _start(self, request: dict[str, Any]) -> dict[str, Any]:
+        epoch_us = request.get("epoch_us")
+        if not isinstance(epoch_us, int) or epoch_us < 0:
+            raise CommandError("start needs `epoch_us`, microseconds since the Unix epoch")
+        if self.clock.running:
+            raise CommandError("the mission has started already")
+        self._begin(epoch_us)
+        return {}
+
+    def _stop_events(self, request: dict[str, Any]) -> dict[str, Any]:
+        self._stop_source()
+        return {}
+
+    def _export_command(self, request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return {"path": str(self.export())}
+        except OSError as error:
+            log.error("could not export the chain: %s", error.strerror)
+            raise CommandError(f"could not export the chain: {error.strerror}") from None
+
+    def _quirk(self, request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            self.agent.quirks.set(str(request.get("name")), request.get("value"))
+        except ValueError as error:
+            raise CommandError(str(error)) from None
+        return dataclasses.asdict(self.agent.quirks)
+
+    def _reconcile(self, request: dict[str, Any]) -> dict[str, Any]:
+        if not self.clock.running:
+            raise CommandError("the mission has not started")
+        self._drive(self.agent.begin_reconcile)
+        return {}
+
+
+def _broadcast_socket(mission: Mission) -> socket.socket:
+    """A socket on the mission's port that hears broadcasts. Raises OSError."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.setblocking(False)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        sock.bind(("", mission.network.port))
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def main(arguments: list[str]) -> int:
+    """Exit status 0; 1 if the export failed; 2 if the mission file is wrong or its port is in use."""
+    if len(arguments) != 1:
+        sys.stderr.write("usage: python -m ucp.node MISSION_FILE\n")
+        return WRONG_MISSION
+    path = Path(arguments[0])
+    try:
+        mission = load_mission(path)
+    except MissionError as error:
+        sys.stderr.write(f"{error}\n")
+        return WRONG_MISSION
+
+    async def run() -> int:
+        return await Node(mission, path.parent).run()
+
+    try:
+        logging.basicConfig(
+            filename=path.parent / f"{mission.agent_id}.log", format="%(asctime)s %(message)s", level=logging.INFO
+        )
+        return asyncio.run(run())
+    except OSError as error:
+        what = f"UDP port {mission.network.port}: " if error.filename is None else ""
+        message = f"agent {mission.agent_id}: {what}{error.strerror}{f': {error.filename}' if error.filename else ''}"
+        log.error(message)
+        sys.stderr.write(
+            f"{message}; another agent may be running here, or choose another port\n" if what else f"{message}\n"
+        )
+        return WRONG_MISSION
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(KeyboardInterrupt):
+        sys.exit(main(sys.argv[1:]))
