@@ -1,0 +1,71 @@
+"""Talking to an agent under test over its control socket (see ucp/CONTRACT.md)."""
+
+import asyncio
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+ANSWER_LIMIT_BYTES = 1024 * 1024
+
+
+class AgentSilentError(Exception):
+    """The agent does not answer, or its socket is gone."""
+
+
+class AgentRefusedError(Exception):
+    """The agent answered that it cannot: its own sentence."""
+
+
+class AgentControl:
+    """One connection, made anew when it breaks; one command at a time."""
+
+    def __init__(self, socket_path: Path) -> None:
+        self._path = socket_path
+        self._lock = asyncio.Lock()
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+
+    async def ask(self, command: str, *, timeout_s: float, **arguments: Any) -> dict[str, Any]:
+        """The agent's answer. Raises AgentSilentError or AgentRefusedError. `timeout_s` is wall time."""
+        async with self._lock:
+            try:
+                async with asyncio.timeout(timeout_s):
+                    answer = await self._exchange({"command": command, **arguments})
+            except (TimeoutError, OSError, ValueError) as error:
+                self.close()
+                what = f"no answer to {command} for {timeout_s:g} s" if isinstance(error, TimeoutError) else str(error)
+                raise AgentSilentError(what) from None
+            except asyncio.CancelledError:
+                self.close()  # an answer is still to come on this connection, and would be taken for the next one's
+                raise
+        if not answer.get("ok"):
+            raise AgentRefusedError(str(answer.get("error", "no reason given")))
+        return answer
+
+    def close(self) -> None:
+        if self._streams is not None:
+            self._streams[1].close()
+            self._streams = None
+
+    async def _exchange(self, request: dict[str, Any]) -> dict[str, Any]:
+        reader, writer = self._streams or await self._connect()
+        writer.write(json.dumps(request).encode() + b"\n")
+        await writer.drain()
+        line = await reader.readline()
+        if not line.endswith(b"\n"):
+            raise ConnectionResetError("it closed its control socket")
+        answer = json.loads(line)
+        if not isinstance(answer, dict):
+            raise ValueError("its answer is not a JSON object")
+        return answer
+
+    async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        # A socket's address holds 107 bytes, and run directories lie deep: name it through its directory.
+        directory = os.open(self._path.parent, os.O_PATH)
+        try:
+            self._streams = await asyncio.open_unix_connection(
+                f"/proc/self/fd/{directory}/{self._path.name}", limit=ANSWER_LIMIT_BYTES
+            )
+        finally:
+            os.close(directory)
+        return self._streams

@@ -1,0 +1,294 @@
+"""The process backend: a scenario played by real processes in a real, private network.
+
+The story of a run: build the lab, start vehicles and agents, start the mission's clock, play the timeline while
+watching everybody, stop the events, let the agents settle, reconcile finally if asked, export, stop, take the lab down.
+A crash, a hang or Ctrl-C ends the story early, and still exports what there is.
+"""
+
+import asyncio
+import time
+from collections.abc import Coroutine
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from netem.lab import Lab
+
+from harness.backends.agent_process import AgentFailedError, AgentProcess
+from harness.backends.vehicle_process import VehicleProcess
+from harness.errors import CANNOT_HERE, INTERRUPTED, HarnessError, MachineError
+from harness.progress import Progress, Snapshot
+from harness.rundir import RunDirectory
+from harness.scenario import Scenario
+from harness.timeline import NetworkChange, describe, network_changes
+from netem.conditions import NetworkConditions
+from netem.errors import LabUnavailable, NetemError
+from sitl.vehicle import Home, VehicleKind, home_in_field
+
+POLL_S = 0.25
+QUIET_POLL_S = 0.1
+START_DELAY_S = 0.05
+MAX_FINAL_ROUNDS = 20
+"""Bound on the rounds of a final reconcile; each lets every agent reconcile once."""
+
+Outcome = Literal["completed", "interrupted", "failed"]
+
+
+class InterruptedRunError(HarnessError):
+    """The user asked to stop."""
+
+    exit_status = INTERRUPTED
+
+
+@dataclass
+class Played:
+    """What became of a run, before anybody judges it."""
+
+    outcome: Outcome = "completed"
+    outcome_detail: str | None = None
+    exit_status: int = 0
+    engine: str | None = None
+    network: list[dict[str, Any]] = field(default_factory=list)
+    final_reconcile: dict[str, Any] | None = None
+    mission_s: float = 0.0
+    settled: bool = False
+    counters: dict[str, Any] | None = None
+    agents: dict[str, Any] = field(default_factory=dict)
+    vehicles: dict[str, Any] = field(default_factory=dict)
+
+
+async def play(
+    scenario: Scenario,
+    seed: int,
+    kind: VehicleKind | None,
+    initial_data: bytes,
+    rundir: RunDirectory,
+    progress: Progress,
+    interrupted: asyncio.Event,
+) -> Played:
+    """Play the scenario. Raises MachineError if this machine cannot build the lab; all else is in the answer."""
+    return await _Run(scenario, seed, kind, initial_data, rundir, progress, interrupted).play()
+
+
+class _Run:
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        kind: VehicleKind | None,
+        initial_data: bytes,
+        rundir: RunDirectory,
+        progress: Progress,
+        interrupted: asyncio.Event,
+    ) -> None:
+        self.scenario = scenario
+        self.seed = seed
+        self.initial_data = initial_data
+        self.rundir = rundir
+        self.progress = progress
+        self.interrupted = interrupted
+        self.played = Played()
+        self.agents = [AgentProcess(agent_id, rundir) for agent_id in scenario.roster]
+        self.vehicles = [
+            VehicleProcess(vehicle_id, index, kind, rundir)
+            for index, vehicle_id in enumerate(scenario.roster)
+            if kind is not None
+        ]
+        self.stage = "building the lab"
+        self.network = describe(NetworkConditions())
+        self._epoch_s: float | None = None  # wall time of mission second 0
+        self._group = asyncio.TaskGroup()
+        self._watchers: list[asyncio.Task[None]] = []
+
+    async def play(self) -> Played:
+        try:
+            lab = await Lab.open(self.scenario.roster, log=self.rundir.lab_log)
+        except LabUnavailable as error:
+            raise MachineError(str(error)) from None
+        except NetemError as error:
+            raise MachineError(f"the lab could not be built: {error}; see {self.rundir.lab_log}") from None
+        async with lab:
+            self.played.engine = lab.engine
+            try:
+                await self._guarded(self._mission(lab))
+            except HarnessError as error:
+                self._ended_early(error)
+            except NetemError as error:
+                self._ended_early(MachineError(f"the lab failed: {error}"))
+            except OSError as error:
+                self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
+            await self._wind_up(lab)
+        return self.played
+
+    async def _guarded(self, mission: Coroutine[Any, Any, None]) -> None:
+        """Run the mission; the first failure of anything, or the user's interruption, ends it and is raised."""
+        try:
+            async with asyncio.TaskGroup() as self._group:
+                self._watch(self._watch_for_interruption())
+                await mission
+                for watcher in self._watchers:
+                    watcher.cancel()
+        except BaseExceptionGroup as errors:
+            raise _first(errors) from None
+
+    def _watch(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        """Run something beside the mission: what it raises ends the mission, and it ends with the mission."""
+        self._watchers.append(self._group.create_task(coroutine))
+
+    async def _watch_for_interruption(self) -> None:
+        await self.interrupted.wait()
+        raise InterruptedRunError("interrupted")
+
+    # The story
+
+    async def _mission(self, lab: Lab) -> None:
+        await self._start_vehicles(lab)
+        await self._start_agents(lab)
+        changes = network_changes(self.scenario)
+        await self._apply(lab, changes[0])
+        await self._start_clock()
+        self._watch(self._poll_agents())
+        for vehicle in self.vehicles:
+            self._watch(vehicle.take_off(self.scenario.vehicles.takeoff_altitude_m))
+        self.stage = "mission"
+        for change in changes[1:]:
+            await self._until(change.at_s)
+            await self._apply(lab, change)
+        await self._until(self.scenario.duration_s)
+        self.stage = "settling"
+        await asyncio.gather(*(agent.ask("stop_events") for agent in self.agents))
+        self.played.settled = await self._until_idle(self.scenario.settle.limit_s)
+        if self.scenario.final_reconcile:
+            await self._final_reconcile(lab)
+
+    async def _start_vehicles(self, lab: Lab) -> None:
+        if not self.vehicles:
+            return
+        self._show("starting vehicles")
+        field_home = Home(*self.scenario.vehicles.home)
+        await asyncio.gather(
+            *(
+                vehicle.start(lab, home_in_field(index, field_home), self.scenario.speedup)
+                for index, vehicle in enumerate(self.vehicles)
+            )
+        )
+        for vehicle in self.vehicles:
+            self._watch(vehicle.watch())
+
+    async def _start_agents(self, lab: Lab) -> None:
+        self._show("starting agents")
+        with_vehicle = bool(self.vehicles)
+        await asyncio.gather(
+            *(agent.start(lab, self.scenario, self.seed, self.initial_data, with_vehicle) for agent in self.agents)
+        )
+        for agent in self.agents:
+            self._watch(agent.watch())
+
+    async def _start_clock(self) -> None:
+        epoch_s = time.time() + START_DELAY_S
+        await asyncio.gather(*(agent.ask("start", epoch_us=round(epoch_s * 1e6)) for agent in self.agents))
+        self._epoch_s = epoch_s
+
+    async def _apply(self, lab: Lab, change: NetworkChange) -> None:
+        applied = await lab.apply(change.conditions)
+        self.network = change.detail
+        at_s = round(max(change.at_s, self._mission_s()), 3)
+        record = {
+            "at_s": at_s,
+            "what": change.what,
+            "detail": change.detail,
+            "fully_connected": change.conditions.fully_connected,
+        }
+        self.played.network.append(record)
+        self.rundir.append_network({**record, "asked": change.conditions.to_json(), "applied": applied.to_json()})
+
+    async def _until(self, mission_s: float) -> None:
+        await asyncio.sleep(max(0.0, (mission_s - self._mission_s()) / self.scenario.speedup))
+
+    async def _until_idle(self, limit_s: float) -> bool:
+        """Wait until all agents are idle and nothing happens any more; False if `limit_s` mission seconds pass."""
+        deadline_s = self._mission_s() + limit_s
+        handled: list[int] | None = None
+        while self._mission_s() < deadline_s:
+            await asyncio.gather(*(agent.poll() for agent in self.agents))
+            before, handled = handled, [agent.status["handled"] for agent in self.agents]
+            if all(agent.status["idle"] for agent in self.agents) and handled == before:
+                return True
+            await asyncio.sleep(QUIET_POLL_S)
+        return False
+
+    async def _final_reconcile(self, lab: Lab) -> None:
+        """Clear all conditions and let one agent after another reconcile, until a round changes no chain."""
+        self.stage = "final reconcile"
+        conditions = NetworkConditions()
+        began_s = self._mission_s()
+        self.played.final_reconcile = {"at_s": round(began_s, 3), "rounds": 0, "complete": False}
+        await self._apply(lab, NetworkChange(began_s, "final reconcile", describe(conditions), conditions))
+        for number in range(1, MAX_FINAL_ROUNDS + 1):
+            before = self._tops()
+            for agent in self.agents:
+                await agent.ask("reconcile")
+                if not await self._until_idle(self.scenario.settle.limit_s):
+                    return
+            self.played.final_reconcile["rounds"] = number
+            if self._tops() == before:
+                self.played.final_reconcile["complete"] = True
+                return
+
+    def _tops(self) -> list[str]:
+        return [agent.status["top_chain_hash"] for agent in self.agents]
+
+    async def _poll_agents(self) -> None:
+        while True:
+            await asyncio.gather(*(agent.poll() for agent in self.agents))
+            self._show(self.stage)
+            await asyncio.sleep(POLL_S)
+
+    # The end
+
+    def _ended_early(self, error: HarnessError) -> None:
+        self.played.outcome = "interrupted" if isinstance(error, InterruptedRunError) else "failed"
+        self.played.outcome_detail = str(error)
+        self.played.exit_status = error.exit_status
+
+    async def _wind_up(self, lab: Lab) -> None:
+        """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""
+        self._show("exporting")
+        self.played.mission_s = round(self._mission_s(), 1)
+        problems = await asyncio.gather(*(agent.export() for agent in self.agents))
+        for problem in problems:
+            if problem is not None and self.played.outcome == "completed":
+                self.played.outcome, self.played.outcome_detail = "failed", problem
+                self.played.exit_status = CANNOT_HERE
+        self.played.vehicles = {str(vehicle.vehicle_id): vehicle.to_json() for vehicle in self.vehicles}
+        try:
+            self.played.counters = (await lab.read()).to_json()
+            self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
+            await asyncio.gather(*(member.stop() for member in (*self.agents, *self.vehicles)))
+        except NetemError:
+            pass  # the lab is gone, and everybody in it
+        except OSError as error:
+            self.played.outcome_detail = self.played.outcome_detail or f"{error.strerror}: {error.filename}"
+        self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+
+    def _mission_s(self) -> float:
+        return 0.0 if self._epoch_s is None else max(0.0, (time.time() - self._epoch_s) * self.scenario.speedup)
+
+    def _show(self, stage: str) -> None:
+        self.stage = stage
+        self.progress.show(
+            Snapshot(
+                stage,
+                self._mission_s(),
+                self.scenario.duration_s,
+                self.network,
+                {agent.agent_id: agent.status for agent in self.agents},
+            )
+        )
+
+
+def _first(errors: BaseExceptionGroup[BaseException]) -> BaseException:
+    """The error to report: an agent's or vehicle's own before what followed from it."""
+    flat: list[BaseException] = []
+    for error in errors.exceptions:
+        flat += [_first(error)] if isinstance(error, BaseExceptionGroup) else [error]
+    return min(flat, key=lambda error: (not isinstance(error, HarnessError), not isinstance(error, AgentFailedError)))

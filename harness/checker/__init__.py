@@ -1,0 +1,9 @@
+"""The checker: decides from exports, and more from traces, whether the six characteristics hold (Section 4.3).
+
+One file per characteristic, each a function from `Evidence` to `Characteristic`; `verdict.py` gathers them.
+"""
+
+from harness.checker.evidence import Evidence, gather
+from harness.checker.verdict import Result, check
+
+__all__ = ["Evidence", "Result", "check", "gather"]

@@ -1,0 +1,111 @@
+"""Characteristic 1: distributed, event driven and asynchronous.
+
+Every handler run has a local trigger or a message that its sender really sent, and no vote waits for anybody: it ends
+when its own timer does. Only traces can tell.
+"""
+
+from harness.checker.characteristic import Characteristic, Finding, agents, violated
+from harness.checker.evidence import Evidence
+from harness.traces import Trace, TracedRun
+from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER, TRIGGERED_LOCALLY
+
+NAME = "distributed"
+
+SLACK_WALL_S = 1.0
+"""How late a loaded machine may run a timer before it counts as not run, in wall seconds."""
+
+_OF_MESSAGE = {message.NAME: handler.name for message, handler in ON_MESSAGE.items()}
+_OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
+_LOCAL = {handler.name for handler in TRIGGERED_LOCALLY}
+
+
+def check(evidence: Evidence) -> Characteristic:
+    if not evidence.traces:
+        return Characteristic(NAME, "not applicable", "no traces: exports do not show what triggered the handlers")
+    sent = {
+        agent_id: {(message.seq, message.message) for run in trace.runs for message in run.sent}
+        for agent_id, trace in evidence.traces.items()
+    }
+    findings: list[Finding] = []
+    untraced: set[int] = set()
+    runs = 0
+    for agent_id, trace in evidence.traces.items():
+        runs += len(trace.runs)
+        ran: set[str] = set()
+        for run in trace.runs:
+            ran.add(run.handler)
+            sender = run.trigger.get("from")
+            if "message" in run.trigger and sender not in sent:
+                untraced.add(int(sender or 0))
+                continue
+            wrong = _wrong_trigger(run, ran, sent)
+            if wrong:
+                findings.append(Finding(agent_id, f"trace line {run.line}, t={run.t:g} s: {run.handler} {wrong}"))
+        findings += _votes_that_never_ended(agent_id, trace)
+    if findings:
+        return violated(NAME, "a handler ran without a trigger of its own, or waited for another agent", findings)
+    silent = sorted(set(evidence.roster or evidence.exports) - set(evidence.traces))
+    if untraced or silent:
+        return Characteristic(
+            NAME,
+            "not applicable",
+            f"there is no trace of {agents(untraced | set(silent))}, so what they sent and did cannot be checked",
+        )
+    damaged = [agent_id for agent_id, trace in evidence.traces.items() if trace.problem]
+    if damaged:
+        return Characteristic(NAME, "not applicable", f"the trace of {agents(damaged)} is damaged")
+    return Characteristic(
+        NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent"
+    )
+
+
+def _wrong_trigger(run: TracedRun, ran: set[str], sent: dict[int, set[tuple[int, str]]]) -> str | None:
+    """What is wrong with the run's trigger, completing "the handler ..."; None if nothing is."""
+    if run.handler not in HANDLERS or HANDLERS[run.handler].algorithm != run.algorithm:
+        return "is not one of the 20 event handlers"
+    match run.trigger:
+        case {"message": name, "from": sender, "seq": sequence}:
+            if _OF_MESSAGE.get(name) != run.handler:
+                return f"was triggered by a {name}, which is another handler's"
+            if (sequence, name) not in sent[sender]:
+                return f"was triggered by {name} number {sequence}, which agent {sender} never sent"
+        case {"timer": timer}:
+            if _OF_TIMER.get(timer) != run.handler:
+                return f"was triggered by the {timer} timer, which is another handler's"
+        case {"local": by}:
+            if run.handler not in _LOCAL or by not in ran:
+                return f"was triggered by {by}, which had not run"
+        case {"event": _}:
+            if run.handler != "build_data_block":
+                return "was triggered by a logged event, which is Build Data Block's"
+        case {"operator": _}:
+            if run.handler != "reconcile_begin":
+                return "was triggered by the operator, who can only begin a reconcile"
+        case _:
+            return "has no trigger"
+    return None
+
+
+def _votes_that_never_ended(agent_id: int, trace: Trace) -> list[Finding]:
+    timeout_s = trace.header.settings.get("vote_timeout_s")
+    if not isinstance(timeout_s, int | float) or not trace.runs:
+        return []
+    speedup = trace.header.clock.get("speedup", 1)
+    latest = timeout_s + SLACK_WALL_S * (speedup if isinstance(speedup, int | float) else 1)
+    findings = []
+    proposed: TracedRun | None = None
+    for run in trace.runs:
+        if run.handler == "process_next_deque_block" and run.branch == "proposed":
+            proposed = run
+        elif run.handler == "vote_timer_expiration":
+            proposed = None
+        elif proposed is not None and run.t > proposed.t + latest:
+            findings.append(
+                Finding(
+                    agent_id,
+                    f"trace line {proposed.line}, t={proposed.t:g} s: a vote began and did not end within "
+                    f"{timeout_s:g} s",
+                )
+            )
+            proposed = None
+    return findings

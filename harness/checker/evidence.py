@@ -1,0 +1,115 @@
+"""What the checker looks at: exports, traces where there are any, and what the run's record says of the network."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from harness import traces
+from harness.errors import RunDirectoryError
+from harness.exports import SUFFIX, Export, export_paths, read_exports
+from harness.naming import name_blocks
+from harness.traces import Trace
+
+RUN_FILE = "run.json"
+
+
+@dataclass
+class Evidence:
+    """`record` is the run's `run.json`, None for exports that came without one."""
+
+    exports: dict[int, Export]
+    traces: dict[int, Trace] = field(default_factory=dict)
+    record: dict[str, Any] | None = None
+    errors: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.names = name_blocks(self.exports)
+
+    def name(self, block_hash: str) -> str:
+        return self.names.get(block_hash, block_hash[:12])
+
+    @property
+    def roster(self) -> list[int] | None:
+        """All agents of the mission, as far as a run's record or a trace tells."""
+        if self.record is not None:
+            roster = self.record.get("roster")
+            if isinstance(roster, list):
+                return [agent for agent in roster if isinstance(agent, int)]
+        for trace in self.traces.values():
+            return sorted(trace.header.roster)
+        return None
+
+    @property
+    def missing(self) -> list[int]:
+        """Agents of the mission whose export is not here."""
+        return [agent for agent in self.roster or [] if agent not in self.exports]
+
+    @property
+    def connected_since_s(self) -> float | None:
+        """Mission time since when every agent has heard every other without loss; None if not, or not on record."""
+        since: float | None = None
+        for change in (self.record or {}).get("network", []):
+            if not change.get("fully_connected"):
+                since = None
+            elif since is None:
+                since = float(change.get("at_s", 0.0))
+        return since
+
+    @property
+    def network_at_end(self) -> str | None:
+        """The conditions at the end of the run, in words; None if not on record."""
+        changes = (self.record or {}).get("network", [])
+        return str(changes[-1].get("detail")) if changes else None
+
+    def completed_blocks(self) -> dict[str, int]:
+        """Hash -> agent of every block known to have been completed."""
+        owners = {block: agent_id for agent_id, export in self.exports.items() for block in export.completed}
+        for agent_id, trace in self.traces.items():
+            owners.update(dict.fromkeys(trace.completed(), agent_id))
+        return owners
+
+
+def gather(paths: Iterable[Path]) -> Evidence:
+    """The evidence in a run directory, or in exports from anywhere with the traces that lie beside them.
+
+    Raises RunDirectoryError if a path does not exist or nothing at all is there.
+    """
+    export_files: list[Path] = []
+    record: dict[str, Any] | None = None
+    errors: list[str] = []
+    for path in paths:
+        if path.is_dir():
+            found = export_paths(path)
+            record = record or _record(path / RUN_FILE, errors)
+            if not found and record is None:
+                raise RunDirectoryError(f"{path}: neither a run directory nor a directory with *{SUFFIX} files")
+            export_files += found
+        elif path.exists():
+            export_files.append(path)
+        else:
+            raise RunDirectoryError(f"{path}: does not exist; give a run directory or exports (*{SUFFIX})")
+    exports = read_exports(export_files)
+    evidence_traces: dict[int, Trace] = {}
+    for directory in dict.fromkeys(path.parent for path in export_files):
+        for path in sorted(directory.glob(f"*{traces.SUFFIX}")):
+            trace = traces.read_trace(path)
+            if trace is None:
+                errors.append(f"{path}: not a trace; it is left out")
+                continue
+            if trace.problem:
+                errors.append(f"{path}: {trace.problem}; it is read up to there")
+            evidence_traces.setdefault(trace.header.agent_id, trace)
+    return Evidence(exports.by_agent, evidence_traces, record, errors + exports.errors)
+
+
+def _record(path: Path, errors: list[str]) -> dict[str, Any] | None:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError):
+        errors.append(f"{path}: damaged; the exports are checked without it")
+        return None
+    return record if isinstance(record, dict) else None

@@ -1,0 +1,80 @@
+"""Characteristic 4: every block was made by the agent of the mission that it names, and is as it was made."""
+
+import base64
+
+from harness.checker.characteristic import Characteristic, Finding, agents, violated
+from harness.checker.evidence import Evidence
+from harness.exports import Export
+from ucp.block import Block, InceptionBlock, next_chain_hash
+
+NAME = "genuine"
+
+
+def check(evidence: Evidence) -> Characteristic:
+    findings: list[Finding] = []
+    roster = evidence.roster
+    completed = evidence.completed_blocks()
+    known = {*evidence.exports, *evidence.traces}
+    unknown: set[int] = set()
+    blocks = 0
+    for agent_id, export in evidence.exports.items():
+        findings += _hashes_that_do_not_recompute(agent_id, export, evidence)
+        for block in export.blocks():
+            blocks += 1
+            name = evidence.name(block.block_hash)
+            if roster is not None and block.agent_id not in roster:
+                detail = f"holds block {name} of agent {block.agent_id}, which is not on the roster"
+            elif block.agent_id not in known:
+                unknown.add(block.agent_id)
+                continue
+            elif completed.get(block.block_hash) != block.agent_id:
+                detail = f"holds block {name}, which agent {block.agent_id} never completed"
+            else:
+                continue
+            findings.append(Finding(agent_id, detail, name, block.block_hash))
+    if findings:
+        return violated(NAME, "a block is not what an agent of this mission made", findings)
+    if not evidence.exports:
+        return Characteristic(NAME, "not applicable", "there is no export to look at")
+    if unknown:
+        return Characteristic(
+            NAME,
+            "not applicable",
+            f"there is neither export nor trace of {agents(unknown)}, so whether they made their blocks is unknown",
+        )
+    return Characteristic(
+        NAME, "holds", f"all hashes recompute, and each of {blocks} blocks was completed by the agent that it names"
+    )
+
+
+def _hashes_that_do_not_recompute(agent_id: int, export: Export, evidence: Evidence) -> list[Finding]:
+    findings = []
+    inception = InceptionBlock(base64.b64decode(export.inception.block_data))
+    if (inception.block_hash.hex(), inception.chain_hash.hex()) != (
+        export.inception.block_hash,
+        export.inception.chain_hash,
+    ):
+        findings.append(Finding(agent_id, "the inception block's hashes do not recompute: the export was edited"))
+    chain_hash = bytes.fromhex(export.inception.chain_hash)
+    for block in export.blocks():
+        name = evidence.name(block.block_hash)
+        if Block(block.agent_id, block.timestamp_us, block.event_bytes).block_hash.hex() != block.block_hash:
+            findings.append(
+                Finding(
+                    agent_id, f"block {name} does not hash to its block hash: it was edited", name, block.block_hash
+                )
+            )
+    for block in export.chain:
+        chain_hash = next_chain_hash(chain_hash, bytes.fromhex(block.block_hash))
+        if block.chain_hash != chain_hash.hex():
+            name = evidence.name(block.block_hash)
+            findings.append(
+                Finding(
+                    agent_id,
+                    f"the chain hash at block {name} is not that of the blocks below it",
+                    name,
+                    block.block_hash,
+                )
+            )
+            break  # every chain hash above depends on this one
+    return findings

@@ -1,0 +1,60 @@
+"""Characteristic 2: an idle agent has committed every block that it completed."""
+
+from harness.checker.characteristic import Characteristic, Finding, agents, violated
+from harness.checker.evidence import Evidence
+
+NAME = "idle implies committed"
+
+
+def check(evidence: Evidence) -> Characteristic:
+    findings = [*_in_exports(evidence), *_in_traces(evidence)]
+    if findings:
+        return violated(NAME, "an idle agent held a completed block that was not in its chain", findings)
+    if not evidence.exports:
+        return Characteristic(NAME, "not applicable", "there is no export to look at")
+    busy = [agent_id for agent_id, export in evidence.exports.items() if not export.idle]
+    if busy:
+        return Characteristic(NAME, "not applicable", f"{agents(busy)} never became idle, so it cannot be judged")
+    if evidence.missing:
+        return Characteristic(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
+    looked = "at the end and after every traced step" if evidence.traces else "at the end"
+    blocks = sum(len(export.completed) for export in evidence.exports.values())
+    return Characteristic(NAME, "holds", f"all {blocks} completed blocks are in their agents' chains, {looked}")
+
+
+def _in_exports(evidence: Evidence) -> list[Finding]:
+    findings = []
+    for agent_id, export in evidence.exports.items():
+        if not export.idle:
+            continue
+        in_chain = set(export.chain_of_block_hashes)
+        missing = [block_hash for block_hash in export.completed if block_hash not in in_chain]
+        aside = [block.block_hash for block in (*export.blocks_to_be_committed, *export.reconcile_stack)]
+        for block_hash in dict.fromkeys((*missing, *aside)):
+            findings.append(
+                Finding(
+                    agent_id,
+                    f"idle at export, and block {evidence.name(block_hash)} is not in its chain",
+                    evidence.name(block_hash),
+                    block_hash,
+                )
+            )
+    return findings
+
+
+def _in_traces(evidence: Evidence) -> list[Finding]:
+    findings = []
+    for agent_id, trace in evidence.traces.items():
+        for run, held in trace.steps():
+            if run.state.idle and (held.not_in_chain or held.size("deque") or held.size("stack")):
+                waiting = next(iter(held.not_in_chain), None)
+                findings.append(
+                    Finding(
+                        agent_id,
+                        f"trace line {run.line}, t={run.t:g} s: idle after {run.handler} with "
+                        f"{held.size('deque')} blocks to be committed and {held.size('stack')} on the reconcile stack",
+                        evidence.name(waiting) if waiting else None,
+                        waiting,
+                    )
+                )
+    return findings

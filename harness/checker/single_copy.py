@@ -1,0 +1,35 @@
+"""Characteristic 3: at most one copy of a block on an agent, across chain, deque and reconcile stack."""
+
+from collections import Counter
+
+from harness.checker.characteristic import Characteristic, Finding, agents, violated
+from harness.checker.evidence import Evidence
+
+NAME = "single copy"
+
+
+def check(evidence: Evidence) -> Characteristic:
+    findings: list[Finding] = []
+    for agent_id, export in evidence.exports.items():
+        copies = Counter(block.block_hash for block in export.blocks())
+        for block_hash, count in copies.items():
+            if count > 1:
+                name = evidence.name(block_hash)
+                findings.append(Finding(agent_id, f"exported {count} copies of block {name}", name, block_hash))
+    for agent_id, trace in evidence.traces.items():
+        for run, held in trace.steps():
+            where = f"trace line {run.line}, t={run.t:g} s, {run.handler}"
+            if held.impossible:
+                findings.append(Finding(agent_id, f"{where}: {held.impossible}"))
+            for _, block_hash in run.changes:
+                if held.copies[block_hash] > 1:
+                    name = evidence.name(block_hash)
+                    findings.append(Finding(agent_id, f"{where}: a second copy of block {name}", name, block_hash))
+    if findings:
+        return violated(NAME, "an agent held a block twice", findings)
+    if not evidence.exports:
+        return Characteristic(NAME, "not applicable", "there is no export to look at")
+    if evidence.missing:
+        return Characteristic(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
+    looked = " and after every traced step" if evidence.traces else ""
+    return Characteristic(NAME, "holds", f"no block twice in {len(evidence.exports)} exports{looked}")

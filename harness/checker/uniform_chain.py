@@ -1,0 +1,44 @@
+"""Characteristic 6: in a fully connected system where all had the chance to reconcile, one uniform chain emerges."""
+
+from collections import Counter
+
+from harness.checker.agreement import had_a_chance, why_no_chance, why_unknown
+from harness.checker.characteristic import Characteristic, Finding, violated
+from harness.checker.evidence import Evidence
+
+NAME = "one uniform chain"
+
+
+def check(evidence: Evidence) -> Characteristic:
+    unknown = why_unknown(evidence)
+    if unknown:
+        return Characteristic(NAME, "not applicable", unknown)
+    chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}
+    holders = Counter(chains.values())
+    if len(holders) == 1:
+        return Characteristic(
+            NAME, "holds", f"{len(chains)} agents hold the same chain of {len(next(iter(holders)))} blocks"
+        )
+    most_common = max(holders, key=lambda chain: (holders[chain], len(chain), chain))
+    differing = {agent_id for agent_id, chain in chains.items() if chain != most_common}
+    no_chance = why_no_chance(evidence, differing)
+    if no_chance:
+        return Characteristic(NAME, "not applicable", f"{len(holders)} distinct chains; {no_chance}")
+    findings = []
+    for agent_id in sorted(had_a_chance(evidence, differing)):
+        chain = chains[agent_id]
+        shared = common_prefix([chain, most_common])
+        parts = chain[shared] if shared < len(chain) else None
+        detail = f"reconciled while fully connected, and still parts from the most common chain after {shared} blocks"
+        findings.append(Finding(agent_id, detail, evidence.name(parts) if parts else None, parts))
+    return violated(NAME, "an agent that had the chance to reconcile holds another chain", findings)
+
+
+def common_prefix(chains: list[tuple[str, ...]]) -> int:
+    """Length of the mutual chain: how many blocks from the inception block on are the same in all."""
+    length = 0
+    for level in zip(*chains, strict=False):
+        if len(set(level)) > 1:
+            break
+        length += 1
+    return length

@@ -1,0 +1,42 @@
+"""What this machine can do for us: facts and ways out. `ucp-harness doctor` prints them."""
+
+import os
+import platform
+import sys
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from netem import doctor as lab_doctor
+from sitl.ardupilot import ArduPilot
+from sitl.vehicle import VehicleError
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fact; `needed` if a run is impossible without it, and what would mend it."""
+
+    name: str
+    ok: bool
+    needed: bool
+    detail: str
+    way_out: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def examine() -> list[Finding]:
+    """Look at this machine; builds and removes a small lab to find out what the kernel allows."""
+    python = Finding(
+        "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
+    )
+    lab = [Finding(one.name, one.ok, one.needed, one.detail, one.way_out) for one in lab_doctor.examine()]
+    return [python, *lab, _ardupilot()]
+
+
+def _ardupilot() -> Finding:
+    try:
+        found = ArduPilot.find(None, os.environ)
+    except VehicleError as error:
+        return Finding("ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle")
+    return Finding("ArduPilot SITL", True, False, str(found.binary))

@@ -1,0 +1,132 @@
+"""One run from scenario to verdict: play it, check what it left, write the record and the report."""
+
+import asyncio
+import os
+import platform
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from harness import checker, report
+from harness.backends.process import Played, play
+from harness.errors import VIOLATED, MachineError
+from harness.progress import Progress
+from harness.rundir import RunDirectory
+from harness.scenario import Scenario, VehicleKind
+from sitl.ardupilot import ArduPilot
+from sitl.embedded import Embedded
+from sitl.vehicle import NoBinaryError, UnusableBinaryError
+from sitl.vehicle import VehicleKind as Kind
+
+PACKAGES = ("ucp-harness", "pymavlink", "pyroute2")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: where it is, how it ended, what was found, and the exit status of the command line."""
+
+    directory: Path
+    played: Played
+    result: checker.Result
+    exit_status: int
+    wall_s: float
+    report: Path
+
+
+def run(scenario: Scenario, seed: int, directory: RunDirectory, progress: Progress) -> Run:
+    """Play `scenario` and judge it. Raises HarnessError if it cannot even begin.
+
+    Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
+    """
+    kind = choose_vehicles(scenario)
+    started = time.monotonic()
+    started_at = datetime.now(UTC)
+    # Another run is another mission: its blocks must not be taken for this one's.
+    initial_data = f"{scenario.name}, seed {seed}, {started_at.isoformat()}".encode()
+    record: dict[str, Any] = {
+        "scenario": scenario.model_dump(mode="json"),
+        "roster": list(scenario.roster),
+        "seed": seed,
+        "backend": "process",
+        "engine": None,
+        "versions": versions(),
+        "started_at": started_at.isoformat(timespec="seconds").replace("+00:00", "Z"),
+        "outcome": "running",
+    }
+    directory.write_record(record)
+    played = asyncio.run(_play(scenario, seed, kind, initial_data, directory, progress))
+    record |= {
+        "engine": played.engine,
+        "outcome": played.outcome,
+        "outcome_detail": played.outcome_detail,
+        "mission_s": played.mission_s,
+        "settled": played.settled,
+        "final_reconcile": played.final_reconcile,
+        "network": played.network,
+        "faults": [change for change in played.network if change["what"] != "start"],
+        "vehicles": played.vehicles,
+        "agents": played.agents,
+        "counters": played.counters,
+    }
+    directory.write_record(record)
+    result = checker.check(checker.gather([directory.path]))
+    wall_s = time.monotonic() - started
+    directory.write_record({**record, **result.to_json(), "wall_s": round(wall_s, 1)})
+    try:
+        page = report.write_report(directory.path)
+    except OSError as error:
+        raise MachineError(f"the report cannot be written: {error.strerror}; run.json has the verdict") from None
+    status = played.exit_status or (VIOLATED if result.violated else 0)
+    return Run(directory.path, played, result, status, wall_s, page)
+
+
+async def _play(
+    scenario: Scenario,
+    seed: int,
+    kind: Kind | None,
+    initial_data: bytes,
+    directory: RunDirectory,
+    progress: Progress,
+) -> Played:
+    interrupted = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, interrupted.set)
+    return await play(scenario, seed, kind, initial_data, directory, progress, interrupted)
+
+
+def choose_vehicles(scenario: Scenario) -> Kind | None:
+    """ArduPilot if a binary is found, else the embedded vehicle, unless the scenario says. None: no vehicles.
+
+    Raises VehicleFailedError for a binary that will not do, MachineError if ArduPilot is asked for and not here.
+    """
+    from harness.backends.vehicle_process import VehicleFailedError
+
+    asked: VehicleKind | None = scenario.vehicles.kind
+    if asked == "none":
+        return None
+    if asked == "embedded":
+        return Embedded()
+    try:
+        return ArduPilot.find(scenario.vehicles.binary, os.environ)
+    except NoBinaryError as error:
+        if asked == "ardupilot":
+            raise MachineError(str(error)) from None
+        return Embedded()
+    except UnusableBinaryError as error:
+        raise VehicleFailedError(str(error)) from None
+
+
+def versions() -> dict[str, str]:
+    """What this ran on, for whoever wants to repeat it."""
+    return {
+        **{package: version(package) for package in PACKAGES},
+        "python": platform.python_version(),
+        "kernel": platform.release(),
+        "platform": sys.platform,
+    }

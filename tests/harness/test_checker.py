@@ -1,0 +1,246 @@
+"""Each characteristic holds where it should, is violated where somebody broke it, and never holds unseen."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.checker import Result, check, gather
+from tests.harness.mission import CONNECTED, LOSSY, edit, edit_lines, fly, reconcile_all, write_exports, write_run
+from tests.ucp.air import Air
+from ucp.messages import CommitBlock
+
+
+def verdicts(result: Result) -> str:
+    """One letter per characteristic: h(olds), v(iolated), n(ot applicable)."""
+    return "".join(result.characteristics[number].verdict[0] for number in "123456")
+
+
+def reason(result: Result, number: str) -> str:
+    return result.characteristics[number].reason
+
+
+@pytest.fixture(scope="module")
+def perfect() -> Air:
+    return fly()
+
+
+@pytest.fixture
+def run_dir(perfect: Air, tmp_path: Path) -> Path:
+    return write_run(perfect, tmp_path / "run", CONNECTED)
+
+
+def test_a_perfect_run_holds_in_all_six(run_dir: Path) -> None:
+    result = check(gather([run_dir]))
+    assert verdicts(result) == "hhhhhh"
+    assert result.figures["distinct_chains"] == 1
+    assert result.figures["mutual_chain"] == result.figures["blocks"] == result.figures["longest_chain"]
+    assert result.figures["copies_min"] == result.figures["copies_mean"] == 5
+    assert result.figures["reconciles"] == 0
+    assert not result.errors
+
+
+def test_exports_alone_say_nothing_of_what_triggered_handlers(perfect: Air, tmp_path: Path) -> None:
+    paths = write_exports(perfect, tmp_path, traces=False)
+    result = check(gather(paths))
+    assert verdicts(result) == "nhhhhh"
+    assert result.figures["messages"] is None
+
+
+def test_after_loss_equal_chains_hold_and_different_ones_do_not_apply(tmp_path: Path) -> None:
+    air = fly(loss=0.3, seed=3)
+    assert len(set(air.chains())) > 1
+    result = check(gather([write_run(air, tmp_path / "before", LOSSY)]))
+    assert verdicts(result) == "hhhhnn"
+    assert "loss 15 %" in reason(result, "6")
+    assert result.figures["distinct_chains"] == len(set(air.chains()))
+    began = air.now
+    reconcile_all(air)
+    healed = [*LOSSY, {"at_s": began, "what": "final reconcile", "detail": "loss 0 %", "fully_connected": True}]
+    result = check(gather([write_run(air, tmp_path / "after", healed)]))
+    assert verdicts(result) == "hhhhhh"
+
+
+def missed_last_block() -> Air:
+    """Fully connected but for one lost commit after which nobody votes: agent 2 stays different."""
+    air = Air([1, 2, 3])
+    air.fill_block(1)
+    air.settle()
+    latency = air.fate
+    air.fate = lambda s, r, m: [] if isinstance(m, CommitBlock) and r == 2 else latency(s, r, m)
+    air.fill_block(3)
+    air.settle()
+    air.fate = latency
+    return air
+
+
+def test_a_difference_that_no_vote_could_find_does_not_apply(tmp_path: Path) -> None:
+    result = check(gather([write_run(missed_last_block(), tmp_path / "run", CONNECTED)]))
+    assert verdicts(result) == "hhhhnn"
+    assert "agent 2 differs by blocks after which neither a vote nor a reconcile took place" in reason(result, "6")
+
+
+def test_a_difference_that_outlives_a_reconcile_violates_5_and_6(tmp_path: Path) -> None:
+    air = missed_last_block()
+    agent = air.agents[2]
+    agent.begin_reconcile(air.now)
+    agent.messages_to_send()  # a radio that is on record as perfect, and says nothing
+    air.flush(2)
+    air.settle()
+    result = check(gather([write_run(air, tmp_path / "run", CONNECTED)]))
+    assert verdicts(result)[4:] == "vv"
+    (finding,) = result.characteristics["5"].evidence
+    assert (finding.agent_id, finding.block) == (2, "3.1")
+
+
+def test_exports_alone_that_differ_do_not_tell_whether_the_system_was_connected(tmp_path: Path) -> None:
+    paths = write_exports(missed_last_block(), tmp_path, traces=False)
+    result = check(gather(paths))
+    assert verdicts(result)[4:] == "nn"
+    assert "exports alone" in reason(result, "6")
+
+
+def test_an_agent_that_never_became_idle_is_not_judged(tmp_path: Path) -> None:
+    air = Air([1, 2])
+    air.fill_block(1)
+    result = check(gather([write_run(air, tmp_path / "run", CONNECTED)]))
+    assert verdicts(result) == "hnhhnn"
+    assert "agent 1 never became idle" in reason(result, "2")
+
+
+def test_an_agent_whose_export_is_missing_is_never_taken_for_agreeing(run_dir: Path) -> None:
+    (run_dir / "agents" / "4.chain.json").unlink()
+    result = check(gather([run_dir]))
+    assert verdicts(result) == "hnnhnn"
+    assert "no export of agent 4" in reason(result, "6")
+
+
+def test_an_idle_agent_with_an_uncommitted_block_violates_2(run_dir: Path) -> None:
+    def hide(export: dict) -> None:
+        export["blocks_to_be_committed"].append({**export["chain"].pop(), "chain_hash": None})
+
+    edit(run_dir / "agents" / "2.chain.json", hide)
+    result = check(gather([run_dir]))
+    assert result.characteristics["2"].verdict == "violated"
+    assert result.characteristics["2"].evidence[0].agent_id == 2
+
+
+def test_a_trace_that_was_idle_with_a_full_deque_violates_2(run_dir: Path) -> None:
+    def claim_idle(lines: list[dict]) -> None:
+        voting = next(line for line in lines[1:] if line["state"]["deque"])
+        voting["state"]["idle"] = True
+
+    edit_lines(run_dir / "agents" / "1.trace.jsonl", claim_idle)
+    result = check(gather([run_dir]))
+    assert result.characteristics["2"].verdict == "violated"
+    assert "trace line" in result.characteristics["2"].evidence[0].detail
+
+
+def test_a_second_copy_in_an_export_violates_3(run_dir: Path) -> None:
+    def copy(export: dict) -> None:
+        export["reconcile_stack"].append({**export["chain"][0], "chain_hash": None})
+
+    edit(run_dir / "agents" / "3.chain.json", copy)
+    result = check(gather([run_dir]))
+    assert result.characteristics["3"].verdict == "violated"
+    (finding,) = result.characteristics["3"].evidence
+    assert finding.agent_id == 3
+    assert finding.block is not None
+
+
+def test_a_second_copy_at_one_step_of_a_trace_violates_3(run_dir: Path) -> None:
+    def copy(lines: list[dict]) -> None:
+        commit = next(line for line in lines[1:] if line["handler"] == "receive_commit_block" and line["changes"])
+        commit["changes"].append(["stack+", commit["changes"][0][1]])
+
+    edit_lines(run_dir / "agents" / "5.trace.jsonl", copy)
+    result = check(gather([run_dir]))
+    assert result.characteristics["3"].verdict == "violated"
+
+
+def test_an_edited_block_violates_4(run_dir: Path) -> None:
+    edit(run_dir / "agents" / "1.chain.json", lambda export: export["chain"][2].update(timestamp_us=1))
+    result = check(gather([run_dir]))
+    assert result.characteristics["4"].verdict == "violated"
+    assert "does not hash to its block hash" in result.characteristics["4"].evidence[0].detail
+
+
+def test_a_reordered_chain_violates_4(run_dir: Path) -> None:
+    edit(run_dir / "agents" / "1.chain.json", lambda export: export["chain"].insert(0, export["chain"].pop(1)))
+    result = check(gather([run_dir]))
+    assert "the chain hash at block" in result.characteristics["4"].evidence[0].detail
+
+
+def test_a_block_that_its_agent_never_completed_violates_4(run_dir: Path) -> None:
+    block = []
+
+    def disown(export: dict) -> None:
+        block.append(export["completed"].pop())
+
+    edit(run_dir / "agents" / "2.chain.json", disown)
+    (run_dir / "agents" / "2.trace.jsonl").unlink()
+    result = check(gather([run_dir]))
+    assert result.characteristics["4"].verdict == "violated"
+    assert {finding.block_hash for finding in result.characteristics["4"].evidence} == set(block)
+
+
+def test_a_block_of_a_stranger_violates_4(run_dir: Path) -> None:
+    edit(run_dir / "run.json", lambda record: record.update(roster=[1, 2, 3, 4]))
+    result = check(gather([run_dir]))
+    assert "agent 5, which is not on the roster" in result.characteristics["4"].evidence[0].detail
+
+
+def test_blocks_of_an_agent_that_left_nothing_are_not_taken_for_genuine(perfect: Air, tmp_path: Path) -> None:
+    paths = write_exports(perfect, tmp_path, traces=False)
+    result = check(gather(path for path in paths if path.name != "3.chain.json"))
+    assert result.characteristics["4"].verdict == "not applicable"
+    assert "agent 3" in reason(result, "4")
+
+
+@pytest.mark.parametrize(
+    ("trigger", "detail"),
+    [
+        ({"message": "Commit Block", "from": 1, "seq": 99999}, "never sent"),
+        ({"message": "Block Response", "from": 1, "seq": 0}, "another handler's"),
+        ({"timer": "voting"}, "another handler's"),
+        ({"local": "reconcile_finalize"}, "had not run"),
+        ({}, "no trigger"),
+    ],
+)
+def test_a_handler_without_a_trigger_of_its_own_violates_1(run_dir: Path, trigger: dict, detail: str) -> None:
+    def forge(lines: list[dict]) -> None:
+        next(line for line in lines[1:] if line["handler"] == "receive_commit_block")["trigger"] = trigger
+
+    edit_lines(run_dir / "agents" / "2.trace.jsonl", forge)
+    result = check(gather([run_dir]))
+    assert result.characteristics["1"].verdict == "violated"
+    assert detail in result.characteristics["1"].evidence[0].detail
+
+
+def test_a_vote_that_never_ends_violates_1(run_dir: Path) -> None:
+    def hang(lines: list[dict]) -> None:
+        lines[:] = [line for line in lines if line.get("handler") != "vote_timer_expiration"]
+
+    edit_lines(run_dir / "agents" / "2.trace.jsonl", hang)
+    result = check(gather([run_dir]))
+    assert any("a vote began and did not end" in one.detail for one in result.characteristics["1"].evidence)
+
+
+def test_a_missing_or_damaged_trace_is_never_taken_for_a_good_one(run_dir: Path) -> None:
+    trace = run_dir / "agents" / "2.trace.jsonl"
+    lines = trace.read_text().splitlines(keepends=True)
+    trace.write_text("".join(lines[:-1]) + "{]\n")
+    result = check(gather([run_dir]))
+    assert "2.trace.jsonl: line" in result.errors[0]
+    assert result.characteristics["1"].verdict != "holds"
+    trace.unlink()
+    result = check(gather([run_dir]))
+    assert result.characteristics["1"].verdict == "not applicable"
+    assert "no trace of agent 2" in reason(result, "1")
+
+
+def test_half_a_last_line_is_that_of_a_killed_agent_and_no_damage(run_dir: Path) -> None:
+    trace = run_dir / "agents" / "2.trace.jsonl"
+    trace.write_text(trace.read_text() + '{"t": 1')
+    result = check(gather([run_dir]))
+    assert verdicts(result) == "hhhhhh"
+    assert not result.errors
