@@ -74,6 +74,19 @@ class Trace:
         """Hashes of the blocks that the agent completed, in order."""
         return [block for run in self.runs for operation, block in run.changes if operation == "complete"]
 
+    def chain_at(self, t: float) -> tuple[str, ...]:
+        """The chain's block hashes, oldest first, as they were before mission second `t`."""
+        chain: list[str] = []
+        for run in self.runs:
+            if run.t >= t:
+                break
+            for operation, block in run.changes:
+                if operation == "chain+":
+                    chain.append(block)
+                elif operation == "chain-" and chain:
+                    chain.pop()
+        return tuple(chain)
+
     def steps(self) -> Iterator[tuple[TracedRun, "Held"]]:
         """Each run with what the agent held after it. The same `Held` is updated from step to step."""
         held = Held()

@@ -1,0 +1,291 @@
+"""One agent as a process, alone on loopback: its files, its control socket, and what happens when things go wrong."""
+
+import asyncio
+import base64
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from harness.agents import AgentControl, AgentRefusedError, AgentSilentError
+from harness.exports import read_export
+from harness.traces import read_trace
+from ucp.block import Block
+from ucp.messages import RequestForBlock, encode
+
+DEADLINE_S = 10.0
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+def mission(**changes: Any) -> dict[str, Any]:
+    return {
+        "schema": "ucp-mission/1",
+        "agent_id": 7,
+        "roster": [7, 9],
+        "initial_data": base64.b64encode(b"test").decode(),
+        "network": {"address": "127.0.0.1", "broadcast": "127.255.255.255", "port": free_port()},
+        "events": {"source": "none"},
+        "seed": 1,
+        "speedup": 100,
+        **changes,
+    }
+
+
+class AgentUnderTest:
+    def __init__(self, directory: Path, document: dict[str, Any]) -> None:
+        self.directory = directory
+        self.document = document
+        path = directory / "7.mission.json"
+        path.write_text(json.dumps(document))
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "ucp.node", str(path)], stderr=subprocess.PIPE, text=True
+        )
+        self.wait_for(lambda: (directory / "7.control").exists() or self.process.poll() is not None)
+
+    def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
+        async def ask() -> dict[str, Any]:
+            control = AgentControl(self.directory / "7.control")
+            try:
+                return await control.ask(command, timeout_s=DEADLINE_S, **arguments)
+            finally:
+                control.close()
+
+        return asyncio.run(ask())
+
+    def start(self) -> None:
+        self.ask("start", epoch_us=round(time.time() * 1e6))
+
+    def wait_for(self, condition: Any) -> None:
+        deadline = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert time.monotonic() < deadline, "it never happened"
+            time.sleep(0.005)
+
+    def send(self, datagram: bytes) -> None:
+        """From an address that is not the agent's own: what comes from that is its own echo."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.bind(("127.0.0.2", 0))
+            sock.sendto(datagram, ("127.0.0.1", self.document["network"]["port"]))
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    """Deeper than a Unix socket's address is long."""
+    deep = tmp_path / ("d" * 100) / "agents"
+    deep.mkdir(parents=True)
+    return deep
+
+
+@pytest.fixture
+def agent(directory: Path) -> Iterator[AgentUnderTest]:
+    agent = AgentUnderTest(directory, mission())
+    yield agent
+    agent.process.kill()
+    agent.process.communicate()
+
+
+def test_it_waits_for_the_start_and_then_builds_commits_and_exports_blocks(directory: Path) -> None:
+    agent = AgentUnderTest(directory, mission(events={"source": "random", "mean_s": 1.0}))
+    assert agent.ask("status")["started"] is False
+    agent.start()
+    agent.wait_for(lambda: agent.ask("status")["chain"] >= 3)
+    agent.ask("stop_events")
+    agent.wait_for(lambda: agent.ask("status")["idle"])
+    agent.process.terminate()
+    assert agent.process.wait(DEADLINE_S) == 0
+    export = read_export(directory / "7.chain.json")
+    assert len(export.chain) == len(export.completed) >= 3
+    trace = read_trace(directory / "7.trace.jsonl")
+    assert trace is not None and not trace.problem
+    assert trace.completed() == export.completed
+    assert trace.header.roster == [7, 9]
+    assert sorted(path.name for path in directory.iterdir()) == [
+        "7.chain.json",
+        "7.log",
+        "7.mission.json",
+        "7.trace.jsonl",
+    ]
+
+
+def test_it_exports_on_command_while_it_runs(agent: AgentUnderTest) -> None:
+    assert agent.ask("export")["path"].endswith("7.chain.json")
+    assert read_export(agent.directory / "7.chain.json").idle
+
+
+def test_it_answers_messages_of_others_and_counts_what_is_hostile(agent: AgentUnderTest) -> None:
+    agent.start()
+    rng = Random(1)
+    for _ in range(200):
+        agent.send(rng.randbytes(rng.randrange(1400)))
+    agent.send(encode(7, 0, RequestForBlock(bytes(32))))
+    agent.send(encode(8, 0, RequestForBlock(bytes(32))))
+    agent.send(encode(9, 0, RequestForBlock(Block(9, 1, b"x").block_hash)))
+    agent.wait_for(lambda: agent.ask("status")["received"] == {"Request for Block": 1})
+    status = agent.ask("status")
+    assert status["dropped"]["own sender"] == 1
+    assert status["dropped"]["sender not on the roster"] == 1
+    assert status["handled"] == 1
+
+
+def test_quirks_are_set_and_reconciles_begun_on_command(agent: AgentUnderTest) -> None:
+    agent.start()
+    assert agent.ask("quirk", name="ignore_commit", value=0.5)["ignore_commit"] == 0.5
+    agent.ask("reconcile")
+    agent.wait_for(lambda: agent.ask("status")["reconciles"] == 1)
+    agent.wait_for(lambda: agent.ask("status")["idle"])
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "sentence"),
+    [
+        ("fly", {}, "unknown command 'fly': there are status, start"),
+        ("start", {"epoch_us": "now"}, "epoch_us"),
+        ("reconcile", {}, "has not started"),
+        ("quirk", {"name": "ignore_commit", "value": 7}, "probability"),
+    ],
+)
+def test_a_command_that_cannot_be_carried_out_is_answered_with_a_sentence(
+    agent: AgentUnderTest, command: str, arguments: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(AgentRefusedError, match=sentence):
+        agent.ask(command, **arguments)
+    assert agent.ask("status")["ok"]
+
+
+def test_garbage_on_the_control_socket_ends_its_connection_and_nothing_else(agent: AgentUnderTest) -> None:
+    with socket.socket(socket.AF_UNIX) as sock:
+        descriptor = os.open(agent.directory, os.O_PATH)
+        sock.connect(f"/proc/self/fd/{descriptor}/7.control")
+        os.close(descriptor)
+        sock.sendall(b"\xff\xfe not json\n[1]\n")
+        assert sock.recv(4096).count(b'"ok": false') >= 1
+        with pytest.raises(ConnectionError):
+            for _ in range(1000):
+                sock.sendall(b"x" * 65536)
+    assert agent.ask("status")["ok"]
+
+
+def test_a_port_in_use_is_one_sentence_and_status_2(agent: AgentUnderTest, tmp_path: Path) -> None:
+    other = AgentUnderTest(tmp_path, agent.document)
+    assert other.process.wait(DEADLINE_S) == 2
+    assert other.process.stderr is not None
+    said = other.process.stderr.read()
+    assert said.count("\n") == 1
+    assert f"UDP port {agent.document['network']['port']}: Address already in use" in said
+    assert agent.ask("status")["ok"]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"schema": "ucp-mission/9"}, "`schema` is 'ucp-mission/9'"),
+        ({"agent_id": 8}, "not on the `roster`"),
+        ({"agent_id": "7"}, "`agent_id` must be a whole number"),
+        ({"speedup": 0}, "`speedup` must be a number above 0"),
+        ({"network": {"address": "here"}}, "`network.address` must be an IPv4 address"),
+        ({"settings": {"vote": 1}}, "`settings.vote` is unknown"),
+        ({"settings": {"vote_timeout_s": "x"}}, "`settings`"),
+        ({"events": {"source": "dice"}}, "random, mavlink or none"),
+        ({"quirks": {"ignore_commit": 2}}, "`quirks`"),
+        ({"initial_data": "!"}, "not base64"),
+    ],
+)
+def test_a_wrong_mission_file_is_one_sentence_and_status_2(
+    tmp_path: Path, change: dict[str, Any], sentence: str
+) -> None:
+    agent = AgentUnderTest(tmp_path, mission(**change))
+    assert agent.process.wait(DEADLINE_S) == 2
+    assert agent.process.stderr is not None
+    said = agent.process.stderr.read()
+    assert sentence in said
+    assert said.count("\n") == 1
+
+
+def test_a_killed_agent_leaves_no_half_export(directory: Path) -> None:
+    """The export is replaced whole, however often and whenever the agent is killed."""
+    rng = Random(5)
+    for _ in range(5):
+        agent = AgentUnderTest(directory, mission(events={"source": "random", "mean_s": 1.0}))
+        agent.start()
+        agent.ask("export")
+        with socket.socket(socket.AF_UNIX) as sock:
+            descriptor = os.open(directory, os.O_PATH)
+            sock.connect(f"/proc/self/fd/{descriptor}/7.control")
+            os.close(descriptor)
+            sock.sendall(b'{"command": "export"}\n' * 200)
+            time.sleep(rng.random() * 0.05)  # the moment is what is random here
+            agent.process.kill()
+        agent.process.communicate()
+        assert read_export(directory / "7.chain.json").agent_id == 7
+        (directory / "7.control").unlink()
+
+
+def test_a_full_disk_fails_the_export_keeps_the_old_one_and_the_agent_lives(tmp_path: Path) -> None:
+    script = r"""
+import json, pathlib, subprocess, sys, time
+sys.path.insert(0, sys.argv[2])
+from tests.ucp.test_node import AgentUnderTest, mission
+from harness.agents import AgentRefusedError
+disk = pathlib.Path(sys.argv[1])
+subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], check=True)
+agent = AgentUnderTest(disk, mission(events={"source": "random", "mean_s": 1.0}))
+agent.start()
+agent.ask("export")
+before = (disk / "7.chain.json").read_text()
+(disk / "ballast").write_bytes(b"")
+try:
+    with (disk / "ballast").open("wb", buffering=0) as ballast:
+        while ballast.write(bytes(4096)) == 4096: pass
+except OSError: pass
+try:
+    agent.ask("export")
+    sys.exit("it claims to have exported to a full disk")
+except AgentRefusedError as error:
+    print(error)
+assert (disk / "7.chain.json").read_text() == before
+agent.wait_for(lambda: agent.ask("status")["trace_problem"])
+print(agent.ask("status")["trace_problem"])
+trace = (disk / "7.trace.jsonl").read_text()
+assert trace.endswith("\n"), "half a line"
+(disk / "ballast").unlink()
+agent.ask("export")
+assert len(json.loads((disk / "7.chain.json").read_text())["chain"]) >= 0
+assert not list(disk.glob(".*")), "a temporary file is left"
+agent.process.terminate()
+sys.exit(agent.process.wait(10))
+"""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    private = ["unshare", "--user", "--map-root-user", "--mount"]
+    done = subprocess.run(
+        [*private, sys.executable, "-c", script, str(disk), str(Path(__file__).parents[2])],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("No space left on device") == 2
+
+
+def test_a_silent_agent_is_noticed(agent: AgentUnderTest) -> None:
+    async def ask() -> None:
+        await AgentControl(agent.directory / "7.control").ask("status", timeout_s=0.2)
+
+    agent.process.send_signal(signal.SIGSTOP)
+    with pytest.raises(AgentSilentError, match=r"no answer to status for 0\.2 s"):
+        asyncio.run(ask())
+    agent.process.send_signal(signal.SIGCONT)
