@@ -1,0 +1,131 @@
+"""ArduPilot SITL: finding the binary, and starting it so that it flies without anybody holding its hand.
+
+The command line is that of ArduPilot's own SITL (`arducopter --help`, developer documentation "SITL Simulator").
+A vehicle is instance 0 in a network namespace of its own, hence always the same ports; builds with CAN want a multicast
+route in that namespace, or exit with status 1. The vehicle's directory gets its parameters, copied, beside the
+`eeprom.bin` and `logs/` that ArduPilot writes there: what a vehicle flew with stays with the run.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sitl.vehicle import Home, Launch, NoBinaryError, UnusableBinaryError, VehicleError, check_launch
+
+BINARY = "arducopter"
+DEFAULTS = "copter.parm"  # of ArduPilot's Tools/autotest/default_params
+OWN_DEFAULTS = "vehicle.parm"
+ENVIRONMENT = "ARDUPILOT_SITL"  # a directory that holds BINARY and, better, DEFAULTS
+
+WAY_OUT = "give the path of an ArduPilot SITL arducopter, or fly embedded vehicles"
+
+# ELF header: e_machine, a u16 at offset 18, by what platform.machine() calls it. A 64-bit machine may run its 32-bit
+# sister's programs.
+_ELF_MACHINES = {
+    "i686": {3: "i686"},
+    "x86_64": {62: "x86_64", 3: "i686"},
+    "armv7l": {40: "armv7l"},
+    "aarch64": {183: "aarch64", 40: "armv7l"},
+    "riscv64": {243: "riscv64"},
+}
+_ELF_NAMES = {number: name for machines in _ELF_MACHINES.values() for number, name in machines.items()}
+
+
+@dataclass(frozen=True)
+class ArduPilot:
+    """The `VehicleKind` of real copters: an executable and, when it has any beside it, its default parameters."""
+
+    binary: Path
+    defaults: Path | None = None
+    name: str = "ardupilot"
+
+    @classmethod
+    def find(cls, binary: Path | None, environ: Mapping[str, str]) -> ArduPilot:
+        """The binary that the scenario names, else that of ARDUPILOT_SITL, else `arducopter` on PATH.
+
+        Raises UnusableBinaryError when one is named and will not do, NoBinaryError when none is named or found.
+        """
+        if binary is not None:
+            return cls._checked(binary, "the scenario")
+        if named := environ.get(ENVIRONMENT):
+            directory = Path(named)
+            if not directory.is_dir():
+                raise UnusableBinaryError(
+                    f"{ENVIRONMENT} is {named}, which is no directory: set it to the directory that holds {BINARY}"
+                )
+            return cls._checked(directory / BINARY, ENVIRONMENT)
+        if on_path := shutil.which(BINARY, path=environ.get("PATH", "")):
+            return cls._checked(Path(on_path), "PATH")
+        raise NoBinaryError(
+            f"no ArduPilot: the scenario names none, {ENVIRONMENT} is not set, and no {BINARY} is on PATH; {WAY_OUT}"
+        )
+
+    @classmethod
+    def _checked(cls, binary: Path, source: str) -> ArduPilot:
+        subject = f"the ArduPilot binary {binary} (from {source})"
+        try:
+            if binary.is_dir():
+                raise UnusableBinaryError(f"{subject} is a directory: name the file in it, usually {BINARY}")
+            if not binary.exists():
+                raise UnusableBinaryError(f"{subject} does not exist: {WAY_OUT}")
+            if not binary.is_file():
+                raise UnusableBinaryError(f"{subject} is not a file: {WAY_OUT}")
+            with binary.open("rb") as file:
+                head = file.read(20)
+        except OSError as error:
+            raise UnusableBinaryError(f"{subject} cannot be read ({error.strerror}): {WAY_OUT}") from None
+        if problem := _not_a_program(head):
+            raise UnusableBinaryError(f"{subject} {problem}: {WAY_OUT}")
+        if not os.access(binary, os.X_OK):
+            raise UnusableBinaryError(f"{subject} is not executable: run chmod +x {binary}")
+        beside = binary.resolve().parent / DEFAULTS
+        return cls(binary.absolute(), beside if beside.is_file() else None)
+
+    def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
+        """Write the vehicle's parameters into `directory`. Raises VehicleError."""
+        check_launch(sysid, speedup)
+        # names, not paths: ArduPilot takes a comma in a path for the end of it
+        files = [OWN_DEFAULTS]
+        try:
+            if self.defaults is not None:
+                shutil.copyfile(self.defaults, directory / DEFAULTS)
+                files.insert(0, DEFAULTS)
+            (directory / OWN_DEFAULTS).write_text(_own_defaults(sysid))
+        except OSError as error:
+            raise VehicleError(f"vehicle {sysid}: cannot write its parameters into {directory}: {error}") from None
+        return Launch(
+            [
+                str(self.binary),
+                *("--model", "+"),
+                *("--home", str(home)),
+                *("-I", "0"),
+                *("--defaults", ",".join(files)),
+                *("--speedup", f"{speedup:g}"),
+                *("--serial0", "tcp:0"),  # the default waits for a client before anything runs, the clock included
+            ]
+        )
+
+
+def _own_defaults(sysid: int) -> str:
+    """Both names of the system ID, before and since 4.7; ArduPilot passes over a parameter that it does not know."""
+    return f"SYSID_THISMAV {sysid}\nMAV_SYSID {sysid}\n"
+
+
+def _not_a_program(head: bytes) -> str | None:
+    """What is wrong with a file that begins like this, or None."""
+    if not head:
+        return "is empty"
+    if head.startswith(b"#!"):  # a wrapper of the user's own
+        return None
+    if not head.startswith(b"\x7fELF") or len(head) < 20:
+        return "is not a program"
+    machine = int.from_bytes(head[18:20], "little" if head[5] == 1 else "big")
+    here = platform.machine()
+    if here in _ELF_MACHINES and machine not in _ELF_MACHINES[here]:
+        return f"is for another processor ({_ELF_NAMES.get(machine, f'ELF machine {machine}')}, this is {here})"
+    return None

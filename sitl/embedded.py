@@ -1,0 +1,140 @@
+"""The embedded vehicle: what flies where no ArduPilot binary is at hand.
+
+    python -m sitl.embedded --sysid 3 --home -35.363262,149.165237,584,270 --speedup 20
+
+A small process (one thread, standard library and a MAVLink dialect) that listens on 127.0.0.1 on ArduPilot SITL's two
+ports and answers like one, so that the same pilot flies both. Its clock runs `speedup` times as fast as ours; what it
+sends in a second of ours is bounded all the same. SIGTERM ends it with exit status 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import selectors
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from sitl.autopilot import Autopilot
+from sitl.port import Port
+from sitl.vehicle import AGENT_PORT, PILOT_PORT, Home, Launch, VehicleError, check_launch
+
+MIN_BATCH_INTERVAL_S = 0.05  # of our time: however fast simulated time runs, telemetry is sent 20 times a second
+MAX_SLEEP_S = 1.0  # a client may have turned off everything; landing and status texts still happen on time
+MAX_DELAY_S = 0.25  # a sleep that takes longer than it should by more was no sleep: the process was stopped
+
+
+class Embedded:
+    """The `VehicleKind` that needs nothing but this package."""
+
+    name = "embedded"
+
+    def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
+        """The embedded vehicle keeps no files: `directory` stays as it is. Raises VehicleError."""
+        check_launch(sysid, speedup)
+        return Launch(
+            [
+                *(sys.executable, "-P", "-m", "sitl.embedded"),
+                *("--sysid", str(sysid)),
+                f"--home={home}",  # one word: a southern latitude begins with a minus sign
+                *("--speedup", f"{speedup:g}"),
+            ]
+        )
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One sentence instead of a screenful of usage."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = _Parser(prog="sitl.embedded", description="A small MAVLink vehicle that flies without ArduPilot.")
+    parser.add_argument("--sysid", type=int, required=True, help="MAVLink system ID, 1 to 255")
+    parser.add_argument("--home", required=True, metavar="LAT,LON,ALT,HDG", help="degrees, metres above sea level")
+    parser.add_argument("--speedup", type=float, default=1.0, help="simulated seconds per second")
+    parser.add_argument("--pilot-port", type=int, default=PILOT_PORT)
+    parser.add_argument("--agent-port", type=int, default=AGENT_PORT)
+    # `--home -35.3,...` reads like an option to argparse; join the two words
+    words = list(sys.argv[1:] if argv is None else argv)
+    for at in reversed(range(len(words) - 1)):
+        if words[at] == "--home":
+            words[at : at + 2] = [f"--home={words[at + 1]}"]
+    arguments = parser.parse_args(words)
+    try:
+        arguments.home = Home.parse(arguments.home)
+        check_launch(arguments.sysid, arguments.speedup)
+    except VehicleError as error:
+        parser.error(str(error))
+    return arguments
+
+
+def main(argv: Sequence[str] | None = None) -> NoReturn:
+    """Fly until SIGTERM. Exit status 2 with one sentence when the arguments or the ports are of no use."""
+    arguments = _arguments(argv)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    autopilot = Autopilot(arguments.sysid, arguments.home, time.time_ns() // 1000)
+    selector = selectors.DefaultSelector()
+    ports = []
+    for number in (arguments.pilot_port, arguments.agent_port):
+        try:
+            ports.append(Port(number, autopilot, selector))
+        except (OSError, OverflowError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "a port is 0 to 65535"
+            sys.exit(_complain(arguments.sysid, number, str(reason)))
+    _fly(autopilot, ports, selector, arguments.speedup)
+
+
+def _complain(sysid: int, port: int, reason: str) -> int:
+    message = (
+        f"vehicle {sysid}: cannot listen on 127.0.0.1:{port}: {reason}; end what listens there or choose another\n"
+    )
+    sys.stderr.write(message)
+    return 2
+
+
+class _Clock:
+    """Simulated seconds since boot. They stand while the process is stopped (SIGSTOP), as ArduPilot's do."""
+
+    def __init__(self, speedup: float) -> None:
+        self._speedup = speedup
+        self._read_at = time.monotonic()
+        self.now_s = 0.0
+
+    def read(self, slept_s: float) -> float:
+        """The time after a sleep that was to take `slept_s`; what it took far beyond that did not happen."""
+        at = time.monotonic()
+        self.now_s += min(at - self._read_at, slept_s + MAX_DELAY_S) * self._speedup
+        self._read_at = at
+        return self.now_s
+
+
+def _fly(autopilot: Autopilot, ports: Sequence[Port], selector: selectors.BaseSelector, speedup: float) -> NoReturn:
+    clock = _Clock(speedup)
+    next_batch = time.monotonic()
+    while True:
+        due_s = [port.channel.next_due_s() for port in ports if port.channel]
+        sleep_s = MAX_SLEEP_S
+        if due_s:
+            until_due_s = (min(due_s) - clock.now_s) / speedup
+            sleep_s = max(0.0, min(sleep_s, max(until_due_s, next_batch - time.monotonic())))
+        events = selector.select(sleep_s)
+        autopilot.advance(clock.read(sleep_s))
+        for key, mask in events:
+            key.data(mask)
+        now = time.monotonic()
+        if now >= next_batch:
+            next_batch = now + MIN_BATCH_INTERVAL_S
+            for port in ports:
+                if port.channel:
+                    port.channel.send_due()
+        for port in ports:
+            port.send()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Finding and starting ArduPilot, with tiny stand-ins; the flight of a real one is in test_pilot.py."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from sitl.ardupilot import ArduPilot
+from sitl.vehicle import NoBinaryError, UnusableBinaryError, VehicleError, VehicleKind
+from tests.sitl.flying import HOME
+
+SCRIPT = '#!/bin/sh\necho "$@"\nexit 1\n'
+
+
+def program(path: Path, content: str | bytes = SCRIPT, mode: int = 0o755) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    path.chmod(mode)
+    return path
+
+
+def test_the_scenario_goes_before_the_environment_and_that_before_path(tmp_path: Path) -> None:
+    named = program(tmp_path / "named" / "my-copter")
+    in_environment = program(tmp_path / "environment" / "arducopter")
+    on_path = program(tmp_path / "path" / "arducopter")
+    both = {"ARDUPILOT_SITL": str(in_environment.parent), "PATH": str(on_path.parent)}
+    assert ArduPilot.find(named, both).binary == named
+    assert ArduPilot.find(None, both).binary == in_environment
+    assert ArduPilot.find(None, {"PATH": str(on_path.parent)}).binary == on_path
+
+
+def test_no_binary_anywhere_is_its_own_error_so_that_a_run_may_go_on_without(tmp_path: Path) -> None:
+    with pytest.raises(NoBinaryError, match="ARDUPILOT_SITL is not set"):
+        ArduPilot.find(None, {"PATH": str(tmp_path)})
+
+
+def test_an_environment_that_names_no_directory_is_an_error_not_a_miss(tmp_path: Path) -> None:
+    with pytest.raises(UnusableBinaryError, match=r"ARDUPILOT_SITL is .* no directory"):
+        ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path / "gone"), "PATH": ""})
+    with pytest.raises(UnusableBinaryError, match="does not exist"):
+        ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path), "PATH": ""})
+
+
+def elf(machine: int) -> bytes:
+    return b"\x7fELF\x02\x01\x01" + bytes(9) + b"\x02\x00" + machine.to_bytes(2, "little") + bytes(44)
+
+
+@pytest.mark.parametrize(
+    ("content", "mode", "problem"),
+    [
+        (SCRIPT, 0o644, r"not executable: run chmod \+x"),
+        ("", 0o755, "is empty"),
+        ("FRAME_CLASS 1\n", 0o755, "is not a program"),
+        (b"\x7fELF", 0o755, "is not a program"),
+        (elf(8), 0o755, "another processor"),
+    ],
+)
+def test_each_unusable_binary_is_told_apart(content: str | bytes, mode: int, problem: str, tmp_path: Path) -> None:
+    binary = program(tmp_path / "arducopter", content, mode)
+    with pytest.raises(UnusableBinaryError, match=problem) as error:
+        ArduPilot.find(binary, {})
+    assert str(binary) in str(error.value)
+
+
+def test_a_missing_binary_and_a_directory_are_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(UnusableBinaryError, match="does not exist"):
+        ArduPilot.find(tmp_path / "arducopter", {})
+    with pytest.raises(UnusableBinaryError, match="is a directory"):
+        ArduPilot.find(tmp_path, {})
+
+
+def test_a_binary_for_another_processor_names_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    with pytest.raises(UnusableBinaryError, match="aarch64, this is x86_64"):
+        ArduPilot.find(program(tmp_path / "arducopter", elf(183)), {})
+    assert ArduPilot.find(program(tmp_path / "arducopter", elf(62)), {}).binary.name == "arducopter"
+
+
+def test_the_command_line_is_what_arducopter_understands(tmp_path: Path) -> None:
+    binary = program(tmp_path / "arducopter")
+    directory = tmp_path / "with, comma"
+    directory.mkdir()
+    kind: VehicleKind = ArduPilot.find(binary, {})
+    launch = kind.launch(7, HOME, 20.0, directory)
+    assert launch.argv[0] == str(binary)
+    said = subprocess.run(launch.argv, cwd=directory, capture_output=True, text=True, check=False)
+    assert said.stdout.strip() == (
+        "--model + --home -35.3632620,149.1652370,584.00,270.0 -I 0 "
+        "--defaults vehicle.parm --speedup 20 --serial0 tcp:0"
+    )
+    assert (launch.pilot_port, launch.agent_port) == (5760, 5762)
+
+
+def test_the_system_id_is_a_default_under_both_its_names(tmp_path: Path) -> None:
+    ArduPilot(program(tmp_path / "arducopter")).launch(7, HOME, 1.0, tmp_path)
+    assert (tmp_path / "vehicle.parm").read_text().splitlines() == ["SYSID_THISMAV 7", "MAV_SYSID 7"]
+
+
+def test_parameters_beside_the_binary_come_along_and_ours_have_the_last_word(tmp_path: Path) -> None:
+    binary = program(tmp_path / "bin" / "arducopter")
+    (binary.parent / "copter.parm").write_text("FRAME_CLASS 1\n")
+    launch = ArduPilot.find(binary, {}).launch(7, HOME, 1.0, tmp_path)
+    assert launch.argv[launch.argv.index("--defaults") + 1] == "copter.parm,vehicle.parm"
+    assert (tmp_path / "copter.parm").read_text() == "FRAME_CLASS 1\n"
+
+
+def test_a_directory_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match="cannot write its parameters into"):
+        ArduPilot(program(tmp_path / "arducopter")).launch(7, HOME, 1.0, tmp_path / "gone")

@@ -1,0 +1,253 @@
+from __future__ import annotations
+
+import math
+import random
+import signal
+import socket
+import subprocess
+import time
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from tests.sitl.flying import DEADLINE_S, HOME, Client, connect, embedded, embedded_argv, until
+
+ACCEPTED, UNSUPPORTED, FAILED = (
+    mavlink.MAV_RESULT_ACCEPTED,
+    mavlink.MAV_RESULT_UNSUPPORTED,
+    mavlink.MAV_RESULT_FAILED,
+)
+ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+TAKE_OFF = mavlink.MAV_CMD_NAV_TAKEOFF
+SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
+SET_INTERVAL = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+GUIDED, LAND = 4, 9
+
+
+def wait_until_ready(client: Client) -> None:
+    def ready() -> bool:
+        health = client.wait_for("SYS_STATUS").onboard_control_sensors_health
+        return bool(health & mavlink.MAV_SYS_STATUS_PREARM_CHECK)
+
+    until(ready, "ready to arm")
+
+
+def take_off(client: Client, altitude_m: float = 20.0) -> None:
+    wait_until_ready(client)
+    assert client.command(SET_MODE, 1, GUIDED) == ACCEPTED
+    assert client.command(ARM, 1) == ACCEPTED
+    assert client.command(TAKE_OFF, 0, 0, 0, 0, 0, 0, altitude_m) == ACCEPTED
+
+
+def altitude(client: Client) -> float:
+    return float(client.wait_for("GLOBAL_POSITION_INT").relative_alt / 1e3)
+
+
+def test_it_says_what_an_arducopter_says_without_being_asked() -> None:
+    with embedded() as vehicle:
+        client = Client(vehicle.pilot_port)
+        heartbeat = client.wait_for("HEARTBEAT")
+        assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (3, 1)
+        assert (heartbeat.type, heartbeat.autopilot) == (mavlink.MAV_TYPE_QUADROTOR, 3)
+        for kind in ("SYSTEM_TIME", "SYS_STATUS", "ATTITUDE", "GLOBAL_POSITION_INT"):
+            client.wait_for(kind)
+
+
+def test_arming_is_refused_before_it_is_ready_and_then_succeeds() -> None:
+    with embedded(speedup=20) as vehicle:
+        client = Client(vehicle.pilot_port)
+        assert client.command(ARM, 1) == FAILED
+        wait_until_ready(client)
+        assert client.command(ARM, 1) == ACCEPTED
+        until(lambda: client.wait_for("HEARTBEAT").base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED, "armed")
+
+
+def test_it_says_why_it_refuses() -> None:
+    with embedded(speedup=1) as vehicle:
+        client = Client(vehicle.pilot_port)
+        client.sock.sendall(mavlink.MAVLink_command_long_message(3, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0).pack(client.mav))
+        assert client.wait_for("STATUSTEXT").text.startswith("PreArm")
+
+
+def test_takeoff_needs_arming_and_guided() -> None:
+    with embedded() as vehicle:
+        client = Client(vehicle.pilot_port)
+        wait_until_ready(client)
+        assert client.command(SET_MODE, 1, GUIDED) == ACCEPTED
+        assert client.command(TAKE_OFF, 0, 0, 0, 0, 0, 0, 20) == FAILED
+        assert client.command(SET_MODE, 1, 0) == ACCEPTED
+        assert client.command(ARM, 1) == ACCEPTED
+        assert client.command(TAKE_OFF, 0, 0, 0, 0, 0, 0, 20) == FAILED
+        assert client.command(SET_MODE, 1, GUIDED) == ACCEPTED
+        assert client.command(TAKE_OFF, 0, 0, 0, 0, 0, 0, math.nan) == FAILED
+        assert client.command(TAKE_OFF, 0, 0, 0, 0, 0, 0, 20) == ACCEPTED
+
+
+def test_a_mode_set_right_after_boot_is_acknowledged_and_undone_as_by_ardupilot() -> None:
+    with embedded(speedup=10) as vehicle:
+        client = Client(vehicle.pilot_port)
+        assert client.command(SET_MODE, 1, GUIDED) == ACCEPTED
+        client.wait_for("HEARTBEAT", custom_mode=GUIDED)
+        client.wait_for("HEARTBEAT", custom_mode=0)
+
+
+def test_it_flies_up_round_and_down_and_disarms() -> None:
+    with embedded() as vehicle:
+        client = Client(vehicle.pilot_port)
+        take_off(client)
+        until(lambda: altitude(client) == pytest.approx(20.0), "at 20 m")
+        first = client.wait_for("GLOBAL_POSITION_INT")
+        until(lambda: abs(client.wait_for("GLOBAL_POSITION_INT").lat - first.lat) > 100, "somewhere else, 1 m at least")
+        assert abs(first.lat / 1e7 - HOME.lat_deg) < 0.001
+        assert client.command(ARM, 0) == FAILED  # not up there
+        assert client.command(SET_MODE, 1, LAND) == ACCEPTED
+        until(lambda: not client.wait_for("HEARTBEAT").base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED, "disarmed")
+        assert altitude(client) == 0.0
+
+
+def test_commands_it_does_not_know_are_unsupported_and_those_for_others_unanswered() -> None:
+    with embedded() as vehicle:
+        client = Client(vehicle.pilot_port)
+        assert client.command(mavlink.MAV_CMD_DO_PARACHUTE) == UNSUPPORTED
+        other = mavlink.MAVLink_command_long_message(4, 1, mavlink.MAV_CMD_DO_PARACHUTE, 0, *[0.0] * 7)
+        client.sock.sendall(other.pack(client.mav))
+        assert client.command(ARM, 0) == ACCEPTED  # the next ACK is for this one
+        assert client.command(SET_MODE, 1, 99) == FAILED
+
+
+def test_messages_come_at_the_interval_asked_for_or_when_asked_for() -> None:
+    with embedded(speedup=10) as vehicle:
+        client = Client(vehicle.pilot_port)
+        assert client.command(SET_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, 2e6) == ACCEPTED
+        client.wait_for("ATTITUDE")
+        first, second = client.wait_for("ATTITUDE"), client.wait_for("ATTITUDE")
+        assert second.time_boot_ms - first.time_boot_ms >= 1000
+        assert client.command(SET_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, -1) == ACCEPTED
+        assert client.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_ATTITUDE) == ACCEPTED
+        for nonsense in (math.nan, math.inf, 1e38, -5, 1.5):
+            assert client.command(SET_INTERVAL, nonsense, 1e6) == FAILED
+        assert client.command(SET_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, math.nan) == FAILED
+
+
+def test_a_client_that_turns_everything_off_is_still_answered() -> None:
+    with embedded() as vehicle:
+        client = Client(vehicle.pilot_port)
+        for message_id in (0, 1, 2, 30, 33):
+            assert client.command(SET_INTERVAL, message_id, -1) == ACCEPTED
+        assert client.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_HEARTBEAT) == ACCEPTED
+
+
+def test_simulated_time_runs_as_fast_as_asked() -> None:
+    with embedded(speedup=50) as vehicle:
+        client = Client(vehicle.pilot_port)
+        boot, began = client.wait_for("SYSTEM_TIME").time_boot_ms, time.monotonic()
+        last = until(lambda: (m := client.wait_for("SYSTEM_TIME")).time_boot_ms > boot + 25_000 and m, "25 s later")
+        factor = (last.time_boot_ms - boot) / 1e3 / (time.monotonic() - began)
+        assert factor == pytest.approx(50, rel=0.3)
+
+
+def test_what_it_sends_in_a_second_is_bounded_however_fast_time_runs() -> None:
+    with embedded(speedup=1000) as vehicle:
+        client = Client(vehicle.pilot_port)
+        client.wait_for("HEARTBEAT")
+        began, messages = time.monotonic(), 0
+        while (passed_s := time.monotonic() - began) < 0.5:
+            client.wait_for("HEARTBEAT")
+            messages += 1
+        assert messages <= 20 * passed_s + 2
+
+
+def test_garbage_and_half_messages_are_tolerated() -> None:
+    with embedded() as vehicle:
+        client = Client(vehicle.pilot_port)
+        rng = random.Random(1)
+        frame = mavlink.MAVLink_command_long_message(3, 1, ARM, 0, *[0.0] * 7).pack(client.mav)
+        client.sock.sendall(rng.randbytes(100_000) + frame[: len(frame) // 2])
+        client.sock.sendall(b"\xfd" * 1000 + bytes(600))
+        assert client.command(ARM, 0) == ACCEPTED
+
+
+def test_a_slow_reader_stalls_neither_the_vehicle_nor_the_other_client() -> None:
+    with embedded(speedup=200) as vehicle:
+        slow = socket.socket()
+        slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        client = Client(vehicle.pilot_port)
+        slow.connect(("127.0.0.1", vehicle.agent_port))
+        ask = mavlink.MAVLink_command_long_message(3, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, 30, *[0.0] * 6)
+        frames = ask.pack(client.mav) * 100_000  # answers of some 7 MB, to one who reads none
+        slow.settimeout(DEADLINE_S)
+        slow.sendall(frames)
+        take_off(client)
+        until(lambda: altitude(client) == pytest.approx(20.0), "flying all the same")
+
+
+def test_a_second_client_hears_nothing_until_the_first_has_gone() -> None:
+    with embedded() as vehicle:
+        first = Client(vehicle.pilot_port)
+        first.wait_for("HEARTBEAT")
+        second = connect(vehicle.pilot_port)
+        second.setblocking(False)
+        first.wait_for("HEARTBEAT")
+        first.wait_for("HEARTBEAT")
+        with pytest.raises(BlockingIOError):
+            second.recv(1)
+        first.sock.close()
+        second.settimeout(DEADLINE_S)
+        assert second.recv(1) == b"\xfd"
+
+
+def test_clients_that_vanish_are_forgotten() -> None:
+    with embedded() as vehicle:
+        for _ in range(10):
+            sock = connect(vehicle.agent_port)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset, no farewell
+            sock.close()
+        Client(vehicle.agent_port).wait_for("HEARTBEAT")
+
+
+def test_simulated_time_stands_while_the_process_is_stopped() -> None:
+    with embedded(speedup=20) as vehicle:
+        client = Client(vehicle.pilot_port)
+        before_ms = client.wait_for("SYSTEM_TIME").time_boot_ms
+        vehicle.process.send_signal(signal.SIGSTOP)
+        time.sleep(1.0)  # not for luck: this is how long it stands
+        vehicle.process.send_signal(signal.SIGCONT)
+        after = until(lambda: (m := client.wait_for("SYSTEM_TIME")).time_boot_ms > before_ms + 3_000 and m, "going on")
+        assert after.time_boot_ms - before_ms < 15_000
+
+
+def test_sigterm_ends_it_with_status_0() -> None:
+    with embedded() as vehicle:
+        Client(vehicle.pilot_port).wait_for("HEARTBEAT")
+        vehicle.process.send_signal(signal.SIGTERM)
+        assert vehicle.process.wait(DEADLINE_S) == 0
+
+
+def refusal(*argv: str) -> str:
+    ended = subprocess.run(argv, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    (sentence,) = ended.stderr.splitlines()
+    return sentence
+
+
+def test_a_port_in_use_is_one_sentence_and_status_2() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        sentence = refusal(*embedded_argv("--pilot-port", port, "--agent-port", "0"))
+    assert f"127.0.0.1:{port}" in sentence and "in use" in sentence
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "problem"),
+    [
+        ("--home", "here", "LAT,LON,ALT,HDG"),
+        ("--home", "-95,0,0,0", "latitude"),
+        ("--sysid", "300", "1 to 255"),
+        ("--speedup", "0", "positive"),
+        ("--speedup", "fast", "--speedup"),
+        ("--pilot-port", "99999", "65535"),
+    ],
+)
+def test_a_bad_argument_is_one_sentence_and_status_2(option: str, value: str, problem: str) -> None:
+    assert problem in refusal(*embedded_argv("--pilot-port", "0", "--agent-port", "0", option, value))

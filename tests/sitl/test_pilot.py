@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink
+
+import sitl.pilot
+from sitl.autopilot import Autopilot, Channel
+from sitl.pilot import Pilot
+from sitl.vehicle import FlightError
+from tests.sitl.flying import DEADLINE_S, HOME, connect, embedded
+
+SPEEDUP = 100.0
+
+
+@asynccontextmanager
+async def piloting(port: int, tlog: Path, sysid: int = 3, speedup: float = SPEEDUP) -> AsyncIterator[Pilot]:
+    pilot = Pilot(sysid, connect(port), tlog, speedup)
+    await pilot.start()
+    try:
+        yield pilot
+    finally:
+        await pilot.close()
+
+
+def messages_of(tlog: Path) -> Iterator[Any]:
+    log = mavutil.mavlink_connection(str(tlog))
+    while (message := log.recv_match()) is not None:
+        yield message
+
+
+def test_it_takes_an_embedded_vehicle_off_and_the_tlog_holds_the_flight(tmp_path: Path) -> None:
+    async def fly(port: int) -> Pilot:
+        async with piloting(port, tmp_path / "3.tlog") as pilot:
+            await pilot.take_off(20.0)
+            assert pilot.state.armed
+            assert pilot.state.position is not None
+            assert pilot.state.position.relative_alt_m >= 19.0
+            return pilot
+
+    with embedded(speedup=SPEEDUP) as vehicle:
+        pilot = asyncio.run(fly(vehicle.pilot_port))
+    flight = list(messages_of(tmp_path / "3.tlog"))
+    assert len(flight) == pilot.state.messages
+    assert max(message.relative_alt for message in flight if message.get_type() == "GLOBAL_POSITION_INT") >= 19_000
+    assert "Arming motors" in [message.text for message in flight if message.get_type() == "STATUSTEXT"]
+    times = [message._timestamp for message in flight]
+    assert times == sorted(times)
+
+
+def test_it_measures_the_real_time_factor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sitl.pilot, "MIN_RATE_SPAN_S", 0.3)
+
+    async def factor(port: int, speedup: float) -> float:
+        async with piloting(port, tmp_path / "3.tlog", speedup=speedup) as pilot:
+            assert pilot.real_time_factor is None
+            async with asyncio.timeout(DEADLINE_S):
+                while pilot.real_time_factor is None:
+                    await asyncio.sleep(0.01)
+            return pilot.real_time_factor
+
+    with embedded(speedup=50) as vehicle:
+        assert asyncio.run(factor(vehicle.pilot_port, 50)) == pytest.approx(1.0, rel=0.3)
+        assert asyncio.run(factor(vehicle.pilot_port, 100)) == pytest.approx(0.5, rel=0.3)
+
+
+async def failure(port: int, tlog: Path, sysid: int = 3, deadline_s: float = 180.0) -> str:
+    async with piloting(port, tlog, sysid) as pilot:
+        with pytest.raises(FlightError) as error:
+            await pilot.take_off(1000.0, deadline_s)
+    return str(error.value)
+
+
+def test_a_missed_deadline_names_the_vehicle_the_step_and_its_last_words(tmp_path: Path) -> None:
+    with embedded(speedup=SPEEDUP) as vehicle:
+        message = asyncio.run(failure(vehicle.pilot_port, tmp_path / "3.tlog", deadline_s=40.0))
+    assert "vehicle 3" in message
+    assert "the climb" in message
+    assert "40 simulated seconds" in message
+    assert "Arming motors" in message
+    assert "3.tlog" in message
+
+
+def test_a_deadline_before_it_is_ready_names_that_step(tmp_path: Path) -> None:
+    with embedded(speedup=10) as vehicle:
+        message = asyncio.run(failure(vehicle.pilot_port, tmp_path / "3.tlog", deadline_s=4.0))
+    assert "ready to arm" in message or "GUIDED" in message
+
+
+def test_a_vehicle_with_another_system_id_is_not_flown(tmp_path: Path) -> None:
+    with embedded(sysid=9) as vehicle:
+        message = asyncio.run(failure(vehicle.pilot_port, tmp_path / "3.tlog", sysid=3))
+    assert "vehicle 3" in message and "system ID is 9" in message
+
+
+def test_a_mute_vehicle_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sitl.pilot, "SILENCE_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        message = asyncio.run(failure(mute.getsockname()[1], tmp_path / "3.tlog"))
+    assert "the first heartbeat" in message and "silent" in message
+
+
+def test_a_vehicle_that_dies_while_taking_off_is_given_up_at_once(tmp_path: Path) -> None:
+    async def fly(port: int) -> None:
+        async with piloting(port, tmp_path / "3.tlog") as pilot:
+            flight = asyncio.create_task(pilot.take_off(1000.0))
+            async with asyncio.timeout(DEADLINE_S):
+                while not pilot.state.armed:
+                    await asyncio.sleep(0.01)
+                vehicle.process.kill()
+                with pytest.raises(FlightError, match=r"vehicle 3 .*ended the connection"):
+                    await flight
+                await pilot.follow()
+
+    with embedded(speedup=SPEEDUP) as vehicle:
+        asyncio.run(fly(vehicle.pilot_port))
+
+
+@contextmanager
+def connected_pilot(tmp_path: Path) -> Iterator[tuple[Pilot, Channel]]:
+    """A pilot fed by hand, and an autopilot's channel that packs what it is fed."""
+    ours, theirs = socket.socketpair()
+    pilot = Pilot(3, ours, tmp_path / "3.tlog", 1.0)
+    channel = Channel(Autopilot(3, HOME, 0))
+    with theirs:
+        yield pilot, channel
+        asyncio.run(pilot.close())
+
+
+def test_garbage_between_messages_is_counted_and_not_logged(tmp_path: Path) -> None:
+    with connected_pilot(tmp_path) as (pilot, channel):
+        channel.send_due()
+        frames = channel.take()
+        pilot.data_received(b"garbage" + frames + b"\x00" * 300)
+        for byte in frames:  # the same, in crumbs
+            pilot.data_received(bytes([byte]))
+        assert pilot.state.garbage == 2
+        assert pilot.state.messages == 10
+    assert len(list(messages_of(tmp_path / "3.tlog"))) == 10
+
+
+def test_only_the_autopilot_is_listened_to(tmp_path: Path) -> None:
+    with connected_pilot(tmp_path) as (pilot, _):
+        gimbal = mavlink.MAVLink(None, srcSystem=3, srcComponent=mavlink.MAV_COMP_ID_GIMBAL)
+        pilot.data_received(mavlink.MAVLink_heartbeat_message(26, 8, 0, 7, 4, 3).pack(gimbal))
+        assert pilot.state.mode is None
+        assert pilot.state.messages == 1
+
+
+def test_messages_of_dialects_it_does_not_know_are_logged_all_the_same(tmp_path: Path) -> None:
+    unknown = b"\xfd\x01\x00\x00\x00\x03\x01\xff\xff\x7f\x01\xaa\xbb"
+    with connected_pilot(tmp_path) as (pilot, _):
+        pilot.data_received(unknown)
+        assert pilot.state.messages == 1
+    assert (tmp_path / "3.tlog").read_bytes()[8:] == unknown
+
+
+def test_a_full_disk_ends_the_log_and_not_the_flight(tmp_path: Path) -> None:
+    (tmp_path / "3.tlog").symlink_to("/dev/full")
+    with connected_pilot(tmp_path) as (pilot, channel):
+        for _ in range(1000):
+            channel.send(channel._autopilot.heartbeat())
+            pilot.data_received(channel.take())
+        assert pilot.state.messages == 1000
+        assert pilot.state.log_error is not None and "No space left" in pilot.state.log_error
+
+
+def test_a_restarted_vehicle_goes_on_in_the_same_tlog(tmp_path: Path) -> None:
+    for _ in range(2):
+        with connected_pilot(tmp_path) as (pilot, channel):
+            channel.send_due()
+            pilot.data_received(channel.take())
+    assert len(list(messages_of(tmp_path / "3.tlog"))) == 10
+
+
+@pytest.mark.ardupilot
+def test_it_takes_a_real_copter_off(tmp_path: Path) -> None:
+    """In a network namespace of its own: ArduPilot listens on every address and may send multicast."""
+    if "ARDUPILOT_SITL" not in os.environ:
+        pytest.skip("no ArduPilot: set ARDUPILOT_SITL to the directory that holds an arducopter")
+    network = "ip link set lo up multicast on && ip route add 224.0.0.0/4 dev lo && exec"
+    inside = ["unshare", "--user", "--map-root-user", "--net", "sh", "-c", f'{network} "$@"', "sh"]
+    flight = [sys.executable, "-m", "tests.sitl.real_flight", str(tmp_path)]
+    flown = subprocess.run([*inside, *flight], capture_output=True, text=True, timeout=180, check=False)
+    if flown.returncode != 0 and "unshare" in flown.stderr:
+        pytest.skip(f"no network namespace to be had here: {flown.stderr.strip()}")
+    assert flown.returncode == 0, flown.stderr
+    kinds = {message.get_type() for message in messages_of(tmp_path / "3.tlog")}
+    assert {"HEARTBEAT", "GLOBAL_POSITION_INT", "COMMAND_ACK"} <= kinds

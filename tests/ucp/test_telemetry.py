@@ -1,0 +1,295 @@
+from __future__ import annotations
+
+import asyncio
+import itertools
+import random
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
+from ucp import telemetry
+from ucp.telemetry import ARMED, DISARMED, MODE_CHANGE, POSITION, STATUS_TEXT, TelemetryEvents, describe, follow
+
+STABILIZE, GUIDED = 0, 4
+
+
+def autopilot(component: int = 1) -> Any:
+    return mavlink.MAVLink(None, srcSystem=3, srcComponent=component)
+
+
+def frames(*messages: Any, component: int = 1) -> bytes:
+    return b"".join(message.pack(autopilot(component)) for message in messages)
+
+
+def heartbeat(mode: int = STABILIZE, armed: bool = False) -> Any:
+    return mavlink.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, mode, 4, 3)
+
+
+def place(ms: int = 60_000, lat: int = -353632620, lon: int = 1491652370) -> Any:
+    return mavlink.MAVLink_global_position_int_message(ms, lat, lon, 604_000, 20_000, 300, -400, -250, 27_000)
+
+
+def text(words: str, identity: int = 0, chunk: int = 0, severity: int = 6) -> Any:
+    return mavlink.MAVLink_statustext_message(severity, words.encode(), identity, chunk)
+
+
+def source(position_interval_s: float = 10.0, seed: int = 1) -> TelemetryEvents:
+    return TelemetryEvents(position_interval_s, random.Random(seed))
+
+
+def test_a_mode_change_is_an_event_and_a_mode_kept_is_none() -> None:
+    events = source()
+    ((first, data),) = events.receive(frames(heartbeat(STABILIZE)), 0.0)
+    assert (first, describe(first, data)) == (MODE_CHANGE, "[0.0 s] mode STABILIZE")
+    assert events.receive(frames(heartbeat(STABILIZE)), 1.0) == []
+    events.receive(frames(place(5_000)), 1.5)
+    ((second, data),) = events.receive(frames(heartbeat(GUIDED)), 2.0)
+    assert (second, data) == (MODE_CHANGE, struct.pack(">IBII", 5_000, 2, STABILIZE, GUIDED))
+    assert describe(second, data) == "[5.0 s] mode GUIDED (was STABILIZE)"
+
+
+def test_arming_and_disarming_are_events() -> None:
+    events = source()
+    events.receive(frames(heartbeat(GUIDED)), 0.0)
+    ((armed, data),) = events.receive(frames(heartbeat(GUIDED, armed=True)), 1.0)
+    assert (armed, data) == (ARMED, struct.pack(">II", 0, GUIDED))
+    ((disarmed, data),) = events.receive(frames(heartbeat(GUIDED)), 2.0)
+    assert disarmed == DISARMED
+    assert describe(disarmed, data) == "[0.0 s] disarmed in mode 4"
+
+
+def test_a_status_text_is_an_event() -> None:
+    ((event_id, data),) = source().receive(frames(text("PreArm: Need Position Estimate", severity=2)), 0.0)
+    assert (event_id, data) == (STATUS_TEXT, struct.pack(">IB", 0, 2) + b"PreArm: Need Position Estimate")
+    assert describe(event_id, data) == "[0.0 s] critical: PreArm: Need Position Estimate"
+
+
+def test_a_status_text_in_chunks_is_one_event() -> None:
+    words = "x" * 50 + "y" * 50 + "z"
+    events = source()
+    chunks = (text(words[at * 50 : at * 50 + 50], 7, at) for at in range(3))
+    ((event_id, data),) = events.receive(frames(*chunks), 0.0)
+    assert (event_id, data[5:].decode()) == (STATUS_TEXT, words)
+
+
+def test_a_status_text_that_lost_its_end_is_kept() -> None:
+    events = source()
+    assert events.receive(frames(text("x" * 50, 7, 0)), 0.0) == []
+    said = [data[5:].decode() for _, data in events.receive(frames(text("next")), 1.0)]
+    assert said == ["x" * 50, "next"]
+
+
+def test_data_never_exceeds_its_limit() -> None:
+    events = source()
+    events.receive(frames(*(text("é" * 25, 7, chunk) for chunk in range(255))), 0.0)
+    ((_, data),) = events.receive(frames(text("", 7, 255)), 1.0)
+    assert len(data) == telemetry.MAX_DATA_BYTES
+
+
+def positions(events: TelemetryEvents, seconds: int) -> list[float]:
+    """Feed a position every tenth of a second; return when position events came."""
+    data = frames(place())
+    return [now / 10 for now in range(10 * seconds) if events.receive(data, now / 10)]
+
+
+def test_positions_come_at_random_intervals_around_the_mean() -> None:
+    times = positions(source(10.0), 2000)
+    gaps = [after - before for before, after in itertools.pairwise(times)]
+    assert min(gaps) >= 5.0
+    assert max(gaps) <= 15.2
+    assert sum(gaps) / len(gaps) == pytest.approx(10.0, rel=0.1)
+    assert max(gaps) - min(gaps) > 5.0
+
+
+def test_a_seed_fixes_the_intervals_and_another_changes_them() -> None:
+    assert positions(source(seed=1), 100) == positions(source(seed=1), 100)
+    assert positions(source(seed=1), 100) != positions(source(seed=2), 100)
+
+
+def test_a_position_holds_attitude_battery_and_mode() -> None:
+    events = source()
+    status = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 15_900, 1_000, 77, 0, 0, 0, 0, 0, 0)
+    events.receive(frames(heartbeat(GUIDED, armed=True), status, place()), 0.0)
+    events.receive(frames(mavlink.MAVLink_attitude_message(59_000, 0.1, -0.2, 3.0, 0.01, 0, float("inf"))), 1.0)
+    events.receive(frames(mavlink.MAVLink_system_time_message(1_700_000_000_000_000, 59_500)), 1.0)
+    ((event_id, data),) = events.receive(frames(place()), 100.0)
+    assert event_id == POSITION
+    assert len(data) == 64
+    fields = telemetry._POSITION.unpack(data)
+    assert fields[:10] == (
+        60_000,
+        1_700_000_000_000_000,
+        -353632620,
+        1491652370,
+        604_000,
+        20_000,
+        300,
+        -400,
+        -250,
+        27_000,
+    )
+    assert fields[10:13] == pytest.approx((0.1, -0.2, 3.0))
+    assert fields[13:] == (10, 0, 32_767, 15_900, 1_000, 77, GUIDED, 1)
+    assert describe(event_id, data) == (
+        "[60.0 s] at -35.3632620 149.1652370, 604.0 m, 20.0 m above home, 5.0 m/s, climb 2.5 m/s, "
+        "heading 270, battery 15.9 V 77 %, mode 4 armed"
+    )
+
+
+def test_a_position_before_the_first_fix_is_no_event() -> None:
+    events = source()
+    assert not any(events.receive(frames(place(lat=0, lon=0)), float(now)) for now in range(100))
+
+
+def test_a_ground_station_or_gimbal_on_the_same_link_makes_no_events() -> None:
+    events = source()
+    assert events.receive(frames(heartbeat(GUIDED), text("hello"), component=154), 0.0) == []
+    ground = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    assert events.receive(frames(ground), 0.0) == []
+
+
+def test_messages_may_come_in_crumbs_and_between_garbage() -> None:
+    events = source()
+    stream = b"noise" + frames(heartbeat(GUIDED)) + b"\x00\xfd\xff" + bytes(300) + frames(text("still here"))
+    made = [event for byte in stream for event in events.receive(bytes([byte]), 0.0)]
+    assert [event_id for event_id, _ in made] == [MODE_CHANGE, STATUS_TEXT]
+    assert events.garbage >= 2
+
+
+def test_what_is_kept_between_reads_is_bounded() -> None:
+    events = source()
+    frame = frames(heartbeat())
+    events.receive(frame[:10], 0.0)
+    for _ in range(2000):  # no read ends with a message
+        events.receive(frame[10:] + frame[:10], 0.0)
+        assert len(events._parser.buf) < 2 * len(frame)
+
+
+@settings(deadline=None)  # a busy machine is not a failure
+@given(st.lists(st.binary(max_size=600), max_size=10))
+def test_random_bytes_raise_nothing(reads: list[bytes]) -> None:
+    events = source()
+    for now, data in enumerate(reads):
+        events.receive(data, float(now))
+
+
+def any_message(kind: type[Any], draw: Callable[[str], Any]) -> Any:
+    return kind(*(draw(name) for name in kind.fieldtypes))
+
+
+_FIELDS = {
+    "uint8_t": st.integers(0, 2**8 - 1),
+    "int8_t": st.integers(-(2**7), 2**7 - 1),
+    "uint16_t": st.integers(0, 2**16 - 1),
+    "int16_t": st.integers(-(2**15), 2**15 - 1),
+    "uint32_t": st.integers(0, 2**32 - 1),
+    "int32_t": st.integers(-(2**31), 2**31 - 1),
+    "uint64_t": st.integers(0, 2**64 - 1),
+    "float": st.floats(width=32),
+    "char": st.binary(max_size=50),
+}
+_KINDS = (
+    mavlink.MAVLink_heartbeat_message,
+    mavlink.MAVLink_sys_status_message,
+    mavlink.MAVLink_system_time_message,
+    mavlink.MAVLink_attitude_message,
+    mavlink.MAVLink_global_position_int_message,
+    mavlink.MAVLink_statustext_message,
+)
+
+
+@settings(deadline=None)  # a busy machine is not a failure
+@given(st.data(), st.lists(st.sampled_from(_KINDS), min_size=1, max_size=12))
+def test_well_formed_messages_with_any_values_make_readable_events(data: st.DataObject, kinds: list[Any]) -> None:
+    events = source()
+    for at, kind in enumerate(kinds):
+        message = any_message(kind, lambda name: data.draw(_FIELDS[name]))
+        for event_id, event_data in events.receive(frames(message), at * 100.0):
+            assert 1 <= event_id <= 254
+            assert len(event_data) <= telemetry.MAX_DATA_BYTES
+            unreadable = describe(event_id, event_data) == "unreadable"
+            assert not unreadable or event_id == STATUS_TEXT  # MAV_SEVERITY ends at 7
+
+
+@settings(deadline=None)  # a busy machine is not a failure
+@given(st.integers(-5, 300), st.binary(max_size=300))
+def test_anything_can_be_described(event_id: int, data: bytes) -> None:
+    described = describe(event_id, data)
+    assert described.isprintable()
+
+
+@pytest.mark.parametrize("event_id", [0, 1, 2, 3, 4, 5, 6, 254])
+def test_what_is_no_event_of_ours_is_unreadable(event_id: int) -> None:
+    assert describe(event_id, b"\x00") == "unreadable"
+
+
+class FakeVehicle:
+    """A server that counts what it is sent, says one thing to each client, and hangs up when told."""
+
+    def __init__(self) -> None:
+        self.requested: set[int] = set()
+        self.clients = 0
+        self._writer: asyncio.StreamWriter | None = None
+        self._mav = mavlink.MAVLink(None)
+
+    async def serve(self, port: int = 0) -> asyncio.Server:
+        return await asyncio.start_server(self._client, "127.0.0.1", port)
+
+    async def _client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.clients += 1
+        self._writer = writer
+        writer.write(b"hello %d" % self.clients)
+        while data := await reader.read(1000):
+            for message in self._mav.parse_buffer(data) or ():
+                assert message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+                self.requested.add(int(message.param1))
+
+    def hang_up(self) -> None:
+        assert self._writer is not None
+        self._writer.transport.abort()
+
+
+async def reached(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(10.0):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+def test_the_connection_waits_for_the_vehicle_asks_and_comes_back_after_a_restart() -> None:
+    async def story() -> None:
+        vehicle, heard = FakeVehicle(), bytearray()
+        port = (probe := await vehicle.serve()).sockets[0].getsockname()[1]
+        probe.close()
+        await probe.wait_closed()
+        following = asyncio.create_task(follow("127.0.0.1", port, heard.extend))
+        await asyncio.sleep(0)  # the first attempt finds nobody
+        server = await vehicle.serve(port)
+        await reached(lambda: vehicle.requested == {1, 2, 30, 33})
+        vehicle.hang_up()
+        await reached(lambda: b"hello 2" in heard)
+        assert bytes(heard) == b"hello 1hello 2"
+        following.cancel()
+        server.close()
+
+    asyncio.run(story())
+
+
+def test_what_the_sink_raises_ends_the_following() -> None:
+    async def story() -> None:
+        vehicle = FakeVehicle()
+        server = await vehicle.serve()
+
+        def full(_data: bytes) -> None:
+            raise OSError("no space left")
+
+        async with asyncio.timeout(10.0):
+            with pytest.raises(OSError, match="no space left"):
+                await follow("127.0.0.1", server.sockets[0].getsockname()[1], full)
+        server.close()
+
+    asyncio.run(story())
