@@ -1,0 +1,48 @@
+# make run    play the thesis's 15 % loss experiment and write a report
+# make test   run all tests
+# Both set up what they need: Debian packages (asking sudo if you are not root) and a virtual environment in .venv.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
+SCENARIO ?= scenarios/loss_15.yaml
+TESTS ?= -n 2
+
+.PHONY: run test test-netem lint setup clean
+
+run: setup
+	$(BIN)/ucp-harness run $(SCENARIO)
+
+test: setup
+	$(BIN)/python -m pytest $(TESTS)
+
+# The tests of real tc netem, inside User Mode Linux: for machines whose kernel lacks sch_netem.
+test-netem: setup
+	$(BIN)/python -m tests.netem.uml
+
+lint: setup
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+setup: $(VENV)/installed
+
+$(VENV)/installed: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)"; exit 3; }
+	@PATH="$$PATH:/usr/sbin:/sbin"; \
+	needed=""; \
+	command -v nft >/dev/null || needed="$$needed nftables"; \
+	command -v unshare >/dev/null || needed="$$needed util-linux"; \
+	$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || needed="$$needed python3-venv"; \
+	if [ -n "$$needed" ]; then \
+	  command -v apt-get >/dev/null || { echo "install these first:$$needed"; exit 3; }; \
+	  set -x; $(SUDO) apt-get update -q && $(SUDO) apt-get install -q -y $$needed; \
+	fi
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q -e '.[test]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,93 @@
+"""Running `ucp-harness` as a user does, and looking at the processes that it started."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+DEADLINE_S = 60.0
+COMMAND = [sys.executable, "-m", "harness.cli"]
+
+
+def harness(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end."""
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=DEADLINE_S, **options
+    )
+
+
+def sentences(stderr: str) -> list[str]:
+    """What was said on standard error, which is never a traceback."""
+    assert "Traceback" not in stderr, stderr
+    return [line.removeprefix("ucp-harness: ") for line in stderr.splitlines()]
+
+
+def write_scenario(directory: Path, **keys: Any) -> Path:
+    """A short mission, two seconds of wall time unless told otherwise."""
+    scenario = {"name": "test", "agents": 3, "duration_s": 200, "speedup": 100, **keys}
+    path = directory / "scenario.yaml"
+    path.write_text(json.dumps(scenario))  # JSON is YAML
+    return path
+
+
+class Running:
+    """A run that goes on while the test looks at it or hurts it."""
+
+    def __init__(self, scenario: Path, out: Path, *options: object) -> None:
+        self.out = out
+        self.process = subprocess.Popen(
+            [*COMMAND, "run", str(scenario), "--out", str(out), *map(str, options)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def wait_for(self, condition: Callable[[], Any], what: str) -> None:
+        deadline = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert self.process.poll() is None, f"it ended before {what}: {self.process.communicate()}"
+            assert time.monotonic() < deadline, f"never: {what}"
+            time.sleep(0.02)
+
+    def wait_for_mission(self, *agents: int) -> None:
+        """Until these agents have traced something."""
+
+        def traced() -> bool:
+            paths = [self.out / "agents" / f"{agent}.trace.jsonl" for agent in agents]
+            return all(path.exists() and path.read_text().count("\n") > 1 for path in paths)
+
+        self.wait_for(traced, "the mission")
+
+    def signal_agent(self, agent: int, number: signal.Signals) -> None:
+        (pid,) = [pid for pid, command in processes(self.out).items() if f"{agent}.mission.json" in command]
+        os.kill(pid, number)
+
+    def end(self) -> tuple[int, str, str]:
+        """Exit status, standard output and error."""
+        out, err = self.process.communicate(timeout=DEADLINE_S)
+        return self.process.returncode, out, err
+
+    def record(self) -> dict[str, Any]:
+        record: dict[str, Any] = json.loads((self.out / "run.json").read_text())
+        return record
+
+
+def processes(directory: Path) -> dict[int, str]:
+    """PID -> command line of every process that has to do with a run directory: by its words or where it works."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit() or int(entry.name) == os.getpid():
+            continue
+        try:
+            command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            working = str((entry / "cwd").readlink())
+        except OSError:
+            continue
+        if str(directory) in command or working.startswith(str(directory)):
+            found[int(entry.name)] = command
+    return found

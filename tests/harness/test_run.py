@@ -1,0 +1,185 @@
+"""Runs as a user meets them: real processes, real namespaces, and everything that can go wrong."""
+
+import json
+import os
+import re
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.harness.command import Running, harness, processes, sentences, write_scenario
+
+pytestmark = pytest.mark.lab
+
+
+def verdicts(record: dict[str, Any]) -> dict[str, str]:
+    return {number: one["verdict"] for number, one in record["characteristics"].items()}
+
+
+def test_a_run_with_vehicles_leaves_everything_that_it_promises(tmp_path: Path) -> None:
+    scenario = write_scenario(
+        tmp_path,
+        network={"loss": 0.1},
+        timeline=[{"at_s": 50, "partition": [[1]]}, {"at_s": 100, "heal": True}],
+        vehicles={"kind": "embedded"},
+        final_reconcile=True,
+    )
+    out = tmp_path / "run"
+    done = harness("run", scenario, "--seed", 7, "--out", out)
+    assert done.returncode == 0, done.stdout + done.stderr
+    record = json.loads((out / "run.json").read_text())
+    assert record["schema"] == "ucp-run/1"
+    assert record["outcome"] == "completed"
+    assert record["seed"] == 7
+    assert set(verdicts(record).values()) == {"holds"}
+    assert record["figures"]["blocks"] > 0
+    assert record["figures"]["bytes"] > 0
+    assert [change["what"] for change in record["network"]] == ["start", "partition", "heal", "final reconcile"]
+    assert record["final_reconcile"]["complete"]
+    assert all(vehicle["armed"] for vehicle in record["vehicles"].values())
+    for agent in (1, 2, 3):
+        assert {path.name for path in (out / "agents").glob(f"{agent}.*")} == {
+            f"{agent}.{end}" for end in ("chain.json", "trace.jsonl", "log", "mission.json")
+        }
+        assert (out / "vehicles" / str(agent) / "telemetry.tlog").stat().st_size > 1000
+    network = [json.loads(line) for line in (out / "network.jsonl").read_text().splitlines()]
+    partition = next(change for change in network if change["what"] == "partition")
+    assert partition["applied"]["receivers"]["1"]["cut_from"] == [2, 3]
+    assert partition["applied"]["receivers"]["2"]["loss"] == pytest.approx(0.1)
+    assert "<html" in (out / "report.html").read_text()
+    assert not processes(out)
+    assert "one uniform chain" in done.stdout
+    again = harness("check", out, "--json")
+    assert json.loads(again.stdout)["characteristics"] == record["characteristics"]
+    assert json.loads(again.stdout)["figures"] == record["figures"]
+
+
+def test_a_partition_without_heal_keeps_chains_apart_and_5_and_6_do_not_apply(tmp_path: Path) -> None:
+    scenario = write_scenario(
+        tmp_path,
+        agents=[7, 300, 65535],
+        duration_s=400,
+        timeline=[{"at_s": 0, "partition": [[7], [300, 65535]]}],
+        vehicles={"kind": "none"},
+        events={"mean_s": 10},
+    )
+    done = harness("run", scenario, "--seed", 3, "--out", tmp_path / "run")
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert verdicts(record) == {**dict.fromkeys("1234", "holds"), **dict.fromkeys("56", "not applicable")}
+    assert "partition 7 | 300 65535" in record["characteristics"]["6"]["reason"]
+    seven = json.loads((tmp_path / "run" / "agents" / "7.chain.json").read_text())
+    assert {block["agent_id"] for block in seven["chain"]} == {7}
+    other = json.loads((tmp_path / "run" / "agents" / "300.chain.json").read_text())
+    assert {block["agent_id"] for block in other["chain"]} == {300, 65535}
+
+
+def test_the_options_of_the_command_line_come_before_the_scenario_s(tmp_path: Path) -> None:
+    scenario = write_scenario(tmp_path, speedup=1)
+    done = harness("run", scenario, "--speedup", 200, "--vehicles", "none", "--seed", 0, "--out", tmp_path / "run")
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert done.returncode == 0
+    assert record["scenario"]["speedup"] == 200
+    assert record["vehicles"] == {}
+    assert record["wall_s"] < 30
+
+
+def test_ctrl_c_stops_cleanly_and_still_exports_and_checks(tmp_path: Path) -> None:
+    run = Running(write_scenario(tmp_path, duration_s=100_000), tmp_path / "run")
+    run.wait_for_mission(1, 2, 3)
+    run.process.send_signal(signal.SIGINT)
+    status, _, err = run.end()
+    assert status == 130
+    assert sentences(err) == ["the run interrupted: interrupted"]
+    record = run.record()
+    assert record["outcome"] == "interrupted"
+    assert record["characteristics"]["3"]["verdict"] == "holds"
+    assert len(list((run.out / "agents").glob("*.chain.json"))) == 3
+    assert (run.out / "report.html").exists()
+    assert not processes(run.out)
+
+
+def test_an_agent_that_crashes_ends_the_run_and_is_named_and_the_others_export(tmp_path: Path) -> None:
+    run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
+    run.wait_for_mission(1, 2, 3)
+    run.signal_agent(2, signal.SIGKILL)
+    status, _, err = run.end()
+    assert status == 1
+    assert sentences(err)[0] == "the run failed: agent 2 ended by itself with SIGKILL; its log is agents/2.log"
+    record = run.record()
+    assert record["agents"]["2"]["outcome"] == "crashed"
+    assert record["agents"]["1"]["outcome"] == record["agents"]["3"]["outcome"] == "exported"
+    assert "ready" in (run.out / "agents" / "2.log").read_text()
+    assert record["characteristics"]["6"]["verdict"] == "not applicable"
+    assert "agent 2" in record["characteristics"]["6"]["reason"]
+
+
+def test_an_agent_that_hangs_ends_the_run_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
+    run.wait_for_mission(1, 2, 3)
+    run.signal_agent(3, signal.SIGSTOP)
+    status, _, err = run.end()
+    assert status == 1
+    assert re.match("the run failed: agent 3 stopped answering: no answer to status for", sentences(err)[0])
+    assert run.record()["agents"]["3"]["outcome"] == "hung"
+    assert not processes(run.out)
+
+
+def executable(path: Path, text: str, mode: int = 0o755) -> Path:
+    path.write_text(text)
+    path.chmod(mode)
+    return path
+
+
+def test_a_vehicle_binary_that_will_not_do_is_one_sentence_before_anything_starts(tmp_path: Path) -> None:
+    not_executable = executable(tmp_path / "arducopter", "#!/bin/sh\n", 0o644)
+    for binary, sentence in ((tmp_path / "nowhere", "does not exist"), (not_executable, "is not executable")):
+        scenario = write_scenario(tmp_path, vehicles={"kind": "ardupilot", "binary": str(binary)})
+        done = harness("run", scenario, "--out", tmp_path / f"run-{sentence[:4]}{len(sentence)}")
+        assert done.returncode == 2
+        (said,) = sentences(done.stderr)
+        assert sentence in said
+        assert str(binary) in said
+
+
+def test_asking_for_ardupilot_without_having_it_says_how_to_get_it(tmp_path: Path) -> None:
+    environment = {**os.environ, "PATH": "/usr/bin:/bin"}
+    environment.pop("ARDUPILOT_SITL", None)
+    done = harness(
+        "run", write_scenario(tmp_path), "--vehicles", "ardupilot", "--out", tmp_path / "run", env=environment
+    )
+    assert done.returncode == 3
+    assert "no ArduPilot" in sentences(done.stderr)[0]
+
+
+def test_a_vehicle_that_exits_at_once_ends_the_run_with_its_last_words(tmp_path: Path) -> None:
+    binary = executable(tmp_path / "arducopter", "#!/bin/sh\necho bind failed >&2\nexit 1\n")
+    scenario = write_scenario(tmp_path, vehicles={"kind": "ardupilot", "binary": str(binary)})
+    done = harness("run", scenario, "--out", tmp_path / "run")
+    assert done.returncode == 2
+    said = sentences(done.stderr)[0]
+    assert re.search(r"vehicle \d \(ardupilot\) ended by itself with status 1; its last words .*: bind failed", said)
+    assert not processes(tmp_path / "run")
+
+
+def test_a_run_directory_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "precious").write_text("data")
+    done = harness("run", write_scenario(tmp_path), "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert "is not empty: choose another --out" in sentences(done.stderr)[0]
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["precious"]
+
+
+def test_two_runs_at_once_do_not_meet(tmp_path: Path) -> None:
+    runs = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        scenario = write_scenario(tmp_path / name, vehicles={"kind": "none"}, duration_s=300)
+        runs.append(Running(scenario, tmp_path / name / "run", "--seed", 1))
+    for run in runs:
+        status, out, err = run.end()
+        assert status == 0, out + err
+        assert {agent["dropped"].get("sender not on the roster", 0) for agent in run.record()["agents"].values()} == {0}
