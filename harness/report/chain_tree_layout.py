@@ -1,0 +1,180 @@
+"""Where everything of a chain tree goes: rows upwards in time, columns so that nothing overlaps.
+
+Each subtree is packed by its outline, row by row, against those to its left (after Reingold and Tilford, "Tidier
+Drawings of Trees", 1981). What stands on a block is centred over it, unless most of the block's agents go on one way:
+then that way goes straight up, and the few that part from it branch off to the side. An oval stands on top of its
+block, or to the right of it if other chains go on from there.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from harness.report.chain_tree import Mark
+
+FONT_SIZE = 13
+CHARACTER_WIDTH = 0.66 * FONT_SIZE
+"""At least the width of a digit or lower-case letter in the common system fonts (0.64 em in DejaVu Sans, Verdana)."""
+SMALL_FONT_SIZE = 12
+BOX_HEIGHT = 26
+LINE_HEIGHT = 17
+PADDING = 7
+COLUMN_GAP = 10
+OVAL_GAP = 18
+ROW_GAP = 24
+ROW_HEIGHT = BOX_HEIGHT + ROW_GAP
+MARGIN = 8
+
+
+@dataclass(slots=True)
+class Placed:
+    """A mark with its centre `x` and top `y`; units are CSS pixels, y grows downwards."""
+
+    mark: Mark
+    width: float
+    height: float
+    row: int
+    x: float = 0.0
+    y: float = 0.0
+    children: list["Placed"] = field(default_factory=list)
+    beside: "Placed | None" = None
+
+    @property
+    def rows(self) -> range:
+        """The rows that it stands in the way of: those that it reaches into, the gap below a row being that row's."""
+        return range(self.row, self.row + math.ceil((self.height + ROW_GAP) / ROW_HEIGHT))
+
+    def walk(self) -> Iterator["Placed"]:
+        """This and everything above it, each after what it stands on."""
+        to_visit = [self]
+        while to_visit:
+            placed = to_visit.pop()
+            yield placed
+            if placed.beside:
+                yield placed.beside
+            to_visit.extend(reversed(placed.children))
+
+
+@dataclass(slots=True)
+class Layout:
+    root: Placed
+    width: float
+    height: float
+
+
+class _Outline:
+    """How far a subtree reaches left and right in each row, as seen from its root."""
+
+    def __init__(self) -> None:
+        self.shift = 0.0
+        self._rows: dict[int, tuple[float, float]] = {}
+
+    def add(self, rows: range, width: float) -> None:
+        for row in rows:
+            self._rows[row] = (-width / 2 - self.shift, width / 2 - self.shift)
+
+    def room_needed(self, right: "_Outline", gap: float = COLUMN_GAP) -> float:
+        """How far to the right of this one's root that one's root must be, with `gap` between them."""
+        shared = self._rows.keys() & right._rows.keys()
+        return max(
+            (self._rows[row][1] + self.shift - right._rows[row][0] - right.shift + gap for row in shared),
+            default=0.0,
+        )
+
+    def joined(self, other: "_Outline", x: float) -> "_Outline":
+        """This outline and the other with its root at `x`; the smaller is merged into the larger."""
+        other.shift += x
+        large, small = (self, other) if len(self._rows) >= len(other._rows) else (other, self)
+        by = small.shift - large.shift
+        for row, (left, right) in small._rows.items():
+            far_left, far_right = large._rows.get(row, (left + by, right + by))
+            large._rows[row] = (min(far_left, left + by), max(far_right, right + by))
+        return large
+
+
+def lay_out(root: Mark) -> Layout:
+    placed = _sized(root)
+    everything = list(placed.walk())
+    offsets = _offsets(everything)
+    for item in everything:
+        for child in item.children:
+            child.x = item.x + offsets[id(child)]
+        if item.beside:
+            item.beside.x = item.x + offsets[id(item.beside)]
+    left = min(item.x - item.width / 2 for item in everything) - MARGIN
+    right = max(item.x + item.width / 2 for item in everything) + MARGIN
+    floor = max(item.row * ROW_HEIGHT + item.height for item in everything) + MARGIN
+    for item in everything:
+        item.x -= left
+        item.y = floor - item.row * ROW_HEIGHT - item.height
+    return Layout(placed, right - left, floor + MARGIN)
+
+
+def _sized(root: Mark) -> Placed:
+    """The marks with their sizes and rows; all boxes but the inception block's are as wide as the longest label."""
+    names = [0]
+    to_measure = list(root.children)
+    while to_measure:
+        mark = to_measure.pop()
+        names += [len(line) for line in mark.lines if mark.kind == "block"]
+        to_measure.extend(mark.children)
+    box_width = _width(max(names))
+
+    def sized(mark: Mark, row: int) -> Placed:
+        if mark.kind == "ellipsis":
+            longest = max(len(line) for line in mark.lines)
+            return Placed(mark, longest * CHARACTER_WIDTH * SMALL_FONT_SIZE / FONT_SIZE, BOX_HEIGHT, row)
+        width = max(_width(len(line)) for line in mark.lines)
+        if mark.kind == "block":
+            width = max(width, box_width)
+        return Placed(mark, width, BOX_HEIGHT + (len(mark.lines) - 1) * LINE_HEIGHT, row)
+
+    placed = sized(root, 0)
+    to_size = [placed]
+    while to_size:
+        below = to_size.pop()
+        below.children = [sized(mark, below.row + 1) for mark in below.mark.children]
+        if below.mark.beside:
+            below.beside = sized(below.mark.beside, below.row)
+        to_size.extend(below.children)
+    return placed
+
+
+def _width(characters: int) -> float:
+    return float(round(characters * CHARACTER_WIDTH + 2 * PADDING))
+
+
+def _offsets(everything: list[Placed]) -> dict[int, float]:
+    """For each placed mark but the root, by identity: how far it is to the right of what it stands on or beside."""
+    offsets: dict[int, float] = {}
+    outlines: dict[int, _Outline] = {}
+    beside = {id(item.beside) for item in everything}
+    for item in reversed(everything):
+        if id(item) in beside:
+            continue
+        outline = _Outline()
+        positions: list[float] = []
+        for child in item.children:
+            right = outlines.pop(id(child))
+            x = outline.room_needed(right)
+            positions.append(x)
+            outline = outline.joined(right, x)
+        own = _root_position(item, positions)
+        outline.shift -= own
+        outline.add(item.rows, item.width)
+        if item.beside:
+            oval = _Outline()
+            oval.add(item.beside.rows, item.beside.width)
+            offsets[id(item.beside)] = outline.room_needed(oval, OVAL_GAP)
+            outline = outline.joined(oval, offsets[id(item.beside)])
+        outlines[id(item)] = outline
+        for child, x in zip(item.children, positions, strict=True):
+            offsets[id(child)] = x - own
+    return offsets
+
+
+def _root_position(item: Placed, positions: list[float]) -> float:
+    for child, x in zip(item.children, positions, strict=True):
+        if 2 * len(child.mark.holders) > len(item.mark.holders):
+            return x
+    return (positions[0] + positions[-1]) / 2 if positions else 0.0

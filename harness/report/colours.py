@@ -1,0 +1,72 @@
+"""A colour for each agent that people with any colour vision can tell apart, in light and in dark.
+
+The first eight are Okabe and Ito's (https://jfly.uni-koeln.de/color/, black replaced by grey). Further agents get the
+same hues lighter, darker, and with a dashed outline; after that colours repeat. No picture relies on colour alone:
+every box says whose it is.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+_BLACK, _WHITE = (0, 0, 0), (255, 255, 255)
+_OKABE_ITO = (
+    (86, 180, 233),  # sky blue
+    (230, 159, 0),  # orange
+    (0, 158, 115),  # bluish green
+    (240, 228, 66),  # yellow
+    (204, 121, 167),  # reddish purple
+    (0, 114, 178),  # blue
+    (213, 94, 0),  # vermillion
+    (160, 160, 160),  # grey
+)
+
+Rgb = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Ink:
+    """How an agent's blocks are drawn; colours are `#rrggbb`."""
+
+    fill: str
+    stroke: str
+    text: str
+    dashed: bool = False
+
+
+def inks(agent_ids: Iterable[int]) -> dict[int, Ink]:
+    """An ink for each agent; the same agents always get the same."""
+    return {agent_id: _ink(position) for position, agent_id in enumerate(sorted(set(agent_ids)))}
+
+
+def contrast(one: str, other: str) -> float:
+    """The contrast ratio of WCAG 2, 1 to 21."""
+    dark, light = sorted((_luminance(one), _luminance(other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def _ink(position: int) -> Ink:
+    hue = _OKABE_ITO[position % len(_OKABE_ITO)]
+    variant = position // len(_OKABE_ITO) % 4
+    if variant == 2:
+        fill, stroke = _mixed(hue, _BLACK, 0.55), _mixed(hue, _WHITE, 0.3)
+    elif variant == 0:
+        fill, stroke = _hex(hue), _mixed(hue, _BLACK, 0.35)
+    else:
+        fill, stroke = _mixed(hue, _WHITE, 0.72), _mixed(hue, _BLACK, 0.35)
+    text = max(("#111111", "#ffffff"), key=lambda ink: contrast(ink, fill))
+    return Ink(fill, stroke, text, dashed=variant == 3)
+
+
+def _mixed(colour: Rgb, into: Rgb, share: float) -> str:
+    red, green, blue = (round(one + (other - one) * share) for one, other in zip(colour, into, strict=True))
+    return _hex((red, green, blue))
+
+
+def _hex(colour: Rgb) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def _luminance(colour: str) -> float:
+    parts = [int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)]
+    red, green, blue = (part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue

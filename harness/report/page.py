@@ -1,0 +1,142 @@
+"""The page: gathers what a run directory holds, draws the pictures, and writes `report.html` and `chains.svg`.
+
+The page loads nothing and runs no script; its Content-Security-Policy allows its own style sheet and nothing else.
+Whatever comes from agents and scenarios is text to the template, which escapes all of it.
+"""
+
+import base64
+import contextlib
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from harness.errors import RunDirectoryError
+from harness.exports import Exports, export_paths, read_exports
+from harness.report import network, swarm, verdicts, words
+from harness.report.chain_tree_svg import STYLE as TREE_STYLE
+from harness.report.chain_tree_svg import ChainTreePicture
+from harness.report.colours import Ink
+from harness.report.result import mapping, number, read_result
+
+FIGURES = {
+    "blocks": "blocks completed",
+    "mutual_chain": "blocks in the mutual chain",
+    "distinct_chains": "distinct chains",
+    "reconciles": "reconciles",
+    "copies_min": "fewest copies of a block",
+    "copies_mean": "copies of a block, mean",
+    "messages": "messages sent",
+    "bytes": "bytes sent",
+}
+EVIDENCE_SHOWN = 3
+LONG_TEXT = 240
+
+_HERE = Path(__file__).parent
+_PAGE_STYLE = (_HERE / "page.css").read_text(encoding="utf-8")
+
+
+def write_report(run_dir: Path) -> Path:
+    """Write `report.html` and `chains.svg` into the run directory; the path of the page.
+
+    Raises RunDirectoryError if there is no run's result in the directory, or if the disk refuses the report. Exports
+    that are missing or damaged are said on the page.
+    """
+    result = read_result(run_dir / "run.json")
+    exports = read_exports(export_paths(run_dir))
+    ink = swarm.agent_inks(result, exports.by_agent)
+    picture = ChainTreePicture(exports.by_agent, ink)
+    _write_atomically(run_dir / "chains.svg", picture.standalone())
+    page = run_dir / "report.html"
+    _write_atomically(page, _page(result, exports, picture, ink, run_dir))
+    return page
+
+
+def _page(
+    result: dict[str, Any], exports: Exports, picture: ChainTreePicture, ink: Mapping[int, Ink], run_dir: Path
+) -> str:
+    environment = Environment(
+        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters.update(value=words.value)
+    style = TREE_STYLE + _PAGE_STYLE
+    judged, outcome = verdicts.verdicts(result), _outcome(result)
+    return environment.get_template("page.html.j2").render(
+        style=Markup(style),  # noqa: S704 - ours, and escaped it would not be what the digest is of
+        style_digest=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii"),
+        title=words.value(mapping(result, "scenario").get("name") or "unnamed scenario"),
+        about=mapping(result, "scenario").get("about"),
+        summary=_summary(result, exports),
+        headline=verdicts.headline(judged, completed=outcome is None),
+        outcome=outcome,
+        missing=swarm.missing(result, exports),
+        export_errors=[error.replace(f"{run_dir}{os.sep}", "") for error in exports.errors],
+        verdicts=judged,
+        figures=[
+            (FIGURES.get(key, words.label(key)), words.value(figure))
+            for key, figure in mapping(result, "figures").items()
+        ],
+        has_chains=bool(exports.by_agent),
+        hidden=picture.hidden,
+        abridged=picture.draw("abridged"),
+        full=picture.draw("full") if picture.hidden else None,
+        blocks=swarm.block_rows(exports.by_agent, ink),
+        strip=network.strip(result),
+        network=network.start(result),
+        faults=network.faults(result),
+        agents=swarm.agents_table(result, exports.by_agent, ink),
+        versions=mapping(result, "versions"),
+        evidence_shown=EVIDENCE_SHOWN,
+        long_text=LONG_TEXT,
+    )
+
+
+def _summary(result: dict[str, Any], exports: Exports) -> list[str]:
+    scenario = mapping(result, "scenario")
+    parts = [words.value(result["outcome"])] if result.get("outcome") else []
+    agents = len({*swarm.roster(result), *exports.by_agent})
+    parts.append("1 agent" if agents == 1 else f"{agents} agents")
+    duration_s, speedup = number(scenario, "duration_s"), number(scenario, "speedup")
+    loss, wall_s = number(scenario, "network", "loss"), number(result, "wall_s")
+    if duration_s is not None:
+        parts.append(f"{words.duration(duration_s)} mission")
+    if loss is not None:
+        parts.append(f"{words.percent(loss)} loss")
+    if speedup is not None:
+        parts.append(f"speedup {words.value(speedup)}")
+    parts += [
+        f"{key} {words.value(result[key])}" for key in ("seed", "backend", "engine") if result.get(key) is not None
+    ]
+    if wall_s is not None:
+        parts.append(f"{words.duration(wall_s)} wall time")
+    if result.get("started_at"):
+        parts.append(f"started {words.started(result['started_at'])}")
+    return parts
+
+
+def _outcome(result: dict[str, Any]) -> tuple[str, str] | None:
+    """What kept the run from completing and the details, if something did."""
+    outcome = result.get("outcome")
+    if outcome == "completed":
+        return None
+    detail = result.get("outcome_detail")
+    if outcome is None:
+        return "This run has not recorded its end", words.value(detail or "It is still going on, or it was killed.")
+    return f"This run did not complete: {words.value(outcome)}", words.value(detail or "")
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    """So that `path` holds the old report or the new one, never half of one."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8", errors="replace")  # JSON can hold half a character
+        temporary.replace(path)
+    except OSError as error:
+        raise RunDirectoryError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)

@@ -1,0 +1,86 @@
+"""Who flew, and what each agent and each block came to."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from harness.exports import Export, Exports
+from harness.naming import name_blocks
+from harness.report import words
+from harness.report.chain_tree import holders, ranges
+from harness.report.colours import Ink, inks
+from harness.report.result import agent_ids, listing, mapping
+
+
+@dataclass(frozen=True, slots=True)
+class BlockRow:
+    name: str
+    ink: Ink
+    at: str
+    block_hash: str
+    held_by: str
+
+
+def roster(result: dict[str, Any]) -> list[int]:
+    """The agents that the run is known to have had, whether or not they left an export."""
+    agents = mapping(result, "scenario").get("agents")
+    if type(agents) is int and 0 < agents <= 1000:
+        agents = range(1, agents + 1)
+    named = [*(agents if isinstance(agents, list | range) else []), *listing(result, "scenario", "vehicles")]
+    return agent_ids([*named, *mapping(result, "agents"), *mapping(result, "vehicles")])
+
+
+def agent_inks(result: dict[str, Any], exports: Mapping[int, Export]) -> dict[int, Ink]:
+    makers = {block.agent_id for export in exports.values() for block in export.blocks()}
+    return inks({*roster(result), *exports, *makers})
+
+
+def missing(result: dict[str, Any], exports: Exports) -> list[str]:
+    """A sentence for each agent of the run without a usable export."""
+    sentences = []
+    for agent_id in roster(result):
+        if agent_id not in exports.by_agent:
+            agent = mapping(result, "agents", str(agent_id))
+            why = ", ".join(words.value(agent[key]) for key in ("outcome", "detail") if agent.get(key))
+            sentences.append(f"agent {agent_id}: no usable export" + (f" ({why})" if why else ""))
+    return sentences
+
+
+def agents_table(result: dict[str, Any], exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> dict[str, Any]:
+    """Column labels, and a row (agent ID, ink, cells by column) for each agent and its vehicle."""
+    rows = []
+    columns: dict[str, None] = {}
+    for agent_id in sorted({*roster(result), *exports}):
+        cells: dict[str, Any] = {}
+        agent, vehicle = (mapping(result, owner, str(agent_id)) for owner in ("agents", "vehicles"))
+        cells |= {words.label(key): value for key, value in agent.items() if key != "detail"}
+        if export := exports.get(agent_id):
+            cells |= {
+                "idle": export.idle,
+                "completed": len(export.completed),
+                "in chain": len(export.chain),
+                "waiting": len(export.blocks_to_be_committed) + len(export.reconcile_stack),
+            }
+        for key, value in vehicle.items():
+            label = words.label(key)
+            cells[f"vehicle {label}" if label in cells or key == "detail" else label] = value
+        cells["detail"] = agent.get("detail")
+        rows.append((agent_id, ink[agent_id], cells))
+        columns |= dict.fromkeys(label for label, value in cells.items() if value is not None)
+    return {"columns": sorted(columns, key=lambda label: label == "detail"), "rows": rows}
+
+
+def block_rows(exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> list[BlockRow]:
+    """Every block that is in a chain, oldest first."""
+    names, held_by = name_blocks(exports), holders(exports)
+    blocks = {block.block_hash: block for export in exports.values() for block in export.chain}
+    return [
+        BlockRow(
+            names[block.block_hash],
+            ink[block.agent_id],
+            words.moment(block.timestamp_us),
+            block.block_hash,
+            ", ".join(ranges(held_by[block.block_hash])),
+        )
+        for block in sorted(blocks.values(), key=lambda block: (block.timestamp_us, block.block_hash))
+    ]

@@ -1,0 +1,86 @@
+"""The report in a real browser: nothing to complain about, nothing cut off, and the keyboard is enough."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from harness.report import write_report
+from tests.harness.report.browser import Browser, chromium_or_skip, open_browser
+from tests.harness.report.runs import write_run
+
+DISCONNECTED = {agent: [f"{agent}.{n}" for n in range(1, 41)] for agent in (1, 2, 3, 4, 65535)}
+TWENTY = {
+    agent: ["1.1", "2.1", *(f"{agent % 7 + 1}.{n}" for n in range(2, 14))][: 14 - agent % 3] for agent in range(1, 21)
+}
+
+SHOWN = "getComputedStyle(document.querySelector('.{}')).display != 'none'"
+LABELS_THAT_DO_NOT_FIT = """
+[...document.querySelectorAll('.abridged .chains g')].filter(g => g.querySelector('rect')).flatMap(g =>
+  [...g.querySelectorAll('text')].filter(t => {
+    const box = g.querySelector('rect').getBBox(), text = t.getBBox();
+    return text.x < box.x + 2 || text.x + text.width > box.x + box.width - 2;
+  }).map(t => t.textContent))
+"""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with open_browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module", params=["disconnected", "twenty"])
+def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    chains = {"disconnected": DISCONNECTED, "twenty": TWENTY}[request.param]
+    return write_report(write_run(tmp_path_factory.mktemp("run") / "run", chains))
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1280])
+def test_it_fits_the_screen_and_the_console_is_silent(
+    browser: Browser, page: Path, width: int, scheme: Literal["light", "dark"]
+) -> None:
+    browser.show(page, width=width, scheme=scheme)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    assert browser.evaluate(LABELS_THAT_DO_NOT_FIT) == []
+    ground = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert ground == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 23, 26)"}[scheme], "the policy lets the style in"
+    assert browser.complaints == []
+
+
+def test_the_keyboard_unfolds_the_tree_and_folds_it_again(browser: Browser, page: Path) -> None:
+    browser.show(page, width=1280, scheme="light")
+    assert browser.evaluate(SHOWN.format("abridged"))
+    assert not browser.evaluate(SHOWN.format("full"))
+    for _ in range(20):
+        browser.press("Tab")
+        if browser.evaluate("document.activeElement.id") == "every-block":
+            break
+    browser.press(" ", text=" ")
+    assert not browser.evaluate(SHOWN.format("abridged"))
+    assert browser.evaluate(SHOWN.format("full"))
+    browser.press(" ", text=" ")
+    assert browser.evaluate(SHOWN.format("abridged"))
+    assert browser.complaints == []
+
+
+def test_a_tree_wider_than_the_screen_scrolls_inside_its_frame_by_keyboard(browser: Browser, page: Path) -> None:
+    browser.show(page, width=360, scheme="light")
+    assert browser.evaluate("document.querySelector('.abridged').tabIndex") == 0
+    frame, tree = browser.evaluate(
+        "[document.querySelector('.abridged').clientWidth, document.querySelector('.abridged').scrollWidth]"
+    )
+    assert frame <= 360
+    assert tree >= frame
+
+
+@pytest.mark.parametrize(("required", "outcome"), [("", pytest.skip.Exception), ("lab,browser", pytest.fail.Exception)])
+def test_a_missing_browser_is_a_failure_only_where_one_is_required(
+    monkeypatch: pytest.MonkeyPatch, required: str, outcome: type[BaseException]
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("UCP_REQUIRE", required)
+    with pytest.raises(outcome, match="no chromium"):
+        chromium_or_skip()
