@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from harness.errors import VIOLATED, HarnessError
+
 ANSWER_LIMIT_BYTES = 1024 * 1024
 
 
@@ -13,8 +15,10 @@ class AgentSilentError(Exception):
     """The agent does not answer, or its socket is gone."""
 
 
-class AgentRefusedError(Exception):
+class AgentRefusedError(HarnessError):
     """The agent answered that it cannot: its own sentence."""
+
+    exit_status = VIOLATED
 
 
 class AgentControl:

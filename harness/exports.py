@@ -20,6 +20,8 @@ from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
 from ucp.export import SCHEMA
 
 SUFFIX = ".chain.json"
+BEFORE_FINAL_RECONCILE = "before_final_reconcile"
+"""Directory in a run's with the exports as the mission left them."""
 MAX_EXPORT_BYTES = 256 * 1024 * 1024
 
 Hash = Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * HASH_BYTES}}}$")]

@@ -14,7 +14,7 @@ from typing import Any
 
 from harness import checker, report
 from harness.backends.process import Played, play
-from harness.errors import VIOLATED, MachineError
+from harness.errors import VIOLATED, MachineError, RunDirectoryError
 from harness.progress import Progress
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario, VehicleKind
@@ -79,8 +79,8 @@ def run(scenario: Scenario, seed: int, directory: RunDirectory, progress: Progre
     directory.write_record({**record, **result.to_json(), "wall_s": round(wall_s, 1)})
     try:
         page = report.write_report(directory.path)
-    except OSError as error:
-        raise MachineError(f"the report cannot be written: {error.strerror}; run.json has the verdict") from None
+    except RunDirectoryError as error:
+        raise MachineError(f"{error}; run.json has the verdict") from None
     status = played.exit_status or (VIOLATED if result.violated else 0)
     return Run(directory.path, played, result, status, wall_s, page)
 

@@ -9,6 +9,7 @@ report.html  chains.svg
 """
 
 import json
+import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 
 from harness.checker.evidence import RUN_FILE
 from harness.errors import MachineError, RunDirectoryError
+from harness.exports import BEFORE_FINAL_RECONCILE, export_paths
 from ucp.files import write_atomically
 
 SCHEMA = "ucp-run/1"
@@ -49,6 +51,13 @@ class RunDirectory:
         path = self.agents / f"{agent_id}.mission.json"
         write_atomically(path, dict(mission))
         return path
+
+    def keep_exports_before_final_reconcile(self) -> None:
+        """Copy the exports as they stand: how the mission left the chains, before anybody put them in order."""
+        kept = self.path / BEFORE_FINAL_RECONCILE
+        kept.mkdir()
+        for path in export_paths(self.path):
+            shutil.copyfile(path, kept / path.name)
 
     def append_network(self, record: Mapping[str, Any]) -> None:
         with (self.path / "network.jsonl").open("a", encoding="utf-8") as file:

@@ -14,7 +14,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from harness.errors import ScenarioError
-from netem.conditions import ConditionsError, LinkConditions, NetworkConditions
+from netem.conditions import LinkConditions, NetworkConditions
+from netem.errors import ConditionsError
 from ucp.block import MAX_AGENT_ID
 from ucp.settings import Quirks, Settings
 

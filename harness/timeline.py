@@ -21,7 +21,8 @@ class NetworkChange:
 
 def network_changes(scenario: Scenario) -> list[NetworkChange]:
     """Every state of the network, in order; the first is at 0 s, when the mission starts."""
-    network, partition = scenario.network, ()
+    network = scenario.network
+    partition: tuple[frozenset[int], ...] = ()
     changes = [_change(0.0, "start", network.conditions())]
     for entry in scenario.timeline_in_order():
         if entry.loss is not None:

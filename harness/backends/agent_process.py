@@ -9,12 +9,11 @@ import sys
 from random import Random
 from typing import Any
 
-from netem.lab import Lab, LabProcess
-
 from harness.agents import AgentControl, AgentRefusedError, AgentSilentError
-from harness.errors import VIOLATED, HarnessError
+from harness.errors import VIOLATED, HarnessError, MachineError
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
+from netem.lab import Lab, LabProcess
 from sitl.vehicle import AGENT_PORT
 from ucp.mission import SCHEMA as MISSION_SCHEMA
 
@@ -92,20 +91,22 @@ class AgentProcess:
     async def poll(self) -> None:
         self.status = await self.ask("status")
 
-    async def export(self) -> str | None:
-        """Have the chain exported; a sentence if that was not possible. An agent that failed is not asked."""
-        if self.outcome != "running":
-            return None
+    async def export(self) -> None:
+        """Have the chain exported. Raises AgentFailedError, or MachineError if the agent could not write it."""
+        await self.poll()
         try:
-            await self.poll()
             await self.ask("export")
         except AgentRefusedError as error:
             self.outcome, self.detail = "not exported", str(error)
-            return f"agent {self.agent_id} {error}"
-        except AgentFailedError as error:
-            return str(error)
-        self.outcome = "exported"
-        return None
+            raise MachineError(
+                f"agent {self.agent_id} {error}; free some space, what was written before is there"
+            ) from None
+
+    async def export_finally(self) -> None:
+        """The last export, of an agent that still runs. Raises as `export`."""
+        if self.outcome == "running":
+            await self.export()
+            self.outcome = "exported"
 
     async def stop(self) -> None:
         self._control.close()

@@ -11,17 +11,16 @@ from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from netem.lab import Lab
-
 from harness.backends.agent_process import AgentFailedError, AgentProcess
 from harness.backends.vehicle_process import VehicleProcess
-from harness.errors import CANNOT_HERE, INTERRUPTED, HarnessError, MachineError
+from harness.errors import INTERRUPTED, HarnessError, MachineError
 from harness.progress import Progress, Snapshot
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.timeline import NetworkChange, describe, network_changes
 from netem.conditions import NetworkConditions
 from netem.errors import LabUnavailable, NetemError
+from netem.lab import Lab
 from sitl.vehicle import Home, VehicleKind, home_in_field
 
 POLL_S = 0.25
@@ -218,6 +217,8 @@ class _Run:
 
     async def _final_reconcile(self, lab: Lab) -> None:
         """Clear all conditions and let one agent after another reconcile, until a round changes no chain."""
+        await asyncio.gather(*(agent.export() for agent in self.agents))
+        self.rundir.keep_exports_before_final_reconcile()
         self.stage = "final reconcile"
         conditions = NetworkConditions()
         began_s = self._mission_s()
@@ -254,16 +255,17 @@ class _Run:
         """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""
         self._show("exporting")
         self.played.mission_s = round(self._mission_s(), 1)
-        problems = await asyncio.gather(*(agent.export() for agent in self.agents))
-        for problem in problems:
-            if problem is not None and self.played.outcome == "completed":
-                self.played.outcome, self.played.outcome_detail = "failed", problem
-                self.played.exit_status = CANNOT_HERE
+        exported = await asyncio.gather(*(agent.export_finally() for agent in self.agents), return_exceptions=True)
+        for error in exported:
+            if error is not None and not isinstance(error, HarnessError):
+                raise error
+            if error is not None and self.played.outcome == "completed":
+                self._ended_early(error)
         self.played.vehicles = {str(vehicle.vehicle_id): vehicle.to_json() for vehicle in self.vehicles}
         try:
             self.played.counters = (await lab.read()).to_json()
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
-            await asyncio.gather(*(member.stop() for member in (*self.agents, *self.vehicles)))
+            await asyncio.gather(*(agent.stop() for agent in self.agents), *(one.stop() for one in self.vehicles))
         except NetemError:
             pass  # the lab is gone, and everybody in it
         except OSError as error:

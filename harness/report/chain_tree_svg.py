@@ -35,9 +35,13 @@ _DOTS_LENGTH = 2 * _DOT_SPACING + 1  # three dots, one of them just before the e
 
 
 class ChainTreePicture:
-    """The tree of these exports, ready to be drawn abridged or with every block."""
+    """The tree of these exports, ready to be drawn abridged or with every block.
 
-    def __init__(self, exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> None:
+    `key` keeps the identifiers of several pictures on one page apart.
+    """
+
+    def __init__(self, exports: Mapping[int, Export], ink: Mapping[int, Ink], key: str = "chains") -> None:
+        self.key = key
         self._ink = ink
         self._names = name_blocks(exports)
         self._held_by = holders(exports)
@@ -96,9 +100,9 @@ class ChainTreePicture:
                     links.append(_path(placed, child) + "m-4 6l4-6 4 6")
         return Markup(
             '<svg xmlns="http://www.w3.org/2000/svg" class="chains" role="img" width="{w}" height="{h}"'
-            ' viewBox="0 0 {w} {h}" aria-labelledby="{form}-title {form}-desc" font-family="{font}" font-size="{size}"'
+            ' viewBox="0 0 {w} {h}" aria-labelledby="{id}-title {id}-desc" font-family="{font}" font-size="{size}"'
             ' text-anchor="middle" fill="none" stroke-width="1.5">'
-            '<title id="{form}-title">Chain tree</title><desc id="{form}-desc">{desc}</desc>{paper}\n'
+            '<title id="{id}-title">Chain tree</title><desc id="{id}-desc">{desc}</desc>{paper}\n'
             '<path class="link" stroke="#5c6670" d="{links}"/>\n'
             '<path class="thread" stroke="#5c6670" stroke-dasharray="2 4" d="{threads}"/>\n'
             '<path class="link" stroke="#5c6670" stroke-width="3" stroke-linecap="round"'
@@ -106,7 +110,7 @@ class ChainTreePicture:
         ).format(
             w=_n(layout.width),
             h=_n(layout.height),
-            form=form,
+            id=f"{self.key}-{form}",
             font=_FONT,
             size=FONT_SIZE,
             desc=self.description(),

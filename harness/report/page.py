@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from harness.errors import RunDirectoryError
-from harness.exports import Exports, export_paths, read_exports
+from harness.exports import BEFORE_FINAL_RECONCILE, Export, Exports, export_paths, read_exports
 from harness.report import network, swarm, verdicts, words
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
@@ -32,6 +32,8 @@ FIGURES = {
     "copies_mean": "copies of a block, mean",
     "messages": "messages sent",
     "bytes": "bytes sent",
+    "mutual_chain_before_final_reconcile": "blocks in the mutual chain before the final reconcile",
+    "distinct_chains_before_final_reconcile": "distinct chains before the final reconcile",
 }
 EVIDENCE_SHOWN = 3
 LONG_TEXT = 240
@@ -49,16 +51,13 @@ def write_report(run_dir: Path) -> Path:
     result = read_result(run_dir / "run.json")
     exports = read_exports(export_paths(run_dir))
     ink = swarm.agent_inks(result, exports.by_agent)
-    picture = ChainTreePicture(exports.by_agent, ink)
-    _write_atomically(run_dir / "chains.svg", picture.standalone())
+    _write_atomically(run_dir / "chains.svg", ChainTreePicture(exports.by_agent, ink).standalone())
     page = run_dir / "report.html"
-    _write_atomically(page, _page(result, exports, picture, ink, run_dir))
+    _write_atomically(page, _page(result, exports, ink, run_dir))
     return page
 
 
-def _page(
-    result: dict[str, Any], exports: Exports, picture: ChainTreePicture, ink: Mapping[int, Ink], run_dir: Path
-) -> str:
+def _page(result: dict[str, Any], exports: Exports, ink: Mapping[int, Ink], run_dir: Path) -> str:
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -80,10 +79,7 @@ def _page(
             (FIGURES.get(key, words.label(key)), words.value(figure))
             for key, figure in mapping(result, "figures").items()
         ],
-        has_chains=bool(exports.by_agent),
-        hidden=picture.hidden,
-        abridged=picture.draw("abridged"),
-        full=picture.draw("full") if picture.hidden else None,
+        pictures=_pictures(exports, ink, run_dir),
         blocks=swarm.block_rows(exports.by_agent, ink),
         strip=network.strip(result),
         network=network.start(result),
@@ -93,6 +89,36 @@ def _page(
         evidence_shown=EVIDENCE_SHOWN,
         long_text=LONG_TEXT,
     )
+
+
+def _pictures(exports: Exports, ink: Mapping[int, Ink], run_dir: Path) -> list[dict[str, Any]]:
+    """The chains at the end of the run, and how the mission had left them where a final reconcile changed them."""
+    if not exports.by_agent:
+        return []
+    before = read_exports(export_paths(run_dir / BEFORE_FINAL_RECONCILE)).by_agent
+    if not before:
+        return [_picture("", exports.by_agent, ink, "chains")]
+    changed = any(
+        agent_id in exports.by_agent and export.top_chain_hash != exports.by_agent[agent_id].top_chain_hash
+        for agent_id, export in before.items()
+    )
+    if not changed:
+        return [_picture("As the mission left them; the final reconcile changed nothing", before, ink, "chains")]
+    return [
+        _picture("As the mission left them", before, ink, "before"),
+        _picture("After the final reconcile", exports.by_agent, ink, "chains"),
+    ]
+
+
+def _picture(heading: str, exports: Mapping[int, Export], ink: Mapping[int, Ink], key: str) -> dict[str, Any]:
+    tree = ChainTreePicture(exports, ink, key)
+    return {
+        "heading": heading,
+        "key": key,
+        "hidden": tree.hidden,
+        "abridged": tree.draw("abridged"),
+        "full": tree.draw("full") if tree.hidden else None,
+    }
 
 
 def _summary(result: dict[str, Any], exports: Exports) -> list[str]:

@@ -41,11 +41,15 @@ def exports(chains: Chains) -> dict[int, Export]:
 
 def write_run(run_dir: Path, chains: Chains, result: Mapping[str, Any] | None = None) -> Path:
     """A run directory with these chains; `result` replaces what `result_of` says."""
-    (run_dir / "agents").mkdir(parents=True)
-    for agent_id, document in documents(chains).items():
-        (run_dir / "agents" / f"{agent_id}.chain.json").write_text(json.dumps(document))
+    write_exports(run_dir / "agents", chains)
     (run_dir / "run.json").write_text(json.dumps({**result_of(list(chains)), **(result or {})}))
     return run_dir
+
+
+def write_exports(directory: Path, chains: Chains) -> None:
+    directory.mkdir(parents=True)
+    for agent_id, document in documents(chains).items():
+        (directory / f"{agent_id}.chain.json").write_text(json.dumps(document))
 
 
 def result_of(agent_ids: Sequence[int]) -> dict[str, Any]:

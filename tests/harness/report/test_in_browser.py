@@ -56,7 +56,7 @@ def test_the_keyboard_unfolds_the_tree_and_folds_it_again(browser: Browser, page
     assert not browser.evaluate(SHOWN.format("full"))
     for _ in range(20):
         browser.press("Tab")
-        if browser.evaluate("document.activeElement.id") == "every-block":
+        if browser.evaluate("document.activeElement.id") == "every-block-chains":
             break
     browser.press(" ", text=" ")
     assert not browser.evaluate(SHOWN.format("abridged"))

@@ -12,8 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from harness.errors import RunDirectoryError
+from harness.exports import BEFORE_FINAL_RECONCILE
 from harness.report import write_report
-from tests.harness.report.runs import result_of, write_run
+from tests.harness.report.runs import result_of, write_exports, write_run
 
 HOSTILE = "</title></style><script>alert(1)</script><img src=x onerror=alert(2)>\"'{{ 7 * 7 }}"
 CHAINS = {1: "1.1 2.1 3.1", 2: "1.1 2.1", 3: "1.1 2.1 3.1"}
@@ -228,3 +229,21 @@ def test_whatever_the_result_holds_there_is_a_report(
 def test_template_and_styles_are_in_the_package() -> None:
     shipped = {entry.name for entry in resources.files("harness.report").iterdir()}
     assert {"page.html.j2", "page.css", "chain_tree.css"} <= shipped
+
+
+def test_what_the_mission_left_is_drawn_beside_what_the_final_reconcile_made_of_it(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path, {1: ["1.1", "2.1"], 2: ["1.1", "2.1"]}, result_of([1, 2]))
+    write_exports(run_dir / BEFORE_FINAL_RECONCILE, {1: ["1.1", "2.1"], 2: ["1.1"]})
+    page = write_report(run_dir).read_text()
+    assert "As the mission left them" in page
+    assert "After the final reconcile" in page
+    identifiers = re.findall(r' id="([^"]+)"', page)
+    assert len(identifiers) == len(set(identifiers))
+
+
+def test_a_final_reconcile_that_changed_nothing_is_said_and_drawn_once(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path, {1: ["1.1"], 2: ["1.1"]}, result_of([1, 2]))
+    write_exports(run_dir / BEFORE_FINAL_RECONCILE, {1: ["1.1"], 2: ["1.1"]})
+    page = write_report(run_dir).read_text()
+    assert "the final reconcile changed nothing" in page
+    assert page.count('class="chains"') == 1
