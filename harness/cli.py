@@ -146,7 +146,7 @@ def _show_result(console: Console, result: checker.Result) -> None:
 
 def _show_end(console: Console, finished: Run) -> None:
     if finished.played.outcome != "completed":
-        _complain(f"the run {finished.played.outcome}: {finished.played.outcome_detail}")
+        _complain(f"{finished.played.outcome_detail}; what there was has been exported and checked")
     for error in finished.result.errors:
         _complain(error)
     slow = [

@@ -87,16 +87,18 @@ def for_console(console: Console) -> Progress:
 
 def _render(snapshot: Snapshot) -> RenderableType:
     table = Table.grid(padding=(0, 2))
-    for title in ("agent", "chain", "waiting", "completed", "reconciles", ""):
-        table.add_column(Text(title, style="dim"), justify="right")
+    for _ in range(6):
+        table.add_column(justify="right")
     table.add_row("agent", "chain", "waiting", "completed", "reconciles", "", style="dim")
     for agent, status in snapshot.statuses.items():
         doing = "reconciling" if status.get("reconcile_in_progress") else "" if status.get("idle") else "voting"
         numbers = (str(status.get(key, "-")) for key in ("chain", "deque", "completed", "reconciles"))
         table.add_row(str(agent), *numbers, Text(doing, style="yellow" if doing == "reconciling" else ""))
-    bar = ProgressBar(total=snapshot.duration_s, completed=min(snapshot.mission_s, snapshot.duration_s), width=40)
-    times = f"{_minutes(snapshot.mission_s)} of {_minutes(snapshot.duration_s)}  {snapshot.stage}  {snapshot.network}"
-    return Group(Text(times), bar, table)
+    elapsed_s, over_s = min(snapshot.mission_s, snapshot.duration_s), snapshot.mission_s - snapshot.duration_s
+    times = f"{_minutes(elapsed_s)} of {_minutes(snapshot.duration_s)}{f' + {_minutes(over_s)}' if over_s >= 1 else ''}"
+    head = Table.grid(padding=(0, 2))
+    head.add_row(ProgressBar(total=snapshot.duration_s, completed=elapsed_s, width=30), times, snapshot.stage)
+    return Group(head, Text(snapshot.network, style="dim"), table)
 
 
 def _minutes(seconds: float) -> str:

@@ -16,6 +16,7 @@ from harness import checker, report
 from harness.backends.process import Played, play
 from harness.errors import VIOLATED, MachineError, RunDirectoryError
 from harness.progress import Progress
+from harness.record import RunRecord
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario, VehicleKind
 from sitl.ardupilot import ArduPilot
@@ -48,41 +49,44 @@ def run(scenario: Scenario, seed: int, directory: RunDirectory, progress: Progre
     started_at = datetime.now(UTC)
     # Another run is another mission: its blocks must not be taken for this one's.
     initial_data = f"{scenario.name}, seed {seed}, {started_at.isoformat()}".encode()
-    record: dict[str, Any] = {
-        "scenario": scenario.model_dump(mode="json"),
-        "roster": list(scenario.roster),
-        "seed": seed,
-        "backend": "process",
-        "engine": None,
-        "versions": versions(),
-        "started_at": started_at.isoformat(timespec="seconds").replace("+00:00", "Z"),
-        "outcome": "running",
-    }
+    record = RunRecord(
+        scenario=scenario,
+        roster=list(scenario.roster),
+        seed=seed,
+        backend="process",
+        versions=versions(),
+        started_at=started_at.isoformat(timespec="seconds").replace("+00:00", "Z"),
+    )
     directory.write_record(record)
     played = asyncio.run(_play(scenario, seed, kind, initial_data, directory, progress))
-    record |= {
-        "engine": played.engine,
-        "outcome": played.outcome,
-        "outcome_detail": played.outcome_detail,
-        "mission_s": played.mission_s,
-        "settled": played.settled,
-        "final_reconcile": played.final_reconcile,
-        "network": played.network,
-        "faults": [change for change in played.network if change["what"] != "start"],
-        "vehicles": played.vehicles,
-        "agents": played.agents,
-        "counters": played.counters,
-    }
+    record = _updated(
+        record,
+        engine=played.engine,
+        outcome=played.outcome,
+        outcome_detail=played.outcome_detail,
+        mission_s=played.mission_s,
+        settled=played.settled,
+        final_reconcile=played.final_reconcile,
+        network=played.network,
+        faults=[change for change in played.network if change["what"] != "start"],
+        agents=played.agents,
+        vehicles=played.vehicles,
+        counters=played.counters,
+    )
     directory.write_record(record)
     result = checker.check(checker.gather([directory.path]))
     wall_s = time.monotonic() - started
-    directory.write_record({**record, **result.to_json(), "wall_s": round(wall_s, 1)})
+    directory.write_record(_updated(record, **result.to_json(), wall_s=round(wall_s, 1)))
     try:
         page = report.write_report(directory.path)
     except RunDirectoryError as error:
         raise MachineError(f"{error}; run.json has the verdict") from None
     status = played.exit_status or (VIOLATED if result.violated else 0)
     return Run(directory.path, played, result, status, wall_s, page)
+
+
+def _updated(record: RunRecord, **keys: Any) -> RunRecord:
+    return RunRecord.model_validate({**record.to_json(), **keys})
 
 
 async def _play(

@@ -18,9 +18,8 @@ from typing import Any
 from harness.checker.evidence import RUN_FILE
 from harness.errors import MachineError, RunDirectoryError
 from harness.exports import BEFORE_FINAL_RECONCILE, export_paths
+from harness.record import RunRecord
 from ucp.files import write_atomically
-
-SCHEMA = "ucp-run/1"
 
 
 class RunDirectory:
@@ -63,10 +62,10 @@ class RunDirectory:
         with (self.path / "network.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(record, separators=(",", ":")) + "\n")
 
-    def write_record(self, record: Mapping[str, Any]) -> None:
+    def write_record(self, record: RunRecord) -> None:
         """Write run.json whole or not at all. Raises MachineError if the disk is full."""
         try:
-            write_atomically(self.path / RUN_FILE, {"schema": SCHEMA, **record})
+            write_atomically(self.path / RUN_FILE, record.to_json())
         except OSError as error:
             raise MachineError(
                 f"{self.path / RUN_FILE} cannot be written: {error.strerror}; what the run left is there, and "

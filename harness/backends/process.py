@@ -135,7 +135,7 @@ class _Run:
 
     async def _watch_for_interruption(self) -> None:
         await self.interrupted.wait()
-        raise InterruptedRunError("interrupted")
+        raise InterruptedRunError(f"the run was interrupted at mission second {self._mission_s():.0f}")
 
     # The story
 

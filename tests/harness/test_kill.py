@@ -44,7 +44,9 @@ def network_namespaces() -> set[str]:
         if entry.name.isdigit():
             with contextlib.suppress(OSError):
                 found.add(str((entry / "ns/net").readlink()))
-                found |= {target for fd in (entry / "fd").iterdir() if (target := str(fd.readlink())).startswith("net:")}
+                found |= {
+                    target for fd in (entry / "fd").iterdir() if (target := str(fd.readlink())).startswith("net:")
+                }
     mounts = Path("/proc/self/mountinfo").read_text().splitlines()
     return found | {line.split()[3] for line in mounts if " nsfs " in line}
 
@@ -60,7 +62,7 @@ def rules() -> str:
 @pytest.mark.parametrize("moment", range(MOMENTS))
 def test_nothing_is_left_of_a_killed_run(moment: int, tmp_path: Path) -> None:
     after_s = Random(moment).uniform(moment, moment + 1) / MOMENTS * LAST_MOMENT_S
-    interfaces, firewall = set(os.listdir("/sys/class/net")), rules()
+    interfaces, firewall = set(Path("/sys/class/net").iterdir()), rules()
     temporary = tmp_path / "tmp"
     work = tmp_path / "work"
     temporary.mkdir()
@@ -89,7 +91,7 @@ def test_nothing_is_left_of_a_killed_run(moment: int, tmp_path: Path) -> None:
     while still := of_the_lab & network_namespaces():
         assert time.monotonic() < deadline, f"still there: {still}"
         time.sleep(0.02)
-    assert set(os.listdir("/sys/class/net")) == interfaces
+    assert set(Path("/sys/class/net").iterdir()) == interfaces
     assert rules() == firewall
     assert not list(temporary.iterdir())
     assert not list(work.iterdir())

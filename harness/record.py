@@ -1,0 +1,90 @@
+"""What run.json says: the record of one run, schema `ucp-run/1`. Keys are added, never removed or renamed."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.scenario import Scenario
+
+SCHEMA = "ucp-run/1"
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+
+
+class Evidence(_Model):
+    """One piece of evidence; `block` is its name for people, such as 4.11."""
+
+    agent_id: int
+    detail: str
+    block: str | None
+    block_hash: str | None
+
+
+class CharacteristicVerdict(_Model):
+    name: str
+    verdict: Literal["holds", "violated", "not applicable"]
+    reason: str
+    evidence: list[Evidence]
+
+
+class NetworkState(_Model):
+    """From mission second `at_s` on, `detail` holds; `fully_connected` means that nothing is lost or cut."""
+
+    at_s: float
+    what: str
+    detail: str
+    fully_connected: bool
+
+
+class FinalReconcile(_Model):
+    """`complete` once a round of reconciles changed no chain."""
+
+    at_s: float
+    rounds: int
+    complete: bool
+
+
+class AgentRecord(_Model):
+    """`outcome` is exported, not exported, crashed, hung, running or not started; counters are null if unknown."""
+
+    outcome: str
+    detail: str | None
+    idle: bool | None
+    bytes_sent: int | None
+    dropped: dict[str, int] | None
+    send_failures: int | None
+    trace_problem: str | None
+
+
+class RunRecord(_Model):
+    """Times are mission seconds except `wall_s`; what is not known yet is null or empty."""
+
+    schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
+    scenario: Scenario
+    roster: list[int]
+    seed: int
+    backend: Literal["process"]
+    engine: str | None = None
+    versions: dict[str, str]
+    started_at: str
+    wall_s: float | None = None
+    outcome: Literal["running", "completed", "interrupted", "failed"] = "running"
+    outcome_detail: str | None = None
+    mission_s: float = 0.0
+    settled: bool = False
+    final_reconcile: FinalReconcile | None = None
+    network: list[NetworkState] = []
+    faults: list[NetworkState] = []
+    agents: dict[str, AgentRecord] = {}
+    vehicles: dict[str, dict[str, Any]] = {}
+    counters: dict[str, Any] | None = None
+    """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
+    characteristics: dict[str, CharacteristicVerdict] = {}
+    figures: dict[str, float | int | None] = {}
+    errors: list[str] = []
+    """A sentence for each file that the checker could not use, or not wholly."""
+
+    def to_json(self) -> dict[str, Any]:
+        return self.model_dump(mode="json", by_alias=True)

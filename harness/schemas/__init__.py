@@ -1,0 +1,35 @@
+"""JSON Schemas of the formats that others read and write, as pydantic generates them.
+
+`python -m harness.schemas` writes them anew after a change; a test fails while they are behind.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from harness.exports import Export
+from harness.record import RunRecord
+from harness.scenario import Scenario
+
+DIRECTORY = Path(__file__).parent
+MODELS: dict[str, type[BaseModel]] = {
+    "scenario": Scenario,
+    "ucp-chain-export-1": Export,
+    "ucp-run-1": RunRecord,
+}
+
+
+def path(name: str) -> Path:
+    return DIRECTORY / f"{name}.schema.json"
+
+
+def generate(name: str) -> dict[str, Any]:
+    schema = MODELS[name].model_json_schema(by_alias=True)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def write_all() -> None:
+    for name in MODELS:
+        path(name).write_text(json.dumps(generate(name), indent=1) + "\n", encoding="utf-8")
