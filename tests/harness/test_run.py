@@ -4,12 +4,14 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.harness.command import Running, harness, processes, sentences, write_scenario
+from tests.harness.command import DEADLINE_S, Running, harness, processes, sentences, write_scenario
 
 pytestmark = pytest.mark.lab
 
@@ -186,3 +188,39 @@ def test_two_runs_at_once_do_not_meet(tmp_path: Path) -> None:
         status, out, err = run.end()
         assert status == 0, out + err
         assert {agent["dropped"].get("sender not on the roster", 0) for agent in run.record()["agents"].values()} == {0}
+
+
+def test_a_full_disk_is_one_sentence_and_status_3_and_what_was_written_stays(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, events={"mean_s": 1}, duration_s=100_000)
+    script = """
+import os, pathlib, signal, subprocess, sys, time
+sys.path.insert(0, sys.argv[3])
+from tests.harness.command import Running
+disk, scenario = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2])
+subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk], check=True)
+run = Running(scenario, disk / "run")
+run.wait_for_mission(1, 2, 3)
+try:
+    with (disk / "ballast").open("wb", buffering=0) as ballast:
+        while ballast.write(bytes(4096)) == 4096: pass
+except OSError: pass
+run.process.send_signal(signal.SIGINT)
+status, out, err = run.end()
+print(out, err)
+traces = list((disk / "run" / "agents").glob("*.trace.jsonl"))
+assert len(traces) == 3 and all(path.read_text().endswith("\\n") for path in traces)
+assert not list(disk.rglob(".*.tmp")), "a temporary file is left"
+sys.exit(status)
+"""
+    private = ["unshare", "--user", "--map-root-user", "--mount"]
+    done = subprocess.run(
+        [*private, sys.executable, "-c", script, str(disk), str(scenario), str(Path(__file__).parents[2])],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+    )
+    assert "Traceback" not in done.stdout + done.stderr, done.stdout + done.stderr
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert "No space left on device" in done.stdout
