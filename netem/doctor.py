@@ -1,0 +1,68 @@
+"""What this machine can do for the lab, as facts; who prints them is not decided here.
+
+Every fact comes from trying, in a lab of two vehicles that is gone a moment later: configuration files
+and module lists say what might work, not what does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from netem import namespaces
+from netem.lab import Lab, LabError, LabUnavailable
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fact: whether it is as it should be, what was seen, and what to do if not (else empty)."""
+
+    name: str
+    ok: bool
+    detail: str
+    way_out: str = ""
+
+
+def examine() -> list[Finding]:
+    """Everything that the lab needs, in the order in which it needs it. Takes about half a second."""
+    ok, word = namespaces.probe()
+    found = [Finding("namespaces", ok, word, "" if ok else namespaces.way_out(word))]
+    if not ok:
+        return found
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder, "lab.log")
+        tried = {name: _try(name, log) for name in ("netem", "nftables")}
+        chosen = _try(None, log)
+    broken = next((e for e in tried.values() if isinstance(e, LabUnavailable) and e.stage == "fabric"), None)
+    if broken is not None:
+        return [*found, Finding("network", False, broken.reason, broken.way_out)]
+    found.append(Finding("network", True, "bridge, veth pairs and a namespace for each vehicle"))
+    usable = [name for name, result in tried.items() if isinstance(result, str)]
+    for name, result in tried.items():
+        if isinstance(result, str):
+            found.append(Finding(name, True, "works"))
+        else:
+            # Without netem there is nftables: worth saying, not worth a failure.
+            way_out = result.way_out if isinstance(result, LabUnavailable) else ""
+            found.append(Finding(name, bool(usable), str(getattr(result, "reason", result)), way_out))
+    if isinstance(chosen, str):
+        found.append(Finding("engine", True, chosen))
+    else:
+        found.append(Finding("engine", False, str(chosen), getattr(chosen, "way_out", "")))
+    return found
+
+
+def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:
+    """The engine that a lab came up with and why, or why it did not."""
+
+    async def attempt() -> str:
+        async with await Lab.open((1, 2), engine=engine, log=log) as lab:
+            return f"{lab.engine} ({lab.engine_reason})"
+
+    try:
+        return asyncio.run(attempt())
+    except LabError as error:
+        return error

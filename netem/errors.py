@@ -1,0 +1,41 @@
+"""The one error family of this package; every message is a sentence that says what to do next."""
+
+from __future__ import annotations
+
+
+class NetemError(Exception):
+    """Base of every error that `netem` raises on purpose."""
+
+
+class ConditionsError(NetemError, ValueError):
+    """Conditions that mean nothing: says the key, the value, and what is allowed."""
+
+
+class NetlinkError(NetemError):
+    """The kernel refused a netlink request; `errno` and the message carry its own word."""
+
+    def __init__(self, message: str, errno: int) -> None:
+        super().__init__(message)
+        self.errno = errno
+
+
+class EngineError(NetemError):
+    """An engine could not be used, or the kernel refused a change of conditions."""
+
+
+class LabError(NetemError):
+    """The lab, or something asked of it, failed."""
+
+
+class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
+    """This machine cannot run the lab (or the engine asked for); `way_out` says how it could."""
+
+    def __init__(self, reason: str, way_out: str, stage: str = "namespaces") -> None:
+        super().__init__(f"{reason.rstrip('.')}. {way_out}")
+        self.reason = reason
+        self.way_out = way_out
+        self.stage = stage  # "namespaces", "fabric" or "engine": how far the lab came
+
+
+class SpawnError(LabError):
+    """A program could not be started in the lab; the message carries the operating system's word."""

@@ -1,0 +1,257 @@
+"""The lab as the orchestrator sees it: vehicles in namespaces of their own on one switch, called `air`.
+
+    async with await Lab.open([1, 2, 3], log=run_dir / "lab.log") as lab:
+        agent = await lab.spawn(1, ["my-agent"], cwd=..., env=..., stdout=..., stderr=...)
+        await lab.apply(NetworkConditions(LinkConditions(loss=0.15)))
+
+Nothing of it is visible from outside: no interface, rule or name in the caller's network. Files and Unix
+sockets are shared with the caller. The lab ends with `close`, or with the caller's process, however that
+ends. Processes have the lab's own numbers: `LabProcess.pid` means nothing outside.
+
+Open it from the main thread: the death signal that guards it (see `netem.namespaces`) follows the thread
+that opened it. From another thread it is left out, and the closing of the control socket alone ends the
+lab, which a stopped (SIGSTOP) lab would not notice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+from netem import addresses, namespaces
+from netem.channel import Channel
+from netem.conditions import NetworkConditions
+from netem.engine import Applied
+from netem.errors import ConditionsError, LabError, LabUnavailable
+
+EngineName = Literal["netem", "nftables"]
+
+_OPEN_DEADLINE_S = 60.0
+_CLOSE_DEADLINE_S = 5.0
+
+
+class LabProcess:
+    """A program in the lab, leader of a session of its own; ends with the lab at the latest."""
+
+    def __init__(self, channel: Channel, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
+        self._channel = channel
+        self._ended = ended
+        self.vehicle = vehicle
+        self.pid = pid
+
+    @property
+    def returncode(self) -> int | None:
+        """None while it runs; then its exit status, or minus the signal that killed it (subprocess)."""
+        return self._ended.result() if self._ended.done() else None
+
+    async def wait(self) -> int:
+        """Wait for its end; -SIGKILL if it ended with the lab."""
+        return await asyncio.shield(self._ended)
+
+    async def send_signal(self, number: int) -> None:
+        """Signal its process group; nothing happens if it has ended."""
+        if not self._ended.done():
+            await self._channel.ask("signal", pid=self.pid, signal=int(number))
+
+    async def terminate(self, grace_s: float) -> int:
+        """End it with SIGTERM, or after `grace_s` seconds with SIGKILL; returns its return code."""
+        await self.send_signal(signal.SIGTERM)
+        await self.send_signal(signal.SIGCONT)  # a stopped process could not obey
+        try:
+            return await asyncio.wait_for(self.wait(), grace_s)
+        except TimeoutError:
+            await self.send_signal(signal.SIGKILL)
+            return await self.wait()
+
+
+class Lab:
+    """See the module. Made by `Lab.open` only."""
+
+    def __init__(self, vehicles: tuple[int, ...], process: asyncio.subprocess.Process, channel: Channel) -> None:
+        self._process = process
+        self._channel = channel
+        self.vehicles = vehicles
+        self.addresses = {vehicle: addresses.address(vehicle) for vehicle in vehicles}
+        self.broadcast = addresses.BROADCAST
+        self.engine = ""
+        self.engine_reason = ""
+
+    @classmethod
+    async def open(cls, vehicles: Sequence[int], *, engine: EngineName | None = None, log: Path) -> Lab:
+        """Bring up a lab for these vehicle IDs (1..65535); `log` takes what its first process says.
+
+        Raises LabUnavailable if this machine cannot, or cannot with the engine asked for.
+        """
+        ids = _checked(vehicles)
+        word = ""
+        for user_namespace in namespaces.ways_in():
+            lab = await cls._enter(ids, user_namespace, log)
+            try:
+                refusal = await asyncio.wait_for(lab._start(engine, log), _OPEN_DEADLINE_S)
+            except TimeoutError:
+                await lab.close()
+                raise LabError(f"The lab was not up within {_OPEN_DEADLINE_S:g} s; see {log}") from None
+            except BaseException:
+                await lab.close()
+                raise
+            if refusal is None:
+                return lab
+            word = refusal
+        raise LabUnavailable(f"This machine does not let us make a private network ({word})", namespaces.way_out(word))
+
+    @classmethod
+    async def _enter(cls, vehicles: tuple[int, ...], user_namespace: bool, log: Path) -> Lab:
+        ours, theirs = socket.socketpair()
+        argv = namespaces.command(
+            [sys.executable, "-P", "-m", "netem.init", str(theirs.fileno())],
+            user_namespace=user_namespace,
+            die_with_parent=threading.current_thread() is threading.main_thread(),
+        )
+        # Wherever we were imported from, so is the lab's first process; what it starts gets its own.
+        path = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
+        try:
+            with theirs, log.open("ab") as output:
+                process = await asyncio.create_subprocess_exec(
+                    *argv,
+                    stdin=asyncio.subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    env={**os.environ, "PYTHONPATH": path},
+                    pass_fds=[theirs.fileno()],
+                    start_new_session=True,  # the terminal's Ctrl-C is for the orchestrator alone
+                )
+        except FileNotFoundError as error:
+            ours.close()
+            word = f"{error.filename} is not installed"
+            raise LabUnavailable(word, namespaces.way_out(word)) from None
+        except BaseException:
+            ours.close()
+            raise
+        return cls(vehicles, process, Channel(ours, log))
+
+    async def _start(self, engine: EngineName | None, log: Path) -> str | None:
+        """Build the network; returns the word of the tool if it could not even get into namespaces."""
+        if not await self._channel.inside():
+            await self.close()
+            word = _last_line(log)
+            if word.startswith(("unshare:", "setpriv:")):
+                return word
+            raise LabError(f"The lab's first process ended before it began ({word}); see {log}")
+        try:
+            result, _ = await self._channel.ask("open", vehicles=self.vehicles, engine=engine)
+        except LabError as error:
+            if not self._channel.open:
+                raise
+            raise LabUnavailable(
+                f"This kernel does not build the lab's network ({error})",
+                "It needs bridges and veth pairs; as root: modprobe -a bridge veth.",
+                "fabric",
+            ) from error
+        if result["engine"] is None:
+            raise LabUnavailable(
+                f"No engine {engine or 'at all'} works here ({result['reason']})",
+                "Install nftables (apt install nftables), or use a kernel with sch_netem (Debian: "
+                "linux-image-amd64; Ubuntu: linux-modules-extra-$(uname -r)).",
+                "engine",
+            )
+        self.engine = result["engine"]
+        self.engine_reason = result["reason"]
+        return None
+
+    async def spawn(
+        self,
+        vehicle: int | None,
+        argv: Sequence[str],
+        *,
+        cwd: Path,
+        env: Mapping[str, str],
+        stdout: Path,
+        stderr: Path,
+    ) -> LabProcess:
+        """Start a program in a vehicle's network (None: in the lab's own, which nothing reaches).
+
+        `env` is all of its environment, its output is appended to the files, its input is empty.
+        Raises SpawnError with the operating system's word.
+        """
+        self._check_vehicle(vehicle)
+        where = {"cwd": str(cwd), "stdout": str(stdout), "stderr": str(stderr)}
+        result, _ = await self._channel.ask("spawn", vehicle=vehicle, argv=[*argv], env={**env}, **where)
+        return LabProcess(self._channel, vehicle, result["pid"], result["ended"])
+
+    async def connect(self, vehicle: int, port: int, *, host: str = "127.0.0.1", timeout_s: float) -> socket.socket:
+        """A TCP connection made inside a vehicle's network, as a blocking socket; `host` is numeric.
+
+        Raises ConnectionError if nobody listens there, TimeoutError after `timeout_s` seconds.
+        """
+        self._check_vehicle(vehicle)
+        try:
+            socket.inet_pton(socket.AF_INET, host)
+        except OSError:
+            raise LabError(f"host: {host!r} is not a numeric IPv4 address; a lab has no names") from None
+        _, connection = await self._channel.ask("connect", vehicle=vehicle, host=host, port=port, timeout_s=timeout_s)
+        if connection is None:
+            raise LabError(f"The lab made no connection to {host}:{port} of vehicle {vehicle}")
+        connection.setblocking(True)
+        return connection
+
+    async def apply(self, conditions: NetworkConditions) -> Applied:
+        """Put conditions into force; returns what the kernel then holds.
+
+        Raises ConditionsError for a vehicle that does not exist, EngineError if the kernel refuses.
+        """
+        conditions.validate(self.vehicles)
+        result, _ = await self._channel.ask("apply", conditions=conditions.to_json())
+        return Applied.from_json(result)
+
+    async def read(self) -> Applied:
+        """What the kernel holds and has counted by now."""
+        result, _ = await self._channel.ask("read")
+        return Applied.from_json(result)
+
+    async def close(self) -> None:
+        """End every process in the lab and remove it; may be called again."""
+        self._channel.close()
+        try:
+            await asyncio.wait_for(self._process.wait(), _CLOSE_DEADLINE_S)
+        except TimeoutError:
+            self._process.kill()
+            await self._process.wait()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    def _check_vehicle(self, vehicle: int | None) -> None:
+        if vehicle is not None and vehicle not in self.addresses:
+            allowed = ", ".join(map(str, self.vehicles))
+            raise LabError(f"vehicle: there is no {vehicle!r} in the lab; allowed is any of {allowed}")
+
+
+def _checked(vehicles: Sequence[int]) -> tuple[int, ...]:
+    ids = tuple(vehicles)
+    for vehicle in ids:
+        if isinstance(vehicle, bool) or not isinstance(vehicle, int) or not 1 <= vehicle <= addresses.MAX_ID:
+            raise ConditionsError(f"vehicles: {vehicle!r} is not a vehicle ID; allowed is 1..{addresses.MAX_ID}")
+    if not ids or len(set(ids)) != len(ids):
+        raise ConditionsError(f"vehicles: {list(ids)} must name each vehicle once, and at least one")
+    return ids
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else "it said nothing"
+
+
+__all__ = ["EngineName", "Lab", "LabError", "LabProcess", "LabUnavailable"]

@@ -1,0 +1,118 @@
+"""How a process gets a private network: unshare(1) around the lab's first process, setns(2) inside it.
+
+The first process is PID 1 of a PID namespace of its own, so its end, for whatever reason, is the end of
+every process in the lab, and with the last of them the kernel removes namespaces, links and rules.
+Three things end it: the orchestrator closes the control socket (or dies, which closes it), the death
+signal that setpriv(1) asks for, and `--kill-child`, which ties it to the unshare process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+CLONE_NEWNET = 0x40000000
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def unshare_network() -> None:
+    """Move this thread into a new network namespace (unshare(2); `os.unshare` is Python 3.12)."""
+    _check(_libc.unshare(CLONE_NEWNET))
+
+
+def open_network() -> int:
+    """A descriptor of the network namespace that this thread is in."""
+    return os.open("/proc/thread-self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
+
+
+def enter_network(namespace: int) -> None:
+    """Move this thread into a network namespace (setns(2); `os.setns` is Python 3.12)."""
+    _check(_libc.setns(namespace, CLONE_NEWNET))
+
+
+@contextmanager
+def inside(namespace: int, home: int) -> Iterator[None]:
+    """Run a block in network namespace `namespace`, then return to `home` (both descriptors)."""
+    enter_network(namespace)
+    try:
+        yield
+    finally:
+        enter_network(home)
+
+
+def _check(result: int) -> None:
+    if result != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+
+
+def command(argv: Sequence[str], *, user_namespace: bool, die_with_parent: bool = True) -> list[str]:
+    """The command line that runs `argv` as first process of a private network (unshare(1)).
+
+    With `user_namespace` it needs no rights but ends up with all of them over what it creates.
+    The death signal follows the *thread* that started the command (PR_SET_PDEATHSIG in prctl(2)):
+    without `die_with_parent`, the command is for a thread that may end before the lab does.
+    """
+    setpriv = ["setpriv", "--pdeathsig", "KILL"] if die_with_parent else []
+    user = ["--user", "--map-root-user"] if user_namespace else []
+    return [*setpriv, "unshare", *user, "--net", "--mount", "--pid", "--fork", "--kill-child",
+            "--mount-proc", *argv]  # fmt: skip
+
+
+def ways_in() -> tuple[bool, ...]:
+    """Values of `user_namespace` worth trying, in order: root needs none unless its rights are clipped."""
+    return (False, True) if os.geteuid() == 0 else (True,)
+
+
+def probe() -> tuple[bool, str]:
+    """Whether this machine lets us make the namespaces; if not, the words of the tool that was refused."""
+    word = ""
+    for user_namespace in ways_in():
+        argv = command(["true"], user_namespace=user_namespace, die_with_parent=False)
+        try:
+            done = subprocess.run(argv, capture_output=True, text=True, timeout=10, check=False)
+        except FileNotFoundError as error:
+            return False, f"{error.filename} is not installed"
+        except subprocess.TimeoutExpired:
+            return False, "unshare did not come back within 10 s"
+        if done.returncode == 0:
+            return True, "own user namespace, no root needed" if user_namespace else "as root"
+        word = done.stderr.strip().splitlines()[-1] if done.stderr.strip() else f"status {done.returncode}"
+    return False, word
+
+
+def way_out(word: str) -> str:
+    """What to do about namespaces that were refused with `word`, from what this machine says of itself."""
+    if "not installed" in word:
+        return "Install util-linux (Debian, Ubuntu: apt install util-linux)."
+    as_root = "or run as root"
+    if _sysctl("user/max_user_namespaces") == 0:
+        return f"User namespaces are switched off: sudo sysctl user.max_user_namespaces=15000, {as_root}."
+    if _sysctl("user/max_net_namespaces") == 0:
+        return "Network namespaces are switched off: sudo sysctl user.max_net_namespaces=15000."
+    if _sysctl("kernel/unprivileged_userns_clone") == 0:
+        return f"This kernel keeps them for root: sudo sysctl kernel.unprivileged_userns_clone=1, {as_root}."
+    if _sysctl("kernel/apparmor_restrict_unprivileged_userns") == 1:
+        return (
+            "AppArmor keeps them from ordinary programs (Ubuntu 24.04 and later): sudo sysctl "
+            f"kernel.apparmor_restrict_unprivileged_userns=0, {as_root}."
+        )
+    if any(Path(mark).exists() for mark in ("/.dockerenv", "/run/.containerenv")):
+        return (
+            "A container runtime forbids them: start the container with --privileged, or with --cap-add "
+            "SYS_ADMIN --cap-add NET_ADMIN --security-opt seccomp=unconfined --security-opt "
+            "apparmor=unconfined --security-opt systempaths=unconfined."
+        )
+    return "Run as root, or on a kernel that allows unprivileged user namespaces."
+
+
+def _sysctl(name: str) -> int | None:
+    try:
+        return int(Path("/proc/sys", name).read_text())
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,74 @@
+"""How orchestrator and lab talk: JSON objects, each after its length, over a Unix stream socket.
+
+Sockets travel beside a message as SCM_RIGHTS (unix(7)); a message that carries one says so in its key
+`descriptors`, and both sides keep the order.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+import os
+import socket
+import struct
+from collections import deque
+from typing import Any
+
+MAX_MESSAGE = 4 << 20  # bytes; figures of the largest swarms stay far below
+
+_LENGTH = struct.Struct("!I")
+_MAX_DESCRIPTORS = 64
+
+
+class WireError(Exception):
+    """The stream is not ours; nothing after this point can be trusted."""
+
+
+def encode(message: dict[str, Any]) -> bytes:
+    body = json.dumps(message, separators=(",", ":")).encode()
+    if len(body) > MAX_MESSAGE:
+        raise WireError(f"a message of {len(body)} bytes; allowed are {MAX_MESSAGE}")
+    return _LENGTH.pack(len(body)) + body
+
+
+class Receiver:
+    """Takes in what a socket has, and gives out whole messages and the descriptors that came along."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self.descriptors: deque[int] = deque()
+
+    def read(self, source: socket.socket) -> bool:
+        """Take in what has arrived; False at the end of the stream. Raises BlockingIOError if nothing."""
+        room = socket.CMSG_SPACE(_MAX_DESCRIPTORS * array.array("i").itemsize)
+        data, ancillary, _, _ = source.recvmsg(1 << 16, room, socket.MSG_CMSG_CLOEXEC)
+        for level, kind, payload in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+                self.descriptors.extend(array.array("i", payload))
+        self._data += data
+        return bool(data)
+
+    def messages(self) -> list[dict[str, Any]]:
+        """The messages that are complete; raises WireError if the stream makes no sense."""
+        found = []
+        while len(self._data) >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(self._data)
+            if length > MAX_MESSAGE:
+                raise WireError(f"a message of {length} bytes; allowed are {MAX_MESSAGE}")
+            end = _LENGTH.size + length
+            if len(self._data) < end:
+                break
+            body = bytes(self._data[_LENGTH.size : end])
+            del self._data[:end]
+            try:
+                message = json.loads(body)
+            except (ValueError, RecursionError) as error:
+                raise WireError(f"a message that is no JSON: {error}") from error
+            if not isinstance(message, dict):
+                raise WireError("a message that is no JSON object")
+            found.append(message)
+        return found
+
+    def close(self) -> None:
+        while self.descriptors:
+            os.close(self.descriptors.popleft())

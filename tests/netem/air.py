@@ -1,0 +1,98 @@
+"""The programs that tests run inside vehicles: standard library only, one file, started by its path.
+
+    air.py listen            every frame that arrives on eth0, by AF_PACKET
+    air.py receive PORT      every UDP datagram that arrives on a port
+    air.py broadcast PORT COUNT FROM BROADCAST_ADDRESS
+    air.py frames DESTINATION_MAC,... ETHERTYPE...   one frame of each
+    air.py serve PORT        a TCP server that greets
+
+`listen` and `receive` say "ready", and on SIGTERM what they got, one JSON object.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import signal
+import socket
+import struct
+import sys
+import time
+from pathlib import Path
+
+_BURST = 20
+_QUIET_S = 0.3
+
+
+def say(what: object) -> None:
+    sys.stdout.write(f"{json.dumps(what)}\n")
+    sys.stdout.flush()
+
+
+def collect(source: socket.socket, size: int) -> list[bytes]:
+    """All that arrives until SIGTERM, and after it until the air is quiet."""
+    asked, wake = socket.socketpair()
+    signal.signal(signal.SIGTERM, lambda *_: wake.send(b"x"))
+    say("ready")
+    found: list[bytes] = []
+    ending = False
+    while True:
+        ready, _, _ = select.select([source] if ending else [source, asked], [], [], _QUIET_S if ending else None)
+        if asked in ready:
+            ending = True
+        elif not ready:
+            return found
+        if source in ready:
+            found.append(source.recv(size))
+
+
+def listen() -> None:
+    source = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
+    source.bind(("eth0", 0))
+    counts: dict[str, dict[str, int]] = {}
+    for frame in collect(source, 64):
+        sender, kind = frame[6:12].hex(":"), frame[12:14].hex()
+        counts.setdefault(sender, {})[kind] = counts.get(sender, {}).get(kind, 0) + 1
+    say({"frames": counts})
+
+
+def receive(port: str) -> None:
+    source = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    source.bind(("", int(port)))
+    numbers = [struct.unpack("!I", data)[0] for data in collect(source, 64)]
+    lines = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
+    overflow = int(dict(zip(*lines, strict=True))["RcvbufErrors"])
+    say({"numbers": numbers, "overflow": overflow})
+
+
+def broadcast(port: str, count: str, first: str, address: str) -> None:
+    out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    out.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+    for number in range(int(first), int(first) + int(count)):
+        out.sendto(struct.pack("!I", number), (address, int(port)))
+        if number % _BURST == 0:
+            time.sleep(0.001)  # receivers' buffers are small, and they say so if they overflow
+
+
+def frames(destinations: str, *kinds: str) -> None:
+    out = socket.socket(socket.AF_PACKET, socket.SOCK_RAW)
+    out.bind(("eth0", 0))
+    sender = out.getsockname()[4]
+    for destination in destinations.split(","):
+        for kind in kinds:
+            out.send(bytes.fromhex(destination.replace(":", "")) + sender + bytes.fromhex(kind) + bytes(46))
+
+
+def serve(port: str) -> None:
+    server = socket.create_server(("127.0.0.1", int(port)))
+    say("ready")
+    while True:
+        client, _ = server.accept()
+        client.sendall(b"hello")
+        client.close()
+
+
+if __name__ == "__main__":
+    programs = {f.__name__: f for f in (listen, receive, broadcast, frames, serve)}
+    programs[sys.argv[1]](*sys.argv[2:])

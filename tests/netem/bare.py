@@ -1,0 +1,39 @@
+"""The smallest orchestrator: opens a lab, fills it with programs that want to live on, and waits.
+
+bare.py FOLDER [ENGINE]       says on standard output how far it has come
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import sys
+from pathlib import Path
+
+from netem.conditions import LinkConditions, NetworkConditions
+from netem.lab import Lab
+
+_STUBBORN = ["/bin/sh", "-c", "trap '' TERM HUP INT; setsid sleep 1000 & while :; do sleep 1000; done"]
+
+
+def say(what: str) -> None:
+    sys.stdout.write(f"{what}\n")
+    sys.stdout.flush()
+
+
+async def main(folder: Path) -> None:
+    say("opening")
+    lab = await Lab.open(range(1, 6), log=folder / "lab.log")
+    say("open")
+    for vehicle in (*lab.vehicles, None):
+        output = folder / f"{vehicle}.log"
+        await lab.spawn(vehicle, _STUBBORN, cwd=folder, env=os.environ, stdout=output, stderr=output)
+    say("full")
+    for step in itertools.count():
+        conditions = NetworkConditions(LinkConditions(0.1 * (step % 10)))
+        await lab.apply(conditions.with_partition([[1, 2]]) if step % 2 else conditions)
+
+
+if __name__ == "__main__":
+    asyncio.run(main(Path(sys.argv[1])))

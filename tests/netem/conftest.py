@@ -1,0 +1,140 @@
+"""What the tests of the lab share: whether this machine can, and programs on the air.
+
+`UCP_REQUIRE` is a list of "lab", "netem" and "nftables" (comma between): what it names may not be missing,
+a test that would be skipped for the lack of it fails instead.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from netem.lab import Lab, LabProcess, LabUnavailable
+
+AIR = Path(__file__).with_name("air.py")
+PORT = 14600
+DEADLINE_S = 30.0
+PACKETS = int(os.environ.get("UCP_TEST_PACKETS", "4000"))
+
+
+@functools.cache
+def unavailable(engine: str | None) -> LabUnavailable | None:
+    """Why there is no lab with this engine (None: any) here, if there is none."""
+
+    async def attempt() -> None:
+        lab = await Lab.open([1, 2], engine=engine, log=Path(folder, "lab.log"))  # type: ignore[arg-type]
+        await lab.close()
+
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            asyncio.run(attempt())
+        except LabUnavailable as error:
+            return error
+    return None
+
+
+def require(engine: str | None) -> None:
+    """Skip, or fail if UCP_REQUIRE says that it has to be there."""
+    if (error := unavailable(engine)) is None:
+        return
+    required = os.environ.get("UCP_REQUIRE", "").split(",")
+    if ("lab" if error.stage != "engine" else engine) in required:
+        pytest.fail(f"UCP_REQUIRE={os.environ['UCP_REQUIRE']}, but: {error}")
+    pytest.skip(str(error))
+
+
+@pytest.fixture(autouse=True)
+def _machine_can(request: pytest.FixtureRequest) -> None:
+    if request.node.get_closest_marker("lab"):
+        require(None)
+
+
+@pytest.fixture(params=["netem", "nftables"])
+def engine(request: pytest.FixtureRequest) -> str:
+    """Each engine in turn."""
+    require(request.param)
+    return str(request.param)
+
+
+class Program:
+    """A program of `air.py` that runs in a vehicle."""
+
+    def __init__(self, process: LabProcess, output: Path) -> None:
+        self.process = process
+        self.output = output
+
+    def said(self) -> list[Any]:
+        return [json.loads(line) for line in self.output.read_text().splitlines()]
+
+    async def finish(self) -> Any:
+        """Have it stop listening, and return what it got."""
+        await self.process.send_signal(15)
+        assert await asyncio.wait_for(self.process.wait(), DEADLINE_S) == 0, self.output.read_text()
+        return self.said()[-1]
+
+
+class Air:
+    """Starts programs of `air.py` in vehicles of a lab."""
+
+    def __init__(self, lab: Lab, folder: Path) -> None:
+        self.lab = lab
+        self.folder = folder
+        self._count = 0
+
+    async def start(self, vehicle: int | None, *arguments: object) -> Program:
+        self._count += 1
+        output = self.folder / f"{vehicle}-{arguments[0]}-{self._count}.log"
+        process = await self.lab.spawn(
+            vehicle,
+            [sys.executable, "-S", str(AIR), *map(str, arguments)],
+            cwd=self.folder,
+            env={"PATH": os.environ["PATH"]},
+            stdout=output,
+            stderr=output,
+        )
+        return Program(process, output)
+
+    async def start_ready(self, vehicle: int, *arguments: object) -> Program:
+        """Start a listener and wait until it listens."""
+        program = await self.start(vehicle, *arguments)
+        await until(lambda: "ready" in program.output.read_text(), f"{arguments} on {vehicle} is ready")
+        return program
+
+    async def run(self, vehicle: int, *arguments: object) -> None:
+        """Run a sender to its end."""
+        program = await self.start(vehicle, *arguments)
+        assert await asyncio.wait_for(program.process.wait(), 4 * DEADLINE_S) == 0, program.output.read_text()
+
+    async def broadcast(self, vehicle: int, count: int, first: int = 0) -> None:
+        await self.run(vehicle, "broadcast", PORT, count, first, self.lab.broadcast)
+
+
+def play(story: Coroutine[Any, Any, None]) -> None:
+    """Run a test's story; one that comes to a standstill fails instead of holding up the rest."""
+    asyncio.run(asyncio.wait_for(story, 6 * DEADLINE_S))
+
+
+async def until(condition: Any, what: str) -> None:
+    """Wait for a condition, with a deadline."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain until {what}"
+        await asyncio.sleep(0.005)
+
+
+def assert_binomial(found: int, count: int, probability: float) -> None:
+    """`found` of `count` fits the probability; a right program fails one check in 100,000."""
+    deviation = 4.42 * math.sqrt(count * probability * (1 - probability))
+    expected = count * probability
+    assert abs(found - expected) <= deviation, f"{found} of {count}; expected {expected:.0f} ± {deviation:.0f}"

@@ -1,0 +1,193 @@
+"""What conditions do to real packets, the same for both engines, and what the kernel says about it."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from netem import addresses
+from netem.conditions import LinkConditions, NetworkConditions
+from netem.errors import ConditionsError
+from netem.lab import Lab
+from tests.netem.conftest import PACKETS, PORT, Air, assert_binomial, play
+
+pytestmark = pytest.mark.lab
+
+ETHERTYPES = {"0800": "IPv4", "0806": "ARP", "86dd": "IPv6", "88b5": "none that anybody knows"}
+EVERYONE = "ff:ff:ff:ff:ff:ff"
+MULTICAST = "01:00:5e:00:00:fb"
+
+
+def in_lab(vehicles: Sequence[int], engine: str, folder: Path, story: Callable[[Air], Awaitable[None]]) -> None:
+    async def run() -> None:
+        async with await Lab.open(vehicles, engine=engine, log=folder / "lab.log") as lab:  # type: ignore[arg-type]
+            assert lab.engine == engine
+            await story(Air(lab, folder))
+
+    play(run())
+
+
+def loss(default: float, **receivers: float) -> NetworkConditions:
+    """Conditions by example: loss(0.1, v3=0.5)."""
+    links = {int(name[1:]): LinkConditions(value) for name, value in receivers.items()}
+    return NetworkConditions(LinkConditions(default), links)
+
+
+async def deliveries(air: Air, sender: int, receivers: Sequence[int], count: int) -> dict[int, set[int]]:
+    """Broadcast `count` numbered datagrams, and return which of them each receiver got."""
+    listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in receivers}
+    await air.broadcast(sender, count)
+    heard = {vehicle: await listener.finish() for vehicle, listener in listeners.items()}
+    assert all(result["overflow"] == 0 for result in heard.values()), "a receiver was too slow to judge by"
+    for result in heard.values():
+        assert len(result["numbers"]) == len(set(result["numbers"])), "a datagram came twice"
+    return {vehicle: set(result["numbers"]) for vehicle, result in heard.items()}
+
+
+def test_without_conditions_every_broadcast_reaches_everybody(engine: str, tmp_path: Path) -> None:
+    async def story(air: Air) -> None:
+        got = await deliveries(air, 1, [2, 300, 65535], 200)
+        assert got == {vehicle: set(range(200)) for vehicle in (2, 300, 65535)}
+
+    in_lab([1, 2, 300, 65535], engine, tmp_path, story)
+
+
+def test_loss_is_what_was_asked_per_receiver_and_drawn_independently(engine: str, tmp_path: Path) -> None:
+    asked = {2: 0.15, 3: 0.15, 4: 0.5, 5: 0.0, 6: 1.0}
+
+    async def story(air: Air) -> None:
+        applied = await air.lab.apply(loss(0.15, v4=0.5, v5=0.0, v6=1.0))
+        assert {v: applied.receivers[v].loss for v in asked} == asked
+        got = await deliveries(air, 1, list(asked), PACKETS)
+        lost = {vehicle: set(range(PACKETS)) - numbers for vehicle, numbers in got.items()}
+        assert not lost[5]
+        assert not got[6]
+        for vehicle in (2, 3, 4):
+            assert_binomial(len(lost[vehicle]), PACKETS, asked[vehicle])
+        for one, other in ((2, 3), (2, 4), (3, 4)):
+            assert_binomial(len(lost[one] & lost[other]), PACKETS, asked[one] * asked[other])
+        # The kernel counted what the receivers saw, packet for packet.
+        figures = (await air.lab.read()).receivers
+        for vehicle in asked:
+            assert (figures[vehicle].passed, figures[vehicle].lost) == (len(got[vehicle]), len(lost[vehicle]))
+
+    in_lab([1, 2, 3, 4, 5, 6], engine, tmp_path, story)
+
+
+async def crossings(air: Air, vehicles: Sequence[int]) -> set[tuple[int, int, str]]:
+    """Who hears whom and with which protocol, by frames of every kind to everyone, a group and each one."""
+    listeners = {vehicle: await air.start_ready(vehicle, "listen") for vehicle in vehicles}
+    for sender in vehicles:
+        destinations = [EVERYONE, MULTICAST, *(addresses.mac(v) for v in vehicles if v != sender)]
+        await air.run(sender, "frames", ",".join(destinations), *ETHERTYPES)
+    heard: set[tuple[int, int, str]] = set()
+    names = {addresses.mac(vehicle): vehicle for vehicle in vehicles}
+    for receiver, listener in listeners.items():
+        for mac, kinds in (await listener.finish())["frames"].items():
+            heard |= {(names[mac], receiver, kind) for kind in kinds if mac != addresses.mac(receiver)}
+    return heard
+
+
+def all_of(pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int, str]]:
+    return {(a, b, kind) for one, other in pairs for a, b in ((one, other), (other, one)) for kind in ETHERTYPES}
+
+
+def test_nothing_crosses_a_partition_and_healing_restores_everything(engine: str, tmp_path: Path) -> None:
+    async def story(air: Air) -> None:
+        lab = air.lab
+        applied = await lab.apply(NetworkConditions().with_partition([[1, 2]]))
+        assert {v: set(f.cut_from) for v, f in applied.receivers.items()} == {
+            1: {3, 4},
+            2: {3, 4},
+            3: {1, 2},
+            4: {1, 2},
+        }
+        assert await crossings(air, [1, 2, 3, 4]) == all_of([(1, 2), (3, 4)])
+        before = await lab.read()
+        assert all(figures.cut > 0 and figures.lost == 0 for figures in before.receivers.values())
+        # Other groups, with one vehicle that stays where it was and one alone.
+        await lab.apply(NetworkConditions().with_partition([[1, 3, 4], [2]]))
+        assert await crossings(air, [1, 2, 3, 4]) == all_of([(1, 3), (1, 4), (3, 4)])
+        applied = await lab.apply(NetworkConditions())
+        assert not any(figures.cut_from for figures in applied.receivers.values())
+        assert await crossings(air, [1, 2, 3, 4]) == all_of([(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)])
+
+    in_lab([1, 2, 3, 4], engine, tmp_path, story)
+
+
+def test_a_partition_leaves_the_loss_inside_its_groups_as_it_is(engine: str, tmp_path: Path) -> None:
+    async def story(air: Air) -> None:
+        conditions = loss(0.3).with_partition([[1, 2], [3]])
+        applied = await air.lab.apply(conditions)
+        assert all(figures.loss == 0.3 for figures in applied.receivers.values())
+        got = await deliveries(air, 1, [2, 3], PACKETS)
+        assert not got[3]
+        assert_binomial(PACKETS - len(got[2]), PACKETS, 0.3)
+        figures = (await air.lab.read()).receivers
+        assert (figures[3].passed, figures[3].lost, figures[3].cut) == (0, 0, PACKETS)
+
+    in_lab([1, 2, 3], engine, tmp_path, story)
+
+
+def test_conditions_change_while_traffic_runs_and_counts_go_on(engine: str, tmp_path: Path) -> None:
+    count = PACKETS
+
+    async def story(air: Air) -> None:
+        lab = air.lab
+        listener = await air.start_ready(2, "receive", PORT)
+        sender = await air.start(1, "broadcast", PORT, count, 0, lab.broadcast)
+        changes: list[NetworkConditions] = [
+            loss(0.1), loss(0.1).with_partition([[1], [2, 3]]), loss(0.9), loss(0.0).with_partition([[3]]), loss(0.0)
+        ]  # fmt: skip
+        rounds = 0
+        seen = 0
+        while sender.process.returncode is None or rounds < len(changes):
+            applied = await lab.apply(changes[rounds % len(changes)])
+            figures = applied.receivers[2]
+            now = figures.passed + figures.lost + figures.cut
+            assert now >= seen, "a change made the kernel forget what it had counted"
+            seen = now
+            rounds += 1
+        assert await sender.process.wait() == 0
+        got = (await listener.finish())["numbers"]
+        figures = (await lab.read()).receivers[2]
+        assert figures.passed == len(got)
+        assert figures.passed + figures.lost + figures.cut == count
+        assert len(got) == len(set(got))
+
+    in_lab([1, 2, 3], engine, tmp_path, story)
+
+
+def test_an_unknown_vehicle_is_refused_and_the_old_conditions_stay(engine: str, tmp_path: Path) -> None:
+    async def story(air: Air) -> None:
+        before = await air.lab.apply(loss(0.25))
+        with pytest.raises(ConditionsError, match="unknown vehicle 9"):
+            await air.lab.apply(NetworkConditions().with_partition([[9]]))
+        assert await air.lab.read() == before
+
+    in_lab([1, 2], engine, tmp_path, story)
+
+
+@pytest.mark.parametrize("tiny", [1e-12, 1 - 1e-12])
+def test_a_loss_that_is_neither_none_nor_all_never_becomes_it(engine: str, tmp_path: Path, tiny: float) -> None:
+    async def story(air: Air) -> None:
+        applied = await air.lab.apply(loss(tiny))
+        assert applied.receivers[1].loss == pytest.approx(tiny, abs=1e-9)
+        got = await deliveries(air, 1, [2], 100)
+        assert len(got[2]) == (100 if tiny < 0.5 else 0)
+
+    in_lab([1, 2], engine, tmp_path, story)
+
+
+def test_figures_survive_json(engine: str, tmp_path: Path) -> None:
+    async def story(air: Air) -> None:
+        applied = await air.lab.apply(loss(0.25).with_partition([[1]]))
+        figures: dict[str, Any] = applied.to_json()
+        assert figures["engine"] == engine
+        assert figures["receivers"]["1"] == {"loss": 0.25, "cut_from": (2,), "passed": 0, "lost": 0, "cut": 0}
+        assert type(applied).from_json(figures) == applied
+
+    in_lab([1, 2], engine, tmp_path, story)

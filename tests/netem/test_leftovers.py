@@ -1,0 +1,141 @@
+"""A lab whose orchestrator is killed, at any moment, leaves nothing behind."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from netem.lab import Lab
+from tests.netem.conftest import DEADLINE_S, play, until
+
+pytestmark = pytest.mark.lab
+
+_RANDOM = random.Random(7)
+BARE = Path(__file__).with_name("bare.py")
+MOMENTS = [0.0, *(round(_RANDOM.uniform(0.02, 0.6), 3) for _ in range(6))]
+NAMESPACES = ("net", "user", "mnt", "pid")
+
+
+def processes_of(mark: Path) -> set[int]:
+    """Processes that carry the mark in their environment; what has ended, or is not ours, has none."""
+    found = set()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if f"UCP_TEST_MARK={mark}".encode() in (folder / "environ").read_bytes():
+                found.add(int(folder.name))
+        except OSError:
+            continue
+    return found
+
+
+def namespaces() -> set[str]:
+    """Every namespace that some process is in."""
+    found = set()
+    for folder in Path("/proc").glob("[0-9]*"):
+        for kind in NAMESPACES:
+            try:
+                found.add(str((folder / "ns" / kind).readlink()))
+            except OSError:
+                continue
+    return found
+
+
+def interfaces() -> set[str]:
+    return {path.name for path in Path("/sys/class/net").iterdir()}
+
+
+def orchestrator_in(folder: Path) -> subprocess.Popen[bytes]:
+    """Start `bare.py`; it and all that it starts carry the folder's name as their mark."""
+    env = {**os.environ, "UCP_TEST_MARK": str(folder)}
+    return subprocess.Popen([sys.executable, str(BARE), str(folder)], stdout=subprocess.PIPE, env=env)
+
+
+@pytest.mark.parametrize("after_s", MOMENTS)
+def test_a_killed_orchestrator_leaves_nothing(tmp_path: Path, after_s: float) -> None:
+    before = interfaces()
+    with orchestrator_in(tmp_path) as orchestrator:
+        assert orchestrator.stdout is not None
+        assert orchestrator.stdout.readline() == b"opening\n"
+        time.sleep(after_s)  # the moment is the input of this test, nothing is waited for
+        marked = processes_of(tmp_path)
+        inhabited = namespaces_of(marked)
+        during = interfaces()
+        orchestrator.kill()
+    assert orchestrator.pid in marked, "the mark does not show, so its absence would prove nothing"
+    assert during == before
+    play(until(lambda: not processes_of(tmp_path), "every process is gone"))
+    # A moment later: whoever inherits our orphans has to collect them first.
+    play(until(lambda: not inhabited & namespaces(), "every namespace is gone"))
+    assert interfaces() == before
+    assert {path.suffix for path in tmp_path.iterdir()} <= {".log"}
+
+
+def namespaces_of(pids: set[int]) -> set[str]:
+    """The namespaces that these processes are in and we are not."""
+    own = {str(Path("/proc/self/ns", kind).readlink()) for kind in NAMESPACES}
+    found = set()
+    for pid in pids:
+        for kind in NAMESPACES:
+            try:
+                found.add(str(Path(f"/proc/{pid}/ns/{kind}").readlink()))
+            except OSError:
+                continue
+    return found - own
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_full_lab_is_gone_after_its_orchestrator_even_if_it_is_stopped_itself(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    with orchestrator_in(tmp_path) as orchestrator:
+        assert orchestrator.stdout is not None
+        while orchestrator.stdout.readline() != b"full\n":
+            assert orchestrator.poll() is None
+        # The orchestrator, setpriv's unshare, its init, and two of each program at least.
+        everybody = processes_of(tmp_path)
+        for pid in everybody - {orchestrator.pid}:
+            os.kill(pid, signal.SIGSTOP)
+        orchestrator.send_signal(number)
+    assert len(everybody) >= 3 + 6 * 2
+    play(until(lambda: not processes_of(tmp_path), "every process is gone"))
+
+
+def test_a_closed_lab_leaves_nothing(tmp_path: Path) -> None:
+    before = interfaces()
+
+    async def run() -> None:
+        lab = await Lab.open([1, 2], log=tmp_path / "lab.log")
+        env = {"PATH": os.environ["PATH"], "UCP_TEST_MARK": str(tmp_path)}
+        await lab.spawn(1, ["/bin/sleep", "1000"], cwd=tmp_path, env=env, stdout=tmp_path / "o", stderr=tmp_path / "o")
+        await until(lambda: processes_of(tmp_path), "the program runs")
+        await asyncio.wait_for(lab.close(), DEADLINE_S)
+        assert not processes_of(tmp_path)
+
+    play(run())
+    assert interfaces() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"lab.log", "o"}
+
+
+def test_a_lab_that_is_given_up_while_it_opens_leaves_nothing(tmp_path: Path) -> None:
+    os.environ["UCP_TEST_MARK"] = str(tmp_path)
+    try:
+
+        async def run() -> None:
+            opening = asyncio.create_task(Lab.open([1, 2], log=tmp_path / "lab.log"))
+            await until(lambda: processes_of(tmp_path), "the first process runs")
+            opening.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await opening
+            assert not processes_of(tmp_path)
+
+        play(run())
+    finally:
+        del os.environ["UCP_TEST_MARK"]

@@ -1,0 +1,147 @@
+"""Machines that cannot, users who may not, and what doctor says about them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pwd
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from netem import namespaces
+from netem.doctor import examine
+from netem.lab import Lab, LabUnavailable
+from tests.netem.conftest import unavailable
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def as_nobody(argv: list[str]) -> list[str]:
+    """The command line as an ordinary user: this one, or nobody if this one is root."""
+    if os.geteuid() != 0:
+        return argv
+    return ["setpriv", "--reuid", "nobody", "--regid", "nogroup", "--clear-groups", "--inh-caps=-all", *argv]
+
+
+def run_script(script: str, *, prefix: list[str] | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a Python script as an ordinary user, in a folder of that user's own."""
+    made = subprocess.run(as_nobody(["mktemp", "-d"]), capture_output=True, text=True, check=True)
+    folder = made.stdout.strip()
+    try:
+        return subprocess.run(
+            as_nobody([*(prefix or []), sys.executable, "-c", textwrap.dedent(script)]),
+            cwd=folder,
+            env={"PATH": "/usr/bin:/bin", "HOME": folder, "PYTHONPATH": str(REPOSITORY), "TMPDIR": folder},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+    finally:
+        subprocess.run(["rm", "-rf", folder], check=True)
+
+
+_STORY = """
+    import asyncio, os
+    from pathlib import Path
+    from netem.conditions import LinkConditions, NetworkConditions
+    from netem.lab import Lab
+
+    async def main():
+        here = Path.cwd()
+        async with await Lab.open([1, 2], log=here / "lab.log") as lab:
+            applied = await lab.apply(NetworkConditions(LinkConditions(0.25)).with_partition([[1]]))
+            print(os.geteuid(), applied.receivers[1].loss, applied.receivers[1].cut_from)
+            process = await lab.spawn(1, ["/bin/true"], cwd=here, env={}, stdout=here / "o", stderr=here / "o")
+            print(await process.wait(), (here / "o").stat().st_uid)
+
+    asyncio.run(main())
+"""
+
+
+@pytest.mark.lab
+def test_an_ordinary_user_gets_a_lab_without_any_right() -> None:
+    done = run_script(_STORY)
+    user = os.geteuid() or pwd.getpwnam("nobody").pw_uid
+    assert done.stdout.splitlines() == [f"{user} 0.25 (2,)", f"0 {user}"], done.stderr
+
+
+_EXPECT_REFUSAL = """
+    import asyncio
+    from pathlib import Path
+    from netem.lab import Lab, LabUnavailable
+    from netem.doctor import examine
+
+    try:
+        asyncio.run(Lab.open([1, 2], log=Path("lab.log")))
+    except LabUnavailable as error:
+        print(error.stage)
+        print(error.way_out)
+        print(error)
+    for finding in examine():
+        print(finding.name, finding.ok, finding.way_out)
+"""
+
+
+@pytest.mark.lab
+def test_where_user_namespaces_are_forbidden_the_refusal_says_so_and_what_to_do() -> None:
+    # A user namespace may forbid further ones inside it, as an administrator does for a machine. Root's
+    # rights are taken away too, for root needs no user namespace.
+    done = run_script(
+        _EXPECT_REFUSAL,
+        prefix=["unshare", "--user", "--map-root-user", "sh", "-c",
+                'echo 0 > /proc/sys/user/max_user_namespaces && exec setpriv --bounding-set=-all "$@"', "sh"],
+    )  # fmt: skip
+    lines = done.stdout.splitlines()
+    assert lines[0] == "namespaces", done.stderr
+    assert "sudo sysctl user.max_user_namespaces=15000, or run as root" in lines[1]
+    assert lines[2].startswith("This machine does not let us make a private network (unshare:")
+    assert lines[3].startswith("namespaces False User namespaces are switched off")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("user/max_user_namespaces", 0, "user.max_user_namespaces=15000"),
+        ("user/max_net_namespaces", 0, "user.max_net_namespaces=15000"),
+        ("kernel/unprivileged_userns_clone", 0, "kernel.unprivileged_userns_clone=1"),
+        ("kernel/apparmor_restrict_unprivileged_userns", 1, "kernel.apparmor_restrict_unprivileged_userns=0"),
+    ],
+)
+def test_each_way_to_forbid_namespaces_has_its_own_way_out(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: int, expected: str
+) -> None:
+    monkeypatch.setattr(namespaces, "_sysctl", lambda asked: value if asked == name else None)
+    assert expected in namespaces.way_out("unshare: unshare failed: Operation not permitted")
+
+
+def test_a_missing_tool_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(LabUnavailable, match=r"setpriv is not installed\. Install util-linux"):
+        asyncio.run(Lab.open([1], log=tmp_path / "lab.log"))
+    assert [(finding.name, finding.ok) for finding in examine()] == [("namespaces", False)]
+
+
+@pytest.mark.lab
+def test_an_engine_that_the_kernel_lacks_is_refused_with_the_way_out() -> None:
+    for engine in ("netem", "nftables"):
+        if (error := unavailable(engine)) is not None:
+            assert error.stage == "engine"
+            assert f"No engine {engine} works here" in str(error)
+            assert "sch_netem" in error.way_out
+            return
+    pytest.skip("this kernel has both engines")
+
+
+@pytest.mark.lab
+def test_doctor_finds_what_a_lab_finds() -> None:
+    findings = {finding.name: finding for finding in examine()}
+    assert [*findings] == ["namespaces", "network", "netem", "nftables", "engine"]
+    assert all(finding.ok for finding in findings.values())
+    for engine in ("netem", "nftables"):
+        assert (findings[engine].detail == "works") == (unavailable(engine) is None)
+        assert bool(findings[engine].way_out) == (unavailable(engine) is not None)
