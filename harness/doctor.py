@@ -39,4 +39,7 @@ def _ardupilot() -> Finding:
         found = ArduPilot.find(None, os.environ)
     except VehicleError as error:
         return Finding("ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle")
+    if found.defaults is None:
+        way_out = "put ArduPilot's default parameters, copter.parm, beside it: without them it may refuse to arm"
+        return Finding("ArduPilot SITL", False, False, f"{found.binary}, without copter.parm", way_out)
     return Finding("ArduPilot SITL", True, False, str(found.binary))

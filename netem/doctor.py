@@ -18,12 +18,16 @@ from netem.lab import Lab, LabError, LabUnavailable
 
 @dataclass(frozen=True)
 class Finding:
-    """One fact: whether it is as it should be, what was seen, and what to do if not (else empty)."""
+    """One fact: whether it is as it should be, what was seen, and what to do if not (else empty).
+
+    Without what is `needed` there is no lab; of the engines any one will do.
+    """
 
     name: str
     ok: bool
     detail: str
     way_out: str = ""
+    needed: bool = True
 
 
 def examine() -> list[Finding]:
@@ -40,27 +44,25 @@ def examine() -> list[Finding]:
     if broken is not None:
         return [*found, Finding("network", False, broken.reason, broken.way_out)]
     found.append(Finding("network", True, "bridge, veth pairs and a namespace for each vehicle"))
-    usable = [name for name, result in tried.items() if isinstance(result, str)]
     for name, result in tried.items():
         if isinstance(result, str):
-            found.append(Finding(name, True, "works"))
+            found.append(Finding(name, True, "works", needed=False))
         else:
-            # Without netem there is nftables: worth saying, not worth a failure.
-            way_out = result.way_out if isinstance(result, LabUnavailable) else ""
-            found.append(Finding(name, bool(usable), str(getattr(result, "reason", result)), way_out))
+            reason = str(getattr(result, "reason", result))
+            found.append(Finding(name, False, reason, getattr(result, "way_out", ""), needed=False))
     if isinstance(chosen, str):
-        found.append(Finding("engine", True, chosen))
+        found.append(Finding("engine", True, f"{chosen}, the first that works of netem and nftables"))
     else:
         found.append(Finding("engine", False, str(chosen), getattr(chosen, "way_out", "")))
     return found
 
 
 def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:
-    """The engine that a lab came up with and why, or why it did not."""
+    """The engine that a lab came up with, or why it did not."""
 
     async def attempt() -> str:
         async with await Lab.open((1, 2), engine=engine, log=log) as lab:
-            return f"{lab.engine} ({lab.engine_reason})"
+            return lab.engine
 
     try:
         return asyncio.run(attempt())

@@ -34,6 +34,11 @@ from netem.errors import ConditionsError, LabError, LabUnavailable
 
 EngineName = Literal["netem", "nftables"]
 
+_WAYS_OUT: dict[EngineName, str] = {
+    "netem": "Use a kernel with sch_netem, sch_htb, sch_ingress, cls_matchall and act_skbedit (Debian: "
+    "linux-image-amd64; Ubuntu: linux-modules-extra-$(uname -r)).",
+    "nftables": "Install nftables (apt install nftables), on a kernel with nf_tables for bridges and nft_numgen.",
+}
 _OPEN_DEADLINE_S = 60.0
 _CLOSE_DEADLINE_S = 5.0
 
@@ -156,11 +161,9 @@ class Lab:
                 "fabric",
             ) from error
         if result["engine"] is None:
+            wanted = [_WAYS_OUT[engine]] if engine else _WAYS_OUT.values()
             raise LabUnavailable(
-                f"No engine {engine or 'at all'} works here ({result['reason']})",
-                "Install nftables (apt install nftables), or use a kernel with sch_netem (Debian: "
-                "linux-image-amd64; Ubuntu: linux-modules-extra-$(uname -r)).",
-                "engine",
+                f"No engine {engine or 'at all'} works here ({result['reason']})", " Or: ".join(wanted), "engine"
             )
         self.engine = result["engine"]
         self.engine_reason = result["reason"]

@@ -44,7 +44,7 @@ class NftablesEngine(Engine):
         super().__init__(fabric)
         tool = shutil.which("nft", path=_PATH)
         if tool is None:
-            raise EngineError("the program nft is not installed (Debian, Ubuntu: apt install nftables)")
+            raise EngineError("the program nft is not installed")
         self._tool = tool
         self._ports = [addresses.port(vehicle) for vehicle in self._vehicles]
         hook = {"type": "filter", "hook": "forward", "prio": 0, "policy": "accept"}
@@ -56,13 +56,7 @@ class NftablesEngine(Engine):
         for port in self._ports:
             commands += [_add("counter", **_TABLE, name=f"{kind}_{port}") for kind in _COUNTERS]
             commands.append(_add("chain", **_TABLE, name=f"to_{port}"))
-        try:
-            self._run(_STDIN, commands + self._rules(NetworkConditions()))
-        except EngineError as error:
-            raise EngineError(
-                f"{error} (it needs a kernel with CONFIG_NF_TABLES_BRIDGE and CONFIG_NFT_NUMGEN; "
-                "as root: modprobe -a nf_tables nft_numgen)"
-            ) from error
+        self._run(_STDIN, commands + self._rules(NetworkConditions()))
 
     def change(self, conditions: NetworkConditions) -> None:
         emptied: list[dict[str, Any]] = [

@@ -61,10 +61,7 @@ class NetemEngine(Engine):
             for port in self._ports.values():
                 self._netlink.send(port.install())
         except NetlinkError as error:
-            raise EngineError(
-                f"{error} (it needs a kernel with sch_netem, sch_htb, sch_ingress, cls_matchall and "
-                "act_skbedit; Ubuntu: apt install linux-modules-extra-$(uname -r))"
-            ) from error
+            raise EngineError(f"this kernel cannot {error}") from error
         self.change(NetworkConditions())
 
     def _remove(self, port: TrafficControl) -> None:

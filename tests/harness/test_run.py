@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.harness.command import DEADLINE_S, Running, harness, processes, sentences, write_scenario
+from tests.harness.command import COMMAND, DEADLINE_S, Running, harness, processes, sentences, write_scenario
 
 pytestmark = pytest.mark.lab
 
@@ -224,3 +224,17 @@ sys.exit(status)
     assert "Traceback" not in done.stdout + done.stderr, done.stdout + done.stderr
     assert done.returncode == 3, done.stdout + done.stderr
     assert "No space left on device" in done.stdout
+
+
+def test_where_user_namespaces_are_forbidden_a_run_and_doctor_say_so_with_status_3(tmp_path: Path) -> None:
+    # A user namespace may forbid further ones inside it, as an administrator does for a machine; root's rights are
+    # taken away too, for root needs no user namespace.
+    forbid = 'echo 0 > /proc/sys/user/max_user_namespaces && exec setpriv --bounding-set=-all "$@"'
+    forbidden = ["unshare", "--user", "--map-root-user", "sh", "-c", forbid, "sh"]
+    for command in (["run", write_scenario(tmp_path), "--out", tmp_path / "run"], ["doctor"]):
+        done = subprocess.run(
+            [*forbidden, *COMMAND, *map(str, command)], capture_output=True, text=True, timeout=DEADLINE_S
+        )
+        assert done.returncode == 3
+        assert "sysctl user.max_user_namespaces=15000, or run as root" in " ".join((done.stdout + done.stderr).split())
+        assert "Traceback" not in done.stderr

@@ -38,7 +38,7 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nnetwork: {loss: 1.5}", "`network.loss` is 1.5: it should be less than or equal to 1"),
         ("name: x\nnetwork: {loss: .nan}", "`network.loss` is nan"),
         ("name: x\nnetwork: {receivers: {9: {loss: 0.1}}}", "vehicle 9, which does not exist: there are 1, 2, 3, 4, 5"),
-        ("name: x\ntimeline: [{at_s: 1, partition: [[1], [9]]}]", "there is no vehicle 9"),
+        ("name: x\ntimeline: [{at_s: 1, partition: [[1], [9]]}]", "unknown vehicle 9"),
         ("name: x\ntimeline: [{at_s: 1, partition: [[1], [1, 2]]}]", "vehicle 1 is in an earlier group too"),
         ("name: x\ntimeline: [{at_s: 1, heal: true}, {at_s: 1, loss: 0}]", "two entries"),
         ("name: x\ntimeline: [{at_s: 1, heal: true, loss: 0}]", "exactly one of"),

@@ -1,18 +1,12 @@
-"""What the tests of the lab share: whether this machine can, and programs on the air.
-
-`UCP_REQUIRE` is a list of "lab", "netem" and "nftables" (comma between): what it names may not be missing,
-a test that would be skipped for the lack of it fails instead.
-"""
+"""What the tests of the lab share: each engine in turn, and programs on the air."""
 
 from __future__ import annotations
 
 import asyncio
-import functools
 import json
 import math
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Coroutine
 from pathlib import Path
@@ -20,44 +14,13 @@ from typing import Any
 
 import pytest
 
-from netem.lab import Lab, LabProcess, LabUnavailable
+from netem.lab import Lab, LabProcess
+from tests.machine import require
 
 AIR = Path(__file__).with_name("air.py")
 PORT = 14600
 DEADLINE_S = 30.0
 PACKETS = int(os.environ.get("UCP_TEST_PACKETS", "4000"))
-
-
-@functools.cache
-def unavailable(engine: str | None) -> LabUnavailable | None:
-    """Why there is no lab with this engine (None: any) here, if there is none."""
-
-    async def attempt() -> None:
-        lab = await Lab.open([1, 2], engine=engine, log=Path(folder, "lab.log"))  # type: ignore[arg-type]
-        await lab.close()
-
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            asyncio.run(attempt())
-        except LabUnavailable as error:
-            return error
-    return None
-
-
-def require(engine: str | None) -> None:
-    """Skip, or fail if UCP_REQUIRE says that it has to be there."""
-    if (error := unavailable(engine)) is None:
-        return
-    required = os.environ.get("UCP_REQUIRE", "").split(",")
-    if ("lab" if error.stage != "engine" else engine) in required:
-        pytest.fail(f"UCP_REQUIRE={os.environ['UCP_REQUIRE']}, but: {error}")
-    pytest.skip(str(error))
-
-
-@pytest.fixture(autouse=True)
-def _machine_can(request: pytest.FixtureRequest) -> None:
-    if request.node.get_closest_marker("lab"):
-        require(None)
 
 
 @pytest.fixture(params=["netem", "nftables"])

@@ -234,6 +234,7 @@ def test_a_killed_agent_leaves_no_half_export(directory: Path) -> None:
         (directory / "7.control").unlink()
 
 
+@pytest.mark.lab
 def test_a_full_disk_fails_the_export_keeps_the_old_one_and_the_agent_lives(tmp_path: Path) -> None:
     script = r"""
 import json, pathlib, subprocess, sys, time
