@@ -29,15 +29,18 @@ class ControlServer:
 
     async def start(self) -> None:
         """Raises OSError. A socket that a dead agent left is replaced."""
-        self._path.unlink(missing_ok=True)
+        # Under its name it is there only once it listens: whoever sees it can connect.
+        unready = self._path.with_name(f".{self._path.name}")
+        unready.unlink(missing_ok=True)
         # A socket's address holds 107 bytes, and run directories lie deep: name it from its own directory.
         directory = os.open(self._path.parent, os.O_PATH)
         try:
             self._server = await asyncio.start_unix_server(
-                self._serve, f"/proc/self/fd/{directory}/{self._path.name}", limit=MAX_LINE_BYTES
+                self._serve, f"/proc/self/fd/{directory}/{unready.name}", limit=MAX_LINE_BYTES
             )
         finally:
             os.close(directory)
+        unready.replace(self._path)
 
     def close(self) -> None:
         if self._server is not None:
