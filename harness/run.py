@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from harness import checker, report
-from harness.backends.process import Played, play
+from harness.backends.process import Played, ProcessRun
+from harness.backends.vehicle_process import VehicleFailedError
 from harness.errors import VIOLATED, MachineError, RunDirectoryError
 from harness.progress import Progress
 from harness.record import RunRecord
@@ -101,7 +102,7 @@ async def _play(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, interrupted.set)
-    return await play(scenario, seed, kind, initial_data, directory, progress, interrupted)
+    return await ProcessRun(scenario, seed, kind, initial_data, directory, progress, interrupted).play()
 
 
 def choose_vehicles(scenario: Scenario) -> Kind | None:
@@ -109,8 +110,6 @@ def choose_vehicles(scenario: Scenario) -> Kind | None:
 
     Raises VehicleFailedError for a binary that will not do, MachineError if ArduPilot is asked for and not here.
     """
-    from harness.backends.vehicle_process import VehicleFailedError
-
     asked: VehicleKind | None = scenario.vehicles.kind
     if asked == "none":
         return None

@@ -104,30 +104,3 @@ class Engine(ABC):
 
 def _describe(applied: Applied) -> dict[int, dict[str, Any]]:
     return {v: {"loss": f.loss, "cut_from": list(f.cut_from)} for v, f in applied.receivers.items()}
-
-
-def choose(preference: str | None, fabric: Fabric) -> tuple[Engine, str]:
-    """The engine to use on this machine, installed, and why it is this one.
-
-    Without a preference tc netem goes first, because it can do more. An engine is tried by installing
-    it: nothing else tells whether a kernel can. Raises EngineError with the way out if none works.
-    """
-    # Here, because the engines import this module.
-    from netem.nft import NftablesEngine
-    from netem.tc import NetemEngine
-
-    engines: dict[str, type[Engine]] = {kind.name: kind for kind in (NetemEngine, NftablesEngine)}
-    if preference is not None and preference not in engines:
-        raise EngineError(f"engine: {preference!r} is not known; allowed is {' or '.join(engines)}")
-    refused: list[str] = []
-    for name, kind in engines.items():
-        if preference not in (None, name):
-            continue
-        try:
-            engine = kind(fabric)
-        except EngineError as error:
-            refused.append(f"{name}: {error}")
-        else:
-            reason = "asked for" if preference else "works on this kernel"
-            return engine, "; ".join([*refused, f"{name}: {reason}"])
-    raise EngineError("; ".join(refused))

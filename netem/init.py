@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from errno import EINPROGRESS, ETIMEDOUT
 from typing import Any
 
-from netem import engine as engines
+from netem import choice
 from netem.conditions import NetworkConditions
 from netem.engine import Engine
 from netem.errors import ConditionsError, EngineError, NetemError
@@ -153,7 +153,7 @@ class Server:
             raise NetemError("The lab is open already")
         self._fabric = Fabric(message["vehicles"])
         try:
-            self._engine, reason = engines.choose(message["engine"], self._fabric)
+            self._engine, reason = choice.choose(message["engine"], self._fabric)
         except EngineError as error:
             return {"engine": None, "reason": str(error)}
         return {"engine": self._engine.name, "reason": reason}

@@ -55,20 +55,9 @@ class Played:
     vehicles: dict[str, Any] = field(default_factory=dict)
 
 
-async def play(
-    scenario: Scenario,
-    seed: int,
-    kind: VehicleKind | None,
-    initial_data: bytes,
-    rundir: RunDirectory,
-    progress: Progress,
-    interrupted: asyncio.Event,
-) -> Played:
-    """Play the scenario. Raises MachineError if this machine cannot build the lab; all else is in the answer."""
-    return await _Run(scenario, seed, kind, initial_data, rundir, progress, interrupted).play()
+class ProcessRun:
+    """One run; `play` it once. `kind` None: no vehicles. `interrupted` ends the mission early."""
 
-
-class _Run:
     def __init__(
         self,
         scenario: Scenario,
@@ -99,6 +88,7 @@ class _Run:
         self._watchers: list[asyncio.Task[None]] = []
 
     async def play(self) -> Played:
+        """Raises MachineError if this machine cannot build the lab; all else that goes wrong is in the answer."""
         try:
             lab = await Lab.open(self.scenario.roster, log=self.rundir.lab_log)
         except LabUnavailable as error:
