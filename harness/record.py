@@ -10,7 +10,7 @@ SCHEMA = "ucp-run/1"
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+    model_config = ConfigDict(extra="ignore", populate_by_name=True)
 
 
 class Evidence(_Model):
@@ -50,20 +50,28 @@ class AgentRecord(_Model):
     """`outcome` is exported, not exported, crashed, hung, running or not started; counters are null if unknown."""
 
     outcome: str
-    detail: str | None
-    idle: bool | None
-    bytes_sent: int | None
-    dropped: dict[str, int] | None
-    send_failures: int | None
-    trace_problem: str | None
+    detail: str | None = None
+    idle: bool | None = None
+    bytes_sent: int | None = None
+    dropped: dict[str, int] | None = None
+    send_failures: int | None = None
+    trace_problem: str | None = None
 
 
-class RunRecord(_Model):
-    """Times are mission seconds except `wall_s`; what is not known yet is null or empty."""
+class JudgedRecord(_Model):
+    """The part of a record that a judgement of the run needs."""
 
     schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
-    scenario: Scenario
     roster: list[int]
+    network: list[NetworkState] = []
+    final_reconcile: FinalReconcile | None = None
+    agents: dict[str, AgentRecord] = {}
+
+
+class RunRecord(JudgedRecord):
+    """All of a record. Times are mission seconds except `wall_s`; what is not known yet is null or empty."""
+
+    scenario: Scenario
     seed: int
     backend: Literal["process"]
     engine: str | None = None
@@ -74,10 +82,7 @@ class RunRecord(_Model):
     outcome_detail: str | None = None
     mission_s: float = 0.0
     settled: bool = False
-    final_reconcile: FinalReconcile | None = None
-    network: list[NetworkState] = []
     faults: list[NetworkState] = []
-    agents: dict[str, AgentRecord] = {}
     vehicles: dict[str, dict[str, Any]] = {}
     counters: dict[str, Any] | None = None
     """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""

@@ -47,7 +47,7 @@ class TracedRun(BaseModel):
     t: float
     handler: str
     algorithm: int
-    trigger: dict[str, Any]
+    trigger: dict[str, int | str]
     branch: str
     changes: list[tuple[str, str]]
     sent: list[Sent]

@@ -35,8 +35,8 @@ def check(evidence: Evidence) -> Characteristic:
         for run in trace.runs:
             ran.add(run.handler)
             sender = run.trigger.get("from")
-            if "message" in run.trigger and sender not in sent:
-                untraced.add(int(sender or 0))
+            if isinstance(sender, int) and sender not in sent:
+                untraced.add(sender)
                 continue
             wrong = _wrong_trigger(run, ran, sent)
             if wrong:
@@ -64,12 +64,12 @@ def _wrong_trigger(run: TracedRun, ran: set[str], sent: dict[int, set[tuple[int,
     if run.handler not in HANDLERS or HANDLERS[run.handler].algorithm != run.algorithm:
         return "is not one of the 20 event handlers"
     match run.trigger:
-        case {"message": name, "from": sender, "seq": sequence}:
+        case {"message": str(name), "from": int(sender), "seq": int(sequence)}:
             if _OF_MESSAGE.get(name) != run.handler:
                 return f"was triggered by a {name}, which is another handler's"
             if (sequence, name) not in sent[sender]:
                 return f"was triggered by {name} number {sequence}, which agent {sender} never sent"
-        case {"timer": timer}:
+        case {"timer": str(timer)}:
             if _OF_TIMER.get(timer) != run.handler:
                 return f"was triggered by the {timer} timer, which is another handler's"
         case {"local": by}:

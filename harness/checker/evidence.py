@@ -1,18 +1,18 @@
 """What the checker looks at: exports, traces where there are any, and what the run's record says of the network."""
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from harness import traces
 from harness.errors import RunDirectoryError
 from harness.exports import SUFFIX, Export, export_paths, read_exports
 from harness.naming import name_blocks
+from harness.record import JudgedRecord
 from harness.traces import Trace
 
 RUN_FILE = "run.json"
+MAX_RECORD_BYTES = 64 * 1024 * 1024
 
 
 @dataclass
@@ -21,7 +21,7 @@ class Evidence:
 
     exports: dict[int, Export]
     traces: dict[int, Trace] = field(default_factory=dict)
-    record: dict[str, Any] | None = None
+    record: JudgedRecord | None = None
     errors: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -34,9 +34,7 @@ class Evidence:
     def roster(self) -> list[int] | None:
         """All agents of the mission, as far as a run's record or a trace tells."""
         if self.record is not None:
-            roster = self.record.get("roster")
-            if isinstance(roster, list):
-                return [agent for agent in roster if isinstance(agent, int)]
+            return self.record.roster
         for trace in self.traces.values():
             return sorted(trace.header.roster)
         return None
@@ -50,18 +48,17 @@ class Evidence:
     def connected_since_s(self) -> float | None:
         """Mission time since when every agent has heard every other without loss; None if not, or not on record."""
         since: float | None = None
-        for change in (self.record or {}).get("network", []):
-            if not change.get("fully_connected"):
+        for state in self.record.network if self.record else ():
+            if not state.fully_connected:
                 since = None
             elif since is None:
-                since = float(change.get("at_s", 0.0))
+                since = state.at_s
         return since
 
     @property
     def network_at_end(self) -> str | None:
         """The conditions at the end of the run, in words; None if not on record."""
-        changes = (self.record or {}).get("network", [])
-        return str(changes[-1].get("detail")) if changes else None
+        return self.record.network[-1].detail if self.record and self.record.network else None
 
     def completed_blocks(self) -> dict[str, int]:
         """Hash -> agent of every block known to have been completed."""
@@ -77,7 +74,7 @@ def gather(paths: Iterable[Path]) -> Evidence:
     Raises RunDirectoryError if a path does not exist or nothing at all is there.
     """
     export_files: list[Path] = []
-    record: dict[str, Any] | None = None
+    record: JudgedRecord | None = None
     errors: list[str] = []
     for path in paths:
         if path.is_dir():
@@ -104,12 +101,13 @@ def gather(paths: Iterable[Path]) -> Evidence:
     return Evidence(exports.by_agent, evidence_traces, record, errors + exports.errors)
 
 
-def _record(path: Path, errors: list[str]) -> dict[str, Any] | None:
+def _record(path: Path, errors: list[str]) -> JudgedRecord | None:
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > MAX_RECORD_BYTES:
+            raise ValueError("too large")
+        return JudgedRecord.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, RecursionError):
-        errors.append(f"{path}: damaged; the exports are checked without it")
+    except (OSError, ValueError):
+        errors.append(f"{path}: damaged, or not a run's record; the exports are checked without it")
         return None
-    return record if isinstance(record, dict) else None

@@ -31,13 +31,13 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
         result["reconciles"] = sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in runs)
         result["messages"] = messages
         result["messages_per_block"] = round(messages / len(completed), 1) if completed else None
-    final = (evidence.record or {}).get("final_reconcile")
-    if final and set(evidence.traces) == set(evidence.exports):
-        before = [trace.chain_at(final["at_s"]) for trace in evidence.traces.values()]
+    record = evidence.record
+    if record and record.final_reconcile and set(evidence.traces) == set(evidence.exports):
+        before = [trace.chain_at(record.final_reconcile.at_s) for trace in evidence.traces.values()]
         result["mutual_chain_before_final_reconcile"] = common_prefix(before)
         result["distinct_chains_before_final_reconcile"] = len(set(before))
-    agents = (evidence.record or {}).get("agents", {})
-    sent = [agent["bytes_sent"] for agent in agents.values() if isinstance(agent.get("bytes_sent"), int)]
-    if sent and len(sent) == len(agents):
-        result["bytes"] = sum(sent)
+    sent = [agent.bytes_sent for agent in record.agents.values()] if record else []
+    known = [count for count in sent if count is not None]
+    if known and len(known) == len(sent):
+        result["bytes"] = sum(known)
     return result

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from harness.checker import Result, check, gather
 from tests.harness.mission import CONNECTED, LOSSY, edit, edit_lines, fly, reconcile_all, write_exports, write_run
@@ -244,3 +246,36 @@ def test_half_a_last_line_is_that_of_a_killed_agent_and_no_damage(run_dir: Path)
     result = check(gather([run_dir]))
     assert verdicts(result) == "hhhhhh"
     assert not result.errors
+
+
+def test_a_damaged_record_is_told_and_the_exports_are_checked_without_it(run_dir: Path) -> None:
+    (run_dir / "run.json").write_text('{"schema": "ucp-run/1", "roster": "all", "network": [7]}')
+    result = check(gather([run_dir]))
+    assert "run.json: damaged" in result.errors[0]
+    assert verdicts(result)[1:4] == "hhh"
+
+
+strange = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda children: st.lists(children, max_size=3) | st.dictionaries(st.text(max_size=5), children, max_size=3),
+    max_leaves=5,
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=60)
+@given(data=st.data())
+def test_whatever_a_run_directory_holds_there_is_a_verdict(run_dir: Path, data: st.DataObject) -> None:
+    trace, record = run_dir / "agents" / "2.trace.jsonl", run_dir / "run.json"
+    kept = trace.read_text(), record.read_text()
+
+    def spoil(document: dict) -> None:
+        document[data.draw(st.sampled_from(sorted(document)))] = data.draw(strange)
+
+    try:
+        edit_lines(trace, lambda lines: spoil(lines[data.draw(st.integers(0, len(lines) - 1))]))
+        edit(record, spoil)
+        result = check(gather([run_dir]))
+        assert set(verdicts(result)) <= set("hvn")
+    finally:
+        trace.write_text(kept[0])
+        record.write_text(kept[1])
