@@ -27,8 +27,19 @@ def as_nobody(argv: list[str]) -> list[str]:
     return ["setpriv", "--reuid", "nobody", "--regid", "nogroup", "--clear-groups", "--inh-caps=-all", *argv]
 
 
+def require_nobody_can() -> None:
+    """Skip where root keeps its Python or this checkout to itself; run by an ordinary user, the tests need no nobody."""
+    probe = [sys.executable, "-c", "import netem.lab"]
+    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(as_nobody(probe), env=environment, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        word = (done.stderr.strip().splitlines() or ["it gave no reason"])[-1]
+        pytest.skip(f"the user nobody cannot run {sys.executable} with this checkout: {word}")
+
+
 def run_script(script: str, *, prefix: list[str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run a Python script as an ordinary user, in a folder of that user's own."""
+    require_nobody_can()
     made = subprocess.run(as_nobody(["mktemp", "-d"]), capture_output=True, text=True, check=True)
     folder = made.stdout.strip()
     try:
