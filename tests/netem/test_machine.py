@@ -28,7 +28,7 @@ def as_nobody(argv: list[str]) -> list[str]:
 
 
 def require_nobody_can() -> None:
-    """Skip where root keeps its Python or this checkout to itself; run by an ordinary user, the tests need no nobody."""
+    """Skip where root keeps its Python or this checkout to itself; an ordinary user needs no nobody."""
     probe = [sys.executable, "-c", "import netem.lab"]
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(as_nobody(probe), env=environment, capture_output=True, text=True, check=False)

@@ -28,15 +28,15 @@ MEMORY = "768M"
 _TESTS = ["-q", "-k", "not nftables", *(f"tests/netem/test_{name}.py" for name in ("engine", "lab", "machine"))]
 
 _SCRIPT = """#!/bin/sh
-export PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/tmp LANG=C.UTF-8
+export PATH=/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8
 mount -t proc proc /proc
 mount -t sysfs sysfs /sys
+# The host's files stay as they are: sockets and files of the tests are this kernel's own.
 mount -t tmpfs tmpfs /run
-# The host's /tmp stays the host's: sockets and files of the tests are this kernel's own.
-mount -t tmpfs tmpfs /tmp
-mkdir -p /tmp/modules/lib && ln -s {modules} /tmp/modules/lib/modules
-modprobe -d /tmp/modules -a bridge veth sch_netem sch_htb sch_ingress cls_matchall act_skbedit af_packet
-modprobe -d /tmp/modules -q -a nf_tables nft_numgen
+mkdir -m 1777 /run/tmp && mkdir -p /run/modules/lib && ln -s {modules} /run/modules/lib/modules
+export HOME=/run/tmp TMPDIR=/run/tmp
+modprobe -d /run/modules -a bridge veth sch_netem sch_htb sch_ingress cls_matchall act_skbedit af_packet
+modprobe -d /run/modules -q -a nf_tables nft_numgen
 ip link set lo up
 cd {repository}
 export PYTHONDONTWRITEBYTECODE=1 UCP_TEST_PACKETS=${{UCP_TEST_PACKETS:-1500}} UCP_REQUIRE=lab,netem
