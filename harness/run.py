@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import checker, report
+from harness.backends.agent_process import agent_command
 from harness.backends.process import Played, ProcessRun
 from harness.backends.vehicle_process import VehicleFailedError
 from harness.errors import VIOLATED, MachineError, RunDirectoryError
@@ -46,6 +47,7 @@ def run(scenario: Scenario, seed: int, directory: RunDirectory, progress: Progre
     Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
     """
     kind = choose_vehicles(scenario)
+    agent_command(scenario)
     started = time.monotonic()
     started_at = datetime.now(UTC)
     # Another run is another mission: its blocks must not be taken for this one's.

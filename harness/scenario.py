@@ -118,6 +118,8 @@ class Scenario(_Model):
     timeline: Annotated[list[TimelineEntry], Field(max_length=10_000)] = []
     events: Events = Events()
     vehicles: Vehicles = Vehicles()
+    agent_command: Annotated[list[str], Field(min_length=1, max_length=100)] | None = None
+    """Any program that follows ucp/CONTRACT.md, with its arguments; the mission file's name is added."""
     settings: Settings = Settings()
     quirks: Quirks = Quirks()
     settle: Settle = Settle()

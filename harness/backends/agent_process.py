@@ -4,13 +4,15 @@ import asyncio
 import base64
 import dataclasses
 import os
+import shutil
 import signal
 import sys
+from pathlib import Path
 from random import Random
 from typing import Any
 
 from harness.agents import AgentControl, AgentRefusedError, AgentSilentError
-from harness.errors import VIOLATED, HarnessError, MachineError
+from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from netem.lab import Lab, LabProcess
@@ -23,6 +25,17 @@ ANSWER_LIMIT_S = 10.0
 """Wall time after which an agent that does not answer counts as hung."""
 STOP_GRACE_S = 5.0
 ASK_AGAIN_S = 0.02
+
+
+def agent_command(scenario: Scenario) -> list[str]:
+    """What starts an agent, but for the mission file. Raises ScenarioError if there is no such program."""
+    if scenario.agent_command is None:
+        return [sys.executable, "-P", "-m", "ucp.node"]
+    program, *arguments = scenario.agent_command
+    found = shutil.which(program)
+    if found is None:
+        raise ScenarioError(f"`agent_command`: {program} is no program: give a path, or a name on PATH")
+    return [str(Path(found).absolute()), *arguments]  # agents work in a directory of their own
 
 
 class AgentFailedError(HarnessError):
@@ -55,7 +68,7 @@ class AgentProcess:
         output = self._rundir.agents / f"{self.agent_id}.log"
         self._process = await lab.spawn(
             self.agent_id,
-            [sys.executable, "-P", "-m", "ucp.node", path.name],
+            [*agent_command(scenario), path.name],
             cwd=self._rundir.agents,
             env=dict(os.environ),
             stdout=output,

@@ -256,8 +256,8 @@ class ProcessRun:
             self.played.counters = (await lab.read()).to_json()
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
             await asyncio.gather(*(agent.stop() for agent in self.agents), *(one.stop() for one in self.vehicles))
-        except NetemError:
-            pass  # the lab is gone, and everybody in it
+        except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed
+            self._ended_early(MachineError(str(error)))
         except OSError as error:
             self.played.outcome_detail = self.played.outcome_detail or f"{error.strerror}: {error.filename}"
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}

@@ -238,3 +238,40 @@ def test_where_user_namespaces_are_forbidden_a_run_and_doctor_say_so_with_status
         assert done.returncode == 3
         assert "sysctl user.max_user_namespaces=15000, or run as root" in " ".join((done.stdout + done.stderr).split())
         assert "Traceback" not in done.stderr
+
+
+def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: Path) -> None:
+    agent = executable(
+        tmp_path / "my-agent", f"#!/bin/sh\necho $1 >>{tmp_path}/started\nexec {sys.executable} -m ucp.node $2\n"
+    )
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=[str(agent), "--mine"])
+    done = harness("run", scenario, "--seed", 1, "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "started").read_text() == "--mine\n" * 3
+
+
+def test_an_agent_command_that_is_no_program_is_one_sentence_before_anything_starts(tmp_path: Path) -> None:
+    done = harness("run", write_scenario(tmp_path, agent_command=["./nowhere"]), "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert sentences(done.stderr) == ["`agent_command`: ./nowhere is no program: give a path, or a name on PATH"]
+
+
+def test_an_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> None:
+    agent = executable(tmp_path / "my-agent", "#!/bin/sh\necho no licence >&2\nexit 4\n")
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=[str(agent)])
+    done = harness("run", scenario, "--out", tmp_path / "run")
+    assert done.returncode == 1
+    assert re.match(r"agent \d ended by itself with status 4; its log is agents/\d\.log", sentences(done.stderr)[0])
+    assert (tmp_path / "run" / "agents" / "1.log").read_text() == "no licence\n"
+
+
+def test_a_lab_that_dies_is_blamed_and_not_the_agents_that_die_with_it(tmp_path: Path) -> None:
+    run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
+    run.wait_for_mission(1, 2, 3)
+    (unshare,) = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children").read_text().split()
+    os.kill(int(unshare), signal.SIGKILL)
+    status, _, err = run.end()
+    assert status == 3
+    assert sentences(err)[0].startswith("The lab's first process ended unexpectedly")
+    assert run.record()["outcome"] == "failed"
+    assert not processes(run.out)
