@@ -25,6 +25,11 @@ ANSWER_LIMIT_S = 10.0
 """Wall time after which an agent that does not answer counts as hung."""
 STOP_GRACE_S = 5.0
 ASK_AGAIN_S = 0.02
+STATUS = (
+    *("started", "idle", "reconcile_in_progress", "chain", "deque", "stack", "completed", "reconciles"),
+    *("top_chain_hash", "handled", "bytes_sent"),
+)
+"""What ucp/CONTRACT.md promises of an agent's status."""
 
 
 def agent_command(scenario: Scenario) -> list[str]:
@@ -62,7 +67,7 @@ class AgentProcess:
         self._process: LabProcess | None = None
 
     async def start(self, lab: Lab, scenario: Scenario, seed: int, initial_data: bytes, with_vehicle: bool) -> None:
-        """Start the process and wait until it answers. Raises AgentFailedError."""
+        """Start the process and wait until it answers. Raises AgentFailedError, AgentRefusedError."""
         mission = _mission(self.agent_id, lab, scenario, seed, initial_data, with_vehicle)
         path = self._rundir.write_mission(self.agent_id, mission)
         output = self._rundir.agents / f"{self.agent_id}.log"
@@ -78,7 +83,7 @@ class AgentProcess:
         deadline = asyncio.get_running_loop().time() + START_LIMIT_S
         while True:
             try:
-                self.status = await self._control.ask("status", timeout_s=ANSWER_LIMIT_S)
+                self._take(await self._control.ask("status", timeout_s=ANSWER_LIMIT_S))
                 return
             except AgentSilentError:
                 if self._process.returncode is not None:
@@ -102,7 +107,14 @@ class AgentProcess:
             raise self._failed("hung", f"stopped answering: {error}") from None
 
     async def poll(self) -> None:
-        self.status = await self.ask("status")
+        """Ask for the status. Raises AgentFailedError."""
+        self._take(await self.ask("status"))
+
+    def _take(self, status: dict[str, Any]) -> None:
+        missing = [key for key in STATUS if key not in status]
+        if missing:
+            raise self._failed("broken", f"does not follow the agent contract: its status lacks {', '.join(missing)}")
+        self.status = status
 
     async def export(self) -> None:
         """Have the chain exported. Raises AgentFailedError, or MachineError if the agent could not write it."""

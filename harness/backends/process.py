@@ -22,6 +22,7 @@ from netem.conditions import NetworkConditions
 from netem.errors import LabUnavailable, NetemError
 from netem.lab import Lab
 from sitl.vehicle import Home, VehicleKind, home_in_field
+from ucp.clock import MICROSECONDS, MissionClock
 
 POLL_S = 0.25
 QUIET_POLL_S = 0.1
@@ -83,7 +84,7 @@ class ProcessRun:
         ]
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
-        self._epoch_s: float | None = None  # wall time of mission second 0
+        self.clock = MissionClock(scenario.speedup)
         self._group = asyncio.TaskGroup()
         self._watchers: list[asyncio.Task[None]] = []
 
@@ -125,7 +126,7 @@ class ProcessRun:
 
     async def _watch_for_interruption(self) -> None:
         await self.interrupted.wait()
-        raise InterruptedRunError(f"the run was interrupted at mission second {self._mission_s():.0f}")
+        raise InterruptedRunError(f"the run was interrupted at mission second {self.clock.now():.0f}")
 
     # The story
 
@@ -173,14 +174,14 @@ class ProcessRun:
             self._watch(agent.watch())
 
     async def _start_clock(self) -> None:
-        epoch_s = time.time() + START_DELAY_S
-        await asyncio.gather(*(agent.ask("start", epoch_us=round(epoch_s * 1e6)) for agent in self.agents))
-        self._epoch_s = epoch_s
+        epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
+        await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
+        self.clock.start(epoch_us)
 
     async def _apply(self, lab: Lab, change: NetworkChange) -> None:
         applied = await lab.apply(change.conditions)
         self.network = change.detail
-        at_s = round(max(change.at_s, self._mission_s()), 3)
+        at_s = round(max(change.at_s, self.clock.now()), 3)
         record = {
             "at_s": at_s,
             "what": change.what,
@@ -191,13 +192,13 @@ class ProcessRun:
         self.rundir.append_network({**record, "asked": change.conditions.to_json(), "applied": applied.to_json()})
 
     async def _until(self, mission_s: float) -> None:
-        await asyncio.sleep(max(0.0, (mission_s - self._mission_s()) / self.scenario.speedup))
+        await asyncio.sleep(max(0.0, self.clock.wall_s(mission_s - self.clock.now())))
 
     async def _until_idle(self, limit_s: float) -> bool:
         """Wait until all agents are idle and nothing happens any more; False if `limit_s` mission seconds pass."""
-        deadline_s = self._mission_s() + limit_s
+        deadline_s = self.clock.now() + limit_s
         handled: list[int] | None = None
-        while self._mission_s() < deadline_s:
+        while self.clock.now() < deadline_s:
             await asyncio.gather(*(agent.poll() for agent in self.agents))
             before, handled = handled, [agent.status["handled"] for agent in self.agents]
             if all(agent.status["idle"] for agent in self.agents) and handled == before:
@@ -211,7 +212,7 @@ class ProcessRun:
         self.rundir.keep_exports_before_final_reconcile()
         self.stage = "final reconcile"
         conditions = NetworkConditions()
-        began_s = self._mission_s()
+        began_s = self.clock.now()
         self.played.final_reconcile = {"at_s": round(began_s, 3), "rounds": 0, "complete": False}
         await self._apply(lab, NetworkChange(began_s, "final reconcile", describe(conditions), conditions))
         for number in range(1, MAX_FINAL_ROUNDS + 1):
@@ -244,7 +245,7 @@ class ProcessRun:
     async def _wind_up(self, lab: Lab) -> None:
         """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""
         self._show("exporting")
-        self.played.mission_s = round(self._mission_s(), 1)
+        self.played.mission_s = round(self.clock.now(), 1)
         exported = await asyncio.gather(*(agent.export_finally() for agent in self.agents), return_exceptions=True)
         for error in exported:
             if error is not None and not isinstance(error, HarnessError):
@@ -259,18 +260,15 @@ class ProcessRun:
         except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed
             self._ended_early(MachineError(str(error)))
         except OSError as error:
-            self.played.outcome_detail = self.played.outcome_detail or f"{error.strerror}: {error.filename}"
+            self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
-
-    def _mission_s(self) -> float:
-        return 0.0 if self._epoch_s is None else max(0.0, (time.time() - self._epoch_s) * self.scenario.speedup)
 
     def _show(self, stage: str) -> None:
         self.stage = stage
         self.progress.show(
             Snapshot(
                 stage,
-                self._mission_s(),
+                self.clock.now(),
                 self.scenario.duration_s,
                 self.network,
                 {agent.agent_id: agent.status for agent in self.agents},

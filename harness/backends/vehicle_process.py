@@ -102,6 +102,8 @@ class VehicleProcess:
             record["real_time_factor"] = None if factor is None else round(factor, 4)
             if state.position is not None:
                 record["altitude_m"] = round(state.position.relative_alt_m, 1)
+            if state.log_error is not None:
+                record["telemetry_log_error"] = state.log_error
             if state.texts:
                 record["last_text"] = state.texts[-1]
         return record

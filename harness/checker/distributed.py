@@ -53,7 +53,7 @@ def check(evidence: Evidence) -> Characteristic:
         )
     damaged = [agent_id for agent_id, trace in evidence.traces.items() if trace.problem]
     if damaged:
-        return Characteristic(NAME, "not applicable", f"the trace of {agents(damaged)} is damaged")
+        return Characteristic(NAME, "not applicable", f"the trace of {agents(damaged)} is incomplete")
     return Characteristic(
         NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent"
     )

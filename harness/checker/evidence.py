@@ -95,8 +95,11 @@ def gather(paths: Iterable[Path]) -> Evidence:
             if trace is None:
                 errors.append(f"{path}: not a trace; it is left out")
                 continue
+            agent = record.agents.get(str(trace.header.agent_id)) if record else None
+            if agent is not None and agent.trace_problem:
+                trace.problem = f"it ends early: {agent.trace_problem}"
             if trace.problem:
-                errors.append(f"{path}: {trace.problem}; it is read up to there")
+                errors.append(f"{path}: {trace.problem}; what is there is read")
             evidence_traces.setdefault(trace.header.agent_id, trace)
     return Evidence(exports.by_agent, evidence_traces, record, errors + exports.errors)
 

@@ -279,3 +279,11 @@ def test_whatever_a_run_directory_holds_there_is_a_verdict(run_dir: Path, data: 
     finally:
         trace.write_text(kept[0])
         record.write_text(kept[1])
+
+
+def test_a_trace_that_a_full_disk_ended_is_never_taken_for_a_whole_one(run_dir: Path) -> None:
+    full = {"outcome": "exported", "trace_problem": "No space left on device"}
+    edit(run_dir / "run.json", lambda record: record.update(agents={"3": full}))
+    result = check(gather([run_dir]))
+    assert "3.trace.jsonl: it ends early: No space left on device" in result.errors[0]
+    assert result.characteristics["1"].verdict == "not applicable"

@@ -275,3 +275,22 @@ def test_a_lab_that_dies_is_blamed_and_not_the_agents_that_die_with_it(tmp_path:
     assert sentences(err)[0].startswith("The lab's first process ended unexpectedly")
     assert run.record()["outcome"] == "failed"
     assert not processes(run.out)
+
+
+def test_an_agent_that_does_not_follow_the_contract_is_told_so(tmp_path: Path) -> None:
+    program = """
+import os, socket, sys
+control = sys.argv[1].replace("mission.json", "control")
+with socket.socket(socket.AF_UNIX) as server:
+    server.bind(control)
+    server.listen()
+    client, _ = server.accept()
+    client.recv(1000)
+    client.sendall(b'{"ok": true, "idle": true}\\n')
+    client.recv(1000)
+"""
+    agent = executable(tmp_path / "my-agent", f"#!{sys.executable}\n{program}")
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=[str(agent)])
+    done = harness("run", scenario, "--out", tmp_path / "run")
+    assert done.returncode == 1
+    assert "does not follow the agent contract: its status lacks started, reconcile_in_progress" in done.stderr
