@@ -62,11 +62,15 @@ def test_after_loss_equal_chains_hold_and_different_ones_do_not_apply(tmp_path: 
     assert verdicts(result) == "hhhhhh"
 
 
-def missed_last_block() -> Air:
+def missed_last_block(reconcile_before: bool = False) -> Air:
     """Fully connected but for one lost commit after which nobody votes: agent 2 stays different."""
     air = Air([1, 2, 3])
     air.fill_block(1)
     air.settle()
+    if reconcile_before:
+        air.agents[2].begin_reconcile(air.now)
+        air.flush(2)
+        air.settle()
     latency = air.fate
     air.fate = lambda s, r, m: [] if isinstance(m, CommitBlock) and r == 2 else latency(s, r, m)
     air.fill_block(3)
@@ -75,8 +79,9 @@ def missed_last_block() -> Air:
     return air
 
 
-def test_a_difference_that_no_vote_could_find_does_not_apply(tmp_path: Path) -> None:
-    result = check(gather([write_run(missed_last_block(), tmp_path / "run", CONNECTED)]))
+@pytest.mark.parametrize("reconcile_before", [False, True])
+def test_a_difference_that_no_vote_could_find_does_not_apply(tmp_path: Path, reconcile_before: bool) -> None:
+    result = check(gather([write_run(missed_last_block(reconcile_before), tmp_path / "run", CONNECTED)]))
     assert verdicts(result) == "hhhhnn"
     assert "agent 2 differs by blocks after which neither a vote nor a reconcile took place" in reason(result, "6")
 
