@@ -1,8 +1,13 @@
 """Tests marked `lab` need private network namespaces: skipped where the machine has none, saying why."""
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.machine import require
+
+# How fast a machine is, is no property of the code.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 
 @pytest.fixture(autouse=True)

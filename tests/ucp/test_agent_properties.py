@@ -78,7 +78,7 @@ def test_well_formed_messages_of_a_liar_never_break_characteristics_2_and_3(lies
         assert not agent.idle or set(agent.completed) <= {block.block_hash for block in agent.chain}
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(
     agents=st.integers(1, 7),
     loss=st.sampled_from([0.0, 0.1, 0.3, 0.6, 1.0]),
@@ -111,7 +111,7 @@ def test_characteristics_2_to_4_hold_after_every_step(
             assert_characteristics_2_to_4(agent, completed_by)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(loss=st.sampled_from([0.0, 0.15, 0.5]), seed=st.integers(0, 2**32))
 def test_equal_inputs_give_equal_outputs_and_traces_replay_to_the_state(loss: float, seed: int) -> None:
     def run() -> Air:

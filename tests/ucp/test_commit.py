@@ -59,6 +59,18 @@ def test_an_approved_block_is_committed_by_everybody() -> None:
     assert all(agent.reconciles == 0 for agent in air.agents.values())
 
 
+def test_blocks_wait_their_turn_while_a_vote_runs() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    first = air.fill_block(1)
+    air.run_until(4.0)
+    second = air.fill_block(1)
+    assert air.branches(1, "process_next_deque_block") == ["proposed", "vote running"]
+    air.run_until(10.0)
+    assert [block.block_hash for block in air.agents[1].chain] == [first]
+    air.run_until(20.0)
+    assert [block.block_hash for block in air.agents[1].chain] == [first, second]
+
+
 def test_a_responder_counts_once_per_round() -> None:
     air = Air([1, 2, 3], fate=lambda *_: [])
     block_hash = air.fill_block(1)

@@ -211,6 +211,14 @@ def test_a_responder_of_phase_2_counts_once_and_only_for_the_chain_asked_about()
     assert air.branches(1, "receive_response_next_in_sequence")[-1] == "not in phase 2"
 
 
+def test_a_block_that_was_not_asked_for_does_not_delay_the_end_of_phase_3() -> None:
+    air, _ = phase_2([(A, 5)])  # phase 3 begins at 10 s
+    air.agents[1].receive_message(2, 3, BlockResponse(Block(2, 1, b"other")), 13.0)
+    assert air.agents[1].next_timer() == 15.0
+    air.settle()
+    assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
+
+
 def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever() -> None:
     air = Air([1, 2, 3], fate=lambda *_: [])
     agent = air.agents[1]
