@@ -267,7 +267,7 @@ strange = st.recursive(
 )
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=60)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 @given(data=st.data())
 def test_whatever_a_run_directory_holds_there_is_a_verdict(run_dir: Path, data: st.DataObject) -> None:
     trace, record = run_dir / "agents" / "2.trace.jsonl", run_dir / "run.json"

@@ -3,7 +3,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sitl.kinematics import CIRCLE_RADIUS_M, CIRCLE_SPEED_MS, CLIMB_MS, DESCENT_MS, Copter, Motion, Phase
@@ -63,7 +63,6 @@ def test_it_takes_off_again_from_where_it_landed() -> None:
     assert copter.motion.up_m == pytest.approx(10.0)
 
 
-@settings(deadline=None)  # a busy machine is not a failure
 @given(steps, st.floats(0, 359), st.lists(st.sampled_from(["land", "hold", "nothing"]), max_size=30))
 def test_it_never_jumps_nor_goes_underground(waits: list[float], heading: float, wishes: list[str]) -> None:
     copter, now = flying(20.0, heading), 0.0
@@ -79,7 +78,6 @@ def test_it_never_jumps_nor_goes_underground(waits: list[float], heading: float,
         assert copter.motion.up_m >= 0.0
 
 
-@settings(deadline=None)  # a busy machine is not a failure
 @given(steps)
 def test_the_track_does_not_depend_on_the_steps(waits: list[float]) -> None:
     fine, coarse = flying(), flying()

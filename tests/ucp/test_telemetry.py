@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -170,7 +170,6 @@ def test_what_is_kept_between_reads_is_bounded() -> None:
         assert len(events._parser.buf) < 2 * len(frame)
 
 
-@settings(deadline=None)  # a busy machine is not a failure
 @given(st.lists(st.binary(max_size=600), max_size=10))
 def test_random_bytes_raise_nothing(reads: list[bytes]) -> None:
     events = source()
@@ -203,7 +202,6 @@ _KINDS = (
 )
 
 
-@settings(deadline=None)  # a busy machine is not a failure
 @given(st.data(), st.lists(st.sampled_from(_KINDS), min_size=1, max_size=12))
 def test_well_formed_messages_with_any_values_make_readable_events(data: st.DataObject, kinds: list[Any]) -> None:
     events = source()
@@ -216,7 +214,6 @@ def test_well_formed_messages_with_any_values_make_readable_events(data: st.Data
             assert not unreadable or event_id == STATUS_TEXT  # MAV_SEVERITY ends at 7
 
 
-@settings(deadline=None)  # a busy machine is not a failure
 @given(st.integers(-5, 300), st.binary(max_size=300))
 def test_anything_can_be_described(event_id: int, data: bytes) -> None:
     described = describe(event_id, data)

@@ -4,7 +4,7 @@ import itertools
 import time
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.naming import name_blocks
@@ -70,7 +70,6 @@ def swarms(draw: st.DrawFn) -> dict[int, list[str]]:
     return chains
 
 
-@settings(deadline=None)
 @given(swarms(), st.booleans())
 def test_no_boxes_overlap_and_no_link_runs_through_one(chains: dict[int, list[str]], abridged: bool) -> None:
     assert_readable(layout(chains, abridged=abridged))

@@ -217,7 +217,7 @@ KEYS = list(result_of([1]))[1:]
 SCENARIO_KEYS = list(result_of([1])["scenario"])
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.dictionaries(st.sampled_from(KEYS), JSON), st.dictionaries(st.sampled_from(SCENARIO_KEYS), JSON))
 def test_whatever_the_result_holds_there_is_a_report(
     tmp_path: Path, result: dict[str, Any], scenario: dict[str, Any]
