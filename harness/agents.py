@@ -6,9 +6,32 @@ import os
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ConfigDict
+
 from harness.errors import VIOLATED, HarnessError
 
 ANSWER_LIMIT_BYTES = 1024 * 1024
+
+
+class Status(BaseModel):
+    """What ucp/CONTRACT.md promises of an agent's status, and what the default agent says besides."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    started: bool
+    idle: bool
+    reconcile_in_progress: bool
+    chain: int
+    deque: int
+    stack: int
+    completed: int
+    reconciles: int
+    top_chain_hash: str
+    handled: int
+    bytes_sent: int
+    dropped: dict[str, int] = {}
+    send_failures: int | None = None
+    trace_problem: str | None = None
 
 
 class AgentSilentError(Exception):
@@ -35,7 +58,7 @@ class AgentControl:
             try:
                 async with asyncio.timeout(timeout_s):
                     answer = await self._exchange({"command": command, **arguments})
-            except (TimeoutError, OSError, ValueError) as error:
+            except (TimeoutError, OSError, ValueError, RecursionError) as error:
                 self.close()
                 what = f"no answer to {command} for {timeout_s:g} s" if isinstance(error, TimeoutError) else str(error)
                 raise AgentSilentError(what) from None

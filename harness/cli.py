@@ -20,7 +20,7 @@ from harness import checker, progress
 from harness.doctor import examine
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, HarnessError
 from harness.run import Run, run
-from harness.rundir import RunDirectory, default_path
+from harness.rundir import default_path
 from harness.scenario import Scenario, load_scenario
 
 app = typer.Typer(
@@ -54,9 +54,9 @@ def run_command(
     """Play a scenario, check the six characteristics, write a report."""
     console = Console()
     request = _with_options(load_scenario(scenario), speedup, vehicles)
-    directory = RunDirectory(out or default_path(request.name))
+    directory = (out or default_path(request.name)).absolute()
     chosen_seed = secrets.randbelow(2**32) if seed is None else seed
-    console.print(f"{request.name}, seed {chosen_seed}, into {directory.path}", highlight=False, soft_wrap=True)
+    console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
     shown = progress.for_console(console)
     try:
         finished = run(request, chosen_seed, directory, shown)

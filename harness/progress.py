@@ -6,7 +6,7 @@ On a terminal a live table; elsewhere (CI logs) a line every few seconds.
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -14,18 +14,20 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from harness.agents import Status
+
 LINE_EVERY_S = 10.0
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The swarm at one moment: mission seconds, and each agent's last status (empty before its first)."""
+    """The swarm at one moment: mission seconds, and each agent's last status (None before its first)."""
 
     stage: str
     mission_s: float
     duration_s: float
     network: str
-    statuses: Mapping[int, Mapping[str, Any]]
+    statuses: Mapping[int, Status | None]
 
 
 class Progress(Protocol):
@@ -57,9 +59,10 @@ class Lines:
             return
         self._stage, self._last = snapshot.stage, now
         line = f"{_minutes(snapshot.mission_s)} {snapshot.stage}"
-        if snapshot.statuses:
-            chains = " ".join(f"{agent}:{status.get('chain', '-')}" for agent, status in snapshot.statuses.items())
-            reconciling = [agent for agent, status in snapshot.statuses.items() if status.get("reconcile_in_progress")]
+        if any(snapshot.statuses.values()):
+            known = {agent: status for agent, status in snapshot.statuses.items() if status}
+            chains = " ".join(f"{agent}:{status.chain}" for agent, status in known.items())
+            reconciling = [agent for agent, status in known.items() if status.reconcile_in_progress]
             line += f"; chain lengths {chains}; {_reconciling(reconciling)}; {snapshot.network}"
         self._console.print(line, highlight=False, soft_wrap=True)
 
@@ -91,9 +94,12 @@ def _render(snapshot: Snapshot) -> RenderableType:
         table.add_column(justify="right")
     table.add_row("agent", "chain", "waiting", "completed", "reconciles", "", style="dim")
     for agent, status in snapshot.statuses.items():
-        doing = "reconciling" if status.get("reconcile_in_progress") else "" if status.get("idle") else "voting"
-        numbers = (str(status.get(key, "-")) for key in ("chain", "deque", "completed", "reconciles"))
-        table.add_row(str(agent), *numbers, Text(doing, style="yellow" if doing == "reconciling" else ""))
+        if status is None:
+            table.add_row(str(agent))
+            continue
+        doing = "reconciling" if status.reconcile_in_progress else "" if status.idle else "voting"
+        numbers = (status.chain, status.deque, status.completed, status.reconciles)
+        table.add_row(str(agent), *map(str, numbers), Text(doing, style="yellow" if doing == "reconciling" else ""))
     elapsed_s, over_s = min(snapshot.mission_s, snapshot.duration_s), snapshot.mission_s - snapshot.duration_s
     times = f"{_minutes(elapsed_s)} of {_minutes(snapshot.duration_s)}{f' + {_minutes(over_s)}' if over_s >= 1 else ''}"
     head = Table.grid(padding=(0, 2))

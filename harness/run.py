@@ -16,7 +16,7 @@ from harness import checker, report
 from harness.backends.agent_process import agent_command
 from harness.backends.process import Played, ProcessRun
 from harness.backends.vehicle_process import VehicleFailedError
-from harness.errors import VIOLATED, MachineError, RunDirectoryError
+from harness.errors import VIOLATED, HarnessError, MachineError, RunDirectoryError
 from harness.progress import Progress
 from harness.record import RunRecord
 from harness.rundir import RunDirectory
@@ -41,13 +41,14 @@ class Run:
     report: Path
 
 
-def run(scenario: Scenario, seed: int, directory: RunDirectory, progress: Progress) -> Run:
-    """Play `scenario` and judge it. Raises HarnessError if it cannot even begin.
+def run(scenario: Scenario, seed: int, out: Path, progress: Progress) -> Run:
+    """Play `scenario` and judge it, into the new or empty directory `out`. Raises HarnessError if it cannot even begin.
 
     Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
     """
     kind = choose_vehicles(scenario)
     agent_command(scenario)
+    directory = RunDirectory(out)
     started = time.monotonic()
     started_at = datetime.now(UTC)
     # Another run is another mission: its blocks must not be taken for this one's.
@@ -61,7 +62,11 @@ def run(scenario: Scenario, seed: int, directory: RunDirectory, progress: Progre
         started_at=started_at.isoformat(timespec="seconds").replace("+00:00", "Z"),
     )
     directory.write_record(record)
-    played = asyncio.run(_play(scenario, seed, kind, initial_data, directory, progress))
+    try:
+        played = asyncio.run(_play(scenario, seed, kind, initial_data, directory, progress))
+    except HarnessError as error:
+        directory.write_record(_updated(record, outcome="failed", outcome_detail=str(error)))
+        raise
     record = _updated(
         record,
         engine=played.engine,

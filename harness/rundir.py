@@ -19,7 +19,7 @@ from harness.checker.evidence import RUN_FILE
 from harness.errors import MachineError, RunDirectoryError
 from harness.exports import BEFORE_FINAL_RECONCILE, export_paths
 from harness.record import RunRecord
-from ucp.files import write_atomically
+from ucp.files import write_json_atomically
 
 
 class RunDirectory:
@@ -48,7 +48,7 @@ class RunDirectory:
 
     def write_mission(self, agent_id: int, mission: Mapping[str, Any]) -> Path:
         path = self.agents / f"{agent_id}.mission.json"
-        write_atomically(path, dict(mission))
+        write_json_atomically(path, dict(mission))
         return path
 
     def keep_exports_before_final_reconcile(self) -> None:
@@ -65,7 +65,7 @@ class RunDirectory:
     def write_record(self, record: RunRecord) -> None:
         """Write run.json whole or not at all. Raises MachineError if the disk is full."""
         try:
-            write_atomically(self.path / RUN_FILE, record.to_json())
+            write_json_atomically(self.path / RUN_FILE, record.to_json())
         except OSError as error:
             raise MachineError(
                 f"{self.path / RUN_FILE} cannot be written: {error.strerror}; what the run left is there, and "

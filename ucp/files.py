@@ -7,13 +7,20 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 
-def write_atomically(path: Path, document: dict[str, Any]) -> None:
-    """Write JSON so that `path` holds either the old document or all of the new. Raises OSError (disk full, ...)."""
+def write_json_atomically(path: Path, document: dict[str, Any]) -> None:
+    """Write JSON as `write_atomically` does."""
+    write_atomically(path, json.dumps(document, indent=1) + "\n")
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write so that `path` holds either the old text or all of the new. Raises OSError (disk full, ...).
+
+    Half a character, which JSON can hold and UTF-8 cannot, is written as a question mark.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("w", encoding="ascii") as file:
-            json.dump(document, file, indent=1)
-            file.write("\n")
+        with temporary.open("w", encoding="utf-8", errors="replace") as file:
+            file.write(text)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)

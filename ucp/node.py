@@ -23,7 +23,7 @@ from ucp.clock import MissionClock
 from ucp.control import CommandError, ControlServer
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.export import export_chain
-from ucp.files import TraceFile, write_atomically
+from ucp.files import TraceFile, write_json_atomically
 from ucp.mission import Mission, MissionError, load_mission
 from ucp.trace import header_line
 
@@ -94,7 +94,7 @@ class Node:
         """Write the chain export whole or not at all. Raises OSError."""
         path = self._directory / f"{self.mission.agent_id}.chain.json"
         now = self.clock.now()
-        write_atomically(path, export_chain(self.agent, self.clock.timestamp_us(now)))
+        write_json_atomically(path, export_chain(self.agent, self.clock.timestamp_us(now)))
         return path
 
     # Inputs of the agent

@@ -11,7 +11,9 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from harness.agents import AgentControl, AgentRefusedError, AgentSilentError
+from pydantic import ValidationError
+
+from harness.agents import AgentControl, AgentRefusedError, AgentSilentError, Status
 from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
@@ -25,11 +27,6 @@ ANSWER_LIMIT_S = 10.0
 """Wall time after which an agent that does not answer counts as hung."""
 STOP_GRACE_S = 5.0
 ASK_AGAIN_S = 0.02
-STATUS = (
-    *("started", "idle", "reconcile_in_progress", "chain", "deque", "stack", "completed", "reconciles"),
-    *("top_chain_hash", "handled", "bytes_sent"),
-)
-"""What ucp/CONTRACT.md promises of an agent's status."""
 
 
 def agent_command(scenario: Scenario) -> list[str]:
@@ -55,11 +52,11 @@ class AgentFailedError(HarnessError):
 
 
 class AgentProcess:
-    """`status` is the agent's last answer to `status`; `outcome` what became of it, for run.json."""
+    """`status` is the agent's last, None before the first; `outcome` is what became of it, for run.json."""
 
     def __init__(self, agent_id: int, rundir: RunDirectory) -> None:
         self.agent_id = agent_id
-        self.status: dict[str, Any] = {}
+        self.status: Status | None = None
         self.outcome = "not started"
         self.detail: str | None = None
         self._rundir = rundir
@@ -101,20 +98,25 @@ class AgentProcess:
         """Raises AgentFailedError if the agent does not answer, AgentRefusedError if it cannot."""
         try:
             return await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
+        except AgentRefusedError as error:
+            raise AgentRefusedError(f"agent {self.agent_id} refused to {command}: {error}") from None
         except AgentSilentError as error:
             if self._process is not None and self._process.returncode is not None:
                 raise self._crashed(self._process.returncode) from None
             raise self._failed("hung", f"stopped answering: {error}") from None
 
-    async def poll(self) -> None:
+    async def poll(self) -> Status:
         """Ask for the status. Raises AgentFailedError."""
-        self._take(await self.ask("status"))
+        return self._take(await self.ask("status"))
 
-    def _take(self, status: dict[str, Any]) -> None:
-        missing = [key for key in STATUS if key not in status]
-        if missing:
-            raise self._failed("broken", f"does not follow the agent contract: its status lacks {', '.join(missing)}")
-        self.status = status
+    def _take(self, status: dict[str, Any]) -> Status:
+        try:
+            self.status = Status.model_validate(status)
+        except ValidationError as error:
+            wrong = ", ".join(dict.fromkeys(str(problem["loc"][0]) for problem in error.errors()))
+            detail = f"does not follow the agent contract: in its status {wrong} is missing or wrong"
+            raise self._failed("broken", detail) from None
+        return self.status
 
     async def export(self) -> None:
         """Have the chain exported. Raises AgentFailedError, or MachineError if the agent could not write it."""
@@ -123,9 +125,7 @@ class AgentProcess:
             await self.ask("export")
         except AgentRefusedError as error:
             self.outcome, self.detail = "not exported", str(error)
-            raise MachineError(
-                f"agent {self.agent_id} {error}; free some space, what was written before is there"
-            ) from None
+            raise MachineError(f"{error}; what was written before is there") from None
 
     async def export_finally(self) -> None:
         """The last export, of an agent that still runs. Raises as `export`."""
@@ -143,8 +143,9 @@ class AgentProcess:
                 await self._process.terminate(STOP_GRACE_S)
 
     def to_json(self) -> dict[str, Any]:
-        counters = {key: self.status.get(key) for key in ("bytes_sent", "dropped", "send_failures", "trace_problem")}
-        return {"outcome": self.outcome, "detail": self.detail, "idle": self.status.get("idle"), **counters}
+        told = {"idle", "bytes_sent", "dropped", "send_failures", "trace_problem"}
+        status = self.status.model_dump(include=told) if self.status else {}
+        return {"outcome": self.outcome, "detail": self.detail, **status}
 
     def _crashed(self, returncode: int) -> AgentFailedError:
         how = signal.Signals(-returncode).name if returncode < 0 else f"status {returncode}"

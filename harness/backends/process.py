@@ -199,9 +199,9 @@ class ProcessRun:
         deadline_s = self.clock.now() + limit_s
         handled: list[int] | None = None
         while self.clock.now() < deadline_s:
-            await asyncio.gather(*(agent.poll() for agent in self.agents))
-            before, handled = handled, [agent.status["handled"] for agent in self.agents]
-            if all(agent.status["idle"] for agent in self.agents) and handled == before:
+            statuses = await asyncio.gather(*(agent.poll() for agent in self.agents))
+            before, handled = handled, [status.handled for status in statuses]
+            if all(status.idle for status in statuses) and handled == before:
                 return True
             await asyncio.sleep(QUIET_POLL_S)
         return False
@@ -216,18 +216,18 @@ class ProcessRun:
         self.played.final_reconcile = {"at_s": round(began_s, 3), "rounds": 0, "complete": False}
         await self._apply(lab, NetworkChange(began_s, "final reconcile", describe(conditions), conditions))
         for number in range(1, MAX_FINAL_ROUNDS + 1):
-            before = self._tops()
+            before = await self._tops()
             for agent in self.agents:
                 await agent.ask("reconcile")
                 if not await self._until_idle(self.scenario.settle.limit_s):
                     return
             self.played.final_reconcile["rounds"] = number
-            if self._tops() == before:
+            if await self._tops() == before:
                 self.played.final_reconcile["complete"] = True
                 return
 
-    def _tops(self) -> list[str]:
-        return [agent.status["top_chain_hash"] for agent in self.agents]
+    async def _tops(self) -> list[str]:
+        return [status.top_chain_hash for status in await asyncio.gather(*(agent.poll() for agent in self.agents))]
 
     async def _poll_agents(self) -> None:
         while True:

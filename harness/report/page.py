@@ -5,7 +5,6 @@ Whatever comes from agents and scenarios is text to the template, which escapes 
 """
 
 import base64
-import contextlib
 import hashlib
 import os
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.colours import Ink
 from harness.report.result import mapping, number, read_result
+from ucp.files import write_atomically
 
 FIGURES = {
     "blocks": "blocks completed",
@@ -51,9 +51,9 @@ def write_report(run_dir: Path) -> Path:
     result = read_result(run_dir / "run.json")
     exports = read_exports(export_paths(run_dir))
     ink = swarm.agent_inks(result, exports.by_agent)
-    _write_atomically(run_dir / "chains.svg", ChainTreePicture(exports.by_agent, ink).standalone())
+    _write(run_dir / "chains.svg", ChainTreePicture(exports.by_agent, ink).standalone())
     page = run_dir / "report.html"
-    _write_atomically(page, _page(result, exports, ink, run_dir))
+    _write(page, _page(result, exports, ink, run_dir))
     return page
 
 
@@ -155,14 +155,8 @@ def _outcome(result: dict[str, Any]) -> tuple[str, str] | None:
     return f"This run did not complete: {words.value(outcome)}", words.value(detail or "")
 
 
-def _write_atomically(path: Path, text: str) -> None:
-    """So that `path` holds the old report or the new one, never half of one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def _write(path: Path, text: str) -> None:
     try:
-        temporary.write_text(text, encoding="utf-8", errors="replace")  # JSON can hold half a character
-        temporary.replace(path)
+        write_atomically(path, text)
     except OSError as error:
         raise RunDirectoryError(f"{path}: cannot be written: {error.strerror}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)

@@ -22,10 +22,8 @@ def fly(loss: float = 0.0, seed: int = 1, agents: int = 5, duration_s: float = 6
 def reconcile_all(air: Air) -> None:
     air.fate = uniform_latency(Random(9))
     for _ in range(3):
-        for agent_id, agent in air.agents.items():
-            agent.begin_reconcile(air.now)
-            air.flush(agent_id)
-            air.settle()
+        for agent_id in air.agents:
+            air.reconcile(agent_id)
 
 
 def write_exports(air: Air, directory: Path, traces: bool = True) -> list[Path]:

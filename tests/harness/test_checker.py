@@ -68,9 +68,7 @@ def missed_last_block(reconcile_before: bool = False) -> Air:
     air.fill_block(1)
     air.settle()
     if reconcile_before:
-        air.agents[2].begin_reconcile(air.now)
-        air.flush(2)
-        air.settle()
+        air.reconcile(2)
     latency = air.fate
     air.fate = lambda s, r, m: [] if isinstance(m, CommitBlock) and r == 2 else latency(s, r, m)
     air.fill_block(3)

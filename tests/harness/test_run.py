@@ -147,6 +147,7 @@ def test_a_vehicle_binary_that_will_not_do_is_one_sentence_before_anything_start
         (said,) = sentences(done.stderr)
         assert sentence in said
         assert str(binary) in said
+    assert not list(tmp_path.glob("run-*"))
 
 
 def test_asking_for_ardupilot_without_having_it_says_how_to_get_it(tmp_path: Path) -> None:
@@ -238,6 +239,7 @@ def test_where_user_namespaces_are_forbidden_a_run_and_doctor_say_so_with_status
         assert done.returncode == 3
         assert "sysctl user.max_user_namespaces=15000, or run as root" in " ".join((done.stdout + done.stderr).split())
         assert "Traceback" not in done.stderr
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["outcome"] == "failed"
 
 
 def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: Path) -> None:
@@ -293,4 +295,4 @@ with socket.socket(socket.AF_UNIX) as server:
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=[str(agent)])
     done = harness("run", scenario, "--out", tmp_path / "run")
     assert done.returncode == 1
-    assert "does not follow the agent contract: its status lacks started, reconcile_in_progress" in done.stderr
+    assert "does not follow the agent contract: in its status started, reconcile_in_progress" in done.stderr

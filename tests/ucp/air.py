@@ -47,6 +47,12 @@ class Air:
             self.log(agent_id)
         return agent.completed[-1]
 
+    def reconcile(self, agent_id: int) -> None:
+        """Have the agent reconcile, and wait until all are done."""
+        self.agents[agent_id].begin_reconcile(self.now)
+        self.flush(agent_id)
+        self.settle()
+
     def flush(self, agent_id: int) -> None:
         """Put what the agent broadcasts on the air."""
         agent = self.agents[agent_id]

@@ -41,10 +41,8 @@ def test_at_15_percent_loss_no_block_is_lost_and_a_final_reconcile_makes_one_cha
     assert completed <= {block_hash for chain in air.chains() for block_hash in chain}
     air.fate = uniform_latency(Random(seed))
     for _ in range(3):
-        for agent_id, agent in air.agents.items():
-            agent.begin_reconcile(air.now)
-            air.flush(agent_id)
-            air.settle()
+        for agent_id in air.agents:
+            air.reconcile(agent_id)
     assert len(set(air.chains())) == 1
     assert set(air.chains()[0]) == completed
 

@@ -42,9 +42,7 @@ def test_an_outvoted_agent_rebuilds_on_the_majority_s_chain_and_gives_back_its_o
     air = diverged(blocks_on_2=2)
     (own,) = air.agents[1].completed
     theirs = tuple(air.agents[2].completed)
-    air.agents[1].begin_reconcile(air.now)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert air.chains() == [(*theirs, own)] * 3
     assert air.branches(1, "reconcile_phase_1_timer_expiration") == ["not contained", "contained"]
     assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["block", "block", "top of chain"]
@@ -67,9 +65,7 @@ def test_blocks_popped_in_phase_1_are_taken_from_the_stack_and_not_asked_for() -
     own = next(iter(air.agents[1].chain))
     for agent_id in (2, 3):
         air.agents[agent_id].commit(own)
-    air.agents[1].begin_reconcile(air.now)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert air.branches(1, "reconcile_phase_3") == ["asked", "from the stack"]
     assert len(set(air.chains())) == 1
 
@@ -80,18 +76,14 @@ def test_a_queried_agent_that_does_not_have_the_chain_reconciles_too() -> None:
     air.fill_block(1)
     air.settle()
     air.fate = uniform_latency(Random(3))
-    air.agents[1].begin_reconcile(air.now)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert "diverged" in air.branches(3, "receive_request_next_in_sequence")
     assert len(set(air.chains())) == 1
 
 
 def test_nobody_answers_phase_1() -> None:
     air = Air([1, 2], fate=lambda *_: [])
-    air.agents[1].begin_reconcile(0.0)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert air.now == 5.0
     assert air.branches(1, "reconcile_phase_1_timer_expiration") == ["no response"]
     assert air.agents[1].idle
@@ -101,9 +93,7 @@ def test_nobody_answers_phase_2() -> None:
     air = diverged()
     latency = air.fate
     air.fate = lambda s, r, m: [] if isinstance(m, NextInSequenceResponse) else latency(s, r, m)
-    air.agents[1].begin_reconcile(air.now)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["no response"]
     assert len(air.agents[1].chain) == 1  # its own block went back on top
 
@@ -112,9 +102,7 @@ def test_no_block_comes_in_phase_3_and_the_rest_of_the_stack_goes_back() -> None
     air = diverged()
     latency = air.fate
     air.fate = lambda s, r, m: [] if isinstance(m, BlockResponse) else latency(s, r, m)
-    air.agents[1].begin_reconcile(air.now)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
     assert len(air.agents[1].chain) == 1
     assert air.agents[1].majority_response_block_hash is None
@@ -260,9 +248,7 @@ def test_finalize_pauses_between_commits_and_the_others_follow() -> None:
     air.fill_block(2)
     air.settle()
     air.fate = uniform_latency(Random(3))
-    air.agents[1].begin_reconcile(air.now)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert air.branches(1, "reconcile_finalize") == ["recommitted, more to come", "recommitted, more to come", "done"]
     recommits = [
         run.t
@@ -276,9 +262,7 @@ def test_finalize_pauses_between_commits_and_the_others_follow() -> None:
 
 def test_without_a_gap_finalize_commits_all_at_once() -> None:
     air = diverged(finalize_gap_s=0.0)
-    air.agents[1].begin_reconcile(air.now)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert air.branches(1, "reconcile_finalize") == ["done"]
 
 
@@ -310,8 +294,6 @@ def test_a_divergence_of_50_blocks_is_reconciled() -> None:
         air.fill_block(2)
         air.settle()
     air.fate = uniform_latency(Random(3))
-    air.agents[1].begin_reconcile(air.now)
-    air.flush(1)
-    air.settle()
+    air.reconcile(1)
     assert len(set(air.chains())) == 1
     assert len(air.agents[1].chain) == 100
