@@ -20,7 +20,8 @@ from harness.errors import VIOLATED, HarnessError, MachineError, RunDirectoryErr
 from harness.progress import Progress
 from harness.record import RunRecord
 from harness.rundir import RunDirectory
-from harness.scenario import Scenario, VehicleKind
+from harness.scenario import Scenario
+from harness.scenario.vehicles import VehicleKind
 from sitl.ardupilot import ArduPilot
 from sitl.embedded import Embedded
 from sitl.vehicle import NoBinaryError, UnusableBinaryError

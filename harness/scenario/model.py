@@ -1,0 +1,23 @@
+"""What all parts of a scenario share: strict models, and the types of their values."""
+
+import reprlib
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from ucp.block import MAX_AGENT_ID
+
+MAX_AGENTS = 1000
+
+BOUNDED = reprlib.Repr()  # a few lines of YAML aliases can stand for gigabytes
+BOUNDED.maxlevel = 2
+
+Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Instant = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+"""Mission seconds since the start."""
+VehicleId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]
+
+
+class Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)

@@ -1,0 +1,105 @@
+"""One experiment, whole: `Scenario.model_json_schema()` documents every key."""
+
+import dataclasses
+from collections import Counter
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator, model_validator
+
+from harness.scenario.events import Events
+from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds
+from harness.scenario.network import NetworkModel
+from harness.scenario.timeline import TimelineEntry
+from harness.scenario.vehicles import Vehicles
+from netem.errors import ConditionsError
+from ucp.block import MAX_AGENT_ID
+from ucp.settings import Quirks, Settings
+
+
+class Settle(Model):
+    """After the mission the agents finish their votes and reconciles, for at most `limit_s` mission seconds."""
+
+    limit_s: Seconds = 1800.0
+
+
+class Scenario(Model):
+    """One experiment. Times are mission seconds."""
+
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    about: Annotated[str, Field(max_length=2000)] = ""
+    agents: int | list[int] = 5
+    duration_s: Seconds = 1200.0
+    speedup: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    network: NetworkModel = NetworkModel()
+    timeline: Annotated[list[TimelineEntry], Field(max_length=10_000)] = []
+    events: Events = Events()
+    vehicles: Vehicles = Vehicles()
+    agent_command: Annotated[list[str], Field(min_length=1, max_length=100)] | None = None
+    """Any program that follows ucp/CONTRACT.md, with its arguments; the mission file's name is added."""
+    settings: Settings = Settings()
+    quirks: Quirks = Quirks()
+    settle: Settle = Settle()
+    final_reconcile: bool = False
+
+    @property
+    def roster(self) -> tuple[int, ...]:
+        """The agents' IDs, ascending."""
+        return tuple(range(1, self.agents + 1)) if isinstance(self.agents, int) else tuple(sorted(self.agents))
+
+    def timeline_in_order(self) -> list[TimelineEntry]:
+        return sorted(self.timeline, key=lambda entry: entry.at_s)
+
+    @field_validator("agents", mode="before")
+    @classmethod
+    def _count_or_ids(cls, agents: Any) -> Any:
+        ids = range(1, agents + 1) if isinstance(agents, int) and agents <= MAX_AGENTS else agents
+        if not isinstance(ids, range | list) or not 1 <= len(ids) <= MAX_AGENTS:
+            raise ValueError(f"it should be a number of agents 1..{MAX_AGENTS}, or a list of their IDs")
+        for agent in ids:
+            if isinstance(agent, bool) or not isinstance(agent, int) or not 1 <= agent <= MAX_AGENT_ID:
+                raise ValueError(f"{BOUNDED.repr(agent)} is not an agent ID: it should be 1..{MAX_AGENT_ID}")
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"names {Counter(ids).most_common(1)[0][0]} twice")
+        return agents
+
+    @field_validator("settings", mode="before")
+    @classmethod
+    def _known_settings(cls, settings: Any) -> Any:
+        known = [field.name for field in dataclasses.fields(Settings)]
+        for name in settings if isinstance(settings, dict) else ():
+            if name not in known:
+                raise ValueError(f"{name} is unknown: there are {', '.join(known)}")
+        return settings
+
+    @field_validator("quirks", mode="before")
+    @classmethod
+    def _known_quirks(cls, quirks: Any) -> Any:
+        if isinstance(quirks, dict):
+            for name, value in quirks.items():
+                Quirks().set(name, value)
+        return quirks
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Scenario":
+        roster = set(self.roster)
+        for vehicle in self.network.receivers:
+            if vehicle not in roster:
+                raise ValueError(f"network.receivers names vehicle {vehicle}, which does not exist: {_names(roster)}")
+        instants = Counter(entry.at_s for entry in self.timeline)
+        for index, entry in enumerate(self.timeline):
+            where = f"timeline.{index}"
+            if entry.at_s > self.duration_s:
+                raise ValueError(f"{where}.at_s {entry.at_s:g} is after the mission's end at {self.duration_s:g} s")
+            if instants[entry.at_s] > 1:
+                raise ValueError(f"{where}.at_s {entry.at_s:g} has two entries: which comes first?")
+            try:
+                partition = tuple(frozenset(group) for group in entry.partition or ())
+                self.network.conditions(partition).validate(self.roster)
+            except ConditionsError as error:
+                raise ValueError(f"{where}: {error}") from None
+        return self
+
+
+def _names(roster: set[int]) -> str:
+    ordered = sorted(roster)
+    return f"there are {', '.join(map(str, ordered[:20]))}{', ...' if len(ordered) > 20 else ''}"
