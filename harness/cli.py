@@ -1,4 +1,4 @@
-"""The command line: `ucp-harness run`, `check` and `doctor`.
+"""The command line: `ucp-harness run`, `check`, `matrix` and `doctor`.
 
 Exit status 0: ran, and no characteristic is violated. 1: at least one is violated, or an agent failed. 2: the request
 was wrong. 3: this machine cannot do it. 130: interrupted.
@@ -16,12 +16,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from harness import checker, progress
+from harness import checker, matrix, progress
 from harness.doctor import examine
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, HarnessError
+from harness.matrix import outputs as matrix_outputs
+from harness.matrix import table as matrix_table
 from harness.run import Run, run
 from harness.rundir import default_path
 from harness.scenario import Scenario, load_scenario
+from harness.sweep import cores
 
 app = typer.Typer(
     add_completion=False,
@@ -39,6 +42,10 @@ class Vehicles(StrEnum):
     ardupilot = "ardupilot"
     embedded = "embedded"
     none = "none"
+
+
+class MatrixBackend(StrEnum):
+    sim = "sim"
 
 
 @app.command("run")
@@ -105,6 +112,34 @@ def doctor_command(
         Console().print(table)
     if any(finding.needed and not finding.ok for finding in findings):
         raise typer.Exit(CANNOT_HERE)
+
+
+@app.command("matrix")
+def matrix_command(
+    file: Annotated[Path, typer.Argument(metavar="MATRIX", help="Matrix file (YAML).")],
+    backend: Annotated[MatrixBackend, typer.Option(help="What plays the runs.")] = MatrixBackend.sim,
+    out: Annotated[Path | None, typer.Option(help="Directory of the results; must be new or empty.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="matrix.json on standard output, no table.")] = False,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
+    ] = None,
+) -> None:
+    """Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated."""
+    request = matrix.load_matrix(file)
+    directory = (out or default_path(request.name)).absolute()
+    matrix_outputs.claim(directory)
+    finished = matrix.run_matrix(request, jobs or cores(), shown=True)
+    matrix_outputs.write(finished, directory)
+    record = finished.record
+    if as_json:
+        _print_json(record.to_json())
+    else:
+        console = Console()
+        console.print(matrix_table.render(record))
+        console.print(f"{record.wall_s:.0f} s; {directory / 'matrix.svg'}", highlight=False, soft_wrap=True)
+    if record.outcome == "interrupted":
+        _complain(f"interrupted; the {record.runs} of {record.runs_asked} runs that had ended are in {directory}")
+    raise typer.Exit(record.exit_status)
 
 
 def main() -> NoReturn:

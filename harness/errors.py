@@ -27,3 +27,9 @@ class MachineError(HarnessError):
     """This machine cannot do what was asked."""
 
     exit_status = CANNOT_HERE
+
+
+class InterruptedRunError(HarnessError):
+    """The user asked to stop."""
+
+    exit_status = INTERRUPTED

@@ -16,7 +16,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from harness.errors import ExportError
-from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
+from ucp.agent import Agent
+from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
 from ucp.export import SCHEMA
 
 SUFFIX = ".chain.json"
@@ -109,6 +110,53 @@ class Exports:
 
     by_agent: dict[int, Export] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
+
+
+class ExportMaker:
+    """Exports of agents in this process, without a file between. Blocks that agents share are made once."""
+
+    def __init__(self) -> None:
+        self._blocks: dict[tuple[bytes, bytes | None], ExportedBlock] = {}
+        self._event_data: dict[bytes, str] = {}
+
+    def export(self, agent: Agent, exported_at_us: int) -> Export:
+        """What `read_export` would read of a file with `ucp.export.export_chain(agent, exported_at_us)`."""
+        inception = agent.chain.inception
+        return Export.model_construct(
+            schema_=SCHEMA,
+            agent_id=agent.agent_id,
+            exported_at_us=exported_at_us,
+            inception=ExportedInception.model_construct(
+                block_data=_base64(inception.block_data),
+                block_hash=inception.block_hash.hex(),
+                chain_hash=inception.chain_hash.hex(),
+            ),
+            chain=[self._block(block, chain_hash) for block, chain_hash in agent.chain.with_chain_hashes()],
+            blocks_to_be_committed=[self._block(block, None) for block in agent.blocks_to_be_committed],
+            reconcile_stack=[self._block(block, None) for block in agent.reconcile_stack],
+            current_block=CurrentBlock.model_construct(event_data=_base64(bytes(agent.current_block))),
+            reconcile_in_progress=agent.reconcile_in_progress,
+            idle=agent.idle,
+            completed=[block_hash.hex() for block_hash in agent.completed],
+        )
+
+    def _block(self, block: Block, chain_hash: bytes | None) -> ExportedBlock:
+        key = block.block_hash, chain_hash
+        exported = self._blocks.get(key)
+        if exported is None:
+            event_data = self._event_data.setdefault(block.block_hash, _base64(block.event_data))
+            exported = self._blocks[key] = ExportedBlock.model_construct(
+                agent_id=block.agent_id,
+                timestamp_us=block.timestamp_us,
+                event_data=event_data,
+                block_hash=block.block_hash.hex(),
+                chain_hash=chain_hash.hex() if chain_hash else None,
+            )
+        return exported
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
 
 
 def read_export(path: Path) -> Export:

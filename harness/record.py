@@ -38,6 +38,16 @@ class NetworkState(_Model):
     fully_connected: bool
 
 
+class Fault(_Model):
+    """What a scenario did to the network or to agents at `at_s`; `detail` says it to people."""
+
+    at_s: float
+    what: str
+    detail: str
+    fully_connected: bool | None = None
+    agents: list[int] | None = None
+
+
 class FinalReconcile(_Model):
     """`complete` once a round of reconciles changed no chain."""
 
@@ -47,11 +57,18 @@ class FinalReconcile(_Model):
 
 
 class AgentRecord(_Model):
-    """`outcome` is exported, not exported, crashed, hung, running or not started; counters are null if unknown."""
+    """`outcome` is exported, not exported, killed, crashed, hung, running or not started; counters are null if unknown.
+
+    Counters are those of all its lives, if it was restarted.
+    """
 
     outcome: str
     detail: str | None = None
+    restarts: int = 0
     idle: bool | None = None
+    reconciles: int | None = None
+    chain_changed_at_s: float | None = None
+    messages_sent: int | None = None
     bytes_sent: int | None = None
     dropped: dict[str, int] | None = None
     send_failures: int | None = None
@@ -73,7 +90,7 @@ class RunRecord(JudgedRecord):
 
     scenario: Scenario
     seed: int
-    backend: Literal["process"]
+    backend: Literal["process", "sim"]
     engine: str | None = None
     versions: dict[str, str]
     started_at: str
@@ -82,8 +99,10 @@ class RunRecord(JudgedRecord):
     outcome_detail: str | None = None
     mission_s: float = 0.0
     settled: bool = False
-    faults: list[NetworkState] = []
+    faults: list[Fault] = []
     vehicles: dict[str, dict[str, Any]] = {}
+    unmatched_fates: list[str] = []
+    """A sentence for each scripted fate that decided nothing."""
     counters: dict[str, Any] | None = None
     """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
     characteristics: dict[str, CharacteristicVerdict] = {}

@@ -14,9 +14,10 @@ from typing import Any
 
 from harness import checker, report
 from harness.backends.agent_process import agent_command
-from harness.backends.process import Played, ProcessRun
+from harness.backends.process import ProcessRun
 from harness.backends.vehicle_process import VehicleFailedError
 from harness.errors import VIOLATED, HarnessError, MachineError, RunDirectoryError
+from harness.mission import Played
 from harness.progress import Progress
 from harness.record import RunRecord
 from harness.rundir import RunDirectory
@@ -77,7 +78,7 @@ def run(scenario: Scenario, seed: int, out: Path, progress: Progress) -> Run:
         settled=played.settled,
         final_reconcile=played.final_reconcile,
         network=played.network,
-        faults=[change for change in played.network if change["what"] != "start"],
+        faults=played.faults,
         agents=played.agents,
         vehicles=played.vehicles,
         counters=played.counters,

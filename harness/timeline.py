@@ -4,9 +4,12 @@ A timeline is computed before the run from the scenario alone, so every backend 
 """
 
 from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
 
 from harness.scenario import Scenario
-from netem.conditions import NetworkConditions
+from harness.scenario.timeline import FaultName
+from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 
 @dataclass(frozen=True)
@@ -18,13 +21,45 @@ class NetworkChange:
     detail: str
     conditions: NetworkConditions
 
+    def to_json(self, at_s: float) -> dict[str, Any]:
+        """The record of this change, made at `at_s`."""
+        return {
+            "at_s": at_s,
+            "what": self.what,
+            "detail": self.detail,
+            "fully_connected": self.conditions.fully_connected,
+        }
 
-def network_changes(scenario: Scenario) -> list[NetworkChange]:
-    """Every state of the network, in order; the first is at 0 s, when the mission starts."""
+
+@dataclass(frozen=True)
+class AgentFault:
+    """At `at_s` mission seconds something happens to `agents`."""
+
+    at_s: float
+    what: FaultName
+    agents: tuple[int, ...]
+
+    @property
+    def detail(self) -> str:
+        return f"agent{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
+
+    def to_json(self, at_s: float) -> dict[str, Any]:
+        """The record of this fault, made at `at_s`."""
+        return {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
+
+
+Change = NetworkChange | AgentFault
+
+
+def timeline_of(scenario: Scenario) -> list[Change]:
+    """All that the scenario changes, in order; the first is the network's first state, at 0 s."""
     network = scenario.network
     partition: tuple[frozenset[int], ...] = ()
-    changes = [_change(0.0, "start", network.conditions())]
+    played: list[Change] = [_change(0.0, "start", network.conditions())]
     for entry in scenario.timeline_in_order():
+        if entry.fault is not None:
+            played.append(AgentFault(entry.at_s, *entry.fault))
+            continue
         if entry.loss is not None:
             network, what = network.model_copy(update={"loss": entry.loss}), "loss"
         elif entry.partition is not None:
@@ -33,23 +68,82 @@ def network_changes(scenario: Scenario) -> list[NetworkChange]:
             partition, what = (), "heal"
         change = _change(entry.at_s, what, network.conditions(partition))
         if entry.at_s == 0:
-            changes[0] = change
+            played[0] = change
         else:
-            changes.append(change)
-    return changes
+            played.append(change)
+    return played
+
+
+def final_reconcile(at_s: float) -> NetworkChange:
+    """All conditions are cleared, so that everybody can hear everybody."""
+    return _change(at_s, "final reconcile", NetworkConditions())
 
 
 def _change(at_s: float, what: str, conditions: NetworkConditions) -> NetworkChange:
     return NetworkChange(at_s, what, describe(conditions), conditions)
 
 
+MAX_DESCRIBED_LINKS = 8
+
+
 def describe(conditions: NetworkConditions) -> str:
-    """Conditions in words: "loss 15 %, partition 1 2 | 3 4 5"."""
-    words = [f"loss {_percent(conditions.default.loss)}"]
-    words += [f"loss {_percent(link.loss)} to {vehicle}" for vehicle, link in sorted(conditions.receivers.items())]
+    """Conditions in words: "loss 15 %, loss 50 % to 3, loss 90 % from 1 to 2, partition 1 2 | 3 4 5".
+
+    A receiver is told by what differs from the default, a link by what differs from its receiver.
+    """
+    words = _differences(conditions.default, LinkConditions())
+    if conditions.default.loss == 0.0:
+        words.insert(0, "loss 0 %")
+    for receiver, link in conditions.receivers.items():
+        words += [f"{word} to {receiver}" for word in _differences(link, conditions.default)]
+    linked = []
+    for sender, links in groupby(conditions.links.items(), key=lambda item: item[0][0]):
+        receivers: dict[str, list[str]] = {}
+        for (_, receiver), link in links:
+            for word in _differences(link, conditions.receivers.get(receiver, conditions.default)):
+                receivers.setdefault(word, []).append(str(receiver))
+        linked += [f"{word} from {sender} to {' '.join(named)}" for word, named in receivers.items()]
+    words += linked[:MAX_DESCRIBED_LINKS]
+    if len(linked) > MAX_DESCRIBED_LINKS:
+        words.append(f"{len(linked) - MAX_DESCRIBED_LINKS} more differences of links")
     if conditions.partition:
         words.append("partition " + " | ".join(" ".join(map(str, sorted(group))) for group in conditions.partition))
     return ", ".join(words)
+
+
+def _differences(link: LinkConditions, usual: LinkConditions) -> list[str]:
+    words = []
+    if link.loss != usual.loss:
+        words.append(_loss(link.loss))
+    if link.delay != usual.delay:
+        words.append(_delay(link.delay))
+    if link.duplicate != usual.duplicate:
+        words.append(f"duplicate {_percent(link.duplicate)}")
+    if link.reorder != usual.reorder:
+        words.append(f"reorder {_percent(link.reorder)}")
+    return words
+
+
+def _loss(loss: float | GilbertElliott) -> str:
+    if not isinstance(loss, GilbertElliott):
+        return f"loss {_percent(loss)}"
+    bursts = [f"{_percent(loss.p)} in", f"{_percent(loss.r)} out"]
+    if (loss.loss_bad, loss.loss_good) != (1.0, 0.0):
+        bursts += [f"{_percent(loss.loss_bad)} inside", f"{_percent(loss.loss_good)} outside"]
+    return f"loss in bursts ({', '.join(bursts)})"
+
+
+def _delay(delay: Delay | None) -> str:
+    if delay is None:
+        return "no delay"
+    if not delay.jitter_s:
+        return f"delay {_duration(delay.mean_s)}"
+    shape = "" if delay.distribution == "uniform" else f" {delay.distribution}"
+    return f"delay {_duration(delay.mean_s)} ± {_duration(delay.jitter_s)}{shape}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:g} s" if seconds >= 1 else f"{seconds * 1000:g} ms"
 
 
 def _percent(probability: float) -> str:

@@ -8,51 +8,18 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from ucp.trace import SCHEMA
+from ucp.trace import SCHEMA, HandlerRun
 
 SUFFIX = ".trace.jsonl"
 MAX_LINE_CHARACTERS = 1024 * 1024
 PLACES = ("chain", "deque", "stack")
-
-
-class Sent(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
-    message: str
-    seq: int
-    block: str | None = None
-
-
-class State(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
-    chain: int
-    deque: int
-    stack: int
-    reconciling: bool
-    idle: bool
-    top: str
-
-
-class TracedRun(BaseModel):
-    """One handler run; see `ucp.trace.HandlerRun`. `line` counts from 1."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    t: float
-    handler: str
-    algorithm: int
-    trigger: dict[str, int | str]
-    branch: str
-    changes: list[tuple[str, str]]
-    sent: list[Sent]
-    state: State
-    line: int = 0
+HANDLER_RUN = TypeAdapter(HandlerRun)
 
 
 class Header(BaseModel):
@@ -66,33 +33,36 @@ class Header(BaseModel):
 
 @dataclass
 class Trace:
+    """`runs` of all lives of the agent; those with index n >= starts[k] are of life k + 2, after the kth restart."""
+
     header: Header
-    runs: list[TracedRun] = field(default_factory=list)
+    runs: list[HandlerRun] = field(default_factory=list)
+    starts: list[int] = field(default_factory=list)
     problem: str | None = None
+
+    def lives(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
+        """Each life of the agent: its runs, with their lines, which count from 1. A life begins with a header line."""
+        bounds = [0, *self.starts, len(self.runs)]
+        for life, (start, end) in enumerate(pairwise(bounds), 1):
+            yield enumerate(islice(self.runs, start, end), start + life + 1)
 
     def completed(self) -> list[str]:
         """Hashes of the blocks that the agent completed, in order."""
         return [block for run in self.runs for operation, block in run.changes if operation == "complete"]
 
-    def chain_at(self, t: float) -> tuple[str, ...]:
-        """The chain's block hashes, oldest first, as they were before mission second `t`."""
-        chain: list[str] = []
-        for run in self.runs:
-            if run.t >= t:
-                break
-            for operation, block in run.changes:
-                if operation == "chain+":
-                    chain.append(block)
-                elif operation == "chain-" and chain:
-                    chain.pop()
-        return tuple(chain)
+    def chain_changed_at(self) -> float:
+        """When the chain last changed, in mission seconds; 0 if it never did."""
+        return max(
+            (run.t for run in self.runs if any("chain" in operation for operation, _ in run.changes)), default=0.0
+        )
 
-    def steps(self) -> Iterator[tuple[TracedRun, "Held"]]:
-        """Each run with what the agent held after it. The same `Held` is updated from step to step."""
-        held = Held()
-        for run in self.runs:
-            held.replay(run)
-            yield run, held
+    def steps(self) -> Iterator[tuple[int, HandlerRun, "Held"]]:
+        """Line, run, and what the agent held after it. The same `Held` is updated from step to step of a life."""
+        for life in self.lives():
+            held = Held()
+            for line, run in life:
+                held.replay(run)
+                yield line, run, held
 
 
 class Held:
@@ -107,7 +77,7 @@ class Held:
         self.impossible: str | None = None
         """What the last run's changes claim to remove although it was not there."""
 
-    def replay(self, run: TracedRun) -> None:
+    def replay(self, run: HandlerRun) -> None:
         self.impossible = None
         for operation, block in run.changes:
             if operation == "complete":
@@ -150,15 +120,17 @@ def read_trace(path: Path) -> Trace | None:
                 try:
                     document = json.loads(line)
                     if isinstance(document, dict) and "schema" in document:
-                        if document["schema"] != SCHEMA or trace is not None:
-                            raise ValueError("a header in the wrong place")
-                        trace = Trace(Header.model_validate(document))
+                        header = Header.model_validate(document)
+                        if document["schema"] != SCHEMA or (trace and trace.header.agent_id != header.agent_id):
+                            raise ValueError("another header than this trace's")
+                        if trace is None:
+                            trace = Trace(header)
+                        else:
+                            trace.starts.append(len(trace.runs))
                     elif trace is None:
                         return None
                     else:
-                        run = TracedRun.model_validate(document)
-                        run.line = number
-                        trace.runs.append(run)
+                        trace.runs.append(HANDLER_RUN.validate_python(document))
                 except (ValueError, ValidationError, RecursionError):
                     if trace is not None:
                         trace.problem = f"line {number} is damaged"

@@ -1,6 +1,8 @@
-"""What the air is like: loss and partitions as plain values, which know nothing of how they are applied.
+"""What the air is like: links and partitions as plain values, which know nothing of how they are applied.
 
-Loss belongs to the receiver, as in the thesis: a broadcast is drawn for by every receiver on its own.
+What happens to a packet belongs to the receiver, as in the thesis: a broadcast is drawn for by every
+receiver on its own. Where that is not enough, a link from one sender to one receiver differs, in one
+direction. `netem.link` says what there is to ask of a link.
 A partition is a tuple of groups; a packet crosses from one vehicle to another only inside a group.
 Vehicles named in no group form one more group together, "the rest", so a single group cuts its members
 off from everybody else.
@@ -8,58 +10,43 @@ off from everybody else.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain, islice
 from typing import Any
 
 from netem.addresses import MAX_ID, MIN_ID
 from netem.errors import ConditionsError
+from netem.link import Delay, Distribution, GilbertElliott, LinkConditions, keywords
 
-
-@dataclass(frozen=True)
-class LinkConditions:
-    """What happens to packets on the way to one receiver.
-
-    `loss` is the probability, 0..1, that a packet is dropped, drawn for each packet on its own.
-    """
-
-    loss: float = 0.0
-
-    def __post_init__(self) -> None:
-        loss = self.loss
-        if isinstance(loss, bool) or not isinstance(loss, (int, float)):
-            raise ConditionsError(f"loss: {loss!r} is not a number; allowed is a probability 0..1")
-        if math.isnan(loss) or not 0.0 <= loss <= 1.0:
-            hint = f" (for {loss:g} % write {loss / 100:g})" if 1.0 < loss <= 100.0 else ""
-            raise ConditionsError(f"loss: {loss!r} is not a probability; allowed is 0..1{hint}")
-        object.__setattr__(self, "loss", float(loss))
-
-    def to_json(self) -> dict[str, Any]:
-        return {"loss": self.loss}
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> LinkConditions:
-        return cls(**_known(value, {"loss"}))
+__all__ = ["Delay", "Distribution", "GilbertElliott", "LinkConditions", "NetworkConditions"]
 
 
 @dataclass(frozen=True)
 class NetworkConditions:
     """The conditions between all vehicles at one time.
 
-    `default` holds for every receiver that `receivers` (vehicle ID -> conditions) does not name.
+    The most specific holds, whole: `links` (sender and receiver -> conditions, in this direction), then
+    `receivers` (vehicle ID -> conditions of all that is sent to it), then `default`.
     `partition` are disjoint groups of vehicle IDs; empty means that nothing is cut.
     """
 
     default: LinkConditions = field(default_factory=LinkConditions)
     receivers: Mapping[int, LinkConditions] = field(default_factory=dict)
+    links: Mapping[tuple[int, int], LinkConditions] = field(default_factory=dict)
     partition: tuple[frozenset[int], ...] = ()
 
     def __post_init__(self) -> None:
         for vehicle in self.receivers:
             _check_id("receivers", vehicle)
+        for sender, receiver in self.links:
+            _check_id("links", sender)
+            _check_id("links", receiver)
+            if sender == receiver:
+                raise ConditionsError(f"links: {sender}>{receiver} leads to itself; allowed is another receiver")
         # Copies: a value that its maker can still change is none.
         object.__setattr__(self, "receivers", dict(sorted(self.receivers.items())))
+        object.__setattr__(self, "links", dict(sorted(self.links.items())))
         groups = tuple(frozenset(group) for group in self.partition)
         seen: set[int] = set()
         for index, group in enumerate(groups):
@@ -77,7 +64,7 @@ class NetworkConditions:
 
     def link(self, sender: int, receiver: int) -> LinkConditions:
         """What happens to a packet from `sender` to `receiver` that no partition cuts."""
-        return self.receivers.get(receiver, self.default)
+        return self.links.get((sender, receiver)) or self.receivers.get(receiver, self.default)
 
     def is_cut(self, sender: int, receiver: int) -> bool:
         """Whether a partition stands between the two."""
@@ -85,9 +72,20 @@ class NetworkConditions:
 
     @property
     def fully_connected(self) -> bool:
-        """No loss anywhere and no partition."""
-        links = (self.default, *self.receivers.values())
-        return not self.partition and all(link.loss == 0.0 for link in links)
+        """No loss of any kind anywhere and no partition; what is late or comes twice does come."""
+        links = (self.default, *self.receivers.values(), *self.links.values())
+        return not self.partition and all(link.lossless for link in links)
+
+    def needs(self) -> tuple[str, ...]:
+        """What these conditions ask beyond independent loss per receiver and partition, by key.
+
+        Each key once, with the first place that asks for it: "delay", "receivers 3 reorder", "links 1>2".
+        """
+        asked = {key: key for key in self.default.needs()}
+        for vehicle, link in self.receivers.items():
+            asked |= {key: f"receivers {vehicle} {key}" for key in link.needs() if key not in asked}
+        differing = (pair for pair, link in self.links.items() if link != self.receivers.get(pair[1], self.default))
+        return (*asked.values(), *(f"links {sender}>{receiver}" for sender, receiver in islice(differing, 1)))
 
     def groups(self, vehicles: Iterable[int]) -> tuple[frozenset[int], ...]:
         """The groups that `vehicles` fall into, the rest last; one group when nothing is cut."""
@@ -107,7 +105,7 @@ class NetworkConditions:
     def validate(self, vehicles: Iterable[int]) -> None:
         """Raise ConditionsError if a vehicle is named that is not one of `vehicles`."""
         known = set(vehicles)
-        named = [("receivers", frozenset(self.receivers))]
+        named = [("receivers", frozenset(self.receivers)), ("links", frozenset(chain.from_iterable(self.links)))]
         named += [(f"partition[{index}]", group) for index, group in enumerate(self.partition)]
         for key, group in named:
             if unknown := sorted(group - known):
@@ -118,16 +116,18 @@ class NetworkConditions:
         return {
             "default": self.default.to_json(),
             "receivers": {str(vehicle): link.to_json() for vehicle, link in self.receivers.items()},
+            "links": {f"{sender}>{receiver}": link.to_json() for (sender, receiver), link in self.links.items()},
             "partition": [sorted(group) for group in self.partition],
         }
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> NetworkConditions:
         """The inverse of `to_json`."""
-        _known(value, {"default", "receivers", "partition"})
+        keywords(cls, value)
         return cls(
             LinkConditions.from_json(value.get("default", {})),
             {int(key): LinkConditions.from_json(link) for key, link in value.get("receivers", {}).items()},
+            {_pair(key): LinkConditions.from_json(link) for key, link in value.get("links", {}).items()},
             tuple(frozenset(group) for group in value.get("partition", ())),
         )
 
@@ -143,11 +143,11 @@ def _check_id(key: str, vehicle: object) -> None:
         raise ConditionsError(f"{key}: {vehicle!r} is not a vehicle ID; allowed is {MIN_ID}..{MAX_ID}")
 
 
-def _known(value: Mapping[str, Any], keys: set[str]) -> dict[str, Any]:
-    for key in value:
-        if key not in keys:
-            raise ConditionsError(f"{key}: not a key of the conditions; allowed is {', '.join(sorted(keys))}")
-    return dict(value)
+def _pair(key: str) -> tuple[int, int]:
+    sender, separator, receiver = key.partition(">")
+    if not (separator and sender.isdecimal() and receiver.isdecimal()):
+        raise ConditionsError(f'links: {key!r} is not a link; allowed is "sender>receiver", such as "1>2"')
+    return int(sender), int(receiver)
 
 
 def _name(vehicles: list[int]) -> str:

@@ -80,10 +80,15 @@ class Engine(ABC):
     def apply(self, conditions: NetworkConditions) -> Applied:
         """Change the conditions and return what the kernel then holds.
 
-        Raises ConditionsError for an unknown vehicle, EngineError if the kernel refuses or holds
-        something else than asked.
+        Raises ConditionsError for an unknown vehicle, EngineError if engines cannot do it, or if the
+        kernel refuses or holds something else than asked.
         """
         conditions.validate(self._vehicles)
+        if needs := conditions.needs():
+            raise EngineError(
+                f"Engine {self.name} knows loss per receiver and partitions, not yet {', '.join(needs)}; "
+                "the simulation does (--backend sim)"
+            )
         try:
             self.change(conditions)
         except EngineError as error:
@@ -91,7 +96,7 @@ class Engine(ABC):
             raise EngineError(f"{error}. Asked: {conditions.to_json()}; in force: {held}") from error
         applied = self.read()
         for receiver, figures in applied.receivers.items():
-            loss = conditions.link(receiver, receiver).loss
+            loss = conditions.link(receiver, receiver).independent_loss
             cut_from = tuple(s for s in self._vehicles if conditions.is_cut(s, receiver))
             if abs(figures.loss - loss) > RESOLUTION or set(figures.cut_from) != set(cut_from):
                 raise EngineError(

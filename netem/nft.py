@@ -83,7 +83,7 @@ class NftablesEngine(Engine):
                 other = _match("!=", {"meta": {"key": "mark"}}, mark[vehicle])
                 commands.append(_rule(chain, other, {"counter": f"cut_{port}"}, {"drop": None}))
             # What is neither 0 nor 1 must not become it by rounding.
-            loss = conditions.link(vehicle, vehicle).loss
+            loss = conditions.link(vehicle, vehicle).independent_loss
             threshold = round(loss * _MODULUS)
             if loss == 1.0:
                 commands.append(_rule(chain, {"counter": f"lost_{port}"}, {"drop": None}))

@@ -80,12 +80,12 @@ class TrafficControl:
 
     def change_class(self, kind: int, link: LinkConditions) -> Request:
         """Set the netem of a class, in place if there is one."""
-        loss = round(link.loss * _ALWAYS)
-        if 0.0 < link.loss < 1.0:  # what is neither 0 nor 1 must not become it by rounding
+        loss = round(link.independent_loss * _ALWAYS)
+        if 0.0 < link.independent_loss < 1.0:  # what is neither 0 nor 1 must not become it by rounding
             loss = min(max(loss, 1), _ALWAYS - 1)
         options = {"limit": _LIMIT, "loss": loss}
         message = self._message("netem", _HTB | kind, (0x8000 | kind) << 16, options)
-        return Request(f"set qdisc netem to loss {link.loss:g}", RTM_NEWQDISC, message, _SET)
+        return Request(f"set qdisc netem to loss {link.independent_loss:g}", RTM_NEWQDISC, message, _SET)
 
     def remove_class(self, kind: int) -> Request:
         return Request("delete class of htb", RTM_DELTCLASS, self._message("htb", _HTB, _HTB | kind))

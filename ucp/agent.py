@@ -45,6 +45,7 @@ from ucp.chain import Chain
 from ucp.events import LoggableEvent
 from ucp.handler import EventHandler
 from ucp.messages import (
+    CARRY_A_BLOCK,
     BlockAddRequest,
     BlockAddResponse,
     BlockResponse,
@@ -56,12 +57,15 @@ from ucp.messages import (
     Message,
     NextInSequenceResponse,
     RequestForBlock,
+    block_named,
     decode,
     encode,
 )
 from ucp.settings import Quirks, Settings
 from ucp.timers import Timer
-from ucp.trace import HandlerRun
+from ucp.trace import HandlerRun, Sent, State
+
+Trigger = dict[str, int | str]
 
 ON_MESSAGE: dict[type[Message], EventHandler[Any]] = {
     BlockAddRequest: commit.receive_request_add_block,
@@ -154,17 +158,19 @@ class Agent:
         self.finalize_timer = Timer("finalize gap")
 
         self.reconciles = 0
+        self.chain_changed_at = 0.0
         self.sent: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
 
-        self._timers = (
-            self.voting_timer,
+        self._reconcile_timers = (
             self.phase_one_timer,
             self.phase_two_timer,
             self.phase_three_timer,
             self.finalize_timer,
         )
+        self._timers = (self.voting_timer, *self._reconcile_timers)
+        self._others = self.roster - {agent_id}
         self._rng = Random(seed)
         self._held_aside: set[bytes] = set()  # hashes of the blocks in the deque and on the reconcile stack
         self._triggered: deque[tuple[EventHandler[[]], str]] = deque()
@@ -174,7 +180,7 @@ class Agent:
         self._tracing = tracing
         self._trace: list[HandlerRun] = []
         self._changes: list[tuple[str, str]] = []
-        self._announced: list[dict[str, Any]] = []
+        self._announced: list[Sent] = []
 
     # What drives an agent
 
@@ -189,17 +195,14 @@ class Agent:
 
     def receive_message(self, sender: int, sequence: int, message: Message, now: float) -> None:
         """Handle a decoded message, if it is another agent's on the roster and carries only the roster's blocks."""
-        if sender == self.agent_id:
-            self.dropped["own sender"] += 1
+        if sender not in self._others:
+            self.dropped["own sender" if sender == self.agent_id else "sender not on the roster"] += 1
             return
-        if sender not in self.roster:
-            self.dropped["sender not on the roster"] += 1
-            return
-        if isinstance(message, CommitBlock | BlockResponse) and message.block.agent_id not in self.roster:
+        if type(message) in CARRY_A_BLOCK and message.block.agent_id not in self.roster:  # type: ignore[union-attr]
             self.dropped["block not of the roster"] += 1
             return
         self.received[message.NAME] += 1
-        trigger = {"message": message.NAME, "from": sender, "seq": sequence}
+        trigger: Trigger = {"message": message.NAME, "from": sender, "seq": sequence}
         self._handle(now, trigger, ON_MESSAGE[type(message)], sender, message)
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
@@ -211,8 +214,23 @@ class Agent:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` has something to do next, in mission seconds; None if no timer runs."""
-        deadlines = [timer.deadline for timer in self._timers if timer.deadline is not None]
-        return min(deadlines, default=None)
+        soonest = None
+        for timer in self._timers:
+            deadline = timer.deadline
+            if deadline is not None and (soonest is None or deadline < soonest):
+                soonest = deadline
+        return soonest
+
+    def answers_nobody_until(self) -> float:
+        """An agent that reconciles answers nobody, and stops only when a timer of the reconcile ends: when that is.
+
+        In mission seconds; 0 if it does not reconcile, or no such timer runs.
+        """
+        if self.reconcile_in_progress:
+            for timer in self._reconcile_timers:
+                if timer.deadline is not None:
+                    return timer.deadline
+        return 0.0
 
     def handle_timer(self, now: float) -> None:
         """Run the handlers of all timers that have expired at `now`, the earliest first."""
@@ -245,7 +263,7 @@ class Agent:
     @property
     def idle(self) -> bool:
         """No timer armed, no reconcile, nothing triggered and not yet run."""
-        return not (self.reconcile_in_progress or self._triggered or any(timer.active for timer in self._timers))
+        return not (self.reconcile_in_progress or self._triggered) and self.next_timer() is None
 
     # What handlers do
 
@@ -258,14 +276,8 @@ class Agent:
         self._outbox.append((self._sequence, message))
         self.sent[message.NAME] += 1
         if self._tracing:
-            block_hash = _block_named(message)
-            self._announced.append(
-                {
-                    "message": message.NAME,
-                    "seq": self._sequence,
-                    "block": block_hash.hex() if block_hash else None,
-                }
-            )
+            block_hash = block_named(message)
+            self._announced.append(Sent(message.NAME, self._sequence, block_hash.hex() if block_hash else None))
         self._sequence += 1
 
     def holds(self, block_hash: bytes) -> bool:
@@ -290,11 +302,13 @@ class Agent:
     def commit(self, block: Block) -> None:
         """Append `block` to the chain, computing its chain hash (eq. 3.2)."""
         self.chain.append(block)
+        self.chain_changed_at = self.now
         self._changed("chain+", block)
 
     def pop_to_stack(self) -> None:
         """Move the chain's top block onto the reconcile stack."""
         block = self.chain.pop()
+        self.chain_changed_at = self.now
         self._changed("chain-", block)
         self.reconcile_stack.append(block)
         self._held_aside.add(block.block_hash)
@@ -321,38 +335,31 @@ class Agent:
 
     # How a handler runs
 
-    def _handle(self, now: float, trigger: dict[str, Any], handler: EventHandler[Any], *inputs: object) -> None:
+    def _handle(self, now: float, trigger: Trigger, handler: EventHandler[Any], *inputs: object) -> None:
+        """Run a handler, and then those that it triggered, in order."""
         self.now = now
-        self._run(trigger, handler, inputs)
-        while self._triggered:
-            triggered, by = self._triggered.popleft()
-            self._run({"local": by}, triggered, ())
+        while True:
+            self._running = handler.name
+            branch = handler.run(self, *inputs)
+            if self._tracing:
+                self._trace_run(trigger, handler, branch)
+            if not self._triggered:
+                return
+            handler, by = self._triggered.popleft()
+            trigger, inputs = {"local": by}, ()
 
-    def _run(self, trigger: dict[str, Any], handler: EventHandler[Any], inputs: tuple[object, ...]) -> None:
-        self._running = handler.name
-        branch = handler.run(self, *inputs)
-        if handler is reconcile.reconcile_begin and branch == "begun":
-            self.reconciles += 1
-        if not self._tracing:
-            return
-        state = {
-            "chain": len(self.chain),
-            "deque": len(self.blocks_to_be_committed),
-            "stack": len(self.reconcile_stack),
-            "reconciling": self.reconcile_in_progress,
-            "idle": self.idle,
-            "top": self.chain.top_chain_hash.hex(),
-        }
+    def _trace_run(self, trigger: Trigger, handler: EventHandler[Any], branch: str) -> None:
+        state = State(
+            len(self.chain),
+            len(self.blocks_to_be_committed),
+            len(self.reconcile_stack),
+            self.reconcile_in_progress,
+            self.idle,
+            self.chain.top_chain_hash.hex(),
+        )
         self._trace.append(
             HandlerRun(
-                self.now,
-                handler.name,
-                handler.algorithm,
-                trigger,
-                branch,
-                self._changes,
-                self._announced,
-                state,
+                self.now, handler.name, handler.algorithm, trigger, branch, self._changes, self._announced, state
             )
         )
         self._changes, self._announced = [], []
@@ -360,10 +367,3 @@ class Agent:
     def _changed(self, operation: str, block: Block) -> None:
         if self._tracing:
             self._changes.append((operation, block.block_hash.hex()))
-
-
-def _block_named(message: Message) -> bytes | None:
-    """The hash of the block that a message is about, if it is about one."""
-    if isinstance(message, CommitBlock | BlockResponse):
-        return message.block.block_hash
-    return getattr(message, "block_hash", None)

@@ -57,18 +57,18 @@ def decode_events(event_data: bytes) -> list[LoggableEvent]:
 class RandomEvents:
     """Algorithm 21: each second, with probability 1/mean, an event with a random ID and random data.
 
-    The thesis gives no loop period: one trial per second, each agent with a random phase. `due` is the time of the
-    next trial in mission seconds.
+    The thesis gives no loop period: one trial per second, each agent with a random phase.
     """
 
     def __init__(self, rng: Random, mean_s: float = MEAN_TIME_BETWEEN_EVENTS_S) -> None:
         self._rng = rng
         self._probability = TRIAL_PERIOD_S / mean_s
-        self.due = rng.random() * TRIAL_PERIOD_S
+        self._next_trial_s = rng.random() * TRIAL_PERIOD_S
 
-    def trial(self) -> tuple[int, bytes] | None:
-        """Run the trial that is due: (event_id, data), or None if nothing happened."""
-        self.due += TRIAL_PERIOD_S
-        if self._rng.random() > self._probability:
-            return None
-        return self._rng.randint(1, 254), self._rng.randbytes(self._rng.choice(EVENT_DATA_BYTES))
+    def next(self) -> tuple[float, int, bytes]:
+        """Run trials until something happens: (mission seconds, event_id, data)."""
+        lot, probability, at_s = self._rng.random, self._probability, self._next_trial_s
+        while lot() > probability:
+            at_s += TRIAL_PERIOD_S
+        self._next_trial_s = at_s + TRIAL_PERIOD_S
+        return at_s, self._rng.randint(1, 254), self._rng.randbytes(self._rng.choice(EVENT_DATA_BYTES))

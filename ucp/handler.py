@@ -14,13 +14,10 @@ P = ParamSpec("P")
 class EventHandler(Generic[P]):
     """A handler changes the agent, tells it what to send and trigger, and returns the branch that it took."""
 
+    name: str
     run: "Callable[Concatenate[Agent, P], str]"
     algorithm: int
     branches: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        return self.run.__name__
 
 
 def event_handler(
@@ -29,6 +26,6 @@ def event_handler(
     """Declare a function to be the handler of Algorithm `algorithm`, and the only branches that it returns."""
 
     def declare(run: "Callable[Concatenate[Agent, P], str]") -> EventHandler[P]:
-        return EventHandler(run, algorithm, branches)
+        return EventHandler(run.__name__, run, algorithm, branches)
 
     return declare

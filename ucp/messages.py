@@ -217,6 +217,21 @@ TYPE_CODES: dict[type[Message], int] = {
 _FROM_BODY: dict[int, Callable[[bytes], Message]] = {code: message.from_body for message, code in TYPE_CODES.items()}
 
 
+CARRY_A_BLOCK = frozenset((CommitBlock, BlockResponse))
+
+
+def block_named(message: Message) -> bytes | None:
+    """The hash of the block that a message is about, if it is about one."""
+    if isinstance(message, CommitBlock | BlockResponse):
+        return message.block.block_hash
+    return getattr(message, "block_hash", None)
+
+
+def datagram_bytes(message: Message) -> int:
+    """Length of the datagram that `encode` makes of `message`."""
+    return HEADER.size + len(message.body())
+
+
 def encode(sender: int, sequence: int, message: Message) -> bytes:
     """One datagram, at most MAX_DATAGRAM_BYTES long. `sequence` wraps at 2**32."""
     body = message.body()

@@ -168,10 +168,9 @@ class Node:
     async def _random_events(self) -> None:
         source = RandomEvents(Random(self.mission.seed), self.mission.events.mean_s)
         while True:
-            await asyncio.sleep(self.clock.wall_s(source.due - self.clock.now()))
-            event = source.trial()
-            if event is not None:
-                self._log_event(*event)
+            due, event_id, data = source.next()
+            await asyncio.sleep(self.clock.wall_s(due - self.clock.now()))
+            self._log_event(event_id, data)
 
     async def _vehicle_events(self) -> None:
         from ucp import telemetry  # pymavlink: only where a vehicle is

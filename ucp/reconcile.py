@@ -32,6 +32,7 @@ def reconcile_begin(agent: "Agent") -> str:
     if agent.reconcile_in_progress:
         return "already in progress"
     agent.reconcile_in_progress = True
+    agent.reconciles += 1
     agent.trigger(reconcile_phase_1)
     return "begun"
 

@@ -4,30 +4,32 @@
 class Timer:
     """`deadline` is in mission seconds; None while the timer is stopped or paused."""
 
-    __slots__ = ("_remaining", "deadline", "name")
+    __slots__ = ("_paused", "deadline", "name")
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.deadline: float | None = None
-        self._remaining: float | None = None
+        self._paused: tuple[float, float] | None = None  # when, and the deadline that it had
 
     @property
     def active(self) -> bool:
-        return self.deadline is not None or self._remaining is not None
+        return self.deadline is not None or self._paused is not None
 
     def start(self, now: float, duration_s: float) -> None:
         self.deadline = now + duration_s
-        self._remaining = None
+        self._paused = None
 
     def stop(self) -> None:
-        self.deadline = self._remaining = None
+        self.deadline = self._paused = None
 
     def pause(self, now: float) -> None:
         if self.deadline is not None:
-            self._remaining = self.deadline - now
+            self._paused = now, self.deadline
             self.deadline = None
 
     def resume(self, now: float) -> None:
-        if self._remaining is not None:
-            self.deadline = now + self._remaining
-            self._remaining = None
+        """Go on from where it was paused; resumed in the same instant, it has the same deadline to the last bit."""
+        if self._paused is not None:
+            paused_at, deadline = self._paused
+            self.deadline = deadline + (now - paused_at)
+            self._paused = None

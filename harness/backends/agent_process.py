@@ -8,7 +8,6 @@ import shutil
 import signal
 import sys
 from pathlib import Path
-from random import Random
 from typing import Any
 
 from pydantic import ValidationError
@@ -17,6 +16,7 @@ from harness.agents import AgentControl, AgentRefusedError, AgentSilentError, St
 from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
+from harness.seeds import agent_seed
 from netem.lab import Lab, LabProcess
 from sitl.vehicle import AGENT_PORT
 from ucp.mission import SCHEMA as MISSION_SCHEMA
@@ -175,7 +175,7 @@ def _mission(
         },
         "settings": dataclasses.asdict(scenario.settings),
         "quirks": dataclasses.asdict(scenario.quirks),
-        "seed": Random(f"{seed}/agent {agent_id}").getrandbits(63),
+        "seed": agent_seed(seed, agent_id),
         "speedup": scenario.speedup,
         "epoch_us": None,
     }

@@ -1,23 +1,23 @@
 """The process backend: a scenario played by real processes in a real, private network.
 
-The story of a run: build the lab, start vehicles and agents, start the mission's clock, play the timeline while
-watching everybody, stop the events, let the agents settle, reconcile finally if asked, export, stop, take the lab down.
-A crash, a hang or Ctrl-C ends the story early, and still exports what there is.
+Build the lab, start vehicles and agents and the mission's clock, play the mission while watching everybody, export,
+stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and still exports what there is.
 """
 
 import asyncio
 import time
 from collections.abc import Coroutine
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
+from harness import mission
 from harness.backends.agent_process import AgentFailedError, AgentProcess
 from harness.backends.vehicle_process import VehicleProcess
-from harness.errors import INTERRUPTED, HarnessError, MachineError
+from harness.errors import HarnessError, InterruptedRunError, MachineError
+from harness.mission import Played
 from harness.progress import Progress, Snapshot
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
-from harness.timeline import NetworkChange, describe, network_changes
+from harness.timeline import Change, NetworkChange, describe
 from netem.conditions import NetworkConditions
 from netem.errors import LabUnavailable, NetemError
 from netem.lab import Lab
@@ -27,33 +27,6 @@ from ucp.clock import MICROSECONDS, MissionClock
 POLL_S = 0.25
 QUIET_POLL_S = 0.1
 START_DELAY_S = 0.05
-MAX_FINAL_ROUNDS = 20
-"""Bound on the rounds of a final reconcile; each lets every agent reconcile once."""
-
-Outcome = Literal["completed", "interrupted", "failed"]
-
-
-class InterruptedRunError(HarnessError):
-    """The user asked to stop."""
-
-    exit_status = INTERRUPTED
-
-
-@dataclass
-class Played:
-    """What became of a run, before anybody judges it."""
-
-    outcome: Outcome = "completed"
-    outcome_detail: str | None = None
-    exit_status: int = 0
-    engine: str | None = None
-    network: list[dict[str, Any]] = field(default_factory=list)
-    final_reconcile: dict[str, Any] | None = None
-    mission_s: float = 0.0
-    settled: bool = False
-    counters: dict[str, Any] | None = None
-    agents: dict[str, Any] = field(default_factory=dict)
-    vehicles: dict[str, Any] = field(default_factory=dict)
 
 
 class ProcessRun:
@@ -97,9 +70,10 @@ class ProcessRun:
         except NetemError as error:
             raise MachineError(f"the lab could not be built: {error}; see {self.rundir.lab_log}") from None
         async with lab:
+            self._lab = lab
             self.played.engine = lab.engine
             try:
-                await self._guarded(self._mission(lab))
+                await self._guarded(mission.play(self, self.scenario))
             except HarnessError as error:
                 self._ended_early(error)
             except NetemError as error:
@@ -109,12 +83,12 @@ class ProcessRun:
             await self._wind_up(lab)
         return self.played
 
-    async def _guarded(self, mission: Coroutine[Any, Any, None]) -> None:
+    async def _guarded(self, story: Coroutine[Any, Any, None]) -> None:
         """Run the mission; the first failure of anything, or the user's interruption, ends it and is raised."""
         try:
             async with asyncio.TaskGroup() as self._group:
                 self._watch(self._watch_for_interruption())
-                await mission
+                await story
                 for watcher in self._watchers:
                     watcher.cancel()
         except BaseExceptionGroup as errors:
@@ -128,27 +102,22 @@ class ProcessRun:
         await self.interrupted.wait()
         raise InterruptedRunError(f"the run was interrupted at mission second {self.clock.now():.0f}")
 
-    # The story
+    # The story, as harness.mission tells it
 
-    async def _mission(self, lab: Lab) -> None:
-        await self._start_vehicles(lab)
-        await self._start_agents(lab)
-        changes = network_changes(self.scenario)
-        await self._apply(lab, changes[0])
+    def now(self) -> float:
+        return self.clock.now()
+
+    def enter(self, stage: str) -> None:
+        self.stage = stage
+
+    async def begin(self, first: Change) -> None:
+        await self._start_vehicles(self._lab)
+        await self._start_agents(self._lab)
+        await self.apply(first)
         await self._start_clock()
         self._watch(self._poll_agents())
         for vehicle in self.vehicles:
             self._watch(vehicle.take_off(self.scenario.vehicles.takeoff_altitude_m))
-        self.stage = "mission"
-        for change in changes[1:]:
-            await self._until(change.at_s)
-            await self._apply(lab, change)
-        await self._until(self.scenario.duration_s)
-        self.stage = "settling"
-        await asyncio.gather(*(agent.ask("stop_events") for agent in self.agents))
-        self.played.settled = await self._until_idle(self.scenario.settle.limit_s)
-        if self.scenario.final_reconcile:
-            await self._final_reconcile(lab)
 
     async def _start_vehicles(self, lab: Lab) -> None:
         if not self.vehicles:
@@ -178,24 +147,21 @@ class ProcessRun:
         await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
         self.clock.start(epoch_us)
 
-    async def _apply(self, lab: Lab, change: NetworkChange) -> None:
-        applied = await lab.apply(change.conditions)
+    async def apply(self, change: Change) -> None:
+        assert isinstance(change, NetworkChange), "check_for_processes refuses a scenario with other faults"
+        applied = await self._lab.apply(change.conditions)
         self.network = change.detail
-        at_s = round(max(change.at_s, self.clock.now()), 3)
-        record = {
-            "at_s": at_s,
-            "what": change.what,
-            "detail": change.detail,
-            "fully_connected": change.conditions.fully_connected,
-        }
-        self.played.network.append(record)
+        record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
+        self.played.record(record)
         self.rundir.append_network({**record, "asked": change.conditions.to_json(), "applied": applied.to_json()})
 
-    async def _until(self, mission_s: float) -> None:
+    async def until(self, mission_s: float) -> None:
         await asyncio.sleep(max(0.0, self.clock.wall_s(mission_s - self.clock.now())))
 
-    async def _until_idle(self, limit_s: float) -> bool:
-        """Wait until all agents are idle and nothing happens any more; False if `limit_s` mission seconds pass."""
+    async def stop_events(self) -> None:
+        await asyncio.gather(*(agent.ask("stop_events") for agent in self.agents))
+
+    async def until_idle(self, limit_s: float) -> bool:
         deadline_s = self.clock.now() + limit_s
         handled: list[int] | None = None
         while self.clock.now() < deadline_s:
@@ -206,28 +172,16 @@ class ProcessRun:
             await asyncio.sleep(QUIET_POLL_S)
         return False
 
-    async def _final_reconcile(self, lab: Lab) -> None:
-        """Clear all conditions and let one agent after another reconcile, until a round changes no chain."""
+    async def keep_chains(self) -> None:
         await asyncio.gather(*(agent.export() for agent in self.agents))
         self.rundir.keep_exports_before_final_reconcile()
-        self.stage = "final reconcile"
-        conditions = NetworkConditions()
-        began_s = self.clock.now()
-        self.played.final_reconcile = {"at_s": round(began_s, 3), "rounds": 0, "complete": False}
-        await self._apply(lab, NetworkChange(began_s, "final reconcile", describe(conditions), conditions))
-        for number in range(1, MAX_FINAL_ROUNDS + 1):
-            before = await self._tops()
-            for agent in self.agents:
-                await agent.ask("reconcile")
-                if not await self._until_idle(self.scenario.settle.limit_s):
-                    return
-            self.played.final_reconcile["rounds"] = number
-            if await self._tops() == before:
-                self.played.final_reconcile["complete"] = True
-                return
 
-    async def _tops(self) -> list[str]:
-        return [status.top_chain_hash for status in await asyncio.gather(*(agent.poll() for agent in self.agents))]
+    async def reconcile(self, agent_id: int) -> None:
+        await next(agent for agent in self.agents if agent.agent_id == agent_id).ask("reconcile")
+
+    async def top_chain_hashes(self) -> dict[int, str]:
+        statuses = await asyncio.gather(*(agent.poll() for agent in self.agents))
+        return {agent.agent_id: status.top_chain_hash for agent, status in zip(self.agents, statuses, strict=True)}
 
     async def _poll_agents(self) -> None:
         while True:

@@ -28,6 +28,9 @@ def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
     since = evidence.connected_since_s
     if since is None:
         return f"the system was not fully connected: {evidence.network_at_end or 'its conditions are not on record'}"
+    untraced = differing - set(evidence.traces)
+    if untraced:
+        return f"there is no trace of {agents(untraced)} to tell whether they had the chance to reconcile"
     if not had_a_chance(evidence, differing):
         return (
             f"{agents(differing)} differ{'s' if len(differing) == 1 else ''} by blocks after which neither a vote nor "
@@ -42,10 +45,7 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
     if since is None:
         return set()
     had = set()
-    last_change = {
-        agent_id: max((run.t for run in trace.runs if _changes_chain(run.changes)), default=0.0)
-        for agent_id, trace in evidence.traces.items()
-    }
+    last_change = {agent_id: trace.chain_changed_at() for agent_id, trace in evidence.traces.items()}
     for agent_id in differing & set(evidence.traces):
         others = max((t for other, t in last_change.items() if other != agent_id), default=0.0)
         began = False
@@ -55,7 +55,3 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
             elif began and run.handler == "reconcile_finalize" and not run.state.reconciling:
                 had.add(agent_id)
     return had
-
-
-def _changes_chain(changes: list[tuple[str, str]]) -> bool:
-    return any(operation in ("chain+", "chain-") for operation, _ in changes)

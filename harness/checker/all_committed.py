@@ -11,7 +11,7 @@ def check(evidence: Evidence) -> Characteristic:
     unknown = why_unknown(evidence)
     if unknown:
         return Characteristic(NAME, "not applicable", unknown)
-    completed = evidence.completed_blocks()
+    gone, completed = _gone_and_left(evidence)
     lacking: dict[int, list[str]] = {}
     for agent_id, export in evidence.exports.items():
         in_chain = set(export.chain_of_block_hashes)
@@ -19,7 +19,8 @@ def check(evidence: Evidence) -> Characteristic:
         if missing:
             lacking[agent_id] = missing
     if not lacking:
-        return Characteristic(NAME, "holds", f"all {len(completed)} completed blocks are in every chain")
+        but = f"; {gone} more were gone with the agents that were killed" if gone else ""
+        return Characteristic(NAME, "holds", f"all {len(completed)} completed blocks are in every chain{but}")
     no_chance = why_no_chance(evidence, set(lacking))
     if no_chance:
         lack = sum(map(len, lacking.values()))
@@ -39,3 +40,17 @@ def check(evidence: Evidence) -> Characteristic:
         for block_hash in lacking[agent_id]
     ]
     return violated(NAME, "a completed block is not in the chain of an agent that could have it", findings)
+
+
+def _gone_and_left(evidence: Evidence) -> tuple[int, list[str]]:
+    """How many completed blocks were lost with killed agents (Section 3.3), and the others, which anybody can have."""
+    completed = evidence.completed_blocks()
+    exports = evidence.exports.values()
+    left = {block.block_hash for export in exports for block in export.blocks()}
+    left.update(block_hash for export in exports for block_hash in export.completed)
+    gone = {
+        block_hash
+        for block_hash, agent_id in completed.items()
+        if block_hash not in left and (evidence.was_killed(agent_id) or evidence.was_restarted(agent_id))
+    }
+    return len(gone), [block_hash for block_hash in completed if block_hash not in gone]

@@ -6,8 +6,9 @@ when its own timer does. Only traces can tell.
 
 from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
-from harness.traces import Trace, TracedRun
+from harness.traces import Trace
 from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER, TRIGGERED_LOCALLY
+from ucp.trace import HandlerRun
 
 NAME = "distributed"
 
@@ -31,16 +32,17 @@ def check(evidence: Evidence) -> Characteristic:
     runs = 0
     for agent_id, trace in evidence.traces.items():
         runs += len(trace.runs)
-        ran: set[str] = set()
-        for run in trace.runs:
-            ran.add(run.handler)
-            sender = run.trigger.get("from")
-            if isinstance(sender, int) and sender not in sent:
-                untraced.add(sender)
-                continue
-            wrong = _wrong_trigger(run, ran, sent)
-            if wrong:
-                findings.append(Finding(agent_id, f"trace line {run.line}, t={run.t:g} s: {run.handler} {wrong}"))
+        for life in trace.lives():
+            ran: set[str] = set()
+            for line, run in life:
+                ran.add(run.handler)
+                sender = run.trigger.get("from")
+                if isinstance(sender, int) and sender not in sent:
+                    untraced.add(sender)
+                    continue
+                wrong = _wrong_trigger(run, ran, sent)
+                if wrong:
+                    findings.append(Finding(agent_id, f"trace line {line}, t={run.t:g} s: {run.handler} {wrong}"))
         findings += _votes_that_never_ended(agent_id, trace)
     if findings:
         return violated(NAME, "a handler ran without a trigger of its own, or waited for another agent", findings)
@@ -59,7 +61,7 @@ def check(evidence: Evidence) -> Characteristic:
     )
 
 
-def _wrong_trigger(run: TracedRun, ran: set[str], sent: dict[int, set[tuple[int, str]]]) -> str | None:
+def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, set[tuple[int, str]]]) -> str | None:
     """What is wrong with the run's trigger, completing "the handler ..."; None if nothing is."""
     if run.handler not in HANDLERS or HANDLERS[run.handler].algorithm != run.algorithm:
         return "is not one of the 20 event handlers"
@@ -93,19 +95,16 @@ def _votes_that_never_ended(agent_id: int, trace: Trace) -> list[Finding]:
     speedup = trace.header.clock.get("speedup", 1)
     latest = timeout_s + SLACK_WALL_S * (speedup if isinstance(speedup, int | float) else 1)
     findings = []
-    proposed: TracedRun | None = None
-    for run in trace.runs:
-        if run.handler == "process_next_deque_block" and run.branch == "proposed":
-            proposed = run
-        elif run.handler == "vote_timer_expiration":
-            proposed = None
-        elif proposed is not None and run.t > proposed.t + latest:
-            findings.append(
-                Finding(
-                    agent_id,
-                    f"trace line {proposed.line}, t={proposed.t:g} s: a vote began and did not end within "
-                    f"{timeout_s:g} s",
-                )
-            )
-            proposed = None
+    for life in trace.lives():
+        proposed: tuple[int, float] | None = None
+        for line, run in life:
+            if run.handler == "process_next_deque_block" and run.branch == "proposed":
+                proposed = line, run.t
+            elif run.handler == "vote_timer_expiration":
+                proposed = None
+            elif proposed is not None and run.t > proposed[1] + latest:
+                where = f"trace line {proposed[0]}, t={proposed[1]:g} s"
+                detail = f"{where}: a vote began and did not end within {timeout_s:g} s"
+                findings.append(Finding(agent_id, detail))
+                proposed = None
     return findings

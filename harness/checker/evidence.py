@@ -6,9 +6,9 @@ from pathlib import Path
 
 from harness import traces
 from harness.errors import RunDirectoryError
-from harness.exports import SUFFIX, Export, export_paths, read_exports
+from harness.exports import BEFORE_FINAL_RECONCILE, SUFFIX, Export, export_paths, read_exports
 from harness.naming import name_blocks
-from harness.record import JudgedRecord
+from harness.record import AgentRecord, JudgedRecord
 from harness.traces import Trace
 
 RUN_FILE = "run.json"
@@ -17,12 +17,16 @@ MAX_RECORD_BYTES = 64 * 1024 * 1024
 
 @dataclass
 class Evidence:
-    """`record` is the run's `run.json`, None for exports that came without one."""
+    """`record` is the run's `run.json`, None for exports that came without one.
+
+    `before_final_reconcile` are the exports as the mission left them, if a final reconcile followed.
+    """
 
     exports: dict[int, Export]
     traces: dict[int, Trace] = field(default_factory=dict)
     record: JudgedRecord | None = None
     errors: list[str] = field(default_factory=list)
+    before_final_reconcile: dict[int, Export] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.names = name_blocks(self.exports)
@@ -41,8 +45,21 @@ class Evidence:
 
     @property
     def missing(self) -> list[int]:
-        """Agents of the mission whose export is not here."""
-        return [agent for agent in self.roster or [] if agent not in self.exports]
+        """Living agents of the mission whose export is not here."""
+        return [agent for agent in self.roster or [] if agent not in self.exports and not self.was_killed(agent)]
+
+    def was_killed(self, agent_id: int) -> bool:
+        """Whether the scenario killed the agent for good, and with it all that it held."""
+        agent = self._recorded(agent_id)
+        return agent is not None and agent.outcome == "killed"
+
+    def was_restarted(self, agent_id: int) -> bool:
+        """Whether the scenario killed and restarted the agent: its export knows its last life only."""
+        agent = self._recorded(agent_id)
+        return agent is not None and agent.restarts > 0
+
+    def _recorded(self, agent_id: int) -> AgentRecord | None:
+        return self.record.agents.get(str(agent_id)) if self.record else None
 
     @property
     def connected_since_s(self) -> float | None:
@@ -101,7 +118,14 @@ def gather(paths: Iterable[Path]) -> Evidence:
             if trace.problem:
                 errors.append(f"{path}: {trace.problem}; what is there is read")
             evidence_traces.setdefault(trace.header.agent_id, trace)
-    return Evidence(exports.by_agent, evidence_traces, record, errors + exports.errors)
+    return Evidence(exports.by_agent, evidence_traces, record, errors + exports.errors, _before(export_files))
+
+
+def _before(export_files: list[Path]) -> dict[int, Export]:
+    """The exports that a final reconcile found, if that is what the files come from."""
+    runs = dict.fromkeys(path.parent.parent for path in export_files)
+    kept = [path for run in runs for path in export_paths(run / BEFORE_FINAL_RECONCILE)]
+    return read_exports(kept).by_agent
 
 
 def _record(path: Path, errors: list[str]) -> JudgedRecord | None:

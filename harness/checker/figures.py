@@ -7,37 +7,59 @@ from harness.checker.uniform_chain import common_prefix
 
 
 def figures(evidence: Evidence) -> dict[str, float | int | None]:
-    """Counts of blocks and messages; None where nothing tells. `copies` are of each completed block, per agent."""
+    """Counts of blocks and messages; None where nothing tells. `copies` are of each completed block, per agent.
+
+    `uniform_at_s` is when the chains became what they all are in the end, in mission seconds; None if they differ.
+    """
     chains = [export.chain_of_block_hashes for export in evidence.exports.values()]
     completed = evidence.completed_blocks()
-    copies = Counter(block_hash for chain in chains for block_hash in set(chain))
+    copies = Counter(block_hash for chain in chains for block_hash in chain)
     per_block = [copies[block_hash] for block_hash in completed]
+    distinct = len(set(chains))
+    messages = _of_all_agents(evidence, "messages_sent")
     result: dict[str, float | int | None] = {
         "agents": len(chains),
         "blocks": len(completed),
         "mutual_chain": common_prefix(chains),
         "longest_chain": max(map(len, chains), default=0),
-        "distinct_chains": len(set(chains)),
+        "distinct_chains": distinct,
         "copies_min": min(per_block, default=None),
         "copies_mean": round(sum(per_block) / len(per_block), 3) if per_block else None,
-        "reconciles": None,
-        "messages": None,
-        "bytes": None,
-        "messages_per_block": None,
+        "uniform_at_s": _chains_changed_at(evidence) if distinct == 1 else None,
+        "reconciles": _of_all_agents(evidence, "reconciles"),
+        "messages": messages,
+        "bytes": _of_all_agents(evidence, "bytes_sent"),
+        "messages_per_block": round(messages / len(completed), 1) if completed and messages is not None else None,
     }
-    if evidence.traces:
-        runs = [run for trace in evidence.traces.values() for run in trace.runs]
-        messages = sum(len(run.sent) for run in runs)
-        result["reconciles"] = sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in runs)
-        result["messages"] = messages
-        result["messages_per_block"] = round(messages / len(completed), 1) if completed else None
-    record = evidence.record
-    if record and record.final_reconcile and set(evidence.traces) == set(evidence.exports):
-        before = [trace.chain_at(record.final_reconcile.at_s) for trace in evidence.traces.values()]
+    if evidence.before_final_reconcile:
+        before = [export.chain_of_block_hashes for export in evidence.before_final_reconcile.values()]
         result["mutual_chain_before_final_reconcile"] = common_prefix(before)
         result["distinct_chains_before_final_reconcile"] = len(set(before))
-    sent = [agent.bytes_sent for agent in record.agents.values()] if record else []
-    known = [count for count in sent if count is not None]
-    if known and len(known) == len(sent):
-        result["bytes"] = sum(known)
     return result
+
+
+def _of_all_agents(evidence: Evidence, counter: str) -> int | None:
+    """The sum of a counter that the run's record has of every agent; else what the traces have; else None."""
+    agents = evidence.record.agents.values() if evidence.record else ()
+    counts: list[int | None] = [getattr(agent, counter) for agent in agents]
+    known = [count for count in counts if count is not None]
+    if known and len(known) == len(counts):
+        return sum(known)
+    runs = [run for trace in evidence.traces.values() for run in trace.runs]
+    if not runs:
+        return None
+    match counter:
+        case "messages_sent":
+            return sum(len(run.sent) for run in runs)
+        case "reconciles":
+            return sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in runs)
+    return None
+
+
+def _chains_changed_at(evidence: Evidence) -> float | None:
+    """When the last agent's chain last changed."""
+    agents = evidence.record.agents.values() if evidence.record else ()
+    recorded = [agent.chain_changed_at_s for agent in agents if agent.chain_changed_at_s is not None]
+    if recorded:
+        return max(recorded)
+    return max((round(trace.chain_changed_at(), 3) for trace in evidence.traces.values()), default=None)

@@ -24,7 +24,9 @@ def check(evidence: Evidence) -> Characteristic:
             name = evidence.name(block.block_hash)
             if roster is not None and block.agent_id not in roster:
                 detail = f"holds block {name} of agent {block.agent_id}, which is not on the roster"
-            elif block.agent_id not in known:
+            elif block.agent_id not in known or (
+                block.block_hash not in completed and evidence.was_restarted(block.agent_id) and not evidence.traces
+            ):
                 unknown.add(block.agent_id)
                 continue
             elif completed.get(block.block_hash) != block.agent_id:
@@ -40,7 +42,7 @@ def check(evidence: Evidence) -> Characteristic:
         return Characteristic(
             NAME,
             "not applicable",
-            f"there is neither export nor trace of {agents(unknown)}, so whether they made their blocks is unknown",
+            f"neither export nor trace tells what {agents(unknown)} completed, so who made their blocks is unknown",
         )
     return Characteristic(
         NAME, "holds", f"all hashes recompute, and each of {blocks} blocks was completed by the agent that it names"

@@ -17,8 +17,8 @@ def check(evidence: Evidence) -> Characteristic:
                 name = evidence.name(block_hash)
                 findings.append(Finding(agent_id, f"exported {count} copies of block {name}", name, block_hash))
     for agent_id, trace in evidence.traces.items():
-        for run, held in trace.steps():
-            where = f"trace line {run.line}, t={run.t:g} s, {run.handler}"
+        for line, run, held in trace.steps():
+            where = f"trace line {line}, t={run.t:g} s, {run.handler}"
             if held.impossible:
                 findings.append(Finding(agent_id, f"{where}: {held.impossible}"))
             for _, block_hash in run.changes:

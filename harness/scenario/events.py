@@ -2,9 +2,17 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from harness.scenario.model import Model, Seconds
+from harness.scenario.model import Instant, Model, Seconds, VehicleId
+
+
+class ScriptedEvent(Model):
+    """At `at_s` mission seconds `agent` logs one event with `bytes` bytes of data, all zero."""
+
+    at_s: Instant
+    agent: VehicleId
+    bytes: Annotated[int, Field(ge=0, le=1024)] = 256
 
 
 class Events(Model):
@@ -12,8 +20,16 @@ class Events(Model):
 
     `mavlink`: the vehicle's telemetry, a position every `position_interval_s` mission seconds on average.
     `random`: Algorithm 21, one every `mean_s` mission seconds on average. Without vehicles events are random.
+    `scripted`: those of `script`, and no others.
     """
 
-    source: Literal["mavlink", "random"] = "mavlink"
+    source: Literal["mavlink", "random", "scripted"] = "mavlink"
     position_interval_s: Seconds = 10.0
     mean_s: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 30.0
+    script: Annotated[list[ScriptedEvent], Field(max_length=1_000_000)] = []
+
+    @model_validator(mode="after")
+    def _script_is_played(self) -> "Events":
+        if self.script and self.source != "scripted":
+            raise ValueError(f"`script` needs `source: scripted`, not {self.source}")
+        return self

@@ -1,7 +1,8 @@
-"""From a file to a scenario, and from what pydantic found to a sentence for a person."""
+"""From a file to a scenario (or to whatever else is YAML), and from what pydantic found to a sentence for a person."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -15,9 +16,18 @@ MAX_SCENARIO_BYTES = 1024 * 1024
 
 def load_scenario(path: Path) -> Scenario:
     """Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed."""
+    document = read_yaml(path, "scenario")
+    try:
+        return Scenario.model_validate(document)
+    except ValidationError as error:
+        raise ScenarioError(f"{path}: {explain(error, Scenario)}") from None
+
+
+def read_yaml(path: Path, what: str) -> dict[str, Any]:
+    """The mapping in a YAML file that should be a `what`. Raises ScenarioError."""
     try:
         if path.stat().st_size > MAX_SCENARIO_BYTES:
-            raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which no scenario is")
+            raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which no {what} is")
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
@@ -27,11 +37,8 @@ def load_scenario(path: Path) -> Scenario:
         problem = getattr(error, "problem", None) or "it cannot be decoded"
         raise ScenarioError(f"{path}: not YAML{where}: {problem}") from None
     if not isinstance(document, dict):
-        raise ScenarioError(f"{path}: a scenario is a YAML mapping with at least `name`")
-    try:
-        return Scenario.model_validate(document)
-    except ValidationError as error:
-        raise ScenarioError(f"{path}: {explain(error, Scenario)}") from None
+        raise ScenarioError(f"{path}: a {what} is a YAML mapping with at least `name`")
+    return document
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
@@ -52,10 +59,18 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
 
 def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
     """The keys that are allowed beside the one at `location`."""
-    current: Any = model
+    current = model
     for part in location[:-1]:
-        if isinstance(part, str) and part in current.model_fields:
-            annotation = current.model_fields[part].annotation
-            candidates = [annotation, *getattr(annotation, "__args__", ())]
-            current = next((one for one in candidates if isinstance(one, type) and issubclass(one, BaseModel)), current)
-    return list(current.model_fields)
+        for name, field in current.model_fields.items():
+            if part in (name, field.alias):
+                current = next(_models(field.annotation), current)
+                break
+    return [field.alias or name for name, field in current.model_fields.items()]
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models that a value of this type can be."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models(part)

@@ -3,7 +3,7 @@
 import reprlib
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from ucp.block import MAX_AGENT_ID
 
@@ -17,6 +17,11 @@ Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Instant = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 """Mission seconds since the start."""
 VehicleId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]
+
+VehicleKey = Annotated[
+    VehicleId, BeforeValidator(lambda value: int(value) if isinstance(value, str) and value.isdecimal() else value)
+]
+"""A vehicle as the key of a mapping: JSON has strings there."""
 
 
 class Model(BaseModel):

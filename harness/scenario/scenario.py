@@ -2,14 +2,16 @@
 
 import dataclasses
 from collections import Counter
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
 from harness.scenario.events import Events
-from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds
+from harness.scenario.fates import Fate
+from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
-from harness.scenario.timeline import TimelineEntry
+from harness.scenario.timeline import FAULT_LEADS_TO, FAULT_NEEDS, TimelineEntry
 from harness.scenario.vehicles import Vehicles
 from netem.errors import ConditionsError
 from ucp.block import MAX_AGENT_ID
@@ -20,6 +22,13 @@ class Settle(Model):
     """After the mission the agents finish their votes and reconciles, for at most `limit_s` mission seconds."""
 
     limit_s: Seconds = 1800.0
+
+
+class Clock(Model):
+    """An agent's own clock: at mission second t it shows offset_s + (1 + drift) * t seconds."""
+
+    offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    drift: Annotated[float, Field(gt=-0.5, le=1.0)] = 0.0
 
 
 class Scenario(Model):
@@ -38,6 +47,8 @@ class Scenario(Model):
     """Any program that follows ucp/CONTRACT.md, with its arguments; the mission file's name is added."""
     settings: Settings = Settings()
     quirks: Quirks = Quirks()
+    clocks: dict[VehicleKey, Clock] = {}
+    fates: Annotated[list[Fate], Field(max_length=100_000)] = []
     settle: Settle = Settle()
     final_reconcile: bool = False
 
@@ -80,11 +91,35 @@ class Scenario(Model):
         return quirks
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Scenario":
+    def _names_what_there_is(self) -> "Scenario":
         roster = set(self.roster)
-        for vehicle in self.network.receivers:
+        for key, vehicle in self._named():
             if vehicle not in roster:
-                raise ValueError(f"network.receivers names vehicle {vehicle}, which does not exist: {_names(roster)}")
+                raise ValueError(f"{key} names vehicle {vehicle}, which does not exist: {_names(roster)}")
+        names = Counter(fate.name for fate in self.fates if fate.name is not None)
+        for index, fate in enumerate(self.fates):
+            if fate.name is not None and names[fate.name] > 1:
+                raise ValueError(f"fates.{index}.name {fate.name!r} is taken by another fate")
+            if fate.after is not None and fate.after not in names:
+                raise ValueError(f"fates.{index}.after {fate.after!r} is the name of no fate")
+        return self
+
+    def _named(self) -> Iterator[tuple[str, int]]:
+        """Every vehicle that is named anywhere but in a partition, with the key that names it."""
+        yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named())
+        yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
+        yield from (("clocks", vehicle) for vehicle in self.clocks)
+        for index, fate in enumerate(self.fates):
+            yield from ((f"fates.{index}.sender", vehicle) for vehicle in (fate.sender,) if vehicle)
+            yield from ((f"fates.{index}.receiver", vehicle) for vehicle in (fate.receiver,) if vehicle)
+            yield from ((f"fates.{index}.block", int(name.split(".")[0])) for name in (fate.block,) if name)
+        for index, entry in enumerate(self.timeline):
+            if entry.fault is not None:
+                what, agents = entry.fault
+                yield from ((f"timeline.{index}.{what}", agent) for agent in agents)
+
+    @model_validator(mode="after")
+    def _timeline_can_be_played(self) -> "Scenario":
         instants = Counter(entry.at_s for entry in self.timeline)
         for index, entry in enumerate(self.timeline):
             where = f"timeline.{index}"
@@ -97,6 +132,16 @@ class Scenario(Model):
                 self.network.conditions(partition).validate(self.roster)
             except ConditionsError as error:
                 raise ValueError(f"{where}: {error}") from None
+        state = dict.fromkeys(self.roster, "running")
+        for entry in self.timeline_in_order():
+            if entry.fault is not None:
+                what, agents = entry.fault
+                needed, then = FAULT_NEEDS[what], FAULT_LEADS_TO[what]
+                for agent in agents:
+                    if state[agent] not in needed:
+                        where = f"timeline.{self.timeline.index(entry)}.{what}"
+                        raise ValueError(f"{where}: agent {agent} is {state[agent]} then, not {' or '.join(needed)}")
+                    state[agent] = then
         return self
 
 

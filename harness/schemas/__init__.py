@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from harness.exports import Export
+from harness.matrix import MatrixRecord
 from harness.record import RunRecord
 from harness.scenario import Scenario
 
@@ -17,6 +18,7 @@ DIRECTORY = Path(__file__).parent
 MODELS: dict[str, type[BaseModel]] = {
     "scenario": Scenario,
     "ucp-chain-export-1": Export,
+    "ucp-matrix-1": MatrixRecord,
     "ucp-run-1": RunRecord,
 }
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
+from types import SimpleNamespace
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from netem import addresses
-from netem.conditions import LinkConditions, NetworkConditions
-from netem.errors import ConditionsError, NetemError
+from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
+from netem.engine import Applied, Engine
+from netem.errors import ConditionsError, EngineError, NetemError
 
 
 @pytest.mark.parametrize("loss", [-0.1, 1.5, math.nan, math.inf, "0.1", None, True])
@@ -25,6 +29,118 @@ def test_a_loss_that_is_no_probability_is_refused_with_the_value_and_what_is_all
 def test_a_loss_in_percent_is_told_how_to_write_it() -> None:
     with pytest.raises(ConditionsError, match=r"for 15 % write 0\.15"):
         LinkConditions(loss=15)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: GilbertElliott(1.5, 0.1), r"^loss\.p: 1\.5 is not a probability; allowed is 0\.\.1"),
+        (lambda: GilbertElliott(0.1, True), r"^loss\.r: True is not a number; allowed is a probability 0\.\.1"),
+        (lambda: GilbertElliott(0.1, 0.1, loss_bad=math.nan), r"^loss\.loss_bad: nan is not"),
+        (lambda: GilbertElliott(0.1, 0.1, loss_good=-1), r"^loss\.loss_good: -1 is not"),
+        (lambda: Delay(-0.1), r"^delay\.mean_s: -0\.1 is out of range; allowed is seconds 0\.\.60"),
+        (lambda: Delay(61), r"^delay\.mean_s: 61\.0 is out of range; allowed is seconds 0\.\.60"),
+        (lambda: Delay(math.nan), r"^delay\.mean_s: nan is not a number"),
+        (lambda: Delay("1"), r"^delay\.mean_s: '1' is not a number"),  # type: ignore[arg-type]
+        (lambda: Delay(0.1, 0.2), r"^delay\.jitter_s: 0\.2 is out of range; allowed is 0\.\.mean_s, 0\.1"),
+        (lambda: Delay(0, 0.1), r"^delay\.jitter_s: 0\.1 is out of range"),
+        (lambda: Delay(0.1, -0.1), r"^delay\.jitter_s: -0\.1 is out of range"),
+        (lambda: Delay(0.1, 0, "gauss"), r"^delay\.distribution: 'gauss' is not known; allowed is uniform, normal, "),
+        (lambda: LinkConditions(delay=0.1), r"^delay: 0\.1 is not a delay"),
+        (lambda: LinkConditions(duplicate=2), r"^duplicate: 2 is not a probability"),
+        (lambda: LinkConditions(reorder=2, delay=Delay(1)), r"^reorder: 2 is not a probability"),
+        (lambda: LinkConditions(reorder=0.1), r"^reorder: 0\.1 needs a delay"),
+        (lambda: LinkConditions(delay=Delay(0), reorder=0.1), r"^reorder: 0\.1 needs a delay"),
+        (lambda: NetworkConditions(links={(1, 1): LinkConditions()}), "^links: 1>1 leads to itself"),
+        (lambda: NetworkConditions(links={(1, 0): LinkConditions()}), "^links: 0 is not a vehicle ID"),
+        (lambda: NetworkConditions.from_json({"links": {"1-2": {}}}), "^links: '1-2' is not a link; .* \"1>2\""),
+        (lambda: LinkConditions.from_json({"loss": {"p": 0.1}}), r"^loss\.r: is missing"),
+        (lambda: LinkConditions.from_json({"loss": {"p": 0.1, "r": 0.1, "k": 1}}), r"^loss\.k: not a key"),
+        (lambda: LinkConditions.from_json({"delay": {"jitter_s": 1}}), r"^delay\.mean_s: is missing"),
+    ],
+)
+def test_what_means_nothing_is_refused_with_the_key_the_value_and_what_is_allowed(make: Any, sentence: str) -> None:
+    with pytest.raises(ConditionsError, match=sentence) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_delay_of_nothing_is_none() -> None:
+    assert LinkConditions(delay=Delay(0)) == LinkConditions()
+
+
+def test_the_mean_of_bursts_is_the_loss_in_the_long_run() -> None:
+    assert GilbertElliott(0.1, 0.3).mean == pytest.approx(0.25)
+    assert GilbertElliott(0.1, 0.3, 0.8, 0.04).mean == pytest.approx(0.23)
+    assert GilbertElliott(0, 0, loss_good=0.2).mean == 0.2  # begins in the good state, and stays
+    assert GilbertElliott(0.1, 0).mean == 1
+
+
+def test_lossless_means_that_nothing_is_ever_lost() -> None:
+    late = LinkConditions(delay=Delay(0.1), duplicate=0.5, reorder=0.5)
+    assert late.lossless
+    assert NetworkConditions(late).fully_connected
+    assert LinkConditions(GilbertElliott(0, 0.5)).lossless
+    assert LinkConditions(GilbertElliott(0.5, 0.5, loss_bad=0)).lossless
+    assert not LinkConditions(GilbertElliott(0.5, 0.5)).lossless
+    assert not LinkConditions(GilbertElliott(0.5, 0, 0, loss_good=0.1)).lossless  # mean 0, but not at first
+    assert not LinkConditions(0.1).lossless
+
+
+def test_a_link_comes_before_its_receiver_and_that_before_the_default() -> None:
+    conditions = NetworkConditions(
+        LinkConditions(0.1), {2: LinkConditions(0.2)}, {(1, 2): LinkConditions(), (1, 3): LinkConditions(0.4)}
+    )
+    assert conditions.link(1, 2).loss == 0
+    assert conditions.link(3, 2).loss == 0.2
+    assert conditions.link(1, 3).loss == 0.4
+    assert conditions.link(3, 1).loss == 0.1
+    assert conditions.link(2, 2).loss == 0.2
+
+
+def test_needs_name_what_goes_beyond_loss_and_partition_once_and_where() -> None:
+    assert NetworkConditions(LinkConditions(0.1), {1: LinkConditions(0.2)}, partition=({1},)).needs() == ()
+    late = LinkConditions(delay=Delay(0.1), reorder=0.1)
+    both = LinkConditions(GilbertElliott(0.1, 0.1), Delay(0.1), 0.1)
+    assert NetworkConditions(late).needs() == ("delay", "reorder")
+    assert NetworkConditions(late, {3: both, 4: both}).needs() == (
+        "delay",
+        "reorder",
+        "receivers 3 loss in bursts",
+        "receivers 3 duplicate",
+    )
+    lossy = {(1, 2): LinkConditions(0.2), (1, 3): LinkConditions(0.2), (2, 3): LinkConditions(0.2)}
+    assert NetworkConditions(links=lossy).needs() == ("links 1>2",)
+    # A link that says the same as its receiver needs nothing.
+    assert NetworkConditions(receivers={2: LinkConditions(0.2)}, links=lossy).needs() == ("links 1>3",)
+    assert NetworkConditions(LinkConditions(0.2), links=lossy).needs() == ()
+
+
+class _Untouchable(Engine):
+    name = "untouchable"
+
+    def change(self, conditions: NetworkConditions) -> None:
+        raise AssertionError("changed")
+
+    def read(self) -> Applied:
+        raise AssertionError("read")
+
+
+@pytest.mark.parametrize(
+    ("conditions", "need"),
+    [
+        (NetworkConditions(LinkConditions(GilbertElliott(0.1, 0.1))), "not yet loss in bursts;"),
+        (NetworkConditions(LinkConditions(delay=Delay(0.1), reorder=0.1)), "not yet delay, reorder;"),
+        (NetworkConditions(receivers={2: LinkConditions(duplicate=0.1)}), "not yet receivers 2 duplicate;"),
+        (NetworkConditions(links={(1, 2): LinkConditions(0.1)}), "not yet links 1>2;"),
+    ],
+)
+def test_an_engine_refuses_what_it_cannot_do_before_it_changes_anything(
+    conditions: NetworkConditions, need: str
+) -> None:
+    engine = _Untouchable(SimpleNamespace(vehicles=(1, 2)))  # type: ignore[arg-type]
+    with pytest.raises(EngineError, match=f"^Engine untouchable .* {need} .*--backend sim"):
+        engine.apply(conditions)
 
 
 def test_loss_belongs_to_the_receiver() -> None:
@@ -71,6 +187,8 @@ def test_unknown_vehicles_are_refused_with_the_key_and_who_exists() -> None:
         NetworkConditions().with_partition([[1, 9]]).validate([1, 2])
     with pytest.raises(ConditionsError, match="receivers: unknown vehicles 7, 8"):
         NetworkConditions(receivers={7: LinkConditions(), 8: LinkConditions()}).validate([1, 2])
+    with pytest.raises(ConditionsError, match="links: unknown vehicles 7, 8"):
+        NetworkConditions(links={(1, 7): LinkConditions(), (8, 1): LinkConditions()}).validate([1, 2])
 
 
 def test_what_a_caller_changes_later_does_not_change_the_value() -> None:
@@ -85,19 +203,46 @@ def test_an_unknown_key_is_refused() -> None:
         NetworkConditions.from_json({"default": {"los": 0.1}})
 
 
-_links = st.builds(LinkConditions, st.floats(0, 1))
+def test_the_json_of_a_plain_loss_is_as_it_always_was() -> None:
+    assert LinkConditions(0.1).to_json() == {"loss": 0.1}
+    old = {"default": {"loss": 0.1}, "receivers": {"2": {"loss": 0.5}}, "partition": [[1]]}
+    assert NetworkConditions.from_json(old) == NetworkConditions(
+        LinkConditions(0.1), {2: LinkConditions(0.5)}, partition=({1},)
+    )
+
+
+_shares = st.floats(0, 1)
+_bursts = st.builds(GilbertElliott, _shares, _shares, _shares, _shares)
+_delays = st.floats(0.001, 60).flatmap(
+    lambda mean_s: st.builds(Delay, st.just(mean_s), st.floats(0, mean_s), st.sampled_from(get_args(Distribution)))
+)
+_links = st.builds(LinkConditions, _shares | _bursts, st.none(), _shares) | st.builds(
+    LinkConditions, _shares | _bursts, _delays, _shares, _shares
+)
+_vehicles = st.integers(1, 65535)
+_pairs = st.tuples(_vehicles, _vehicles).filter(lambda pair: pair[0] != pair[1])
 
 
 @given(
     _links,
-    st.dictionaries(st.integers(1, 65535), _links, max_size=4),
+    st.dictionaries(_vehicles, _links, max_size=4),
+    st.dictionaries(_pairs, _links, max_size=4),
     st.lists(st.integers(1, 9), unique=True).map(lambda ids: tuple(frozenset([i]) for i in ids)),
 )
 def test_json_brings_the_same_conditions_back(
-    default: LinkConditions, receivers: dict[int, LinkConditions], partition: tuple[frozenset[int], ...]
+    default: LinkConditions,
+    receivers: dict[int, LinkConditions],
+    links: dict[tuple[int, int], LinkConditions],
+    partition: tuple[frozenset[int], ...],
 ) -> None:
-    conditions = NetworkConditions(default, receivers, partition)
-    assert NetworkConditions.from_json(conditions.to_json()) == conditions
+    conditions = NetworkConditions(default, receivers, links, partition)
+    assert NetworkConditions.from_json(json.loads(json.dumps(conditions.to_json()))) == conditions
+
+
+@given(_bursts)
+def test_the_mean_of_bursts_lies_between_the_two_losses(bursts: GilbertElliott) -> None:
+    low, high = sorted((bursts.loss_good, bursts.loss_bad))
+    assert low - 1e-9 <= bursts.mean <= high + 1e-9
 
 
 def test_no_two_ids_share_an_address_and_none_has_the_broadcast_address() -> None:

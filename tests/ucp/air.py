@@ -26,11 +26,12 @@ class Air:
         self.runs: dict[int, list[HandlerRun]] = {agent_id: [] for agent_id in roster}
         self._in_flight: list[tuple[float, int, int, bytes]] = []
         self._order = itertools.count()
-        self._sources: dict[int, RandomEvents] = {}
+        self._sources: dict[int, tuple[RandomEvents, tuple[float, int, bytes]]] = {}
 
     def generate_events(self, seed: int, mean_s: float = 30.0) -> None:
         for agent_id in self.agents:
-            self._sources[agent_id] = RandomEvents(Random(f"{seed}/{agent_id}"), mean_s)
+            source = RandomEvents(Random(f"{seed}/{agent_id}"), mean_s)
+            self._sources[agent_id] = source, source.next()
 
     def stop_events(self) -> None:
         self._sources.clear()
@@ -66,7 +67,7 @@ class Air:
 
     def next_time(self) -> float | None:
         times = [time for agent in self.agents.values() if (time := agent.next_timer()) is not None]
-        times += [source.due for source in self._sources.values()]
+        times += [due for _, (due, _, _) in self._sources.values()]
         times += [delivery[0] for delivery in self._in_flight[:1]]
         return min(times, default=None)
 
@@ -87,12 +88,11 @@ class Air:
                 agent.handle_timer(self.now)
                 self.flush(agent_id)
                 return True
-        for agent_id, source in self._sources.items():
-            if source.due <= self.now:
-                event = source.trial()
-                if event is not None:
-                    self.agents[agent_id].add_event(LoggableEvent(round(self.now * 1e6), *event), self.now)
-                    self.flush(agent_id)
+        for agent_id, (source, (due, event_id, data)) in self._sources.items():
+            if due <= self.now:
+                self._sources[agent_id] = source, source.next()
+                self.agents[agent_id].add_event(LoggableEvent(round(self.now * 1e6), event_id, data), self.now)
+                self.flush(agent_id)
                 return True
         return True
 

@@ -134,6 +134,6 @@ def test_equal_inputs_give_equal_outputs_and_traces_replay_to_the_state(loss: fl
                 elif operation.endswith("-"):
                     held[operation[:-1]].remove(block_hash)
             assert {name: len(hashes) for name, hashes in held.items()} == {
-                name: handler_run.state[name] for name in held
+                name: getattr(handler_run.state, name) for name in held
             }
         assert held["chain"] == [block.block_hash.hex() for block in agent.chain]

@@ -5,7 +5,8 @@ from random import Random
 import pytest
 
 from tests.ucp.air import Air, uniform_latency
-from ucp.block import next_chain_hash
+from tests.ucp.branches import takes
+from ucp.block import Block, next_chain_hash
 from ucp.events import LoggableEvent, decode_events
 from ucp.messages import BlockAddRequest, BlockAddResponse, CommitBlock, Message
 from ucp.settings import Settings
@@ -16,6 +17,7 @@ def without(dropped: type[Message]):
     return lambda sender, receiver, message: [] if isinstance(message, dropped) else latency(sender, receiver, message)
 
 
+@takes("build_data_block", "building", "full")
 def test_a_block_is_full_when_the_largest_event_might_not_fit_any_more() -> None:
     air = Air([1])
     agent = air.agents[1]
@@ -41,6 +43,31 @@ def test_an_event_larger_than_the_mission_s_largest_is_refused() -> None:
         agent.add_event(LoggableEvent(0, 1, bytes(257)), 0.0)
 
 
+@takes("process_next_deque_block", "proposed")
+def test_a_full_block_is_proposed_to_go_on_top_of_the_own_chain() -> None:
+    air = Air([1, 2])
+    air.fill_block(2)
+    air.settle()
+    agent = air.agents[1]
+    while not agent.completed:
+        agent.add_event(LoggableEvent(0, 7, bytes(256)), air.now)
+    proposal = BlockAddRequest(agent.completed[0], agent.chain.top_chain_hash)
+    assert agent.messages_to_send() == [(1, proposal)]  # 0 was its approval of 2's
+    assert agent.vote_count == {"yes": 1, "no": 0}  # its own
+    assert agent.next_timer() == air.now + 10.0
+
+
+@takes("receive_request_add_block", "approve", "disapprove")
+def test_an_agent_approves_what_goes_on_top_of_its_own_chain() -> None:
+    agent = Air([1, 2]).agents[1]
+    for chain_hash in (agent.chain.top_chain_hash, bytes(32)):
+        agent.receive_message(2, 0, BlockAddRequest(b"\1" * 32, chain_hash), 0.0)
+    approval, disapproval = (message for _, message in agent.messages_to_send())
+    assert approval == BlockAddResponse(b"\1" * 32, approve=True)
+    assert disapproval == BlockAddResponse(b"\1" * 32, approve=False)
+
+
+@takes("process_next_deque_block", "deque empty")
 def test_an_agent_alone_commits_its_own_blocks_after_the_vote() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     block_hash = air.fill_block(1)
@@ -49,8 +76,12 @@ def test_an_agent_alone_commits_its_own_blocks_after_the_vote() -> None:
     air.run_until(10.0)
     assert block_hash in air.agents[1].chain
     assert air.agents[1].idle
+    assert air.agents[1].sent["Block Add Request"] == 1
 
 
+@takes("receive_vote_add_block", "yes")
+@takes("vote_timer_expiration", "approved")
+@takes("receive_commit_block", "committed")
 def test_an_approved_block_is_committed_by_everybody() -> None:
     air = Air(range(1, 6))
     block_hash = air.fill_block(3)
@@ -59,6 +90,7 @@ def test_an_approved_block_is_committed_by_everybody() -> None:
     assert all(agent.reconciles == 0 for agent in air.agents.values())
 
 
+@takes("process_next_deque_block", "vote running")
 def test_blocks_wait_their_turn_while_a_vote_runs() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     first = air.fill_block(1)
@@ -71,6 +103,7 @@ def test_blocks_wait_their_turn_while_a_vote_runs() -> None:
     assert [block.block_hash for block in air.agents[1].chain] == [first, second]
 
 
+@takes("receive_vote_add_block", "no", "counted already", "another block")
 def test_a_responder_counts_once_per_round() -> None:
     air = Air([1, 2, 3], fate=lambda *_: [])
     block_hash = air.fill_block(1)
@@ -83,6 +116,7 @@ def test_a_responder_counts_once_per_round() -> None:
     assert air.branches(1, "receive_vote_add_block") == ["no", "counted already", "counted already", "another block"]
 
 
+@takes("receive_vote_add_block", "no vote running")
 def test_a_vote_after_the_timer_does_not_count() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     block_hash = air.fill_block(1)
@@ -90,8 +124,10 @@ def test_a_vote_after_the_timer_does_not_count() -> None:
     air.agents[1].receive_message(2, 0, BlockAddResponse(block_hash, approve=True), air.now)
     air.flush(1)
     assert air.branches(1, "receive_vote_add_block") == ["no vote running"]
+    assert air.agents[1].vote_count == {"yes": 1, "no": 0}
 
 
+@takes("vote_timer_expiration", "not approved")
 def test_a_tied_vote_is_not_approved() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     block_hash = air.fill_block(1)
@@ -101,6 +137,22 @@ def test_a_tied_vote_is_not_approved() -> None:
     assert air.agents[1].reconcile_in_progress
 
 
+@takes("vote_timer_expiration", "reconcile in progress")
+def test_a_vote_that_ends_during_a_reconcile_decides_nothing_and_is_repeated_after_it() -> None:
+    air = Air([1, 2], fate=lambda *_: [])
+    block_hash = air.fill_block(1)
+    agent = air.agents[1]
+    agent.begin_reconcile(7.0)  # phase 1 ends at 12, the vote at 10
+    air.run_until(11.0)
+    assert air.branches(1, "vote_timer_expiration") == ["reconcile in progress"]
+    assert [block.block_hash for block in agent.blocks_to_be_committed] == [block_hash]
+    assert agent.sent["Commit Block"] == 0
+    air.settle()
+    assert air.now == 22.0
+    assert air.chains()[0] == (block_hash,)
+
+
+@takes("vote_timer_expiration", "chain changed")
 def test_an_approved_vote_is_repeated_when_the_chain_changed_meanwhile() -> None:
     """Without it an agent would go idle with a block in its deque (characteristic 2)."""
     air = Air([1, 2, 3])
@@ -113,7 +165,13 @@ def test_an_approved_vote_is_repeated_when_the_chain_changed_meanwhile() -> None
     assert air.agents[2].reconciles == 0
 
 
-@pytest.mark.parametrize(("changed_before_tally", "expected"), [(False, "not approved"), (True, "chain changed")])
+@pytest.mark.parametrize(
+    ("changed_before_tally", "expected"),
+    [
+        pytest.param(False, "not approved", marks=takes("vote_timer_expiration", "not approved")),
+        pytest.param(True, "chain changed", marks=takes("vote_timer_expiration", "chain changed")),
+    ],
+)
 def test_the_order_of_algorithm_5_s_tests_is_a_setting(changed_before_tally: bool, expected: str) -> None:
     settings = Settings(changed_before_tally=changed_before_tally)
     air = Air([1, 2], fate=lambda *_: [], settings=settings)
@@ -129,7 +187,13 @@ def test_the_order_of_algorithm_5_s_tests_is_a_setting(changed_before_tally: boo
     assert air.branches(1, "vote_timer_expiration") == [expected]
 
 
-@pytest.mark.parametrize(("names_chain", "yes"), [(False, 2), (True, 1)])
+@pytest.mark.parametrize(
+    ("names_chain", "yes"),
+    [
+        pytest.param(False, 2, marks=takes("receive_vote_add_block", "yes")),
+        pytest.param(True, 1, marks=takes("receive_vote_add_block", "another round")),
+    ],
+)
 def test_a_late_vote_of_an_earlier_round_counts_unless_votes_name_the_chain(names_chain: bool, yes: int) -> None:
     air = Air([1, 2, 3], fate=lambda *_: [], settings=Settings(vote_names_chain=names_chain))
     block_hash = air.fill_block(1)
@@ -138,6 +202,8 @@ def test_a_late_vote_of_an_earlier_round_counts_unless_votes_name_the_chain(name
     assert air.agents[1].vote_count["yes"] == yes
 
 
+@takes("receive_request_add_block", "disapprove")
+@takes("receive_commit_block", "does not succeed")
 def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:
     latency = uniform_latency(Random(1))
     lose_first_commit_to_3 = lambda s, r, m: [] if isinstance(m, CommitBlock) and r == 3 else latency(s, r, m)  # noqa: E731
@@ -151,6 +217,7 @@ def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:
     assert len(air.agents[3].chain) == 0
 
 
+@takes("receive_commit_block", "held already")
 def test_a_second_copy_of_a_block_is_never_committed() -> None:
     """No agent in good faith sends one; characteristic 3 holds all the same."""
     air = Air([1, 2])
@@ -165,6 +232,7 @@ def test_a_second_copy_of_a_block_is_never_committed() -> None:
     assert len(agent.chain) == 1
 
 
+@takes("receive_commit_block", "ignored by quirk")
 def test_the_ignore_commit_quirk_misses_commits() -> None:
     air = Air([1, 2])
     air.agents[2].quirks.set("ignore_commit", 1.0)
@@ -174,17 +242,20 @@ def test_the_ignore_commit_quirk_misses_commits() -> None:
     assert [len(chain) for chain in air.chains()] == [1, 0]
 
 
+@takes("process_next_deque_block", "reconcile in progress")
+@takes("receive_request_add_block", "reconcile in progress")
+@takes("receive_commit_block", "reconcile in progress")
 def test_a_reconciling_agent_neither_votes_nor_commits_nor_proposes() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
     air.fill_block(1)
-    agent.messages_to_send()
-    agent.receive_message(2, 0, BlockAddRequest(bytes(32), agent.chain.top_chain_hash), 1.0)
-    air.flush(1)
-    assert air.branches(1, "receive_request_add_block") == ["reconcile in progress"]
-    assert air.branches(1, "process_next_deque_block") == ["reconcile in progress"]
-    assert not agent.messages_to_send()
+    top, block = agent.chain.top_chain_hash, Block(2, 1, b"x")
+    agent.receive_message(2, 0, BlockAddRequest(block.block_hash, top), 1.0)
+    agent.receive_message(2, 1, CommitBlock(block, next_chain_hash(top, block.block_hash)), 1.0)
+    assert agent.sent == {"Chain Contain Query": 1}
+    assert not agent.voting_timer.active
+    assert len(agent.chain) == 0
 
 
 @pytest.mark.parametrize(

@@ -33,10 +33,12 @@ def test_event_ids_are_1_to_254(event_id: int) -> None:
 
 def test_random_events_come_every_30_seconds_on_average_with_the_thesis_s_sizes() -> None:
     source = RandomEvents(Random(1))
-    first = source.due
-    events = [event for _ in range(100_000) if (event := source.trial()) is not None]
-    assert 0 <= first < 1
-    assert source.due == pytest.approx(first + 100_000)
-    assert len(events) == pytest.approx(100_000 / 30, rel=0.1)
-    assert {len(data) for _, data in events} == set(EVENT_DATA_BYTES)
-    assert {event_id for event_id, _ in events} == set(range(1, 255))
+    events = [source.next() for _ in range(3000)]
+    times = [at_s for at_s, _, _ in events]
+    trials = {round(at_s - times[0], 6) for at_s in times}
+    assert times == sorted(times)
+    assert times[0] % 1 != 0
+    assert all(trial == round(trial) for trial in trials)
+    assert times[-1] == pytest.approx(3000 * 30, rel=0.1)
+    assert {len(data) for _, _, data in events} == set(EVENT_DATA_BYTES)
+    assert {event_id for _, event_id, _ in events} == set(range(1, 255))

@@ -6,13 +6,15 @@ from random import Random
 import pytest
 
 from tests.ucp.air import Air, uniform_latency
+from tests.ucp.branches import takes
+from ucp.agent import Agent
 from ucp.block import Block
 from ucp.messages import (
     BlockResponse,
     ChainContainQuery,
     ChainContainResponse,
     ChainHashSuccessorQuery,
-    CommitBlock,
+    Message,
     NextInSequenceResponse,
     RequestForBlock,
 )
@@ -38,6 +40,88 @@ def diverged(blocks_on_2: int = 1, **settings: object) -> Air:
     return air
 
 
+def with_blocks(count: int) -> Agent:
+    """An agent with that many blocks in its chain."""
+    air = Air([1, 2], fate=lambda *_: [])
+    for _ in range(count):
+        air.fill_block(1)
+        air.settle()
+    return air.agents[1]
+
+
+def answers(agent: Agent, message: Message) -> list[Message]:
+    agent.receive_message(2, 0, message, agent.now)
+    return [answer for _, answer in agent.messages_to_send()]
+
+
+A, B = b"\xaa" * 32, b"\xbb" * 32
+
+
+@takes("reconcile_begin", "begun")
+@takes("reconcile_phase_1", "asked")
+@takes("reconcile_phase_2", "asked")
+@takes("reconcile_phase_3", "asked")
+def test_each_phase_asks_its_question_and_waits_for_answers() -> None:
+    agent = Air([1, 2]).agents[1]
+    top = agent.chain.top_chain_hash
+    agent.begin_reconcile(0.0)
+    assert agent.messages_to_send() == [(0, ChainContainQuery(top))]
+    assert agent.next_timer() == 5.0
+    agent.receive_message(2, 0, ChainContainResponse(top, True), 1.0)
+    agent.handle_timer(5.0)
+    assert agent.messages_to_send() == [(1, ChainHashSuccessorQuery(top))]
+    assert agent.next_timer() == 10.0
+    agent.receive_message(2, 1, NextInSequenceResponse(top, A, 5), 6.0)
+    agent.handle_timer(10.0)
+    assert agent.messages_to_send() == [(2, RequestForBlock(A))]
+    assert agent.next_timer() == 15.0
+
+
+@takes("receive_request_chain_contain", "yes", "no")
+def test_an_agent_says_whether_its_chain_contains_another() -> None:
+    agent = with_blocks(2)
+    (_, below), (_, top) = agent.chain.with_chain_hashes()
+    for chain_hash, contained in ((below, True), (top, True), (bytes(32), False)):
+        assert answers(agent, ChainContainQuery(chain_hash)) == [ChainContainResponse(chain_hash, contained)]
+
+
+@takes("receive_request_next_in_sequence", "successor", "top of chain")
+def test_an_agent_names_its_next_block_or_the_top_of_its_chain_and_the_timestamp() -> None:
+    agent = with_blocks(2)
+    (_, below), (block, top) = agent.chain.with_chain_hashes()
+    successor = NextInSequenceResponse(below, block.block_hash, block.timestamp_us)
+    assert answers(agent, ChainHashSuccessorQuery(below)) == [successor]
+    assert answers(agent, ChainHashSuccessorQuery(top)) == [NextInSequenceResponse(top, None, block.timestamp_us)]
+
+
+@takes("receive_request_block_for_hash", "sent", "not held")
+def test_an_agent_sends_a_block_of_its_chain_and_says_nothing_of_others() -> None:
+    agent = with_blocks(1)
+    (block,) = agent.chain
+    assert answers(agent, RequestForBlock(block.block_hash)) == [BlockResponse(block)]
+    assert answers(agent, RequestForBlock(bytes(32))) == []
+
+
+@takes("receive_phase_1_response", "not in phase 1")
+@takes("receive_response_next_in_sequence", "not in phase 2")
+@takes("receive_response_block_for_hash", "not in phase 3")
+def test_an_answer_that_nobody_waits_for_changes_nothing() -> None:
+    agent = with_blocks(1)
+    top = agent.chain.top_chain_hash
+    late = Block(2, 1, b"late")
+    assert answers(agent, ChainContainResponse(top, False)) == []
+    assert answers(agent, NextInSequenceResponse(top, late.block_hash, 1)) == []
+    assert answers(agent, BlockResponse(late)) == []
+    assert agent.reconcile_vote_count == {"yes": 0, "no": 0}
+    assert not agent.reconcile_response_dictionary
+    assert agent.chain.top_chain_hash == top
+    assert agent.idle
+
+
+@takes("reconcile_phase_1_timer_expiration", "not contained", "contained")
+@takes("reconcile_phase_2_timer_expiration", "block", "top of chain")
+@takes("receive_response_block_for_hash", "committed")
+@takes("reconcile_finalize", "done")
 def test_an_outvoted_agent_rebuilds_on_the_majority_s_chain_and_gives_back_its_own_block() -> None:
     air = diverged(blocks_on_2=2)
     (own,) = air.agents[1].completed
@@ -59,6 +143,7 @@ def test_a_vote_against_a_diverged_chain_starts_the_reconcile() -> None:
     assert len(air.agents[1].chain) == 3
 
 
+@takes("reconcile_phase_3", "from the stack")
 def test_blocks_popped_in_phase_1_are_taken_from_the_stack_and_not_asked_for() -> None:
     """2 and 3 hold 1's first block on top of theirs: phase 3 finds it on 1's stack."""
     air = diverged()
@@ -70,6 +155,7 @@ def test_blocks_popped_in_phase_1_are_taken_from_the_stack_and_not_asked_for() -
     assert len(set(air.chains())) == 1
 
 
+@takes("receive_request_next_in_sequence", "diverged")
 def test_a_queried_agent_that_does_not_have_the_chain_reconciles_too() -> None:
     """Agent 3 missed a block; agent 1's phase 2 tells it so (Algorithm 13)."""
     air = Air([1, 2, 3], fate=part({1, 2}, {3}))
@@ -81,6 +167,7 @@ def test_a_queried_agent_that_does_not_have_the_chain_reconciles_too() -> None:
     assert len(set(air.chains())) == 1
 
 
+@takes("reconcile_phase_1_timer_expiration", "no response")
 def test_nobody_answers_phase_1() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     air.reconcile(1)
@@ -89,6 +176,7 @@ def test_nobody_answers_phase_1() -> None:
     assert air.agents[1].idle
 
 
+@takes("reconcile_phase_2_timer_expiration", "no response")
 def test_nobody_answers_phase_2() -> None:
     air = diverged()
     latency = air.fate
@@ -98,6 +186,7 @@ def test_nobody_answers_phase_2() -> None:
     assert len(air.agents[1].chain) == 1  # its own block went back on top
 
 
+@takes("reconcile_phase_3_timer_expiration", "gave up")
 def test_no_block_comes_in_phase_3_and_the_rest_of_the_stack_goes_back() -> None:
     air = diverged()
     latency = air.fate
@@ -108,6 +197,7 @@ def test_no_block_comes_in_phase_3_and_the_rest_of_the_stack_goes_back() -> None
     assert air.agents[1].majority_response_block_hash is None
 
 
+@takes("reconcile_phase_1_timer_expiration", "at inception")
 def test_the_inception_block_is_never_popped() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     agent = air.agents[1]
@@ -119,7 +209,14 @@ def test_the_inception_block_is_never_popped() -> None:
     assert agent.idle
 
 
-@pytest.mark.parametrize(("phase1_tie", "expected"), [("phase2", "contained"), ("pop", "not contained")])
+@takes("receive_phase_1_response", "yes", "no", "counted already", "another chain")
+@pytest.mark.parametrize(
+    ("phase1_tie", "expected"),
+    [
+        pytest.param("phase2", "contained", marks=takes("reconcile_phase_1_timer_expiration", "contained")),
+        pytest.param("pop", "not contained", marks=takes("reconcile_phase_1_timer_expiration", "not contained")),
+    ],
+)
 def test_a_tie_in_phase_1(phase1_tie: str, expected: str) -> None:
     air = Air([1, 2, 3], fate=lambda *_: [], settings=Settings(phase1_tie=phase1_tie))
     air.fill_block(1)
@@ -135,24 +232,30 @@ def test_a_tie_in_phase_1(phase1_tie: str, expected: str) -> None:
     assert air.branches(1, "receive_phase_1_response") == ["yes", "no", "counted already", "another chain"]
 
 
-def phase_2(answers: list[tuple[bytes | None, int]], **settings: object) -> tuple[Air, str]:
-    """Agent 1 in phase 2 at inception gets one answer (block hash, timestamp) from each of 2, 3, ..."""
-    air = Air(range(1, len(answers) + 2), fate=lambda *_: [], settings=Settings(**settings))
+def in_phase_2(agents: int, **settings: object) -> Air:
+    """Agent 1 has asked for the successor of the inception block, at 5 s; nobody hears anybody."""
+    air = Air(range(1, agents + 1), fate=lambda *_: [], settings=Settings(**settings))
     agent = air.agents[1]
-    top = agent.chain.top_chain_hash
     agent.begin_reconcile(0.0)
-    agent.receive_message(2, 0, ChainContainResponse(top, True), 1.0)
+    agent.receive_message(2, 0, ChainContainResponse(agent.chain.top_chain_hash, True), 1.0)
     air.run_until(5.0)
+    return air
+
+
+def phase_2(answers: list[tuple[bytes | None, int]], **settings: object) -> tuple[Air, str]:
+    """Agent 1 in phase 2 gets one answer (block hash, timestamp) from each of 2, 3, ..."""
+    air = in_phase_2(len(answers) + 1, **settings)
+    agent = air.agents[1]
     for sender, (block_hash, timestamp_us) in enumerate(answers, start=2):
-        agent.receive_message(sender, 1, NextInSequenceResponse(top, block_hash, timestamp_us), 6.0)
+        response = NextInSequenceResponse(agent.chain.top_chain_hash, block_hash, timestamp_us)
+        agent.receive_message(sender, 1, response, 6.0)
     air.run_until(10.0)
     (branch,) = air.branches(1, "reconcile_phase_2_timer_expiration")
     return air, branch
 
 
-A, B = b"\xaa" * 32, b"\xbb" * 32
-
-
+@takes("receive_response_next_in_sequence", "new candidate", "counted")
+@takes("reconcile_phase_2_timer_expiration", "block")
 def test_phase_2_follows_the_plurality() -> None:
     air, branch = phase_2([(A, 9), (A, 9), (B, 1), (None, 0)])
     assert branch == "block"
@@ -165,40 +268,48 @@ def test_phase_2_follows_the_plurality() -> None:
     ]
 
 
+@takes("reconcile_phase_2_timer_expiration", "tie: block")
 def test_a_tie_in_phase_2_goes_to_the_oldest_block() -> None:
     air, branch = phase_2([(A, 9), (B, 1)])
     assert branch == "tie: block"
     assert air.agents[1].majority_response_block_hash == B
 
 
+@takes("reconcile_phase_2_timer_expiration", "tie: block")
 def test_a_tie_of_equal_timestamps_goes_to_the_lowest_hash() -> None:
     air, _ = phase_2([(B, 5), (A, 5)])
     assert air.agents[1].majority_response_block_hash == A
 
 
+@takes("reconcile_phase_2_timer_expiration", "tie: top of chain")
 def test_a_tie_with_top_of_chain_ends_the_search_as_the_mutual_block_is_older() -> None:
-    _, branch = phase_2([(A, 5), (None, 0)])
+    air, branch = phase_2([(A, 5), (None, 0)])
     assert branch == "tie: top of chain"
+    assert air.agents[1].idle
+    assert air.agents[1].sent["Request for Block"] == 0
 
 
+@takes("reconcile_phase_2_timer_expiration", "tie: block")
 def test_a_tie_never_ends_the_search_while_a_block_is_on_offer_if_so_set() -> None:
     air, branch = phase_2([(A, 5), (None, 0)], phase2_tie="block")
     assert branch == "tie: block"
     assert air.agents[1].majority_response_block_hash == A
 
 
+@takes("receive_response_next_in_sequence", "counted already", "another chain")
 def test_a_responder_of_phase_2_counts_once_and_only_for_the_chain_asked_about() -> None:
-    air, _ = phase_2([(A, 5)])
+    """One for A and one for B, who is older: not two or three for A."""
+    air = in_phase_2(agents=4)
     agent = air.agents[1]
-    agent.receive_message(2, 3, BlockResponse(Block(2, 1, b"other")), 11.0)
-    air.flush(1)
-    assert air.branches(1, "receive_response_block_for_hash") == ["another block"]
-    assert agent.phase_three_timer.active
-    agent.receive_message(2, 3, NextInSequenceResponse(agent.chain.top_chain_hash, A, 5), 11.0)
-    air.flush(1)
-    assert air.branches(1, "receive_response_next_in_sequence")[-1] == "not in phase 2"
+    top = agent.chain.top_chain_hash
+    for sender, chain_hash, block_hash, timestamp_us in ((2, top, A, 9), (2, top, A, 9), (3, B, A, 9), (3, top, B, 1)):
+        agent.receive_message(sender, 1, NextInSequenceResponse(chain_hash, block_hash, timestamp_us), 6.0)
+    air.run_until(10.0)
+    assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["tie: block"]
+    assert agent.majority_response_block_hash == B
 
 
+@takes("receive_response_block_for_hash", "another block")
 def test_a_block_that_was_not_asked_for_does_not_delay_the_end_of_phase_3() -> None:
     air, _ = phase_2([(A, 5)])  # phase 3 begins at 10 s
     air.agents[1].receive_message(2, 3, BlockResponse(Block(2, 1, b"other")), 13.0)
@@ -207,24 +318,21 @@ def test_a_block_that_was_not_asked_for_does_not_delay_the_end_of_phase_3() -> N
     assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
 
 
+@takes("reconcile_phase_2_timer_expiration", "tie: crashed by quirk")
 def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever() -> None:
-    air = Air([1, 2, 3], fate=lambda *_: [])
+    air = in_phase_2(agents=3)
     agent = air.agents[1]
     agent.quirks.set("crash_on_tie", True)
     top = agent.chain.top_chain_hash
-    agent.begin_reconcile(0.0)
-    agent.receive_message(2, 0, ChainContainResponse(top, True), 1.0)
-    air.run_until(5.0)
-    agent.receive_message(2, 1, NextInSequenceResponse(top, A, 5), 6.0)
     agent.receive_message(2, 1, NextInSequenceResponse(top, A, 5), 6.0)
     agent.receive_message(3, 1, NextInSequenceResponse(top, None, 0), 6.0)
-    agent.receive_message(3, 1, NextInSequenceResponse(bytes(32), None, 0), 6.0)
     air.settle()
     assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["tie: crashed by quirk"]
     assert agent.reconcile_in_progress
     assert agent.next_timer() is None
 
 
+@takes("reconcile_phase_3", "held already")
 def test_a_block_that_is_held_already_is_not_asked_for() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     air.fill_block(1)
@@ -237,9 +345,11 @@ def test_a_block_that_is_held_already_is_not_asked_for() -> None:
     agent.receive_message(2, 1, NextInSequenceResponse(agent.chain.top_chain_hash, own, 1), air.now)
     air.settle()
     assert air.branches(1, "reconcile_phase_3") == ["held already"]
+    assert agent.sent["Request for Block"] == 0
     assert agent.idle
 
 
+@takes("reconcile_finalize", "recommitted, more to come", "done")
 def test_finalize_pauses_between_commits_and_the_others_follow() -> None:
     air = Air([1, 2, 3], fate=part({1}, {2, 3}))
     for _ in range(3):
@@ -253,38 +363,35 @@ def test_finalize_pauses_between_commits_and_the_others_follow() -> None:
     recommits = [
         run.t
         for run in air.runs[1]
-        if run.handler == "reconcile_finalize" and any(sent["message"] == "Commit Block" for sent in run.sent)
+        if run.handler == "reconcile_finalize" and any(sent.message == "Commit Block" for sent in run.sent)
     ]
     assert [later - earlier for earlier, later in pairwise(recommits)] == pytest.approx([0.1, 0.1])
     assert len(set(air.chains())) == 1
     assert len(air.agents[2].chain) == 4
 
 
+@takes("reconcile_finalize", "done")
 def test_without_a_gap_finalize_commits_all_at_once() -> None:
     air = diverged(finalize_gap_s=0.0)
     air.reconcile(1)
     assert air.branches(1, "reconcile_finalize") == ["done"]
 
 
-def test_a_reconciling_agent_answers_nobody() -> None:
-    air = Air([1, 2], fate=lambda *_: [])
-    agent = air.agents[1]
-    agent.begin_reconcile(0.0)
-    agent.messages_to_send()
+@takes("receive_request_chain_contain", "reconcile in progress")
+@takes("receive_request_next_in_sequence", "reconcile in progress")
+@takes("receive_request_block_for_hash", "reconcile in progress")
+@takes("reconcile_begin", "already in progress")
+def test_a_reconciling_agent_answers_nobody_and_does_not_begin_again() -> None:
+    agent = with_blocks(1)
+    (block,) = agent.chain
     top = agent.chain.top_chain_hash
-    for message in (ChainContainQuery(top), ChainHashSuccessorQuery(top), RequestForBlock(top)):
-        agent.receive_message(2, 0, message, 1.0)
-    agent.receive_message(2, 0, CommitBlock(Block(2, 1, b"x"), bytes(32)), 1.0)
-    agent.begin_reconcile(1.0)
+    agent.begin_reconcile(agent.now)
+    agent.messages_to_send()
+    for question in (ChainContainQuery(top), ChainHashSuccessorQuery(top), RequestForBlock(block.block_hash)):
+        assert answers(agent, question) == []
+    agent.begin_reconcile(agent.now + 1)
     assert not agent.messages_to_send()
-    assert {run.branch for run in agent.trace()[-5:]} == {"reconcile in progress", "already in progress"}
-
-
-def test_an_agent_that_does_not_hold_a_block_says_nothing() -> None:
-    air = Air([1, 2], fate=lambda *_: [])
-    air.agents[1].receive_message(2, 0, RequestForBlock(bytes(32)), 0.0)
-    air.flush(1)
-    assert air.branches(1, "receive_request_block_for_hash") == ["not held"]
+    assert agent.reconciles == 1
 
 
 def test_a_divergence_of_50_blocks_is_reconciled() -> None:

@@ -1,0 +1,105 @@
+"""How fast the simulation is, beside a null model in the same run: `python -m benchmarks.simulation [--rounds 5]`.
+
+The null model delivers as many broadcasts to as many agents as the simulated mission had, and does nothing with them:
+a heap, a random number for loss and one for latency, a set insert and a dictionary look-up for each delivery. Rounds
+alternate between the two, so that a machine that is slow for a while is slow for both; processor time is counted. Every
+simulation is judged with the checker, without traces, as in a matrix; `traced` runs have traces and all six verdicts.
+"""
+
+import argparse
+import heapq
+import random
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+from harness.scenario import Scenario
+from harness.simulate import simulate
+
+MISSION_S = 1200.0
+
+
+def scenario(agents: int, loss: float, settle_s: float) -> Scenario:
+    return Scenario.model_validate(
+        {"name": "benchmark", "agents": agents, "network": {"loss": loss}, "settle": {"limit_s": settle_s}}
+    )
+
+
+def null_model(agents: int, loss: float, broadcasts: int) -> int:
+    """Deliver that many broadcasts, spread over the mission; how many deliveries there were."""
+    coming: list[tuple[float, int, int]] = []
+    seen: set[tuple[int, int]] = set()
+    held = dict.fromkeys(range(agents), 0)
+    deliveries = 0
+    for number in range(broadcasts):
+        now = MISSION_S * number / broadcasts
+        while coming and coming[0][0] <= now:
+            _, message, receiver = heapq.heappop(coming)
+            seen.add((message, receiver))
+            held[receiver] += 1
+            deliveries += 1
+        sender = number % agents
+        for receiver in range(agents):
+            if receiver != sender and random.random() >= loss:
+                heapq.heappush(coming, (now + 0.002 + 0.048 * random.random(), number, receiver))
+    return deliveries + len(coming)
+
+
+def seconds(what: Callable[[], object]) -> float:
+    began = time.process_time()
+    what()
+    return time.process_time() - began
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--agents", type=int, nargs="+", default=[5, 20, 50])
+    parser.add_argument("--loss", type=float, nargs="+", default=[0.15, 0.30])
+    parser.add_argument("--settle", type=float, default=7200.0, help="mission seconds after minute 20, at most")
+    parser.add_argument("--traced", action="store_true", help="also with traces")
+    arguments = parser.parse_args()
+    print_row("agents", "loss", "broadcasts", "null model", "simulation", "ratio", "traced", "ratio")
+    for agents in arguments.agents:
+        for loss in arguments.loss:
+            row(scenario(agents, loss, arguments.settle), agents, loss, arguments.rounds, arguments.traced)
+
+
+def row(what: Scenario, agents: int, loss: float, rounds: int, traced: bool) -> None:
+    broadcasts = []
+    times: dict[str, list[float]] = {"null": [], "plain": [], "traced": []}
+    for seed in range(rounds):
+        messages = simulate(what, seed).result.figures["messages"]
+        assert isinstance(messages, int)
+        broadcasts.append(messages)
+        times["null"].append(seconds(lambda messages=messages: null_model(agents, loss, messages)))  # type: ignore[misc]
+        times["plain"].append(seconds(lambda seed=seed: simulate(what, seed)))  # type: ignore[misc]
+        if traced:
+            times["traced"].append(seconds(lambda seed=seed: simulate(what, seed, tracing=True)))  # type: ignore[misc]
+    null, plain = statistics.median(times["null"]), statistics.median(times["plain"])
+    cells = [
+        str(agents),
+        f"{loss:.2f}",
+        str(round(statistics.median(broadcasts))),
+        ms(null),
+        ms(plain),
+        f"{plain / null:.2f}",
+    ]
+    if traced:
+        with_traces = statistics.median(times["traced"])
+        cells += [ms(with_traces), f"{with_traces / plain:.2f} x"]
+    print_row(*cells)
+
+
+def ms(duration_s: float) -> str:
+    return f"{duration_s * 1000:.1f} ms"
+
+
+def print_row(*cells: str) -> None:
+    sys.stdout.write("".join(f"{cell:>14}" for cell in cells) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

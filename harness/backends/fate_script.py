@@ -1,0 +1,108 @@
+"""Plays scripted fates (`harness.scenario.fates`): decides single messages before chance has its say."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from harness.scenario.fates import Fate
+from netem.medium import Lots
+from ucp.messages import Message, block_named
+
+RIGHT_AFTER_S = 1e-6
+
+
+@dataclass(slots=True, eq=False)
+class _Part:
+    """One fate and what it has come to: messages that fit it, and deliveries that it decided."""
+
+    index: int
+    fate: Fate
+    fitting: int = 0
+    decided: int = 0
+
+
+@dataclass(slots=True)
+class Decided:
+    """When copies of a message arrive at whom, as far as that is known yet, in mission seconds."""
+
+    arrivals: list[tuple[int, float]] = field(default_factory=list)
+    waiting: list[tuple[int, str]] = field(default_factory=list)
+    """(receiver, name): to arrive after the message that the fate with this name is about."""
+    named: list[tuple[str, float]] = field(default_factory=list)
+    """(name, time): when the message arrives that the fate with this name is about."""
+
+
+class FateScript:
+    """Fates for `roster`; receivers are numbered in its order. `name_of` gives a block's name from its hash."""
+
+    def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: Callable[[bytes], str | None]) -> None:
+        self.fates = tuple(fates)
+        self._parts = [_Part(index, fate) for index, fate in enumerate(fates)]
+        self._number = {agent_id: number for number, agent_id in enumerate(roster)}
+        self._name_of = name_of
+        self._about: dict[tuple[str | None, int | None], list[_Part]] = defaultdict(list)
+        for part in self._parts:
+            self._about[part.fate.message, part.fate.sender].append(part)
+
+    def decide(
+        self, now: float, sender: int, message: Message, lots: Lots, hears: Callable[[int], bool]
+    ) -> Decided | None:
+        """What becomes of a message that agent `sender` broadcasts; None if no fate is about it."""
+        parts = [part for part in self._fitting(now, sender, message) if self._picks(part)]
+        if not parts:
+            return None
+        decided = Decided()
+        by_chance = lots.to_all()
+        for agent_id, receiver in self._number.items():
+            if agent_id == sender:
+                continue
+            arrivals = [now + delay for reached, delay in by_chance if reached == receiver]
+            part = next((part for part in parts if part.fate.receiver in (None, agent_id)), None)
+            if part is None:
+                decided.arrivals += [(receiver, at) for at in arrivals]
+                continue
+            part.decided += 1
+            if not hears(receiver):
+                continue
+            fate = part.fate
+            if fate.after is not None:
+                decided.waiting.append((receiver, fate.after))
+                continue
+            if fate.drop:
+                arrivals = []
+            elif fate.delay_s is not None:
+                arrivals = [now + fate.delay_s]
+            elif fate.hold_until_s is not None:
+                arrivals = [max(at, fate.hold_until_s) for at in arrivals]
+            decided.arrivals += [(receiver, at) for at in arrivals]
+            if fate.name is not None and arrivals:
+                decided.named.append((fate.name, arrivals[0]))
+        return decided
+
+    def unmatched(self) -> list[str]:
+        """A sentence for each fate that decided nothing: whoever wrote it believes that it did."""
+        return [
+            f"fates.{part.index} ({part.fate.describe()}) never matched a message"
+            for part in self._parts
+            if not part.decided
+        ]
+
+    def _fitting(self, now: float, sender: int, message: Message) -> Iterator[_Part]:
+        keys = ((message.NAME, sender), (message.NAME, None), (None, sender), (None, None))
+        parts = [part for key in keys for part in self._about.get(key, ())]
+        if not parts:
+            return
+        block_hash = block_named(message)
+        block = self._name_of(block_hash) if block_hash else None
+        for part in sorted(parts, key=lambda part: part.index):
+            fate = part.fate
+            early = fate.from_s is not None and now < fate.from_s
+            late = fate.until_s is not None and now >= fate.until_s
+            if not early and not late and (fate.block is None or fate.block == block):
+                yield part
+
+    def _picks(self, part: _Part) -> bool:
+        """Count the message that fits; whether the fate is about this one."""
+        part.fitting += 1
+        counts = part.fate.counts
+        return counts is None or part.fitting in counts

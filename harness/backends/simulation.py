@@ -1,0 +1,331 @@
+"""The simulation backend: a scenario played in virtual time, by the very agents that `ucp.node` runs.
+
+Nothing here waits, and nothing depends on the machine: the same scenario and seed give the same run, to the last bit.
+Each agent's events, the lots of each sender, and each agent's quirks have random streams of their own, so that adding
+one fault leaves the others as they are. No vehicles fly; without vehicles, events are those of Algorithm 21.
+"""
+
+import dataclasses
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass
+from random import Random
+from typing import Any, Protocol
+
+from harness.backends.fate_script import FateScript
+from harness.backends.virtual_air import Flight, Logged, VirtualAir
+from harness.errors import ScenarioError
+from harness.mission import Played
+from harness.scenario import Scenario
+from harness.scenario.scenario import Clock
+from harness.scenario.timeline import FaultName
+from harness.seeds import agent_seed
+from harness.timeline import Change, NetworkChange
+from netem.medium import Medium
+from ucp.agent import Agent
+from ucp.clock import MICROSECONDS
+from ucp.events import LoggableEvent, RandomEvents
+from ucp.interest import ONLY_COUNTED
+from ucp.messages import datagram_bytes
+from ucp.trace import HandlerRun
+
+ENGINE = "virtual time"
+SCRIPTED_EVENT_ID = 1
+BREATH_S = 20.0
+"""Mission seconds between two looks at whoever watches."""
+
+
+def refuse_what_needs_processes(scenario: Scenario) -> None:
+    """Raises ScenarioError naming the keys that virtual time cannot give."""
+    asked = {
+        "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
+        "vehicles.binary": scenario.vehicles.binary is not None,
+        "agent_command": scenario.agent_command is not None,
+    }
+    keys = [f"`{key}`" for key, needed in asked.items() if needed]
+    if keys:
+        verb = "need" if len(keys) > 1 else "needs"
+        raise ScenarioError(f"{', '.join(keys)} {verb} real processes: use --backend process, or leave it out")
+
+
+class Recorder(Protocol):
+    """Takes down what cannot be asked for at the end."""
+
+    tracing: bool
+    """Whether handler runs are wanted; if not, `write` is not called."""
+
+    def begin(self, life: "Life") -> None:
+        """An agent starts, or starts anew."""
+
+    def write(self, agent_id: int, runs: list[HandlerRun]) -> None: ...
+
+    def keep_chains(self, simulation: "Simulation") -> None:
+        """A final reconcile is about to put the chains in order."""
+
+
+@dataclass(slots=True)
+class Life:
+    """An agent from its start or restart on."""
+
+    agent: Agent
+    source: RandomEvents
+    clock: Clock | None
+    """None shows mission time."""
+    born_at: float
+    deadline: float | None = None
+    """When its next timer ends, in mission seconds."""
+    waiting: list[Flight | Logged] | None = None
+    """What has reached the agent while it is paused; None if it is not."""
+    bytes_sent: int = 0
+
+
+class Simulation:
+    """A swarm in virtual time; see `harness.mission.Swarm`. Agents are numbered in the roster's order.
+
+    `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. `breathe` is
+    awaited every few mission seconds.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        recorder: Recorder,
+        *,
+        deliver_all: bool = False,
+        breathe: Callable[["Simulation"], Awaitable[None]] | None = None,
+    ) -> None:
+        self.scenario = scenario
+        self.roster = scenario.roster
+        self.seed = seed
+        self.played = Played(engine=ENGINE)
+        self.stage = "mission"
+        self.network = ""
+        self._initial_data = f"{scenario.name}, seed {seed}".encode()
+        self._recorder = recorder
+        self._tracing = recorder.tracing
+        self._deliver_all = deliver_all
+        self._breathe = breathe
+        self._now = 0.0
+        self._generating = True
+        self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
+        self._lives: list[list[Life]] = [[] for _ in self.roster]
+        self._alive: list[Life | None] = [None for _ in self.roster]
+        self._medium = Medium(self.roster, seed)
+        self._block_names: dict[bytes, str] = {}
+        script = FateScript(scenario.fates, self.roster, self._block_name)
+        self._air = VirtualAir(self.roster, self._medium, script, deliver_all=deliver_all)
+
+    # The swarm, as harness.mission drives it
+
+    def now(self) -> float:
+        return self._now
+
+    def enter(self, stage: str) -> None:
+        self.stage = stage
+
+    async def begin(self, first: Change) -> None:
+        await self.apply(first)
+        for number in range(len(self.roster)):
+            self._start(number)
+        for event in self.scenario.events.script:
+            self._air.expect(event.at_s, self._number[event.agent], (SCRIPTED_EVENT_ID, bytes(event.bytes)))
+
+    async def until(self, mission_s: float) -> None:
+        if self._breathe is None:
+            self._run(mission_s)
+            return
+        while self._now < mission_s:
+            self._run(min(mission_s, self._now + BREATH_S))
+            await self._breathe(self)
+
+    async def apply(self, change: Change) -> None:
+        if isinstance(change, NetworkChange):
+            self._medium.apply(change.conditions)
+            self.network = change.detail
+        else:
+            for agent_id in change.agents:
+                self._fault(change.what, self._number[agent_id])
+        self.played.record(change.to_json(round(self._now, 3)))
+
+    async def stop_events(self) -> None:
+        self._generating = False
+
+    async def until_idle(self, limit_s: float) -> bool:
+        limit = self._now + limit_s
+        while self._now < limit:
+            last = max(self._air.quiet_at, *(life.deadline or 0.0 for life in self.living() if life.waiting is None))
+            if last <= self._now:
+                return all(life.agent.idle for life in self.living())
+            await self.until(min(limit, last))
+        return False
+
+    async def keep_chains(self) -> None:
+        self._recorder.keep_chains(self)
+
+    async def reconcile(self, agent_id: int) -> None:
+        number = self._number[agent_id]
+        life = self._alive[number]
+        if life is not None:
+            life.agent.begin_reconcile(self._local(life))
+            self._after(number, life)
+
+    async def top_chain_hashes(self) -> dict[int, str]:
+        return {life.agent.agent_id: life.agent.chain.top_chain_hash.hex() for life in self.living()}
+
+    def end(self) -> None:
+        """Take down what there is at the end."""
+        self.played.mission_s = round(self._now, 3)
+        self.played.unmatched_fates = self._air.unmatched_fates()
+        self.played.agents = {str(agent_id): self._agent_to_json(number) for agent_id, number in self._number.items()}
+
+    # What is there
+
+    def living(self) -> Iterator[Life]:
+        return (life for life in self._alive if life is not None)
+
+    def timestamp_us(self, life: Life) -> int:
+        """What the agent's clock shows, in microseconds; never less than 0."""
+        return max(0, round(self._local(life) * MICROSECONDS))
+
+    def _agent_to_json(self, number: int) -> dict[str, Any]:
+        lives = self._lives[number]
+        life = self._alive[number]
+        return {
+            "outcome": "killed" if life is None else "exported",
+            "restarts": len(lives) - 1,
+            "idle": life.agent.idle if life else None,
+            "bytes_sent": sum(life.bytes_sent for life in lives),
+            "messages_sent": sum(life.agent.sent.total() for life in lives),
+            "reconciles": sum(life.agent.reconciles for life in lives),
+            "chain_changed_at_s": round(_mission_time(life, life.agent.chain_changed_at), 3) if life else None,
+        }
+
+    def _block_name(self, block_hash: bytes) -> str | None:
+        """`<agent>.<ordinal>` of a block that an agent has completed."""
+        if block_hash not in self._block_names:
+            for agent_id, lives in zip(self.roster, self._lives, strict=True):
+                completed = [block for life in lives for block in life.agent.completed]
+                self._block_names.update((block, f"{agent_id}.{count}") for count, block in enumerate(completed, 1))
+        return self._block_names.get(block_hash)
+
+    # What happens
+
+    def _run(self, until: float) -> None:
+        """All that happens up to `until`."""
+        alive = self._alive
+        for at, _, number, what in self._air.until(until):
+            self._now = at
+            life = alive[number]
+            if life is None:
+                continue
+            if life.waiting is None:
+                self._happen(number, life, what)
+            elif what is not None:
+                life.waiting.append(what)
+        self._now = until
+
+    def _happen(self, number: int, life: Life, what: Flight | Logged | None) -> None:
+        if isinstance(what, Flight):
+            agent, sender, message = life.agent, what.sender, what.message
+            if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent, sender, message)):
+                agent.receive_message(sender, what.sequence, message, self._local(life))
+                if self._tracing or type(message) not in ONLY_COUNTED:
+                    self._after(number, life)
+        elif what is None:
+            self._timer_ends(number, life)
+        elif self._generating:
+            life.agent.add_event(LoggableEvent(self.timestamp_us(life), *what), self._local(life))
+            self._expect_event(number, life)
+            self._after(number, life)
+
+    def _timer_ends(self, number: int, life: Life) -> None:
+        soonest = life.agent.next_timer()
+        if soonest is None or life.deadline is None or life.deadline > self._now:
+            return  # it was stopped, or started anew, since it was expected to end now
+        life.agent.handle_timer(max(soonest, self._local(life)))
+        self._after(number, life)
+
+    def _after(self, number: int, life: Life) -> None:
+        """Do what the agent says after an input: send, trace, and wait for its next timer."""
+        agent = life.agent
+        for sequence, message in agent.messages_to_send():
+            life.bytes_sent += datagram_bytes(message)
+            self._air.broadcast(self._now, number, sequence, message)
+        if self._tracing:
+            self._recorder.write(agent.agent_id, self._in_mission_time(agent.trace()))
+        soonest = agent.next_timer()
+        deadline = None if soonest is None else max(self._now, _mission_time(life, soonest))
+        if deadline != life.deadline:
+            life.deadline = deadline
+            if deadline is not None:
+                self._air.expect(deadline, number, None)
+        self._air.busy_until[number] = _mission_time(life, agent.answers_nobody_until())
+
+    def _in_mission_time(self, runs: list[HandlerRun]) -> list[HandlerRun]:
+        for run in runs:
+            run.t = self._now
+        return runs
+
+    # An agent's life
+
+    def _start(self, number: int) -> None:
+        agent_id = self.roster[number]
+        scenario = self.scenario
+        seed = agent_seed(self.seed, agent_id, len(self._lives[number]) + 1)
+        agent = Agent(
+            agent_id,
+            self.roster,
+            self._initial_data,
+            scenario.settings,
+            seed=seed,
+            tracing=self._tracing,
+        )
+        agent.quirks = dataclasses.replace(scenario.quirks)
+        source = RandomEvents(Random(seed), scenario.events.mean_s)
+        life = Life(agent, source, scenario.clocks.get(agent_id), self._now)
+        self._lives[number].append(life)
+        self._alive[number] = life
+        self._recorder.begin(life)
+        self._expect_event(number, life)
+
+    def _expect_event(self, number: int, life: Life) -> None:
+        if self.scenario.events.source != "scripted":
+            due, event_id, data = life.source.next()
+            self._air.expect(max(self._now, life.born_at + due), number, (event_id, data))
+
+    def _fault(self, what: FaultName, number: int) -> None:
+        life = self._alive[number]
+        match what:
+            case "kill":
+                self._alive[number] = None
+                self._air.busy_until[number] = 0.0
+            case "restart":
+                self._start(number)
+            case "pause" if life is not None:
+                life.waiting = []
+            case "resume" if life is not None and life.waiting is not None:
+                self._resume(number, life, life.waiting)
+
+    def _resume(self, number: int, life: Life, waiting: list[Flight | Logged]) -> None:
+        """What has waited is handled as a process does it: what the socket holds, then timers, then events."""
+        life.waiting = None
+        for what in waiting:
+            if isinstance(what, Flight):
+                self._happen(number, life, what)
+        self._timer_ends(number, life)
+        for what in waiting:
+            if not isinstance(what, Flight):
+                self._happen(number, life, what)
+
+    # An agent's clock
+
+    def _local(self, life: Life) -> float:
+        """What the agent takes for mission time."""
+        clock = life.clock
+        return self._now if clock is None else clock.offset_s + (1 + clock.drift) * self._now
+
+
+def _mission_time(life: Life, local: float) -> float:
+    """When the agent's clock shows `local`."""
+    clock = life.clock
+    return local if clock is None else (local - clock.offset_s) / (1 + clock.drift)

@@ -1,0 +1,50 @@
+"""What is measured of each run, from the checker's figures. One list for the table, the files and the picture."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from harness.matrix.estimate import Estimate, estimate_mean, estimate_share
+
+Figures = Mapping[str, float | int | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """`of` is None for a run that does not tell. `unit`: a share of the runs, a share in each run, or a number."""
+
+    name: str
+    label: str
+    of: Callable[[Figures], float | None]
+    unit: Literal["share of runs", "share", "number"] = "number"
+
+    def estimate(self, runs: Iterable[Figures]) -> Estimate:
+        values = [value for figures in runs if (value := self.of(figures)) is not None]
+        if self.unit == "share of runs":
+            return estimate_share(round(sum(values)), len(values))
+        return estimate_mean(values)
+
+
+def _figure(name: str) -> Callable[[Figures], float | None]:
+    return lambda figures: figures.get(name)
+
+
+def _uniform(figures: Figures) -> float | None:
+    chains = figures.get("distinct_chains")
+    return None if chains is None else float(chains == 1)
+
+
+def _mutual_share(figures: Figures) -> float | None:
+    mutual, blocks = figures.get("mutual_chain"), figures.get("blocks")
+    return None if mutual is None or not blocks else mutual / blocks
+
+
+METRICS = (
+    Metric("uniform", "one chain", _uniform, "share of runs"),
+    Metric("mutual_share", "mutual chain", _mutual_share, "share"),
+    Metric("distinct_chains", "distinct chains", _figure("distinct_chains")),
+    Metric("reconciles", "reconciles", _figure("reconciles")),
+    Metric("copies_mean", "copies mean", _figure("copies_mean")),
+    Metric("copies_min", "copies fewest", _figure("copies_min")),
+    Metric("messages_per_block", "messages per block", _figure("messages_per_block")),
+)

@@ -1,0 +1,77 @@
+"""What a matrix leaves in its directory.
+
+matrix.json   all of it, schema `ucp-matrix/1`
+matrix.csv    one row a cell
+runs.csv      one row a run: loss, seed, figures, verdicts
+matrix.svg    the picture
+"""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness.checker.verdict import CHECKS
+from harness.errors import MachineError, RunDirectoryError
+from harness.matrix.cell import Cell, Run
+from harness.matrix.metrics import METRICS
+from harness.matrix.picture import draw
+from harness.matrix.run import Finished
+from ucp.files import write_atomically, write_json_atomically
+
+
+def claim(directory: Path) -> None:
+    """Make the directory, or take an empty one. Raises RunDirectoryError if it holds anything already."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        if any(directory.iterdir()):
+            raise RunDirectoryError(f"{directory} is not empty: choose another --out, nothing is overwritten")
+    except (FileExistsError, NotADirectoryError):
+        raise RunDirectoryError(f"{directory} is not a directory: choose another --out") from None
+    except OSError as error:
+        raise RunDirectoryError(f"{directory} cannot be made: {error.strerror}; choose another --out") from None
+
+
+def write(finished: Finished, directory: Path) -> None:
+    """Raises MachineError if the disk refuses."""
+    record = finished.record
+    try:
+        write_json_atomically(directory / "matrix.json", record.to_json())
+        write_atomically(directory / "matrix.csv", _csv(_cell_row(cell) for cell in record.cells))
+        write_atomically(directory / "runs.csv", _csv(_run_rows(finished.runs)))
+        write_atomically(directory / "matrix.svg", draw(record))
+    except OSError as error:
+        raise MachineError(f"{error.filename or directory} cannot be written: {error.strerror}") from None
+
+
+def _cell_row(cell: Cell) -> dict[str, Any]:
+    row: dict[str, Any] = {"loss": cell.loss, "runs": cell.runs, "failed": cell.failed}
+    for metric in METRICS:
+        estimate = cell.estimates[metric.name]
+        row |= {metric.name: estimate.mean, f"{metric.name}_low": estimate.low, f"{metric.name}_high": estimate.high}
+    return row | {f"violated_{number}": len(cell.violated.get(number, [])) for number in CHECKS}
+
+
+def _run_rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
+    figures = list(dict.fromkeys(name for run in runs for name in run.figures))
+    for run in runs:
+        yield {
+            "loss": run.loss,
+            "seed": run.seed,
+            **{name: run.figures.get(name) for name in figures},
+            **{f"characteristic_{number}": run.verdicts.get(number) for number in CHECKS},
+            "failed": run.failed,
+        }
+
+
+def _csv(rows: Iterable[dict[str, Any]]) -> str:
+    """Unknown is an empty field."""
+    file = io.StringIO()
+    writer: csv.DictWriter[str] | None = None
+    for row in rows:
+        if writer is None:
+            writer = csv.DictWriter(file, list(row), lineterminator="\n")
+            writer.writeheader()
+        writer.writerow(row)
+    return file.getvalue()

@@ -1,0 +1,53 @@
+"""What matrix.json says, schema `ucp-matrix/1`. Keys are added, never removed or renamed."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.errors import INTERRUPTED, VIOLATED
+from harness.matrix.cell import Cell
+from harness.matrix.model import Matrix
+
+SCHEMA = "ucp-matrix/1"
+
+
+class FailedRun(BaseModel):
+    """A run without a result, and why."""
+
+    loss: float
+    seed: int
+    reason: str
+
+
+class MatrixRecord(BaseModel):
+    """One matrix. `matrix` is the file as resolved; a cell for each loss of which a run has ended."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    schema_: Literal["ucp-matrix/1"] = Field(default="ucp-matrix/1", alias="schema")
+    matrix: Matrix
+    backend: Literal["simulation"]
+    versions: dict[str, str]
+    started_at: str
+    wall_s: float
+    outcome: Literal["completed", "interrupted"]
+    cells: list[Cell]
+    failed: list[FailedRun] = []
+
+    @property
+    def runs(self) -> int:
+        return sum(cell.runs for cell in self.cells)
+
+    @property
+    def runs_asked(self) -> int:
+        return len(self.matrix.loss) * len(self.matrix.seed_list)
+
+    @property
+    def exit_status(self) -> int:
+        """As documented for the command line; a run that failed counts like an agent that did."""
+        if self.outcome == "interrupted":
+            return INTERRUPTED
+        return VIOLATED if self.failed or any(cell.violated for cell in self.cells) else 0
+
+    def to_json(self) -> dict[str, Any]:
+        return self.model_dump(mode="json", by_alias=True)

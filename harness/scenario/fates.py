@@ -1,0 +1,100 @@
+"""Scripted fates: what is decided about single messages, before chance has its say.
+
+fates:
+  - {message: Commit Block, block: "4.11", receiver: 2, drop: true}
+  - {message: Next in Sequence Response, sender: 3, name: third}
+  - {message: Next in Sequence Response, sender: 4, after: third}
+  - {sender: 3, from_s: 300, until_s: 600, hold_until_s: 600}
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from harness.scenario.model import Instant, Model, VehicleId
+
+MessageName = Literal[
+    "Block Add Request",
+    "Block Add Response",
+    "Commit Block",
+    "Chain Contain Query",
+    "Chain Contain Response",
+    "Chain Hash Successor Query",
+    "Next in Sequence Response",
+    "Request for Block",
+    "Block Response",
+]
+
+BlockName = Annotated[str, Field(pattern=r"^[1-9]\d{0,4}\.[1-9]\d{0,6}$")]
+"""`<agent>.<ordinal>`, the ordinal counting from 1 that agent's completed blocks. YAML needs quotes: "4.10"."""
+
+FateName = Annotated[str, Field(min_length=1, max_length=100)]
+
+
+def _quoted(value: Any) -> Any:
+    if isinstance(value, float):
+        raise ValueError(f'should be quoted, as in "{value}": 4.1 and 4.10 are one number and two blocks')
+    return value
+
+
+class Fate(Model):
+    """Which messages, and what becomes of each on its way to each receiver.
+
+    A message is meant if all that is named fits: its type, sender, the block that it is about, and when it is sent
+    (mission seconds, `until_s` excluded). Of those that are meant `count` picks some: 3 is the third, [1, 2] the first
+    two. Without `receiver` the fate is that of every receiver. The first fate in the list that fits decides.
+
+    One of these happens; a partition still lets nothing pass:
+    `drop: true`: it is lost; `delay_s`: it arrives after so long, whatever chance says; `hold_until_s`: it arrives at
+    that mission second, if it would have arrived before; `after`: it arrives right after the message that the fate
+    with that `name` is about; `name` alone: it arrives as chance says.
+    """
+
+    message: MessageName | None = None
+    sender: VehicleId | None = None
+    receiver: VehicleId | None = None
+    block: Annotated[BlockName | None, BeforeValidator(_quoted)] = None
+    count: Annotated[int, Field(ge=1)] | list[Annotated[int, Field(ge=1)]] | None = None
+    from_s: Instant | None = None
+    until_s: Instant | None = None
+
+    drop: Literal[True] | None = None
+    delay_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    hold_until_s: Instant | None = None
+    after: FateName | None = None
+    name: FateName | None = None
+
+    @property
+    def counts(self) -> tuple[int, ...] | None:
+        return (self.count,) if isinstance(self.count, int) else tuple(self.count) if self.count else None
+
+    @model_validator(mode="after")
+    def _one_outcome(self) -> "Fate":
+        outcomes = [key for key in ("drop", "delay_s", "hold_until_s", "after") if getattr(self, key) is not None]
+        if len(outcomes) > 1 or not (outcomes or self.name):
+            raise ValueError("needs exactly one of `drop: true`, `delay_s`, `hold_until_s` or `after`, or a `name`")
+        if self.from_s is not None and self.until_s is not None and self.from_s >= self.until_s:
+            raise ValueError(f"from_s {self.from_s:g} is not before until_s {self.until_s:g}")
+        return self
+
+    def describe(self) -> str:
+        """In words: "drop Commit Block of 4.11 to 2"."""
+        what = (
+            "drop"
+            if self.drop
+            else f"delay by {self.delay_s:g} s"
+            if self.delay_s is not None
+            else f"hold until {self.hold_until_s:g} s"
+            if self.hold_until_s is not None
+            else f"deliver after {self.after!r}"
+            if self.after
+            else f"name {self.name!r}"
+        )
+        words = [what, self.message or "every message"]
+        words += [f"of block {self.block}"] if self.block else []
+        words += [f"from {self.sender}"] if self.sender else []
+        words += [f"to {self.receiver}"] if self.receiver else []
+        words += [f"number {', '.join(map(str, self.counts))}"] if self.counts else []
+        words += [f"sent from {self.from_s:g} s"] if self.from_s is not None else []
+        words += [f"until {self.until_s:g} s"] if self.until_s is not None else []
+        return " ".join(words)

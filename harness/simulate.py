@@ -1,0 +1,146 @@
+"""Scenarios in virtual time: into a run directory as any other run, or in memory, for sweeps over thousands of runs.
+
+Both are judged by the same checker. In memory the evidence comes straight from the agents, without files between.
+"""
+
+import dataclasses
+from collections.abc import Coroutine
+from dataclasses import dataclass
+from typing import Any
+
+from harness import checker, mission
+from harness.backends.simulation import Life, Simulation, refuse_what_needs_processes
+from harness.checker import Evidence
+from harness.exports import Export, ExportMaker
+from harness.mission import Played
+from harness.record import JudgedRecord
+from harness.rundir import RunDirectory
+from harness.scenario import Scenario
+from harness.traces import Header, Trace
+from ucp.export import export_chain
+from ucp.files import TraceFile, write_json_atomically
+from ucp.trace import HandlerRun, header_line
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulated run, judged."""
+
+    played: Played
+    evidence: Evidence
+    result: checker.Result
+
+
+def simulate(scenario: Scenario, seed: int, *, tracing: bool = False, deliver_all: bool = False) -> Simulated:
+    """Play `scenario` in virtual time and judge it, all in memory.
+
+    Without `tracing` characteristic 1 cannot be judged, and 2 and 3 only at the end. `deliver_all` delivers even what
+    changes nothing. Raises ScenarioError for a scenario that needs real processes.
+    """
+    refuse_what_needs_processes(scenario)
+    memory = InMemory(tracing)
+    simulation = Simulation(scenario, seed, memory, deliver_all=deliver_all)
+    _without_waiting(mission.play(simulation, scenario))
+    simulation.end()
+    evidence = memory.evidence(simulation)
+    return Simulated(simulation.played, evidence, checker.check(evidence))
+
+
+def _without_waiting(story: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine that waits for nothing, as virtual time does not, without an event loop."""
+    try:
+        story.send(None)
+    except StopIteration:
+        return
+    raise AssertionError("virtual time waits for nothing")
+
+
+class InMemory:
+    """Keeps everything as the checker wants it."""
+
+    def __init__(self, tracing: bool) -> None:
+        self.tracing = tracing
+        self._traces: dict[int, Trace] = {}
+        self._maker = ExportMaker()
+        self._kept: dict[int, Export] = {}
+
+    def begin(self, life: Life) -> None:
+        if not self.tracing:
+            return
+        trace = self._traces.get(life.agent.agent_id)
+        if trace is None:
+            self._traces[life.agent.agent_id] = Trace(Header.model_validate(_header(life)))
+        else:
+            trace.starts.append(len(trace.runs))
+
+    def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
+        self._traces[agent_id].runs += runs
+
+    def keep_chains(self, simulation: Simulation) -> None:
+        self._kept = self._exports(simulation)
+
+    def evidence(self, simulation: Simulation) -> Evidence:
+        record = JudgedRecord.model_validate(
+            {
+                "roster": simulation.roster,
+                "network": simulation.played.network,
+                "final_reconcile": simulation.played.final_reconcile,
+                "agents": simulation.played.agents,
+            }
+        )
+        return Evidence(self._exports(simulation), self._traces, record, before_final_reconcile=self._kept)
+
+    def _exports(self, simulation: Simulation) -> dict[int, Export]:
+        return {
+            life.agent.agent_id: self._maker.export(life.agent, simulation.timestamp_us(life))
+            for life in simulation.living()
+        }
+
+
+class OnDisk:
+    """Writes the files of a run directory that agents as processes would write themselves."""
+
+    tracing = True
+
+    def __init__(self, rundir: RunDirectory) -> None:
+        self._rundir = rundir
+        self._traces: dict[int, TraceFile] = {}
+
+    def begin(self, life: Life) -> None:
+        agent_id = life.agent.agent_id
+        if agent_id not in self._traces:
+            self._traces[agent_id] = TraceFile(self._rundir.agents / f"{agent_id}.trace.jsonl")
+        self._traces[agent_id].write(header_line(**_header(life)))
+
+    def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
+        self._traces[agent_id].write("".join([run.to_line() for run in runs]))
+
+    def keep_chains(self, simulation: Simulation) -> None:
+        self.export(simulation)
+        self._rundir.keep_exports_before_final_reconcile()
+
+    def export(self, simulation: Simulation) -> None:
+        """Raises OSError."""
+        for life in simulation.living():
+            path = self._rundir.agents / f"{life.agent.agent_id}.chain.json"
+            write_json_atomically(path, export_chain(life.agent, simulation.timestamp_us(life)))
+
+    def problems(self) -> dict[int, str]:
+        """Why the trace of which agent ends early."""
+        return {agent_id: trace.problem for agent_id, trace in self._traces.items() if trace.problem}
+
+    def close(self) -> None:
+        for trace in self._traces.values():
+            trace.close()
+
+
+def _header(life: Life) -> dict[str, Any]:
+    """The first line of a trace, as keywords of `ucp.trace.header_line`."""
+    agent = life.agent
+    clock = {"epoch_us": 0, "speedup": 1, **(life.clock.model_dump() if life.clock else {})}
+    return {
+        "agent_id": agent.agent_id,
+        "roster": sorted(agent.roster),
+        "settings": dataclasses.asdict(agent.settings),
+        "clock": clock,
+    }

@@ -1,0 +1,186 @@
+"""What happens to packets on the way from one vehicle to another: loss, delay, duplicates, reordering.
+
+The words are those of tc-netem(8), and so is what they mean; every packet's lots are drawn on its own.
+JSON leaves out what is as if nobody had asked for it, so a plain loss reads {"loss": 0.1}.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, get_args
+
+from netem.errors import ConditionsError
+
+Distribution = Literal["uniform", "normal", "pareto", "paretonormal"]
+
+MAX_DELAY_S = 60.0
+"""Six times the longest timer of UCP as the thesis sets it; a 32-bit count of netem's 64 ns ticks reaches 274 s."""
+
+
+@dataclass(frozen=True)
+class GilbertElliott:
+    """Loss in bursts: `loss gemodel p r 1-h 1-k`. Every value is a probability, 0..1.
+
+    A link is in a good or a bad state and begins in the good one. A packet is lost with the probability of
+    the state that it finds; then it is drawn whether the state changes, `p` from good to bad, `r` back.
+    """
+
+    p: float
+    r: float
+    loss_bad: float = 1.0
+    loss_good: float = 0.0
+
+    def __post_init__(self) -> None:
+        for key, value in asdict(self).items():
+            object.__setattr__(self, key, probability(f"loss.{key}", value))
+
+    @property
+    def mean(self) -> float:
+        """The share of packets lost in the long run."""
+        change = self.p + self.r
+        return (self.p * self.loss_bad + self.r * self.loss_good) / change if change else self.loss_good
+
+    @property
+    def lossless(self) -> bool:
+        """Nothing is ever lost, not even in a state that the link leaves for good."""
+        return self.loss_good == 0.0 and (self.p == 0.0 or self.loss_bad == 0.0)
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> GilbertElliott:
+        """The inverse of `to_json`."""
+        return cls(**keywords(cls, value, "loss", required=("p", "r")))
+
+
+@dataclass(frozen=True)
+class Delay:
+    """How long packets take, in seconds: 0..60 on average.
+
+    `jitter_s` is how far a uniform delay strays to either side, and the standard deviation of the others
+    (drawn from netem's tables). It is `mean_s` at most: a uniform delay is then never below 0, and of the
+    others only the end of the tail would be, which is 0, as netem has it.
+    """
+
+    mean_s: float
+    jitter_s: float = 0.0
+    distribution: Distribution = "uniform"
+
+    def __post_init__(self) -> None:
+        mean_s = _number("delay.mean_s", self.mean_s, f"seconds 0..{MAX_DELAY_S:g}")
+        if not 0.0 <= mean_s <= MAX_DELAY_S:
+            raise ConditionsError(f"delay.mean_s: {mean_s!r} is out of range; allowed is seconds 0..{MAX_DELAY_S:g}")
+        jitter_s = _number("delay.jitter_s", self.jitter_s, "seconds 0..mean_s")
+        if not 0.0 <= jitter_s <= mean_s:
+            raise ConditionsError(f"delay.jitter_s: {jitter_s!r} is out of range; allowed is 0..mean_s, {mean_s:g}")
+        if self.distribution not in get_args(Distribution):
+            allowed = ", ".join(get_args(Distribution))
+            raise ConditionsError(f"delay.distribution: {self.distribution!r} is not known; allowed is {allowed}")
+        object.__setattr__(self, "mean_s", mean_s)
+        object.__setattr__(self, "jitter_s", jitter_s)
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Delay:
+        """The inverse of `to_json`."""
+        return cls(**keywords(cls, value, "delay", required=("mean_s",)))
+
+
+@dataclass(frozen=True)
+class LinkConditions:
+    """What happens to packets on the way to one receiver, from everybody or from one sender.
+
+    `loss` is the probability, 0..1, that a packet is dropped, drawn for each packet on its own, or a model
+    of bursts. `duplicate` is the probability that a packet comes twice, `reorder` that it overtakes: it is
+    sent at once, without delay, which needs a delay. A delay of 0 is none.
+    """
+
+    loss: float | GilbertElliott = 0.0
+    delay: Delay | None = None
+    duplicate: float = 0.0
+    reorder: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.loss, GilbertElliott):
+            object.__setattr__(self, "loss", probability("loss", self.loss))
+        object.__setattr__(self, "duplicate", probability("duplicate", self.duplicate))
+        object.__setattr__(self, "reorder", probability("reorder", self.reorder))
+        if not isinstance(self.delay, Delay | None):
+            raise ConditionsError(f"delay: {self.delay!r} is not a delay; allowed is a Delay or None")
+        if self.delay is not None and self.delay.mean_s == 0.0:
+            object.__setattr__(self, "delay", None)
+        if self.reorder and self.delay is None:
+            raise ConditionsError(f"reorder: {self.reorder!r} needs a delay to overtake; allowed is 0 without one")
+
+    @property
+    def lossless(self) -> bool:
+        """Nothing is ever lost."""
+        return self.loss.lossless if isinstance(self.loss, GilbertElliott) else self.loss == 0.0
+
+    @property
+    def independent_loss(self) -> float:
+        """The loss where it is one probability for all packets; raises ConditionsError where it is in bursts."""
+        if isinstance(self.loss, GilbertElliott):
+            raise ConditionsError(f"loss: {self.loss} is in bursts; allowed here is a probability 0..1")
+        return self.loss
+
+    def needs(self) -> tuple[str, ...]:
+        """What is asked beyond independent loss."""
+        asked = {
+            "loss in bursts": isinstance(self.loss, GilbertElliott),
+            "delay": self.delay is not None,
+            "duplicate": self.duplicate > 0.0,
+            "reorder": self.reorder > 0.0,
+        }
+        return tuple(key for key, needed in asked.items() if needed)
+
+    def to_json(self) -> dict[str, Any]:
+        value: dict[str, Any] = {
+            "loss": self.loss.to_json() if isinstance(self.loss, GilbertElliott) else self.loss,
+            "delay": self.delay and self.delay.to_json(),
+            "duplicate": self.duplicate,
+            "reorder": self.reorder,
+        }
+        return {key: asked for key, asked in value.items() if key == "loss" or asked}
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> LinkConditions:
+        """The inverse of `to_json`."""
+        known = keywords(cls, value)
+        for key, kind in (("loss", GilbertElliott), ("delay", Delay)):
+            if isinstance(known.get(key), Mapping):
+                known[key] = kind.from_json(known[key])
+        return cls(**known)
+
+
+def probability(key: str, value: object) -> float:
+    """The value as a float; raises ConditionsError if it is no probability."""
+    number = _number(key, value, "a probability 0..1")
+    if not 0.0 <= number <= 1.0:
+        hint = f" (for {value:g} % write {number / 100:g})" if 1.0 < number <= 100.0 else ""
+        raise ConditionsError(f"{key}: {value!r} is not a probability; allowed is 0..1{hint}")
+    return number
+
+
+def keywords(cls: type[Any], value: Mapping[str, Any], at: str = "", required: tuple[str, ...] = ()) -> dict[str, Any]:
+    """What JSON says of a dataclass's fields; raises ConditionsError for a key that it does not have."""
+    prefix = f"{at}." if at else ""
+    allowed = [field.name for field in fields(cls)]
+    for key in value:
+        if key not in allowed:
+            raise ConditionsError(f"{prefix}{key}: not a key of the conditions; allowed is {', '.join(allowed)}")
+    for key in required:
+        if key not in value:
+            raise ConditionsError(f"{prefix}{key}: is missing; needed are {', '.join(required)}")
+    return dict(value)
+
+
+def _number(key: str, value: object, allowed: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+        raise ConditionsError(f"{key}: {value!r} is not a number; allowed is {allowed}")
+    return float(value)

@@ -1,0 +1,34 @@
+"""A judge that needs no simulation: figures that follow from loss and seed."""
+
+from harness.checker import Result
+from harness.checker.characteristic import Characteristic, Verdict
+from harness.matrix import Matrix
+from harness.scenario import Scenario
+
+CHARACTERISTICS = ("1", "2", "3", "4", "5", "6")
+
+
+def matrix(*, name: str = "test", loss: tuple[float, ...] = (0.0, 0.5), seeds: int | list[int] = 4) -> Matrix:
+    return Matrix(name=name, scenario=Scenario(name=name, agents=5), loss=list(loss), seeds=seeds)
+
+
+def judge(scenario: Scenario, seed: int) -> Result:
+    """Without loss all is well; with it seed 2 violates characteristic 3."""
+    loss = scenario.network.loss
+    assert isinstance(loss, float)
+    verdict: Verdict = "violated" if loss and seed == 2 else "holds"
+    return Result(
+        {number: Characteristic(number, verdict if number == "3" else "holds", "") for number in CHARACTERISTICS},
+        {
+            "agents": 5,
+            "blocks": 40,
+            "mutual_chain": round(40 * (1 - loss)) - seed % 2,
+            "distinct_chains": 1 if not loss else 2 + seed % 2,
+            "copies_min": 5 if not loss else 1,
+            "copies_mean": 5 - 4 * loss,
+            "reconciles": round(20 * loss) + seed,
+            "messages": 800,
+            "bytes": None,
+            "messages_per_block": 20 + 10 * loss,
+        },
+    )

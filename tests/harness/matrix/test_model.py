@@ -1,0 +1,82 @@
+"""The matrix file: what it says, and what is said about its mistakes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import ScenarioError
+from harness.matrix import Matrix, load_matrix
+
+THESIS = Path(__file__).parents[3] / "scenarios" / "thesis_matrix.yaml"
+
+
+def written(directory: Path, **keys: Any) -> Path:
+    path = directory / "matrix.yaml"
+    document = {"name": "test", "scenario": {"agents": 3}, "loss": [0.0, 0.5], "seeds": 2, **keys}
+    path.write_text(json.dumps({key: value for key, value in document.items() if value is not None}))
+    return path
+
+
+def test_the_thesis_matrix_has_the_rates_of_section_4_2() -> None:
+    matrix = load_matrix(THESIS)
+    assert matrix.loss == [0.0, 0.1, 0.15, 0.25, 0.3, 0.5, 0.75, 1.0]
+    assert matrix.seed_list == list(range(1, 201))
+    assert matrix.scenario.name == matrix.name
+    assert len(matrix.scenario.roster) == 5
+
+
+def test_each_cell_has_the_scenario_with_its_loss(tmp_path: Path) -> None:
+    scenario = {"agents": 3, "network": {"receivers": {2: {"loss": 0.9}}}}
+    cell = load_matrix(written(tmp_path, scenario=scenario)).scenario_at(0.5)
+    assert cell.network.loss == 0.5
+    assert cell.network.receivers[2].loss == 0.9
+    assert cell.agents == 3
+
+
+def test_a_scenario_may_stand_in_a_file_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("name: base\nagents: 7")
+    matrix = load_matrix(written(tmp_path, scenario="base.yaml"))
+    assert (matrix.scenario.name, matrix.scenario.agents) == ("base", 7)
+
+
+def test_a_mistake_in_that_file_names_it(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("name: base\nagents: 0")
+    with pytest.raises(ScenarioError, match=r"base\.yaml: `agents`"):
+        load_matrix(written(tmp_path, scenario="base.yaml"))
+
+
+def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
+    matrix = load_matrix(written(tmp_path))
+    assert Matrix.model_validate_json(matrix.model_dump_json()) == matrix
+
+
+@pytest.mark.parametrize(
+    ("keys", "sentence"),
+    [
+        ({"loss": [0.0, 1.5]}, "`loss.1` is 1.5: it should be less than or equal to 1"),
+        ({"loss": []}, "`loss` is []: List should have at least 1 item"),
+        ({"loss": [0.1, 0.2, 0.1]}, "`loss` is [0.1, 0.2, 0.1]: names 0.1 twice"),
+        ({"loss": None}, "`loss` is missing"),
+        ({"seeds": 0}, "`seeds` is 0: it should be a number of seeds 1..10000, or a list of them"),
+        ({"seeds": True}, "`seeds` is True: it should be a number of seeds"),
+        ({"seeds": "many"}, "`seeds` is 'many': it should be a number of seeds"),
+        ({"seeds": [1, -1]}, "`seeds` is [1, -1]: -1 is not a seed: it should be 0..4294967295"),
+        ({"seeds": [7, 7]}, "`seeds` is [7, 7]: names 7 twice"),
+        ({"losses": [0.1]}, "`losses` is unknown: there are name, about, scenario, loss, seeds"),
+        ({"scenario": {"agents": 0}}, "`scenario.agents` is 0: it should be a number of agents 1..1000"),
+        ({"scenario": {"agent": 5}}, "`scenario.agent` is unknown: there are name, about, agents,"),
+        ({"scenario": {"network": {"loss": 0.2}}}, "sets network.loss to 0.2, which the matrix's `loss` is for"),
+        ({"scenario": "nowhere.yaml"}, "nowhere.yaml: cannot be read: No such file or directory"),
+        ({"name": None}, "is missing"),
+    ],
+)
+def test_a_mistake_is_told_with_its_key_value_and_what_is_allowed(
+    tmp_path: Path, keys: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ScenarioError) as told:
+        load_matrix(written(tmp_path, **keys))
+    assert sentence in str(told.value)
+    assert str(tmp_path) in str(told.value)
+    assert "\n" not in str(told.value)

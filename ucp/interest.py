@@ -1,0 +1,82 @@
+"""To whom a message can matter.
+
+Everything is broadcast, so N agents hear N times what each of them says, and nearly all of it changes nothing: an
+answer is for the agents that asked, and whoever reconciles answers nobody. This tells so from an agent's state, without
+running a handler. A driver in virtual time need not deliver what does not matter. Radios deliver it all the same, and
+the handlers then do nothing, as Algorithms 1-20 say.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from ucp.messages import (
+    BlockAddRequest,
+    BlockAddResponse,
+    BlockResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    ChainHashSuccessorQuery,
+    CommitBlock,
+    Message,
+    NextInSequenceResponse,
+    RequestForBlock,
+)
+
+if TYPE_CHECKING:
+    from ucp.agent import Agent
+
+
+Question = tuple[type[Message], bytes]
+"""What an agent wants to hear: answers of this type about this block or chain.
+
+It can have two questions at a time: one about its vote (of type Block Add Response), and one of its reconcile."""
+
+ONLY_COUNTED = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
+"""Answers whose handlers only tally (Algorithms 4, 10 and 14): they send nothing and touch no timer."""
+
+ASKED: dict[type[Message], Callable[[Any], Question]] = {
+    BlockAddRequest: lambda message: (BlockAddResponse, message.block_hash),
+    ChainContainQuery: lambda message: (ChainContainResponse, message.chain_hash),
+    ChainHashSuccessorQuery: lambda message: (NextInSequenceResponse, message.chain_hash),
+    RequestForBlock: lambda message: (BlockResponse, message.block_hash),
+}
+"""Message -> what its sender wants to hear from now on; other messages ask nothing."""
+
+ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
+    BlockAddResponse: lambda message: (BlockAddResponse, message.block_hash),
+    ChainContainResponse: lambda message: (ChainContainResponse, message.chain_hash),
+    NextInSequenceResponse: lambda message: (NextInSequenceResponse, message.chain_hash),
+    BlockResponse: lambda message: (BlockResponse, message.block.block_hash),
+}
+"""Message -> the question that it answers, so that it is nothing to those who have not asked it."""
+
+
+MATTERS: dict[type[Message], Callable[["Agent", int, Any], bool]] = {
+    BlockAddRequest: lambda agent, sender, message: not agent.reconcile_in_progress,
+    BlockAddResponse: lambda agent, sender, message: (
+        agent.voting_timer.active
+        and sender not in agent.voters
+        and agent.candidate_block is not None
+        and agent.candidate_block.block_hash == message.block_hash
+    ),
+    CommitBlock: lambda agent, sender, message: not agent.reconcile_in_progress,
+    ChainContainQuery: lambda agent, sender, message: not agent.reconcile_in_progress,
+    ChainContainResponse: lambda agent, sender, message: (
+        agent.phase_one_timer.active
+        and sender not in agent.reconcile_responders
+        and message.chain_hash == agent.chain.top_chain_hash
+    ),
+    ChainHashSuccessorQuery: lambda agent, sender, message: not agent.reconcile_in_progress,
+    NextInSequenceResponse: lambda agent, sender, message: (
+        agent.phase_two_timer.active
+        and sender not in agent.reconcile_responders
+        and message.chain_hash == agent.chain.top_chain_hash
+    ),
+    RequestForBlock: lambda agent, sender, message: (
+        not agent.reconcile_in_progress and message.block_hash in agent.chain
+    ),
+    BlockResponse: lambda agent, sender, message: (
+        agent.phase_three_timer.active and message.block.block_hash == agent.majority_response_block_hash
+    ),
+}
+"""(agent, sender, message) -> whether the handler could change the agent, or make it send anything."""
