@@ -1,4 +1,4 @@
-"""The command line: `ucp-harness run`, `check`, `matrix` and `doctor`.
+"""The command line: `ucp-harness run`, `check`, `matrix`, `scale` and `doctor`.
 
 Exit status 0: ran, and no characteristic is violated. 1: at least one is violated, or an agent failed. 2: the request
 was wrong. 3: this machine cannot do it. 130: interrupted.
@@ -16,13 +16,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from harness import checker, matrix, progress
+from harness import checker, matrix, progress, scale
 from harness.doctor import examine
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, HarnessError
 from harness.matrix import outputs as matrix_outputs
 from harness.matrix import table as matrix_table
 from harness.run import Run, run
 from harness.rundir import default_path
+from harness.scale import model as scale_model
+from harness.scale import outputs as scale_outputs
+from harness.scale import table as scale_table
 from harness.scenario import Scenario, load_scenario
 from harness.sweep import cores
 
@@ -48,6 +51,11 @@ class MatrixBackend(StrEnum):
     sim = "sim"
 
 
+class RunBackend(StrEnum):
+    process = "process"
+    sim = "sim"
+
+
 @app.command("run")
 def run_command(
     scenario: Annotated[Path, typer.Argument(help="Scenario file (YAML).")],
@@ -56,6 +64,9 @@ def run_command(
     ] = None,
     speedup: Annotated[float | None, typer.Option(help="Mission seconds per second of wall time.")] = None,
     vehicles: Annotated[Vehicles | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
+    backend: Annotated[
+        RunBackend, typer.Option(help="Real processes in a private network, or virtual time.")
+    ] = RunBackend.process,
     out: Annotated[Path | None, typer.Option(help="Run directory; must be new or empty.")] = None,
 ) -> None:
     """Play a scenario, check the six characteristics, write a report."""
@@ -66,7 +77,7 @@ def run_command(
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
     shown = progress.for_console(console)
     try:
-        finished = run(request, chosen_seed, directory, shown)
+        finished = run(request, chosen_seed, directory, shown, backend.value)
     finally:
         shown.close()
     _show_result(console, finished.result)
@@ -142,6 +153,39 @@ def matrix_command(
     raise typer.Exit(record.exit_status)
 
 
+@app.command("scale")
+def scale_command(
+    agents: Annotated[str, typer.Option(help="Numbers of agents, with commas.")] = scale_model.AGENTS,
+    minutes: Annotated[str, typer.Option(help="Mission lengths in minutes, with commas.")] = scale_model.MINUTES,
+    loss: Annotated[str, typer.Option(help="Loss at each receiver, a probability; several with commas.")] = (
+        scale_model.LOSS
+    ),
+    seeds: Annotated[int, typer.Option(help="Runs of each size.")] = scale_model.SEEDS,
+    settle: Annotated[float, typer.Option(help="Minutes to finish after the mission.")] = scale_model.SETTLE_MINUTES,
+    out: Annotated[Path | None, typer.Option(help="Directory of the results; must be new or empty.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="scale.json on standard output, no table.")] = False,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
+    ] = None,
+) -> None:
+    """Fit how messages, bytes and time grow with agents and blocks, in the simulation; by default about 4 minutes."""
+    request = scale.read_request(agents, minutes, loss, seeds, settle)
+    directory = (out or default_path("scale")).absolute()
+    matrix_outputs.claim(directory)
+    finished = scale.run_scale(request, jobs or cores(), shown=True)
+    scale_outputs.write(finished, directory)
+    record = finished.record
+    if as_json:
+        _print_json(record.to_json())
+    else:
+        console = Console()
+        console.print(scale_table.render(record))
+        console.print(f"{record.wall_s:.0f} s; {directory / 'scale.svg'}", highlight=False, soft_wrap=True)
+    if record.outcome == "interrupted":
+        _complain(f"interrupted; the {record.runs} of {record.runs_asked} runs that had ended are in {directory}")
+    raise typer.Exit(record.exit_status)
+
+
 def main() -> NoReturn:
     """The console script: a user's mistake ends in one sentence and the right exit status, never in a traceback."""
     try:
@@ -184,6 +228,8 @@ def _show_end(console: Console, finished: Run) -> None:
         _complain(f"{finished.played.outcome_detail}; what there was has been exported and checked")
     for error in finished.result.errors:
         _complain(error)
+    for sentence in finished.played.unmatched_fates:
+        _complain(f"{sentence}, so this run does not show what it was meant to")
     slow = [
         f"{vehicle} ({record['real_time_factor']:.2f})"
         for vehicle, record in finished.played.vehicles.items()
@@ -191,7 +237,8 @@ def _show_end(console: Console, finished: Run) -> None:
     ]
     if slow:
         _complain(f"vehicles {', '.join(slow)} did not keep up with the clock: choose a smaller --speedup")
-    console.print(f"{finished.wall_s:.0f} s; report: {finished.report}", highlight=False, soft_wrap=True)
+    wall = f"{finished.wall_s:.0f}" if finished.wall_s >= 10 else f"{finished.wall_s:.1f}"
+    console.print(f"{wall} s; report: {finished.report}", highlight=False, soft_wrap=True)
 
 
 def _print_json(document: Any) -> None:

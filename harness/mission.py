@@ -6,6 +6,7 @@ Play the timeline, stop the events, let the agents settle, and reconcile finally
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
+from harness.errors import HarnessError
 from harness.scenario import Scenario
 from harness.timeline import Change, final_reconcile, timeline_of
 
@@ -32,6 +33,12 @@ class Played:
     agents: dict[str, Any] = field(default_factory=dict)
     vehicles: dict[str, Any] = field(default_factory=dict)
     unmatched_fates: list[str] = field(default_factory=list)
+
+    def end_early(self, outcome: Outcome, error: HarnessError) -> None:
+        """The mission did not come to its end, because of `error`."""
+        self.outcome = outcome
+        self.outcome_detail = str(error)
+        self.exit_status = error.exit_status
 
     def record(self, change: dict[str, Any]) -> None:
         """Take down a change that was made."""

@@ -8,6 +8,9 @@ from harness.scenario import Scenario
 
 SCHEMA = "ucp-run/1"
 
+Backend = Literal["process", "sim"]
+"""Real processes in a private network, or virtual time."""
+
 
 class _Model(BaseModel):
     model_config = ConfigDict(extra="ignore", populate_by_name=True)
@@ -65,6 +68,8 @@ class AgentRecord(_Model):
     outcome: str
     detail: str | None = None
     restarts: int = 0
+    completed_before: list[str] = []
+    """Hashes of the blocks that it completed in lives that left no export, since it was killed."""
     idle: bool | None = None
     reconciles: int | None = None
     chain_changed_at_s: float | None = None
@@ -90,7 +95,7 @@ class RunRecord(JudgedRecord):
 
     scenario: Scenario
     seed: int
-    backend: Literal["process", "sim"]
+    backend: Backend
     engine: str | None = None
     versions: dict[str, str]
     started_at: str

@@ -6,6 +6,7 @@ import platform
 import signal
 import sys
 import time
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -14,15 +15,17 @@ from typing import Any
 
 from harness import checker, report
 from harness.backends.agent_process import agent_command
-from harness.backends.process import ProcessRun
+from harness.backends.process import ProcessRun, refuse_what_needs_virtual_time
+from harness.backends.simulation import refuse_what_needs_processes
 from harness.backends.vehicle_process import VehicleFailedError
-from harness.errors import VIOLATED, HarnessError, MachineError, RunDirectoryError
+from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
 from harness.mission import Played
 from harness.progress import Progress
-from harness.record import RunRecord
+from harness.record import Backend, RunRecord
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.scenario.vehicles import VehicleKind
+from harness.simulate import simulate_into
 from sitl.ardupilot import ArduPilot
 from sitl.embedded import Embedded
 from sitl.vehicle import NoBinaryError, UnusableBinaryError
@@ -43,29 +46,25 @@ class Run:
     report: Path
 
 
-def run(scenario: Scenario, seed: int, out: Path, progress: Progress) -> Run:
+def run(scenario: Scenario, seed: int, out: Path, progress: Progress, backend: Backend = "process") -> Run:
     """Play `scenario` and judge it, into the new or empty directory `out`. Raises HarnessError if it cannot even begin.
 
     Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
     """
-    kind = choose_vehicles(scenario)
-    agent_command(scenario)
+    play = prepare(scenario, seed, backend)
     directory = RunDirectory(out)
     started = time.monotonic()
-    started_at = datetime.now(UTC)
-    # Another run is another mission: its blocks must not be taken for this one's.
-    initial_data = f"{scenario.name}, seed {seed}, {started_at.isoformat()}".encode()
     record = RunRecord(
         scenario=scenario,
         roster=list(scenario.roster),
         seed=seed,
-        backend="process",
+        backend=backend,
         versions=versions(),
-        started_at=started_at.isoformat(timespec="seconds").replace("+00:00", "Z"),
+        started_at=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
     )
     directory.write_record(record)
     try:
-        played = asyncio.run(_play(scenario, seed, kind, initial_data, directory, progress))
+        played = asyncio.run(_until_interrupted(play, directory, progress))
     except HarnessError as error:
         directory.write_record(_updated(record, outcome="failed", outcome_detail=str(error)))
         raise
@@ -81,6 +80,7 @@ def run(scenario: Scenario, seed: int, out: Path, progress: Progress) -> Run:
         faults=played.faults,
         agents=played.agents,
         vehicles=played.vehicles,
+        unmatched_fates=played.unmatched_fates,
         counters=played.counters,
     )
     directory.write_record(record)
@@ -91,7 +91,7 @@ def run(scenario: Scenario, seed: int, out: Path, progress: Progress) -> Run:
         page = report.write_report(directory.path)
     except RunDirectoryError as error:
         raise MachineError(f"{error}; run.json has the verdict") from None
-    status = played.exit_status or (VIOLATED if result.violated else 0)
+    status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)
     return Run(directory.path, played, result, status, wall_s, page)
 
 
@@ -99,19 +99,31 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
     return RunRecord.model_validate({**record.to_json(), **keys})
 
 
-async def _play(
-    scenario: Scenario,
-    seed: int,
-    kind: Kind | None,
-    initial_data: bytes,
-    directory: RunDirectory,
-    progress: Progress,
-) -> Played:
+Play = Callable[[RunDirectory, Progress, asyncio.Event], Awaitable[Played]]
+"""Plays one mission into a run directory, until it is over or the event is set."""
+
+
+def prepare(scenario: Scenario, seed: int, backend: Backend) -> Play:
+    """What plays `scenario`. Raises HarnessError if this backend, or this machine, cannot."""
+    if backend == "sim":
+        refuse_what_needs_processes(scenario)
+        return lambda rundir, progress, interrupted: simulate_into(rundir, scenario, seed, progress, interrupted)
+    refuse_what_needs_virtual_time(scenario)
+    kind = choose_vehicles(scenario)
+    agent_command(scenario)
+    # Another run is another mission: its blocks must not be taken for this one's.
+    initial_data = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
+    return lambda rundir, progress, interrupted: ProcessRun(
+        scenario, seed, kind, initial_data, rundir, progress, interrupted
+    ).play()
+
+
+async def _until_interrupted(play: Play, directory: RunDirectory, progress: Progress) -> Played:
     interrupted = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, interrupted.set)
-    return await ProcessRun(scenario, seed, kind, initial_data, directory, progress, interrupted).play()
+    return await play(directory, progress, interrupted)
 
 
 def choose_vehicles(scenario: Scenario) -> Kind | None:

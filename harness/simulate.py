@@ -3,16 +3,21 @@
 Both are judged by the same checker. In memory the evidence comes straight from the agents, without files between.
 """
 
+import asyncio
 import dataclasses
 from collections.abc import Coroutine
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
 from harness import checker, mission
+from harness.agents import Status
 from harness.backends.simulation import Life, Simulation, refuse_what_needs_processes
 from harness.checker import Evidence
+from harness.errors import InterruptedRunError, MachineError
 from harness.exports import Export, ExportMaker
 from harness.mission import Played
+from harness.progress import Progress, Snapshot
 from harness.record import JudgedRecord
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
@@ -46,6 +51,52 @@ def simulate(scenario: Scenario, seed: int, *, tracing: bool = False, deliver_al
     return Simulated(simulation.played, evidence, checker.check(evidence))
 
 
+async def simulate_into(
+    rundir: RunDirectory, scenario: Scenario, seed: int, progress: Progress, interrupted: asyncio.Event
+) -> Played:
+    """Play `scenario` in virtual time into a run directory, as agents as processes would."""
+
+    async def breathe(simulation: Simulation) -> None:
+        progress.show(_snapshot(simulation))
+        await asyncio.sleep(0)  # lets the loop hear of Ctrl-C
+        if interrupted.is_set():
+            raise InterruptedRunError(f"the run was interrupted at mission second {simulation.now():.0f}")
+
+    with closing(OnDisk(rundir)) as files:
+        simulation = Simulation(scenario, seed, files, breathe=breathe)
+        try:
+            await mission.play(simulation, scenario)
+        except InterruptedRunError as error:
+            simulation.played.end_early("interrupted", error)
+        except OSError as error:
+            simulation.played.end_early("failed", MachineError(f"{error.strerror}: {error.filename or rundir.path}"))
+        simulation.end()
+        try:
+            files.export(simulation)
+        except OSError as error:
+            simulation.played.end_early("failed", MachineError(f"{error.strerror}: {error.filename or rundir.path}"))
+        for agent_id, problem in files.problems().items():
+            simulation.played.agents[str(agent_id)]["trace_problem"] = problem
+    return simulation.played
+
+
+def _snapshot(simulation: Simulation) -> Snapshot:
+    statuses = {life.agent.agent_id: _status(life) for life in simulation.living()}
+    return Snapshot(simulation.stage, simulation.now(), simulation.scenario.duration_s, simulation.network, statuses)
+
+
+def _status(life: Life) -> Status:
+    agent = life.agent
+    return Status.model_construct(
+        idle=agent.idle,
+        reconcile_in_progress=agent.reconcile_in_progress,
+        chain=len(agent.chain),
+        deque=len(agent.blocks_to_be_committed),
+        completed=len(agent.completed),
+        reconciles=agent.reconciles,
+    )
+
+
 def _without_waiting(story: Coroutine[Any, Any, None]) -> None:
     """Run a coroutine that waits for nothing, as virtual time does not, without an event loop."""
     try:
@@ -75,6 +126,9 @@ class InMemory:
 
     def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
         self._traces[agent_id].runs += runs
+
+    def changed(self, record: dict[str, Any]) -> None:
+        """The run's record has it."""
 
     def keep_chains(self, simulation: Simulation) -> None:
         self._kept = self._exports(simulation)
@@ -114,6 +168,9 @@ class OnDisk:
 
     def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
         self._traces[agent_id].write("".join([run.to_line() for run in runs]))
+
+    def changed(self, record: dict[str, Any]) -> None:
+        self._rundir.append_network(record)
 
     def keep_chains(self, simulation: Simulation) -> None:
         self.export(simulation)

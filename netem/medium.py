@@ -44,6 +44,9 @@ class Lots(Protocol):
     def first_to(self, receiver: int) -> float | None:
         """The delay in seconds of the first copy that reaches `receiver`; None if it is lost or cut off."""
 
+    def copies_to(self, receiver: int) -> tuple[float, ...]:
+        """The delay in seconds of each copy that reaches `receiver`."""
+
     def to_all(self) -> list[tuple[int, float]]:
         """(receiver, delay in seconds) of every copy that arrives anywhere, by receiver."""
 
@@ -136,6 +139,10 @@ class _PlainLots:
         if self._loss[word] < air.lost_below[receiver] or not air.hears[receiver]:
             return None
         return air.soonest[receiver] + self._latency[word] * air.per_lot[receiver]
+
+    def copies_to(self, receiver: int) -> tuple[float, ...]:
+        first = self.first_to(receiver)
+        return () if first is None else (first,)
 
     def to_all(self) -> list[tuple[int, float]]:
         air = self._air
@@ -235,6 +242,9 @@ class _DrawnLots:
 
     def first_to(self, receiver: int) -> float | None:
         return min(self.delays[receiver], default=None)
+
+    def copies_to(self, receiver: int) -> tuple[float, ...]:
+        return self.delays[receiver]
 
     def to_all(self) -> list[tuple[int, float]]:
         return [(receiver, delay) for receiver, copies in enumerate(self.delays) for delay in copies]

@@ -221,16 +221,16 @@ class Agent:
                 soonest = deadline
         return soonest
 
-    def answers_nobody_until(self) -> float:
+    def answers_nobody_until(self) -> float | None:
         """An agent that reconciles answers nobody, and stops only when a timer of the reconcile ends: when that is.
 
-        In mission seconds; 0 if it does not reconcile, or no such timer runs.
+        In mission seconds; None if it does not reconcile, or no such timer runs.
         """
         if self.reconcile_in_progress:
             for timer in self._reconcile_timers:
                 if timer.deadline is not None:
                     return timer.deadline
-        return 0.0
+        return None
 
     def handle_timer(self, now: float) -> None:
         """Run the handlers of all timers that have expired at `now`, the earliest first."""

@@ -12,12 +12,12 @@ from typing import Any
 from harness import mission
 from harness.backends.agent_process import AgentFailedError, AgentProcess
 from harness.backends.vehicle_process import VehicleProcess
-from harness.errors import HarnessError, InterruptedRunError, MachineError
+from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
 from harness.mission import Played
 from harness.progress import Progress, Snapshot
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
-from harness.timeline import Change, NetworkChange, describe
+from harness.timeline import Change, NetworkChange, describe, timeline_of
 from netem.conditions import NetworkConditions
 from netem.errors import LabUnavailable, NetemError
 from netem.lab import Lab
@@ -27,6 +27,22 @@ from ucp.clock import MICROSECONDS, MissionClock
 POLL_S = 0.25
 QUIET_POLL_S = 0.1
 START_DELAY_S = 0.05
+
+
+def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
+    """Raises ScenarioError naming the keys that real processes cannot be given yet."""
+    faults = dict.fromkeys(entry.fault[0] for entry in scenario.timeline if entry.fault)
+    conditions = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
+    keys = [
+        *(["fates"] if scenario.fates else []),
+        *(["clocks"] if scenario.clocks else []),
+        *(["events.source: scripted"] if scenario.events.source == "scripted" else []),
+        *(f"timeline: {fault}" for fault in faults),
+        *(f"network: {need}" for need in dict.fromkeys(need for state in conditions for need in state.needs())),
+    ]
+    if keys:
+        named = ", ".join(f"`{key}`" for key in keys)
+        raise ScenarioError(f"{named} need{'s' if len(keys) == 1 else ''} virtual time: use --backend sim")
 
 
 class ProcessRun:
@@ -148,7 +164,7 @@ class ProcessRun:
         self.clock.start(epoch_us)
 
     async def apply(self, change: Change) -> None:
-        assert isinstance(change, NetworkChange), "check_for_processes refuses a scenario with other faults"
+        assert isinstance(change, NetworkChange), "others are refused"
         applied = await self._lab.apply(change.conditions)
         self.network = change.detail
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
@@ -192,9 +208,7 @@ class ProcessRun:
     # The end
 
     def _ended_early(self, error: HarnessError) -> None:
-        self.played.outcome = "interrupted" if isinstance(error, InterruptedRunError) else "failed"
-        self.played.outcome_detail = str(error)
-        self.played.exit_status = error.exit_status
+        self.played.end_early("interrupted" if isinstance(error, InterruptedRunError) else "failed", error)
 
     async def _wind_up(self, lab: Lab) -> None:
         """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""

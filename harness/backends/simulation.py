@@ -58,6 +58,9 @@ class Recorder(Protocol):
 
     def write(self, agent_id: int, runs: list[HandlerRun]) -> None: ...
 
+    def changed(self, record: dict[str, Any]) -> None:
+        """A change of the network, or a fault of agents, was made."""
+
     def keep_chains(self, simulation: "Simulation") -> None:
         """A final reconcile is about to put the chains in order."""
 
@@ -139,13 +142,16 @@ class Simulation:
             await self._breathe(self)
 
     async def apply(self, change: Change) -> None:
+        record = change.to_json(round(self._now, 3))
+        self.played.record(record)
         if isinstance(change, NetworkChange):
             self._medium.apply(change.conditions)
             self.network = change.detail
+            record = {**record, "asked": change.conditions.to_json()}
         else:
             for agent_id in change.agents:
                 self._fault(change.what, self._number[agent_id])
-        self.played.record(change.to_json(round(self._now, 3)))
+        self._recorder.changed(record)
 
     async def stop_events(self) -> None:
         self._generating = False
@@ -193,6 +199,7 @@ class Simulation:
         return {
             "outcome": "killed" if life is None else "exported",
             "restarts": len(lives) - 1,
+            "completed_before": [block.hex() for one in lives if one is not life for block in one.agent.completed],
             "idle": life.agent.idle if life else None,
             "bytes_sent": sum(life.bytes_sent for life in lives),
             "messages_sent": sum(life.agent.sent.total() for life in lives),
@@ -259,7 +266,8 @@ class Simulation:
             life.deadline = deadline
             if deadline is not None:
                 self._air.expect(deadline, number, None)
-        self._air.busy_until[number] = _mission_time(life, agent.answers_nobody_until())
+        busy_until = agent.answers_nobody_until()
+        self._air.busy_until[number] = 0.0 if busy_until is None else _mission_time(life, busy_until)
 
     def _in_mission_time(self, runs: list[HandlerRun]) -> list[HandlerRun]:
         for run in runs:

@@ -140,20 +140,20 @@ class VirtualAir:
         waiting = asked_by[of_vote] = _Asked(question)
         self._asking[question][number] = waiting
         for flight in self._answers.get(question, ()):
-            self._answer_to(number, waiting, flight, _counted_as(question, flight))
+            for delay in flight.lots.copies_to(number):
+                self._answer_to(number, waiting, flight, _counted_as(question, flight), delay)
 
     def _answer(self, question: Question, flight: Flight) -> None:
         """Let an answer arrive at whom it can matter: those who ask, if it is the first of its sender to arrive."""
         sender = _counted_as(question, flight)
         for receiver, waiting in self._asking.get(question, {}).items():
             if waiting.first.get(sender, NEVER) > flight.sent_at:
-                self._answer_to(receiver, waiting, flight, sender)
+                delay = flight.lots.first_to(receiver)
+                if delay is not None:
+                    self._answer_to(receiver, waiting, flight, sender, delay)
         self._remember(question, flight)
 
-    def _answer_to(self, receiver: int, waiting: "_Asked", flight: Flight, sender: int) -> None:
-        delay = flight.lots.first_to(receiver)
-        if delay is None:
-            return
+    def _answer_to(self, receiver: int, waiting: "_Asked", flight: Flight, sender: int, delay: float) -> None:
         at = flight.sent_at + delay
         if at < waiting.first.get(sender, NEVER) and (at, flight.rank, receiver) > self._current[:3]:
             waiting.first[sender] = at

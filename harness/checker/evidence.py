@@ -80,6 +80,8 @@ class Evidence:
     def completed_blocks(self) -> dict[str, int]:
         """Hash -> agent of every block known to have been completed."""
         owners = {block: agent_id for agent_id, export in self.exports.items() for block in export.completed}
+        for name, agent in self.record.agents.items() if self.record else ():
+            owners.update(dict.fromkeys(agent.completed_before, int(name)))
         for agent_id, trace in self.traces.items():
             owners.update(dict.fromkeys(trace.completed(), agent_id))
         return owners

@@ -14,7 +14,7 @@ def check(evidence: Evidence) -> Characteristic:
     findings: list[Finding] = []
     roster = evidence.roster
     completed = evidence.completed_blocks()
-    known = {*evidence.exports, *evidence.traces}
+    known = {*evidence.exports, *evidence.traces, *completed.values()}
     unknown: set[int] = set()
     blocks = 0
     for agent_id, export in evidence.exports.items():
@@ -24,9 +24,7 @@ def check(evidence: Evidence) -> Characteristic:
             name = evidence.name(block.block_hash)
             if roster is not None and block.agent_id not in roster:
                 detail = f"holds block {name} of agent {block.agent_id}, which is not on the roster"
-            elif block.agent_id not in known or (
-                block.block_hash not in completed and evidence.was_restarted(block.agent_id) and not evidence.traces
-            ):
+            elif block.agent_id not in known:
                 unknown.add(block.agent_id)
                 continue
             elif completed.get(block.block_hash) != block.agent_id:

@@ -25,11 +25,11 @@ class Metric:
         return estimate_mean(values)
 
 
-def _figure(name: str) -> Callable[[Figures], float | None]:
+def figure(name: str) -> Callable[[Figures], float | None]:
     return lambda figures: figures.get(name)
 
 
-def _uniform(figures: Figures) -> float | None:
+def uniform(figures: Figures) -> float | None:
     chains = figures.get("distinct_chains")
     return None if chains is None else float(chains == 1)
 
@@ -40,11 +40,11 @@ def _mutual_share(figures: Figures) -> float | None:
 
 
 METRICS = (
-    Metric("uniform", "one chain", _uniform, "share of runs"),
+    Metric("uniform", "one chain", uniform, "share of runs"),
     Metric("mutual_share", "mutual chain", _mutual_share, "share"),
-    Metric("distinct_chains", "distinct chains", _figure("distinct_chains")),
-    Metric("reconciles", "reconciles", _figure("reconciles")),
-    Metric("copies_mean", "copies mean", _figure("copies_mean")),
-    Metric("copies_min", "copies fewest", _figure("copies_min")),
-    Metric("messages_per_block", "messages per block", _figure("messages_per_block")),
+    Metric("distinct_chains", "distinct chains", figure("distinct_chains")),
+    Metric("reconciles", "reconciles", figure("reconciles")),
+    Metric("copies_mean", "copies mean", figure("copies_mean")),
+    Metric("copies_min", "copies fewest", figure("copies_min")),
+    Metric("messages_per_block", "messages per block", figure("messages_per_block")),
 )

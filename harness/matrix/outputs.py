@@ -38,8 +38,8 @@ def write(finished: Finished, directory: Path) -> None:
     record = finished.record
     try:
         write_json_atomically(directory / "matrix.json", record.to_json())
-        write_atomically(directory / "matrix.csv", _csv(_cell_row(cell) for cell in record.cells))
-        write_atomically(directory / "runs.csv", _csv(_run_rows(finished.runs)))
+        write_atomically(directory / "matrix.csv", to_csv(_cell_row(cell) for cell in record.cells))
+        write_atomically(directory / "runs.csv", to_csv(_run_rows(finished.runs)))
         write_atomically(directory / "matrix.svg", draw(record))
     except OSError as error:
         raise MachineError(f"{error.filename or directory} cannot be written: {error.strerror}") from None
@@ -65,7 +65,7 @@ def _run_rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
         }
 
 
-def _csv(rows: Iterable[dict[str, Any]]) -> str:
+def to_csv(rows: Iterable[dict[str, Any]]) -> str:
     """Unknown is an empty field."""
     file = io.StringIO()
     writer: csv.DictWriter[str] | None = None

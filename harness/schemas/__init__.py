@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from harness.exports import Export
 from harness.matrix import MatrixRecord
 from harness.record import RunRecord
+from harness.scale import ScaleRecord
 from harness.scenario import Scenario
 
 DIRECTORY = Path(__file__).parent
@@ -20,6 +21,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "ucp-chain-export-1": Export,
     "ucp-matrix-1": MatrixRecord,
     "ucp-run-1": RunRecord,
+    "ucp-scale-1": ScaleRecord,
 }
 
 

@@ -1,0 +1,67 @@
+"""`python -m harness.scale.complexity RUN_DIR`: put a sweep's figures into COMPLEXITY.md.
+
+The tables and the picture come from RUN_DIR; the words around them are written by hand.
+"""
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from harness.matrix.thesis import BEGIN, END, put_between_markers
+from harness.report import words
+from harness.scale.metrics import BY_NAME
+from harness.scale.picture import draw
+from harness.scale.record import ScaleRecord
+from harness.scale.table import GROWN, SIZED, SYMBOLS, rows, say, say_exponent, say_quality
+from ucp.files import write_atomically
+
+__all__ = ["BEGIN", "END", "PAGE", "tables"]
+
+PAGE = Path(__file__).parent / "COMPLEXITY.md"
+PICTURE = PAGE.with_name("scale.svg")
+
+
+def tables(record: ScaleRecord) -> str:
+    """Markdown: for each loss the means of each size, and the exponents."""
+    return "\n".join(part for loss in record.scale.loss for part in (_sizes(record, loss), _exponents(record, loss)))
+
+
+def _sizes(record: ScaleRecord, loss: float) -> str:
+    body = []
+    for cell in record.cells:
+        if cell.loss == loss:
+            estimates = {**cell.estimates, **cell.machine}
+            figures = (say(BY_NAME[name], estimates[name]) for name in SIZED)
+            body.append([f"{cell.minutes:g}", f"{cell.agents}", *figures])
+    return f"**{words.percent(loss)} loss**\n\n" + _markdown(["min", "N", *map(_label, SIZED)], body)
+
+
+def _exponents(record: ScaleRecord, loss: float) -> str:
+    body = []
+    for name, variable, laws in rows(record, loss):
+        its = (laws.get(metric) for metric in GROWN)
+        exponents = (
+            f"{say_exponent(law.exponents[variable])}<br><sub>{say_quality(law)}</sub>" if law else "\u2013"
+            for law in its
+        )
+        body.append([f"{SYMBOLS[variable]}, {name}", *exponents])
+    return _markdown([f"exponent at {words.percent(loss)} loss", *map(_label, GROWN)], body)
+
+
+def _label(metric: str) -> str:
+    return BY_NAME[metric].label.replace("- ", "")
+
+
+def _markdown(headers: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    lines = [headers, ["--:" for _ in headers], *body]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def main(run_dir: Path) -> None:
+    record = ScaleRecord.model_validate_json((run_dir / "scale.json").read_text(encoding="utf-8"))
+    write_atomically(PAGE, put_between_markers(PAGE.read_text(encoding="utf-8"), tables(record)))
+    write_atomically(PICTURE, draw(record))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,42 @@
+"""What a sweep leaves in its directory.
+
+scale.json   all of it, schema `ucp-scale/1`
+scale.csv    one row a run; the last two columns are what it cost this machine
+scale.svg    the picture
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness.errors import MachineError
+from harness.matrix.outputs import to_csv
+from harness.scale.cell import Run
+from harness.scale.metrics import MACHINE_METRICS
+from harness.scale.picture import draw
+from harness.scale.run import Finished
+from ucp.files import write_atomically, write_json_atomically
+
+
+def write(finished: Finished, directory: Path) -> None:
+    """Raises MachineError if the disk refuses."""
+    try:
+        write_json_atomically(directory / "scale.json", finished.record.to_json())
+        write_atomically(directory / "scale.csv", to_csv(_rows(finished.runs)))
+        write_atomically(directory / "scale.svg", draw(finished.record))
+    except OSError as error:
+        raise MachineError(f"{error.filename or directory} cannot be written: {error.strerror}") from None
+
+
+def _rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
+    machine = [metric.name for metric in MACHINE_METRICS]
+    figures = list(dict.fromkeys(name for run in runs for name in run.figures if name not in ("agents", *machine)))
+    for run in runs:
+        yield {
+            **run.size._asdict(),
+            "seed": run.seed,
+            **{name: run.figures.get(name) for name in figures},
+            "violated": " ".join(run.violated),
+            "failed": run.failed,
+            **{f"machine_{name}": run.figures.get(name) for name in machine},
+        }

@@ -1,0 +1,224 @@
+"""The simulation: the same seed gives the same run, on any machine, whatever is delivered or traced."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from harness import checker
+from harness.errors import ScenarioError
+from harness.exports import read_export
+from harness.progress import Silent
+from harness.run import run
+from harness.scenario import load_scenario
+from harness.simulate import Simulated, simulate
+from tests.harness.virtual import scenario
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+
+NOTHING_CAME_OF_IT = {
+    "reconcile in progress",
+    "no vote running",
+    "another block",
+    "another round",
+    "counted already",
+    "does not succeed",
+    "held already",
+    "not in phase 1",
+    "not in phase 2",
+    "not in phase 3",
+    "another chain",
+    "not held",
+}
+"""Branches that a message takes when it changes nothing."""
+
+
+def left_behind(simulated: Simulated) -> dict[str, Any]:
+    """Exports and figures: all that a run gives but its traces."""
+    exports = {agent_id: export.model_dump() for agent_id, export in simulated.evidence.exports.items()}
+    return {"exports": exports, "figures": simulated.result.figures, "played": simulated.played}
+
+
+def effective_runs(simulated: Simulated) -> dict[int, list[str]]:
+    return {
+        agent_id: [
+            run.to_line() for run in trace.runs if "message" not in run.trigger or run.branch not in NOTHING_CAME_OF_IT
+        ]
+        for agent_id, trace in simulated.evidence.traces.items()
+    }
+
+
+probabilities = st.sampled_from([0.0, 0.1, 0.3, 0.7])
+networks = st.fixed_dictionaries(
+    {"loss": st.one_of(probabilities, st.just({"p": 0.05, "r": 0.2}))},
+    optional={
+        "duplicate": probabilities,
+        "delay": st.sampled_from(
+            [0.01, 3.0, {"mean_s": 0.5, "jitter_s": 0.4}, {"mean_s": 1, "jitter_s": 1, "distribution": "pareto"}]
+        ),
+        "links": st.just([{"from": 1, "to": 2, "loss": 0.9}]),
+    },
+)
+timelines = st.lists(
+    st.sampled_from(
+        [
+            {"at_s": 50, "partition": [[1, 2], [3]]},
+            {"at_s": 150, "heal": True},
+            {"at_s": 200, "loss": 0.5},
+            {"at_s": 260, "pause": [2]},
+            {"at_s": 300, "kill": [1]},
+            {"at_s": 300.01, "restart": [1]},
+            {"at_s": 330, "resume": [2]},
+        ]
+    ),
+    unique_by=lambda entry: float(entry["at_s"]),  # type: ignore[arg-type]
+)
+
+
+def playable(timeline: list[dict[str, Any]]) -> bool:
+    return ("pause" in str(timeline)) >= ("resume" in str(timeline)) and ("kill" in str(timeline)) >= (
+        "restart" in str(timeline)
+    )
+
+
+@settings(max_examples=40, phases=(Phase.explicit, Phase.generate))  # shrinking takes minutes
+@given(
+    network=networks,
+    timeline=timelines.filter(playable),
+    agents=st.integers(3, 7),
+    mean_s=st.sampled_from([1, 3, 10]),
+    ignore_commit=probabilities,
+    clocks=st.sampled_from([{}, {2: {"offset_s": -3.5, "drift": 0.001}, 3: {"offset_s": 10}}]),
+    final_reconcile=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_what_is_not_delivered_would_have_changed_nothing(
+    network: dict[str, Any],
+    timeline: list[dict[str, Any]],
+    agents: int,
+    mean_s: int,
+    ignore_commit: float,
+    clocks: dict[int, Any],
+    final_reconcile: bool,
+    seed: int,
+) -> None:
+    """Delivering all N² messages gives the same exports, figures and effective handler runs, to the last byte."""
+    one = scenario(
+        agents=agents,
+        duration_s=400,
+        network=network,
+        timeline=timeline,
+        events={"source": "random", "mean_s": mean_s},
+        quirks={"ignore_commit": ignore_commit},
+        clocks=clocks,
+        settle={"limit_s": 300},
+        final_reconcile=final_reconcile,
+    )
+    needed, all_ = simulate(one, seed, tracing=True), simulate(one, seed, tracing=True, deliver_all=True)
+    assert left_behind(needed) == left_behind(all_)
+    assert effective_runs(needed) == effective_runs(all_)
+    assert left_behind(simulate(one, seed)) == left_behind(needed)
+
+
+def digest(simulated: Simulated) -> str:
+    """Of exports, traces and figures."""
+    document = left_behind(simulated)
+    del document["played"]
+    traces = [run.to_line() for _, trace in sorted(simulated.evidence.traces.items()) for run in trace.runs]
+    return hashlib.sha256(json.dumps([document, traces], sort_keys=True).encode()).hexdigest()[:16]
+
+
+BURSTS = {
+    "loss": {"p": 0.02, "r": 0.3},
+    "delay": {"mean_s": 0.2, "jitter_s": 0.1, "distribution": "paretonormal"},
+    "duplicate": 0.1,
+    "reorder": 0.1,
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "expected"),
+    [
+        ("perfect.yaml", 1, "e5b6c24af37b9538"),
+        ("loss_15.yaml", 1, "f1e908c522dc6fd8"),
+        ("loss_15.yaml", 2, "a8cce796a772945e"),
+        ("missed_commit.yaml", 1, "492a6c65e1d37673"),
+        ("partition_heal.yaml", 1, "988c978a053cea73"),
+        ("bursts", 1, "8c046c273b7f2cdc"),
+    ],
+)
+def test_a_seed_means_the_same_run_on_every_machine(name: str, seed: int, expected: str) -> None:
+    """A digest that changes says that old seeds no longer reproduce old runs: change it knowingly."""
+    one = scenario(network=BURSTS, duration_s=600) if name == "bursts" else load_scenario(SCENARIOS / name)
+    assert digest(simulate(one, seed, tracing=True)) == expected
+
+
+def test_another_seed_is_another_run() -> None:
+    one = scenario(duration_s=300)
+    assert digest(simulate(one, 1)) == digest(simulate(one, 1)) != digest(simulate(one, 2))
+
+
+def test_adding_loss_leaves_the_events_as_they_are() -> None:
+    """One random stream per concern."""
+
+    def completed(**network: Any) -> list[list[str]]:
+        exports = simulate(scenario(network=network), 5).evidence.exports.values()
+        return [export.completed for export in exports]
+
+    assert completed() == completed(loss=0.3) == completed(loss=0.3, duplicate=0.2)
+
+
+def test_a_run_directory_says_what_a_simulation_in_memory_says(tmp_path: Path) -> None:
+    one = load_scenario(SCENARIOS / "loss_15.yaml")
+    finished = run(one, 3, tmp_path / "run", Silent(), "sim")
+    in_memory = simulate(one, 3, tracing=True)
+    assert finished.exit_status == 0
+    assert finished.result.to_json() == in_memory.result.to_json()
+    for agent_id, export in in_memory.evidence.exports.items():
+        assert read_export(tmp_path / "run" / "agents" / f"{agent_id}.chain.json") == export
+    again = checker.check(checker.gather([tmp_path / "run"]))
+    assert again.to_json() == finished.result.to_json()
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (record["backend"], record["outcome"], record["settled"]) == ("sim", "completed", True)
+    network = [json.loads(line) for line in (tmp_path / "run" / "network.jsonl").read_text().splitlines()]
+    assert [change["what"] for change in network] == ["start", "final reconcile"]
+
+
+@pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*[!x].yaml")), ids=lambda path: path.stem)
+def test_every_scenario_that_runs_as_processes_runs_in_virtual_time(path: Path) -> None:
+    simulated = simulate(load_scenario(path), 1, tracing=True)
+    assert simulated.played.settled
+    assert not simulated.result.violated
+
+
+@pytest.mark.parametrize(
+    ("keys", "sentence"),
+    [
+        ({"vehicles": {"kind": "ardupilot"}}, "`vehicles.kind: ardupilot` needs real processes"),
+        ({"vehicles": {"binary": "/bin/x"}, "agent_command": ["x"]}, "`vehicles.binary`, `agent_command` need real"),
+    ],
+)
+def test_what_virtual_time_cannot_give_is_refused_by_its_keys(keys: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ScenarioError, match=sentence):
+        simulate(scenario(**keys), 1)
+
+
+@pytest.mark.parametrize(
+    ("keys", "named"),
+    [
+        ({"fates": [{"sender": 1, "drop": True}]}, "`fates` needs"),
+        ({"clocks": {1: {"drift": 0.1}}, "events": {"source": "scripted"}}, "`clocks`, `events.source: scripted` need"),
+        ({"timeline": [{"at_s": 1, "kill": [1]}]}, "`timeline: kill` needs"),
+        ({"network": {"delay": 1}}, "`network: delay` needs"),
+    ],
+)
+def test_what_processes_cannot_be_given_yet_is_refused_by_its_keys(
+    tmp_path: Path, keys: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(ScenarioError, match=f"{named} virtual time: use --backend sim"):
+        run(scenario(**keys), 1, tmp_path / "run", Silent(), "process")
+    assert not (tmp_path / "run").exists()
