@@ -86,7 +86,9 @@ class JudgedRecord(_Model):
     schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
     roster: list[int]
     network: list[NetworkState] = []
+    faults: list[Fault] = []
     final_reconcile: FinalReconcile | None = None
+    mission_s: float | None = None
     agents: dict[str, AgentRecord] = {}
 
 
@@ -102,9 +104,7 @@ class RunRecord(JudgedRecord):
     wall_s: float | None = None
     outcome: Literal["running", "completed", "interrupted", "failed"] = "running"
     outcome_detail: str | None = None
-    mission_s: float = 0.0
     settled: bool = False
-    faults: list[Fault] = []
     vehicles: dict[str, dict[str, Any]] = {}
     unmatched_fates: list[str] = []
     """A sentence for each scripted fate that decided nothing."""

@@ -42,9 +42,13 @@ def simulate(scenario: Scenario, seed: int, *, tracing: bool = False, deliver_al
     Without `tracing` characteristic 1 cannot be judged, and 2 and 3 only at the end. `deliver_all` delivers even what
     changes nothing. Raises ScenarioError for a scenario that needs real processes.
     """
+    return simulate_in_memory(InMemory(tracing), scenario, seed, deliver_all=deliver_all)
+
+
+def simulate_in_memory(memory: "InMemory", scenario: Scenario, seed: int, **options: Any) -> Simulated:
+    """As `simulate`; `memory` keeps the run, and `options` are the simulation's."""
     refuse_what_needs_processes(scenario)
-    memory = InMemory(tracing)
-    simulation = Simulation(scenario, seed, memory, deliver_all=deliver_all)
+    simulation = Simulation(scenario, seed, memory, **options)
     _without_waiting(mission.play(simulation, scenario))
     simulation.end()
     evidence = memory.evidence(simulation)
@@ -124,6 +128,9 @@ class InMemory:
         else:
             trace.starts.append(len(trace.runs))
 
+    def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
+        """The block that it becomes part of has it."""
+
     def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
         self._traces[agent_id].runs += runs
 
@@ -139,6 +146,8 @@ class InMemory:
                 "roster": simulation.roster,
                 "network": simulation.played.network,
                 "final_reconcile": simulation.played.final_reconcile,
+                "faults": simulation.played.faults,
+                "mission_s": simulation.played.mission_s,
                 "agents": simulation.played.agents,
             }
         )
@@ -165,6 +174,9 @@ class OnDisk:
         if agent_id not in self._traces:
             self._traces[agent_id] = TraceFile(self._rundir.agents / f"{agent_id}.trace.jsonl")
         self._traces[agent_id].write(header_line(**_header(life)))
+
+    def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
+        """The block that it becomes part of has it."""
 
     def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
         self._traces[agent_id].write("".join([run.to_line() for run in runs]))

@@ -74,6 +74,15 @@ def timeline_of(scenario: Scenario) -> list[Change]:
     return played
 
 
+def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Records of network changes, where scripted fates stood between agents until `at_s`, whatever the conditions."""
+    since = round(at_s + 0.001, 3)  # what is sent in the same instant is meant too
+    before = [{**state, "fully_connected": False} for state in network if state["at_s"] < since]
+    after = [state for state in network if state["at_s"] >= since]
+    again = {"at_s": since, "what": "no more fates", "fully_connected": network[len(before) - 1]["fully_connected"]}
+    return [*before, {**before[-1], **again}, *after]
+
+
 def final_reconcile(at_s: float) -> NetworkChange:
     """All conditions are cleared, so that everybody can hear everybody."""
     return _change(at_s, "final reconcile", NetworkConditions())

@@ -1,7 +1,7 @@
 """Plays scripted fates (`harness.scenario.fates`): decides single messages before chance has its say."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from harness.scenario.fates import Fate
@@ -9,6 +9,9 @@ from netem.medium import Lots
 from ucp.messages import Message, block_named
 
 RIGHT_AFTER_S = 1e-6
+
+NameOf = Callable[[bytes], str | None]
+"""A block's name from its hash, if it is known."""
 
 
 @dataclass(slots=True, eq=False)
@@ -35,8 +38,11 @@ class Decided:
 class FateScript:
     """Fates for `roster`; receivers are numbered in its order. `name_of` gives a block's name from its hash."""
 
-    def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: Callable[[bytes], str | None]) -> None:
-        self.fates = tuple(fates)
+    def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf) -> None:
+        self.listens = bool(fates)
+        """Whether `decide` is to be asked at all."""
+        self.last_s: float | None = None
+        """When the last message was sent that did not go as chance would have it."""
         self._parts = [_Part(index, fate) for index, fate in enumerate(fates)]
         self._number = {agent_id: number for number, agent_id in enumerate(roster)}
         self._name_of = name_of
@@ -65,6 +71,8 @@ class FateScript:
             if not hears(receiver):
                 continue
             fate = part.fate
+            if not fate.as_chance_says:
+                self.last_s = now
             if fate.after is not None:
                 decided.waiting.append((receiver, fate.after))
                 continue
@@ -79,13 +87,19 @@ class FateScript:
                 decided.named.append((fate.name, arrivals[0]))
         return decided
 
-    def unmatched(self) -> list[str]:
-        """A sentence for each fate that decided nothing: whoever wrote it believes that it did."""
-        return [
-            f"fates.{part.index} ({part.fate.describe()}) never matched a message"
-            for part in self._parts
-            if not part.decided
-        ]
+    def unmatched(self, waiting: Collection[str]) -> list[str]:
+        """A sentence for each fate that came to nothing: whoever wrote it believes that it did something.
+
+        `waiting`: names of fates whose message others still wait for.
+        """
+        sentences = []
+        for part in self._parts:
+            fate = f"fates.{part.index} ({part.fate.describe()})"
+            if not part.decided:
+                sentences.append(f"{fate} never matched a message")
+            elif part.fate.after in waiting:
+                sentences.append(f"{fate}: the message that {part.fate.after!r} is about never arrived")
+        return sentences
 
     def _fitting(self, now: float, sender: int, message: Message) -> Iterator[_Part]:
         keys = ((message.NAME, sender), (message.NAME, None), (None, sender), (None, None))

@@ -6,20 +6,21 @@ one fault leaves the others as they are. No vehicles fly; without vehicles, even
 """
 
 import dataclasses
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass
 from random import Random
 from typing import Any, Protocol
 
-from harness.backends.fate_script import FateScript
+from harness.backends.fate_script import FateScript, NameOf
 from harness.backends.virtual_air import Flight, Logged, VirtualAir
 from harness.errors import ScenarioError
 from harness.mission import Played
 from harness.scenario import Scenario
+from harness.scenario.fates import Fate
 from harness.scenario.scenario import Clock
 from harness.scenario.timeline import FaultName
 from harness.seeds import agent_seed
-from harness.timeline import Change, NetworkChange
+from harness.timeline import Change, NetworkChange, disconnected_until
 from netem.medium import Medium
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS
@@ -56,6 +57,9 @@ class Recorder(Protocol):
     def begin(self, life: "Life") -> None:
         """An agent starts, or starts anew."""
 
+    def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
+        """An agent is about to log an event with so much data."""
+
     def write(self, agent_id: int, runs: list[HandlerRun]) -> None: ...
 
     def changed(self, record: dict[str, Any]) -> None:
@@ -85,7 +89,7 @@ class Simulation:
     """A swarm in virtual time; see `harness.mission.Swarm`. Agents are numbered in the roster's order.
 
     `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. `breathe` is
-    awaited every few mission seconds.
+    awaited every few mission seconds. `fate_script` makes what plays the scenario's fates.
     """
 
     def __init__(
@@ -96,6 +100,7 @@ class Simulation:
         *,
         deliver_all: bool = False,
         breathe: Callable[["Simulation"], Awaitable[None]] | None = None,
+        fate_script: Callable[[Sequence[Fate], Sequence[int], NameOf], FateScript] = FateScript,
     ) -> None:
         self.scenario = scenario
         self.roster = scenario.roster
@@ -115,8 +120,8 @@ class Simulation:
         self._alive: list[Life | None] = [None for _ in self.roster]
         self._medium = Medium(self.roster, seed)
         self._block_names: dict[bytes, str] = {}
-        script = FateScript(scenario.fates, self.roster, self._block_name)
-        self._air = VirtualAir(self.roster, self._medium, script, deliver_all=deliver_all)
+        self._script = fate_script(scenario.fates, self.roster, self._block_name)
+        self._air = VirtualAir(self.roster, self._medium, self._script, deliver_all=deliver_all)
 
     # The swarm, as harness.mission drives it
 
@@ -181,6 +186,8 @@ class Simulation:
     def end(self) -> None:
         """Take down what there is at the end."""
         self.played.mission_s = round(self._now, 3)
+        if self._script.last_s is not None:
+            self.played.network = disconnected_until(self._script.last_s, self.played.network)
         self.played.unmatched_fates = self._air.unmatched_fates()
         self.played.agents = {str(agent_id): self._agent_to_json(number) for agent_id, number in self._number.items()}
 
@@ -241,6 +248,7 @@ class Simulation:
         elif what is None:
             self._timer_ends(number, life)
         elif self._generating:
+            self._recorder.logged(self._now, life.agent.agent_id, len(what[1]))
             life.agent.add_event(LoggableEvent(self.timestamp_us(life), *what), self._local(life))
             self._expect_event(number, life)
             self._after(number, life)

@@ -107,7 +107,7 @@ class VirtualAir:
         flight = Flight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots)
         if kind in ASKED:
             self._ask(number, ASKED[kind](message))
-        if self._script.fates and self._scripted(now, number, flight):
+        if self._script.listens and self._scripted(now, number, flight):
             return
         if now + lots.latest > self.quiet_at:
             self.quiet_at = now + lots.latest
@@ -198,5 +198,4 @@ class VirtualAir:
 
     def unmatched_fates(self) -> list[str]:
         """A sentence for each scripted fate that came to nothing."""
-        waiting = [f"a message waits for {name!r}, which never arrived" for name in self._waiting]
-        return self._script.unmatched() + waiting
+        return self._script.unmatched(self._waiting)

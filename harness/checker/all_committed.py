@@ -27,7 +27,8 @@ def check(evidence: Evidence) -> Characteristic:
         return Characteristic(
             NAME,
             "not applicable",
-            f"{agents(set(lacking))} lack{'s' if len(lacking) == 1 else ''} {lack} copies of blocks; {no_chance}",
+            f"{agents(set(lacking))} lack{'s' if len(lacking) == 1 else ''} {lack} cop{'y' if lack == 1 else 'ies'} "
+            f"of completed blocks; {no_chance}",
         )
     findings = [
         Finding(

@@ -6,14 +6,11 @@ when its own timer does. Only traces can tell.
 
 from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
-from harness.traces import Trace
+from harness.checker.waiting import waited_too_long
 from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER, TRIGGERED_LOCALLY
 from ucp.trace import HandlerRun
 
 NAME = "distributed"
-
-SLACK_WALL_S = 1.0
-"""How late a loaded machine may run a timer before it counts as not run, in wall seconds."""
 
 _OF_MESSAGE = {message.NAME: handler.name for message, handler in ON_MESSAGE.items()}
 _OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
@@ -43,7 +40,7 @@ def check(evidence: Evidence) -> Characteristic:
                 wrong = _wrong_trigger(run, ran, sent)
                 if wrong:
                     findings.append(Finding(agent_id, f"trace line {line}, t={run.t:g} s: {run.handler} {wrong}"))
-        findings += _votes_that_never_ended(agent_id, trace)
+    findings += waited_too_long(evidence)
     if findings:
         return violated(NAME, "a handler ran without a trigger of its own, or waited for another agent", findings)
     silent = sorted(set(evidence.roster or evidence.exports) - set(evidence.traces))
@@ -86,25 +83,3 @@ def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, set[tuple[int
         case _:
             return "has no trigger"
     return None
-
-
-def _votes_that_never_ended(agent_id: int, trace: Trace) -> list[Finding]:
-    timeout_s = trace.header.settings.get("vote_timeout_s")
-    if not isinstance(timeout_s, int | float) or not trace.runs:
-        return []
-    speedup = trace.header.clock.get("speedup", 1)
-    latest = timeout_s + SLACK_WALL_S * (speedup if isinstance(speedup, int | float) else 1)
-    findings = []
-    for life in trace.lives():
-        proposed: tuple[int, float] | None = None
-        for line, run in life:
-            if run.handler == "process_next_deque_block" and run.branch == "proposed":
-                proposed = line, run.t
-            elif run.handler == "vote_timer_expiration":
-                proposed = None
-            elif proposed is not None and run.t > proposed[1] + latest:
-                where = f"trace line {proposed[0]}, t={proposed[1]:g} s"
-                detail = f"{where}: a vote began and did not end within {timeout_s:g} s"
-                findings.append(Finding(agent_id, detail))
-                proposed = None
-    return findings

@@ -61,6 +61,25 @@ class Evidence:
     def _recorded(self, agent_id: int) -> AgentRecord | None:
         return self.record.agents.get(str(agent_id)) if self.record else None
 
+    def was_paused(self, agent_id: int, from_s: float, until_s: float) -> bool:
+        """Whether the scenario had the agent stand still at any time between the two."""
+        since: float | None = None
+        for fault in self.record.faults if self.record else ():
+            if agent_id not in (fault.agents or ()):
+                continue
+            if fault.what == "pause":
+                since = fault.at_s
+            elif since is not None:
+                if since <= until_s and fault.at_s >= from_s:
+                    return True
+                since = None
+        return since is not None and since <= until_s
+
+    @property
+    def ended_at_s(self) -> float | None:
+        """When the run ended, in mission seconds; None if it is not on record."""
+        return self.record.mission_s if self.record else None
+
     @property
     def connected_since_s(self) -> float | None:
         """Mission time since when every agent has heard every other without loss; None if not, or not on record."""

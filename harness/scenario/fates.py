@@ -65,6 +65,10 @@ class Fate(Model):
     name: FateName | None = None
 
     @property
+    def as_chance_says(self) -> bool:
+        return not self.drop and self.delay_s is None and self.hold_until_s is None and self.after is None
+
+    @property
     def counts(self) -> tuple[int, ...] | None:
         return (self.count,) if isinstance(self.count, int) else tuple(self.count) if self.count else None
 

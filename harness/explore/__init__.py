@@ -1,0 +1,14 @@
+"""Looking for a run that violates a characteristic, and for the smallest one that still does.
+
+search.py    seed after seed, until a run violates one
+tape.py      what happened in a run by chance, taken down: events, and messages that were lost
+document.py  a scenario as a document that can be cut to pieces
+shrink.py    tries smaller documents, by delta debugging, on all cores
+smaller.py   what smaller means: fewer agents, events and fates, less time, less chance
+write.py     the smallest one as a scenario file, for people
+"""
+
+from harness.explore.run import MAX_RUNS, Explored, explore
+from harness.explore.search import Violation
+
+__all__ = ["MAX_RUNS", "Explored", "Violation", "explore"]

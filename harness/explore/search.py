@@ -1,0 +1,62 @@
+"""Seed after seed in the simulation, until a run violates a characteristic."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from harness.checker import Result
+from harness.scenario import Scenario
+from harness.simulate import simulate
+from harness.sweep import Failed, sweep
+
+Judge = Callable[[Scenario, int], Result]
+"""Plays a scenario with a seed, and judges it."""
+
+
+def simulated(scenario: Scenario, seed: int) -> Result:
+    """With traces, so that all six characteristics are judged."""
+    return simulate(scenario, seed, tracing=True).result
+
+
+def violated(result: Result) -> tuple[str, ...]:
+    """The numbers of the characteristics that are violated."""
+    return tuple(number for number, one in result.characteristics.items() if one.verdict == "violated")
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """The run of `seed` violates these characteristics."""
+
+    seed: int
+    numbers: tuple[str, ...]
+
+
+@dataclass
+class Searched:
+    """What became of seeds from the first on. `failed`: seed -> why there is no verdict on its run."""
+
+    played: int = 0
+    violation: Violation | None = None
+    failed: dict[int, str] = field(default_factory=dict)
+    interrupted: bool = False
+
+
+def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> Searched:
+    """Play `seeds` in order; the lowest that violates a characteristic is the one found, however many `jobs`.
+
+    Ctrl-C ends it early. Raises HarnessError if the scenario cannot be played.
+    """
+    searched = Searched()
+    try:
+        with sweep(
+            seeds, lambda seed: violated(judge(scenario, seed)), jobs, what="seeds" if shown else None
+        ) as outcomes:
+            for seed, outcome in outcomes:
+                searched.played += 1
+                if isinstance(outcome, Failed):
+                    searched.failed[seed] = outcome.reason
+                elif outcome:
+                    searched.violation = Violation(seed, outcome)
+                    break
+    except KeyboardInterrupt:
+        searched.interrupted = True
+    return searched

@@ -1,0 +1,117 @@
+"""What happened in a run by chance, taken down: the events that agents logged, and the messages that were lost.
+
+A scenario that scripts them plays the very same run again: a sender's lots for latency are drawn for every broadcast,
+and in their own stream, whatever becomes of it.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from harness.backends.fate_script import Decided, FateScript, NameOf
+from harness.checker import Result
+from harness.scenario import Scenario
+from harness.scenario.fates import Fate
+from harness.simulate import InMemory, simulate_in_memory
+from netem.medium import Lots
+from ucp.messages import CommitBlock, Message, block_named
+from ucp.trace import HandlerRun
+
+
+@dataclass(frozen=True, slots=True)
+class Logged:
+    """An event of an agent; `completes`: with it a block was full."""
+
+    at_s: float
+    agent: int
+    bytes: int
+    completes: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A message that did not reach `receiver`: the `count`th of its type from `sender`, sent at `at_s`.
+
+    `by_quirk`: it came, and the receiver ignored it.
+    """
+
+    at_s: float
+    message: str
+    sender: int
+    receiver: int
+    count: int
+    block: str | None
+    by_quirk: bool = False
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A run, taken down, with its verdict. In the order of time."""
+
+    result: Result
+    logged: list[Logged]
+    lost: list[Lost]
+
+
+def record(scenario: Scenario, seed: int) -> Recording:
+    tape = _Tape()
+    simulated = simulate_in_memory(tape, scenario, seed, fate_script=partial(_Listening, tape=tape))
+    return Recording(simulated.result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
+
+
+class _Tape(InMemory):
+    def __init__(self) -> None:
+        super().__init__(tracing=True)
+        self.events: list[Logged] = []
+        self.lost: list[Lost] = []
+        self.sent: dict[tuple[int, int], Lost] = {}
+        """(sender, sequence) of each Commit Block -> how it would be lost."""
+        self._last_of: dict[int, int] = {}
+        self._counts: Counter[int] = Counter()
+
+    def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
+        self._last_of[agent_id] = len(self.events)
+        self.events.append(Logged(at_s, agent_id, data_bytes, completes=False))
+
+    def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
+        super().write(agent_id, runs)
+        for run in runs:
+            if run.handler == "build_data_block" and run.branch == "full":
+                last = self.events[self._last_of[agent_id]]
+                self.events[self._last_of[agent_id]] = Logged(last.at_s, last.agent, last.bytes, completes=True)
+            for sent in run.sent:
+                if sent.message == CommitBlock.NAME:
+                    self._counts[agent_id] += 1
+                    count = self._counts[agent_id]
+                    self.sent[agent_id, sent.seq] = Lost(run.t, sent.message, agent_id, 0, count, None)
+            if run.branch == "ignored by quirk":
+                sent_by, sequence = run.trigger["from"], run.trigger["seq"]
+                one = self.sent[int(sent_by), int(sequence)]
+                self.lost.append(Lost(one.at_s, one.message, one.sender, agent_id, one.count, None, by_quirk=True))
+
+
+class _Listening(FateScript):
+    """Decides what the script says, and takes down what is lost, whether by script or by chance."""
+
+    def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _Tape) -> None:
+        super().__init__(fates, roster, name_of)
+        self.listens = True
+        self._name = name_of
+        self._roster = roster
+        self._tape = tape
+        self._sent: Counter[tuple[str, int]] = Counter()
+
+    def decide(self, now: float, sender: int, message: Message, lots: Lots, hears: Any) -> Decided | None:
+        decided = super().decide(now, sender, message, lots, hears)
+        self._sent[message.NAME, sender] += 1
+        arrivals = lots.to_all() if decided is None else [*decided.arrivals, *decided.waiting]
+        reached = {number for number, _ in arrivals}
+        block_hash = block_named(message)
+        for number, receiver in enumerate(self._roster):
+            if receiver != sender and number not in reached and hears(number):
+                count = self._sent[message.NAME, sender]
+                name = self._name(block_hash) if block_hash else None
+                self._tape.lost.append(Lost(now, message.NAME, sender, receiver, count, name))
+        return decided
