@@ -27,6 +27,7 @@ FIGURES = {
     "blocks": "blocks completed",
     "mutual_chain": "blocks in the mutual chain",
     "distinct_chains": "distinct chains",
+    "uniform_at_s": "mission seconds until the chains were one",
     "reconciles": "reconciles",
     "copies_min": "fewest copies of a block",
     "copies_mean": "copies of a block, mean",
@@ -132,7 +133,7 @@ def _summary(result: dict[str, Any], exports: Exports) -> list[str]:
         parts.append(f"{words.duration(duration_s)} mission")
     if loss is not None:
         parts.append(f"{words.percent(loss)} loss")
-    if speedup is not None:
+    if speedup is not None and result.get("backend") != "sim":
         parts.append(f"speedup {words.value(speedup)}")
     parts += [
         f"{key} {words.value(result[key])}" for key in ("seed", "backend", "engine") if result.get(key) is not None

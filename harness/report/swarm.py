@@ -41,6 +41,9 @@ def missing(result: dict[str, Any], exports: Exports) -> list[str]:
     for agent_id in roster(result):
         if agent_id not in exports.by_agent:
             agent = mapping(result, "agents", str(agent_id))
+            if agent.get("outcome") == "killed":
+                sentences.append(f"agent {agent_id} was killed, and all that it held with it")
+                continue
             why = ", ".join(words.value(agent[key]) for key in ("outcome", "detail") if agent.get(key))
             sentences.append(f"agent {agent_id}: no usable export" + (f" ({why})" if why else ""))
     return sentences
