@@ -15,14 +15,14 @@ def strip(result: dict[str, Any]) -> Markup | None:
     end_s = number(scenario, "duration_s")
     if not end_s or end_s <= 0:
         return None
-    loss = number(scenario, "network", "loss") or 0.0
-    losses, partitions = [(0.0, words.percent(loss), loss)], [(0.0, "", 0.0)]
+    text, loss = _loss(mapping(scenario, "network")) or ("", 0.0)
+    losses, partitions = [(0.0, text, loss)], [(0.0, "", 0.0)]
     for entry in listing(scenario, "timeline"):
-        at_s, loss_then = number(entry, "at_s"), number(entry, "loss")
+        at_s, loss_then = number(entry, "at_s"), _loss(mapping(entry))
         if at_s is None:
             continue
         if loss_then is not None:
-            losses.append((at_s, words.percent(loss_then), loss_then))
+            losses.append((at_s, *loss_then))
         elif groups := [group for group in listing(entry, "partition") if isinstance(group, list)]:
             text = " | ".join(", ".join(ranges(agent_ids(group))) for group in groups)
             partitions.append((at_s, text, 1.0))
@@ -40,16 +40,24 @@ def strip(result: dict[str, Any]) -> Markup | None:
     return network_strip.draw(lanes, ticks, end_s)
 
 
-def start(result: dict[str, Any]) -> list[str]:
-    """What the network was set to at the start, in a few words each."""
-    network = mapping(result, "scenario", "network")
-    loss = number(network, "loss")
-    facts = [] if loss is None else [f"{words.percent(loss)} loss at every receiver"]
-    for receiver in mapping(network, "receivers"):
-        conditions = mapping(network, "receivers", receiver).items()
-        facts.append(f"receiver {receiver}: " + ", ".join(f"{words.label(k)} {words.value(v)}" for k, v in conditions))
-    others = {key: value for key, value in network.items() if key not in ("loss", "receivers") and value is not None}
-    return facts + [f"{words.label(key)} {words.value(value)}" for key, value in others.items()]
+def _loss(conditions: dict[str, Any]) -> tuple[str, float] | None:
+    """A loss in words, and its share of all messages in the long run."""
+    loss = number(conditions, "loss")
+    if loss is not None:
+        return words.percent(loss), loss
+    p, r = number(conditions, "loss", "p"), number(conditions, "loss", "r")
+    bad, good = number(conditions, "loss", "loss_bad"), number(conditions, "loss", "loss_good")
+    if p is None or r is None or bad is None or good is None or p + r <= 0:
+        return None
+    mean = (p * bad + r * good) / (p + r)
+    return f"{words.percent(mean)} in bursts", mean
+
+
+def start(result: dict[str, Any]) -> str | None:
+    """What the network was set to at the start, in words; None if that is not on record."""
+    states = listing(result, "network")
+    detail = mapping(states[0]).get("detail") if states else None
+    return words.value(detail) if detail else None
 
 
 def faults(result: dict[str, Any]) -> list[tuple[str, str, str]]:
