@@ -1,4 +1,4 @@
-"""The command line: `ucp-harness run`, `check`, `matrix`, `scale` and `doctor`.
+"""The command line: `ucp-harness run`, `check`, `matrix`, `scale`, `explore` and `doctor`.
 
 Exit status 0: ran, and no characteristic is violated. 1: at least one is violated, or an agent failed. 2: the request
 was wrong. 3: this machine cannot do it. 130: interrupted.
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from harness import checker, matrix, progress, scale
+from harness import checker, explore, matrix, progress, scale
 from harness.doctor import examine
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, HarnessError
 from harness.matrix import outputs as matrix_outputs
@@ -75,6 +75,8 @@ def run_command(
     directory = (out or default_path(request.name)).absolute()
     chosen_seed = secrets.randbelow(2**32) if seed is None else seed
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
+    if backend is RunBackend.sim and request.events.source == "mavlink":
+        console.print("No vehicles fly in virtual time: events are random (Algorithm 21).", style="dim")
     shown = progress.for_console(console)
     try:
         finished = run(request, chosen_seed, directory, shown, backend.value)
@@ -184,6 +186,31 @@ def scale_command(
     if record.outcome == "interrupted":
         _complain(f"interrupted; the {record.runs} of {record.runs_asked} runs that had ended are in {directory}")
     raise typer.Exit(record.exit_status)
+
+
+@app.command("explore")
+def explore_command(
+    scenario: Annotated[Path, typer.Argument(help="Scenario file (YAML).")],
+    seeds: Annotated[int, typer.Option(min=1, help="How many seeds to play at most.")] = 1000,
+    first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="File of the smallest run; must be new.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
+    ] = None,
+) -> None:
+    """Play seed after seed in virtual time until a characteristic is violated; then find the smallest such run."""
+    console = Console()
+    request = load_scenario(scenario)
+    with explore.watching(console) as watcher:
+        seeds_asked = range(first_seed, first_seed + seeds)
+        explored = explore.explore(request, str(scenario), seeds_asked, jobs or cores(), out, watcher=watcher)
+    for line in explore.in_words(explored):
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
+    for seed, reason in explored.searched.failed.items():
+        _complain(f"there is no verdict on seed {seed}: {reason}")
+    if explored.interrupted:
+        _complain("interrupted")
+    raise typer.Exit(explored.exit_status)
 
 
 def main() -> NoReturn:

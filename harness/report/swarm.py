@@ -57,6 +57,9 @@ def agents_table(result: dict[str, Any], exports: Mapping[int, Export], ink: Map
         cells: dict[str, Any] = {}
         agent, vehicle = (mapping(result, owner, str(agent_id)) for owner in ("agents", "vehicles"))
         cells |= {words.label(key): value for key, value in agent.items() if key not in ("detail", "dropped")}
+        gone = listing(agent, "completed_before")
+        cells["completed before"] = len(gone) or None
+        cells["restarts"] = agent.get("restarts") or None
         if dropped := mapping(agent, "dropped"):
             cells["dropped"] = ", ".join(f"{words.value(count)} {reason}" for reason, count in dropped.items())
         if export := exports.get(agent_id):

@@ -8,6 +8,8 @@ import pytest
 from tests.harness.command import harness, sentences
 from tests.harness.mission import CONNECTED, edit, fly, write_exports, write_run
 
+PERFECT = Path(__file__).parents[2] / "scenarios" / "perfect.yaml"
+
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
@@ -93,3 +95,18 @@ def test_doctor_says_what_this_machine_can_do_as_text_and_json() -> None:
     assert as_text.returncode == as_json.returncode
     for finding in findings:
         assert finding["name"] in as_text.stdout
+
+
+def test_a_scenario_runs_in_virtual_time_and_says_that_no_vehicles_fly(tmp_path: Path) -> None:
+    done = harness("run", PERFECT, "--backend", "sim", "--seed", "1", "--out", tmp_path / "run")
+    assert done.returncode == 0
+    assert "No vehicles fly in virtual time" in done.stdout
+    assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_virtual_time_has_no_ardupilot(tmp_path: Path) -> None:
+    asked = ("run", PERFECT, "--backend", "sim", "--vehicles", "ardupilot", "--out", tmp_path / "run")
+    done = harness(*asked)
+    assert done.returncode == 2
+    assert "`vehicles.kind: ardupilot` needs real processes" in " ".join(sentences(done.stderr))
+    assert not (tmp_path / "run").exists()
