@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from harness.progress import Silent
 from harness.run import run
 from harness.scenario import load_scenario
 from harness.simulate import Simulated, simulate
+from tests.harness.command import Running, sentences, write_scenario
 from tests.harness.virtual import scenario
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -222,3 +224,16 @@ def test_what_processes_cannot_be_given_yet_is_refused_by_its_keys(
     with pytest.raises(ScenarioError, match=f"{named} virtual time: use --backend sim"):
         run(scenario(**keys), 1, tmp_path / "run", Silent(), "process")
     assert not (tmp_path / "run").exists()
+
+
+def test_ctrl_c_ends_a_long_simulation_with_everything_kept(tmp_path: Path) -> None:
+    keys = {"agents": 40, "network": {"loss": 0.3}, "events": {"source": "random"}}
+    running = Running(write_scenario(tmp_path, duration_s=50_000, **keys), tmp_path / "run", "--backend", "sim")
+    running.wait_for_mission(1)
+    running.process.send_signal(signal.SIGINT)
+    status, _, err = running.end()
+    assert status == 130
+    assert "interrupted at mission second" in " ".join(sentences(err))
+    record = running.record()
+    assert (record["outcome"], set(record["characteristics"])) == ("interrupted", set("123456"))
+    assert len(list((tmp_path / "run" / "agents").glob("*.chain.json"))) == 40
