@@ -22,30 +22,34 @@ PICTURE = PAGE.with_name("scale.svg")
 
 
 def tables(record: ScaleRecord) -> str:
-    """Markdown: for each loss the means of each size, and the exponents."""
-    return "\n".join(part for loss in record.scale.loss for part in (_sizes(record, loss), _exponents(record, loss)))
+    """Markdown: the means at the middle mission length, and the exponents over agents and blocks together."""
+    return f"{_sizes(record)}\n{_exponents(record)}"
 
 
-def _sizes(record: ScaleRecord, loss: float) -> str:
+def _sizes(record: ScaleRecord) -> str:
+    minutes = record.scale.minutes[len(record.scale.minutes) // 2]
     body = []
     for cell in record.cells:
-        if cell.loss == loss:
+        if cell.minutes == minutes:
             estimates = {**cell.estimates, **cell.machine}
             figures = (say(BY_NAME[name], estimates[name]) for name in SIZED)
-            body.append([f"{cell.minutes:g}", f"{cell.agents}", *figures])
-    return f"**{words.percent(loss)} loss**\n\n" + _markdown(["min", "N", *map(_label, SIZED)], body)
+            body.append([words.percent(cell.loss), f"{cell.agents}", *figures])
+    return _markdown([f"loss, {minutes:g} min", "N", *map(_label, SIZED)], body)
 
 
-def _exponents(record: ScaleRecord, loss: float) -> str:
+def _exponents(record: ScaleRecord) -> str:
     body = []
-    for name, variable, laws in rows(record, loss):
-        its = (laws.get(metric) for metric in GROWN)
-        exponents = (
-            f"{say_exponent(law.exponents[variable])}<br><sub>{say_quality(law)}</sub>" if law else "\u2013"
-            for law in its
-        )
-        body.append([f"{SYMBOLS[variable]}, {name}", *exponents])
-    return _markdown([f"exponent at {words.percent(loss)} loss", *map(_label, GROWN)], body)
+    for loss in record.scale.loss:
+        for name, variable, laws in rows(record, loss):
+            if name.startswith("both"):
+                its = [laws.get(metric) for metric in GROWN]
+                figures = (
+                    f"{say_exponent(law.exponents[variable])}<br><sub>{say_quality(law)}</sub>" if law else "\u2013"
+                    for law in its
+                )
+                load = name.removeprefix("both").removeprefix(", load").strip() or "any"
+                body.append([words.percent(loss), load, SYMBOLS[variable], *figures])
+    return _markdown(["loss", "load", "exponent of", *map(_label, GROWN)], body)
 
 
 def _label(metric: str) -> str:

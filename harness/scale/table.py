@@ -99,21 +99,23 @@ def explanation(record: ScaleRecord) -> str:
     return (
         f"{'One run' if seeds == 1 else f'Means of {seeds} runs'} a size. load: blocks completed in the time that a "
         "vote takes; from 1 on they come faster than they can be committed. Exponents of N agents and B blocks: least "
-        "squares in logarithms, a run a point, with 95\u00a0% intervals. Processor seconds are this machine's, all "
-        "else is virtual."
+        "squares in logarithms, a run a point, with 95\u00a0% intervals; n points where other runs have no logarithm. "
+        "Processor seconds are this machine's, all else is virtual."
     )
 
 
 def unsettled(record: ScaleRecord) -> Iterable[str]:
-    """A sentence for each size of which runs were cut off before all agents were idle."""
-    for cell in record.cells:
-        share = cell.estimates["settled"]
-        if share.mean is not None and share.mean < 1:
-            yield (
-                f"{words.percent(cell.loss)} loss, {cell.minutes:g} min, {cell.agents} agents: "
-                f"{round(share.n * (1 - share.mean))} of {share.n} runs did not settle in "
-                f"{record.scale.settle_minutes:g} min; their figures are up to then"
-            )
+    """A sentence for each loss at which runs were cut off before all agents were idle."""
+    for loss in record.scale.loss:
+        which = []
+        for cell in record.cells:
+            share = cell.estimates["settled"]
+            if cell.loss == loss and share.mean is not None and share.mean < 1:
+                count = round(share.n * (1 - share.mean))
+                which.append(f"{cell.minutes:g} min {cell.agents} agents ({count} of {share.n})")
+        if which:
+            limit = f"{record.scale.settle_minutes:g} min"
+            yield f"{words.percent(loss)} loss: not settled in {limit}, with figures up to then: {', '.join(which)}"
 
 
 def _sizes(cells: Sequence[Cell]) -> Table:

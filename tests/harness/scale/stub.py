@@ -18,7 +18,7 @@ def scale(
 
 
 def judge(scenario: Scenario, seed: int) -> tuple[Played, Result]:
-    """Each agent completes a block in 200 s; messages are 3 N^1.5 B; 40 agents never settle; without loss no message."""
+    """Each agent completes a block in 200 s; 3 N^1.5 B messages, none without loss; 40 agents never settle."""
     agents, loss = len(scenario.roster), scenario.network.loss
     blocks = round(agents * scenario.duration_s / 200)
     messages = round(3 * agents**1.5 * blocks) if loss else 0

@@ -13,7 +13,7 @@ from rich.console import Console
 from harness.checker import Result
 from harness.mission import Played
 from harness.scale import Scale, ScaleRecord, outputs, run_scale, table
-from harness.scale.complexity import BEGIN, END, PAGE
+from harness.scale.complexity import BEGIN, END, PAGE, tables
 from harness.scale.picture import PANELS, draw
 from harness.scenario import Scenario
 from tests.harness.scale.stub import judge, scale
@@ -56,7 +56,7 @@ def test_a_cell_says_how_many_runs_are_uniform_and_how_many_settled() -> None:
     assert [cell.estimates["uniform"].mean for cell in record.cells] == [0.5] * 6
     assert [cell.estimates["settled"].mean for cell in record.cells] == [1, 1, 0] * 2
     assert record.cells[0].estimates["uniform_after_s"].n == 1
-    assert "15 % loss, 10 min, 40 agents: 2 of 2 runs did not settle in 20 min" in shown(record, 200)
+    assert "15 % loss: not settled in 20 min, with figures up to then: 10 min 40 agents (2 of 2)" in shown(record, 200)
 
 
 def test_what_is_not_of_this_machine_does_not_depend_on_the_number_of_jobs() -> None:
@@ -89,7 +89,7 @@ def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> N
     with (tmp_path / "scale.csv").open() as file:
         runs = list(csv.DictReader(file))
     assert len(runs) == 12
-    assert (runs[0]["loss"], runs[0]["minutes"], runs[0]["agents"], runs[0]["seed"]) == ("0.15", "10", "5", "1")
+    assert (runs[0]["loss"], runs[0]["minutes"], runs[0]["agents"], runs[0]["seed"]) == ("0.15", "10.0", "5", "1")
     assert (float(runs[0]["uniform_after_s"]), runs[1]["uniform_after_s"]) == (5, ""), "unknown is empty"
     assert list(runs[0])[-2:] == ["machine_processor_s", "machine_wall_s"]
     parsed((tmp_path / "scale.svg").read_text())
@@ -171,6 +171,10 @@ def test_the_table_fits_eighty_columns() -> None:
     assert "2.50\u00b1.00" in lines
 
 
-def test_the_page_has_a_place_for_its_tables() -> None:
+def test_the_page_has_the_tables_of_a_sweep() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert page.count(BEGIN) == page.count(END) == 1
+    text = tables(run_scale(scale(agents=(5, 10, 40, 80)), 1, judge).record)
+    assert "| 15\u00a0% | 5 | 30 |" in text
+    assert "| 15\u00a0% | any | N | 1.50\u00b1.00<br>" in text
+    assert len({line.count("|") for line in text.split("\n\n")[0].splitlines()}) == 1
