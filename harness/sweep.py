@@ -34,6 +34,8 @@ R = TypeVar("R")
 
 REDRAW_EVERY_S = 0.1
 LINE_EVERY_S = 10.0
+WAKE_EVERY_S = 1.0
+"""A signal that comes in the moment before we fall asleep is heard when we wake."""
 
 _FORK = multiprocessing.get_context("fork")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -139,7 +141,7 @@ class _Pool(Generic[T, R]):
                 self._begin(number, begun[number])
             if not self._busy:
                 return
-            for connection in wait(list(self._busy)):
+            for connection in wait(list(self._busy), timeout=WAKE_EVERY_S):
                 number, outcome = self._end(connection)  # type: ignore[arg-type]  # it waits for other things too
                 ended[number] = _raised(self._count(outcome))
             while due in ended:
