@@ -1,5 +1,7 @@
 """How fast the simulation is, beside a null model in the same run: `python -m benchmarks.simulation [--rounds 5]`.
 
+`--agents 200 --loss 0.15 --settle 1200 --rounds 1` is the largest swarm; `--matrix` also times 8 x 200 runs of five.
+
 The null model delivers as many broadcasts to as many agents as the simulated mission had, and does nothing with them:
 a heap, a random number for loss and one for latency, a set insert and a dictionary look-up for each delivery. Rounds
 alternate between the two, so that a machine that is slow for a while is slow for both; processor time is counted. Every
@@ -7,17 +9,22 @@ simulation is judged with the checker, without traces, as in a matrix; `traced` 
 """
 
 import argparse
+import gc
 import heapq
 import random
+import resource
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 from harness.scenario import Scenario
 from harness.simulate import simulate
 
 MISSION_S = 1200.0
+MATRIX_LOSS = [0.0, 0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35]
+MATRIX_SEEDS = 200
 
 
 def scenario(agents: int, loss: float, settle_s: float) -> Scenario:
@@ -47,6 +54,7 @@ def null_model(agents: int, loss: float, broadcasts: int) -> int:
 
 
 def seconds(what: Callable[[], object]) -> float:
+    gc.collect()  # what earlier runs left is not this one's
     began = time.process_time()
     what()
     return time.process_time() - began
@@ -59,11 +67,22 @@ def main() -> None:
     parser.add_argument("--loss", type=float, nargs="+", default=[0.15, 0.30])
     parser.add_argument("--settle", type=float, default=7200.0, help="mission seconds after minute 20, at most")
     parser.add_argument("--traced", action="store_true", help="also with traces")
+    parser.add_argument("--matrix", action="store_true", help=f"also {len(MATRIX_LOSS)} x {MATRIX_SEEDS} runs of 5")
     arguments = parser.parse_args()
-    print_row("agents", "loss", "broadcasts", "null model", "simulation", "ratio", "traced", "ratio")
+    print_row("agents", "loss", "broadcasts", "null model", "simulation", "ratio", "peak so far", "traced", "ratio")
     for agents in arguments.agents:
         for loss in arguments.loss:
             row(scenario(agents, loss, arguments.settle), agents, loss, arguments.rounds, arguments.traced)
+    if arguments.matrix:
+        print_row("matrix", f"{len(MATRIX_LOSS)} x {MATRIX_SEEDS}", ms(seconds(matrix)))
+
+
+def matrix() -> None:
+    """What `ucp-harness matrix` does on one core, without its files."""
+    for loss in MATRIX_LOSS:
+        cell = scenario(5, loss, 1800.0)
+        for seed in range(MATRIX_SEEDS):
+            simulate(cell, seed)
 
 
 def row(what: Scenario, agents: int, loss: float, rounds: int, traced: bool) -> None:
@@ -73,10 +92,10 @@ def row(what: Scenario, agents: int, loss: float, rounds: int, traced: bool) -> 
         messages = simulate(what, seed).result.figures["messages"]
         assert isinstance(messages, int)
         broadcasts.append(messages)
-        times["null"].append(seconds(lambda messages=messages: null_model(agents, loss, messages)))  # type: ignore[misc]
-        times["plain"].append(seconds(lambda seed=seed: simulate(what, seed)))  # type: ignore[misc]
+        times["plain"].append(seconds(partial(simulate, what, seed)))
+        times["null"].append(seconds(partial(null_model, agents, loss, messages)))
         if traced:
-            times["traced"].append(seconds(lambda seed=seed: simulate(what, seed, tracing=True)))  # type: ignore[misc]
+            times["traced"].append(seconds(partial(simulate, what, seed, tracing=True)))
     null, plain = statistics.median(times["null"]), statistics.median(times["plain"])
     cells = [
         str(agents),
@@ -85,6 +104,7 @@ def row(what: Scenario, agents: int, loss: float, rounds: int, traced: bool) -> 
         ms(null),
         ms(plain),
         f"{plain / null:.2f}",
+        f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB",
     ]
     if traced:
         with_traces = statistics.median(times["traced"])

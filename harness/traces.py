@@ -70,6 +70,8 @@ class Held:
 
     def __init__(self) -> None:
         self.places: dict[str, Counter[str]] = {place: Counter() for place in PLACES}
+        self.size = dict.fromkeys(PLACES, 0)
+        """How many blocks are where."""
         self.copies: Counter[str] = Counter()
         self.completed: dict[str, None] = {}
         self.not_in_chain: set[str] = set()
@@ -90,6 +92,7 @@ class Held:
                 continue
             if sign == "+":
                 self.places[place][block] += 1
+                self.size[place] += 1
                 self.copies[block] += 1
                 if place == "chain":
                     self.not_in_chain.discard(block)
@@ -97,12 +100,10 @@ class Held:
                 self.impossible = f"{block[:12]} leaves the {place} without having been there"
             else:
                 self.places[place][block] -= 1
+                self.size[place] -= 1
                 self.copies[block] -= 1
                 if place == "chain" and block in self.completed and not self.places[place][block]:
                     self.not_in_chain.add(block)
-
-    def size(self, place: str) -> int:
-        return self.places[place].total()
 
 
 def read_trace(path: Path) -> Trace | None:

@@ -19,6 +19,7 @@ from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from math import inf
 from random import Random
 from statistics import NormalDist
 from typing import Protocol
@@ -41,11 +42,8 @@ class Lots(Protocol):
     latest: float
     """No copy arrives later than this many seconds after it was sent."""
 
-    def first_to(self, receiver: int) -> float | None:
-        """The delay in seconds of the first copy that reaches `receiver`; None if it is lost or cut off."""
-
     def copies_to(self, receiver: int) -> tuple[float, ...]:
-        """The delay in seconds of each copy that reaches `receiver`."""
+        """The delay in seconds of every copy that reaches `receiver`."""
 
     def to_all(self) -> list[tuple[int, float]]:
         """(receiver, delay in seconds) of every copy that arrives anywhere, by receiver."""
@@ -60,6 +58,9 @@ class Medium:
         self._words = [_Words(self._stream("loss", sender), self._stream("latency", sender)) for sender in vehicles]
         self._rare = [(self._stream("duplication", sender), self._stream("reordering", sender)) for sender in vehicles]
         self._in_bad_state: set[tuple[int, int]] = set()  # (sender, receiver) by number
+        self.soonest = LATENCY.mean_s
+        self.latest = LATENCY.mean_s
+        """No copy has ever arrived sooner or later after it was sent, or will under these conditions, in seconds."""
         self.apply(NetworkConditions())
 
     def apply(self, conditions: NetworkConditions) -> None:
@@ -70,6 +71,8 @@ class Medium:
         }
         self._group = [group[vehicle] for vehicle in self._vehicles]
         self._air = [self._air_of(number, sender, conditions) for number, sender in enumerate(self._vehicles)]
+        self.soonest = min(self.soonest, *(air.soonest_of_all for air in self._air))
+        self.latest = max(self.latest, *(air.latest for air in self._air))
 
     def hears(self, sender: int, receiver: int) -> bool:
         """Whether no partition stands between the two, by their numbers."""
@@ -93,6 +96,9 @@ class Medium:
 class _Air(Protocol):
     """Around one sender, under one set of conditions."""
 
+    soonest_of_all: float
+    latest: float
+
     def draw(self) -> Lots: ...
 
 
@@ -111,13 +117,17 @@ class _PlainAir:
         self.hears = hears
         self.lost_below = [round(link.independent_loss * _WORD) for link in links]
         self.soonest = [delay.mean_s - delay.jitter_s for delay in delays]
+        self.soonest_of_all = min(self.soonest)
         self.per_lot = [2 * delay.jitter_s / _WORD for delay in delays]
         self.latest = max(delay.mean_s + delay.jitter_s for delay in delays)
         self._words = words
 
     def draw(self) -> Lots:
         words = self._words
-        at = words.take(self.receivers)
+        at = words.next
+        if at + self.receivers > len(words.loss):
+            at = words.refill(self.receivers)
+        words.next = at + self.receivers
         return _PlainLots(self, words.loss, words.latency, at, self.latest)
 
 
@@ -133,16 +143,12 @@ class _PlainLots:
         self._at = at
         self.latest = latest
 
-    def first_to(self, receiver: int) -> float | None:
+    def copies_to(self, receiver: int) -> tuple[float, ...]:
         air = self._air
         word = self._at + receiver
         if self._loss[word] < air.lost_below[receiver] or not air.hears[receiver]:
-            return None
-        return air.soonest[receiver] + self._latency[word] * air.per_lot[receiver]
-
-    def copies_to(self, receiver: int) -> tuple[float, ...]:
-        first = self.first_to(receiver)
-        return () if first is None else (first,)
+            return ()
+        return (air.soonest[receiver] + self._latency[word] * air.per_lot[receiver],)
 
     def to_all(self) -> list[tuple[int, float]]:
         air = self._air
@@ -157,24 +163,28 @@ class _PlainLots:
 
 
 class _Words:
-    """Two streams of words of 32 bits, drawn many at a time and taken in step."""
+    """Two streams of words of 32 bits, drawn many at a time and taken in step: those from `next` on are left."""
 
     def __init__(self, loss: Random, latency: Random) -> None:
         self.loss = array("I")
         self.latency = array("I")
         self._streams = loss, latency
-        self._next = 0
+        self.next = 0
 
     def take(self, count: int) -> int:
         """Where the next `count` words stand in `loss` and `latency` as they are then; these arrays do not change."""
-        at = self._next
+        at = self.next
         if at + count > len(self.loss):
-            loss, latency = self._streams
-            self.loss = self.loss[at:] + _draw(loss, _BROADCASTS_AT_ONCE * count)
-            self.latency = self.latency[at:] + _draw(latency, _BROADCASTS_AT_ONCE * count)
-            at = 0
-        self._next = at + count
+            at = self.refill(count)
+        self.next = at + count
         return at
+
+    def refill(self, count: int) -> int:
+        """Draw words for many times `count`; where the next stand now."""
+        loss, latency = self._streams
+        self.loss = self.loss[self.next :] + _draw(loss, _BROADCASTS_AT_ONCE * count)
+        self.latency = self.latency[self.next :] + _draw(latency, _BROADCASTS_AT_ONCE * count)
+        return 0
 
 
 def _draw(stream: Random, count: int) -> array[int]:
@@ -186,6 +196,9 @@ def _draw(stream: Random, count: int) -> array[int]:
 
 class _AnyAir:
     """All that conditions can ask. Every lot is drawn for every receiver, so that no one's lots depend on another's."""
+
+    soonest_of_all = 0.0
+    latest = inf
 
     def __init__(
         self,
@@ -239,9 +252,6 @@ class _DrawnLots:
 
     def __post_init__(self) -> None:
         self.latest = max((delay for copies in self.delays for delay in copies), default=0.0)
-
-    def first_to(self, receiver: int) -> float | None:
-        return min(self.delays[receiver], default=None)
 
     def copies_to(self, receiver: int) -> tuple[float, ...]:
         return self.delays[receiver]

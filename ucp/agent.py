@@ -181,6 +181,7 @@ class Agent:
         self._trace: list[HandlerRun] = []
         self._changes: list[tuple[str, str]] = []
         self._announced: list[Sent] = []
+        self._state = self._state_now()
 
     # What drives an agent
 
@@ -349,7 +350,18 @@ class Agent:
             trigger, inputs = {"local": by}, ()
 
     def _trace_run(self, trigger: Trigger, handler: EventHandler[Any], branch: str) -> None:
-        state = State(
+        state = self._state
+        if self._changes or state.reconciling != self.reconcile_in_progress or state.idle != self.idle:
+            state = self._state = self._state_now()
+        self._trace.append(
+            HandlerRun(
+                self.now, handler.name, handler.algorithm, trigger, branch, self._changes, self._announced, state
+            )
+        )
+        self._changes, self._announced = [], []
+
+    def _state_now(self) -> State:
+        return State(
             len(self.chain),
             len(self.blocks_to_be_committed),
             len(self.reconcile_stack),
@@ -357,12 +369,6 @@ class Agent:
             self.idle,
             self.chain.top_chain_hash.hex(),
         )
-        self._trace.append(
-            HandlerRun(
-                self.now, handler.name, handler.algorithm, trigger, branch, self._changes, self._announced, state
-            )
-        )
-        self._changes, self._announced = [], []
 
     def _changed(self, operation: str, block: Block) -> None:
         if self._tracing:

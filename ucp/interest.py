@@ -21,35 +21,49 @@ from ucp.messages import (
     NextInSequenceResponse,
     RequestForBlock,
 )
+from ucp.settings import Settings
 
 if TYPE_CHECKING:
     from ucp.agent import Agent
 
 
 Question = tuple[type[Message], bytes]
-"""What an agent wants to hear: answers of this type about this block or chain.
+"""What an agent wants to hear: answers of this type about this block or chain, or both.
 
 It can have two questions at a time: one about its vote (of type Block Add Response), and one of its reconcile."""
 
 ONLY_COUNTED = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
 """Answers whose handlers only tally (Algorithms 4, 10 and 14): they send nothing and touch no timer."""
 
-ASKED: dict[type[Message], Callable[[Any], Question]] = {
-    BlockAddRequest: lambda message: (BlockAddResponse, message.block_hash),
-    ChainContainQuery: lambda message: (ChainContainResponse, message.chain_hash),
-    ChainHashSuccessorQuery: lambda message: (NextInSequenceResponse, message.chain_hash),
-    RequestForBlock: lambda message: (BlockResponse, message.block_hash),
+ASKED: dict[type[Message], Callable[[Any, Settings], Question]] = {
+    BlockAddRequest: lambda message, settings: (
+        BlockAddResponse,
+        message.block_hash + message.chain_hash if settings.vote_names_chain else message.block_hash,
+    ),
+    ChainContainQuery: lambda message, settings: (ChainContainResponse, message.chain_hash),
+    ChainHashSuccessorQuery: lambda message, settings: (NextInSequenceResponse, message.chain_hash),
+    RequestForBlock: lambda message, settings: (BlockResponse, message.block_hash),
 }
 """Message -> what its sender wants to hear from now on; other messages ask nothing."""
 
 ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
-    BlockAddResponse: lambda message: (BlockAddResponse, message.block_hash),
+    BlockAddResponse: lambda message: (
+        BlockAddResponse,
+        message.block_hash if message.chain_hash is None else message.block_hash + message.chain_hash,
+    ),
     ChainContainResponse: lambda message: (ChainContainResponse, message.chain_hash),
     NextInSequenceResponse: lambda message: (NextInSequenceResponse, message.chain_hash),
     BlockResponse: lambda message: (BlockResponse, message.block.block_hash),
 }
 """Message -> the question that it answers, so that it is nothing to those who have not asked it."""
 
+STILL_ASKED: dict[type[Message], Callable[["Agent"], bool]] = {
+    BlockAddResponse: lambda agent: agent.voting_timer.active,
+    ChainContainResponse: lambda agent: agent.phase_one_timer.active,
+    NextInSequenceResponse: lambda agent: agent.phase_two_timer.active,
+    BlockResponse: lambda agent: agent.phase_three_timer.active,
+}
+"""Answer -> whether the agent still waits for any of its type."""
 
 MATTERS: dict[type[Message], Callable[["Agent", int, Any], bool]] = {
     BlockAddRequest: lambda agent, sender, message: not agent.reconcile_in_progress,
@@ -58,6 +72,7 @@ MATTERS: dict[type[Message], Callable[["Agent", int, Any], bool]] = {
         and sender not in agent.voters
         and agent.candidate_block is not None
         and agent.candidate_block.block_hash == message.block_hash
+        and (not agent.settings.vote_names_chain or agent.top_chain_hash_at_initiation == message.chain_hash)
     ),
     CommitBlock: lambda agent, sender, message: not agent.reconcile_in_progress,
     ChainContainQuery: lambda agent, sender, message: not agent.reconcile_in_progress,

@@ -6,13 +6,15 @@ one fault leaves the others as they are. No vehicles fly; without vehicles, even
 """
 
 import dataclasses
+import gc
 from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from random import Random
 from typing import Any, Protocol
 
 from harness.backends.fate_script import FateScript, NameOf
-from harness.backends.virtual_air import Flight, Logged, VirtualAir
+from harness.backends.virtual_air import Flight, Happening, Logged, VirtualAir
 from harness.errors import ScenarioError
 from harness.mission import Played
 from harness.scenario import Scenario
@@ -80,8 +82,10 @@ class Life:
     born_at: float
     deadline: float | None = None
     """When its next timer ends, in mission seconds."""
-    waiting: list[Flight | Logged] | None = None
+    waiting: list[Happening] | None = None
     """What has reached the agent while it is paused; None if it is not."""
+    resumed_at: float = 0.0
+    """Whatever came before is handled then."""
     bytes_sent: int = 0
 
 
@@ -121,7 +125,7 @@ class Simulation:
         self._medium = Medium(self.roster, seed)
         self._block_names: dict[bytes, str] = {}
         self._script = fate_script(scenario.fates, self.roster, self._block_name)
-        self._air = VirtualAir(self.roster, self._medium, self._script, deliver_all=deliver_all)
+        self._air = VirtualAir(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
 
     # The swarm, as harness.mission drives it
 
@@ -164,9 +168,10 @@ class Simulation:
     async def until_idle(self, limit_s: float) -> bool:
         limit = self._now + limit_s
         while self._now < limit:
-            last = max(self._air.quiet_at, *(life.deadline or 0.0 for life in self.living() if life.waiting is None))
+            awake = (life for life in self.living() if life.waiting is None)
+            last = max([self._air.quiet_at, *(life.deadline or 0.0 for life in awake)])
             if last <= self._now:
-                return all(life.agent.idle for life in self.living())
+                return all(life.waiting is None and life.agent.idle for life in self.living())
             await self.until(min(limit, last))
         return False
 
@@ -177,6 +182,7 @@ class Simulation:
         number = self._number[agent_id]
         life = self._alive[number]
         if life is not None:
+            self._hear(number, life)
             life.agent.begin_reconcile(self._local(life))
             self._after(number, life)
 
@@ -185,6 +191,9 @@ class Simulation:
 
     def end(self) -> None:
         """Take down what there is at the end."""
+        for number, life in enumerate(self._alive):
+            if life is not None:
+                self._hear(number, life)
         self.played.mission_s = round(self._now, 3)
         if self._script.last_s is not None:
             self.played.network = disconnected_until(self._script.last_s, self.played.network)
@@ -226,25 +235,33 @@ class Simulation:
 
     def _run(self, until: float) -> None:
         """All that happens up to `until`."""
+        with _without_collecting():
+            self._play(until)
+        self._now = until
+
+    def _play(self, until: float) -> None:
         alive = self._alive
-        for at, _, number, what in self._air.until(until):
-            self._now = at
+        for happening in self._air.until(until):
+            self._now, _, number, what = happening
             life = alive[number]
             if life is None:
                 continue
             if life.waiting is None:
                 self._happen(number, life, what)
             elif what is not None:
-                life.waiting.append(what)
-        self._now = until
+                life.waiting.append(happening)
 
     def _happen(self, number: int, life: Life, what: Flight | Logged | None) -> None:
+        if self._tracing or (isinstance(what, Flight) and type(what.message) in ONLY_COUNTED):
+            self._hear(number, life)
         if isinstance(what, Flight):
             agent, sender, message = life.agent, what.sender, what.message
             if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent, sender, message)):
                 agent.receive_message(sender, what.sequence, message, self._local(life))
-                if self._tracing or type(message) not in ONLY_COUNTED:
+                if self._tracing or agent.reconcile_in_progress:
                     self._after(number, life)
+                else:
+                    self._say(number, life)  # of the handlers of messages only a reconcile's touch timers
         elif what is None:
             self._timer_ends(number, life)
         elif self._generating:
@@ -257,17 +274,30 @@ class Simulation:
         soonest = life.agent.next_timer()
         if soonest is None or life.deadline is None or life.deadline > self._now:
             return  # it was stopped, or started anew, since it was expected to end now
+        self._hear(number, life)
         life.agent.handle_timer(max(soonest, self._local(life)))
+        self._air.no_longer_asked(number, life.agent)
         self._after(number, life)
+
+    def _hear(self, number: int, life: Life) -> None:
+        """Tell the agent of the answers that have come and that it only tallies: before anybody looks at the tally."""
+        if life.waiting is not None:
+            return
+        agent = life.agent
+        for at, _, answer in self._air.hear(number):
+            if answer.matters(agent, answer.sender, answer.message):
+                at = max(at, life.resumed_at)
+                local = max(agent.now, self._local(life, at))
+                agent.receive_message(answer.sender, answer.sequence, answer.message, local)
+                if self._tracing:
+                    self._take_down(agent, at)
 
     def _after(self, number: int, life: Life) -> None:
         """Do what the agent says after an input: send, trace, and wait for its next timer."""
         agent = life.agent
-        for sequence, message in agent.messages_to_send():
-            life.bytes_sent += datagram_bytes(message)
-            self._air.broadcast(self._now, number, sequence, message)
+        self._say(number, life)
         if self._tracing:
-            self._recorder.write(agent.agent_id, self._in_mission_time(agent.trace()))
+            self._take_down(agent, self._now)
         soonest = agent.next_timer()
         deadline = None if soonest is None else max(self._now, _mission_time(life, soonest))
         if deadline != life.deadline:
@@ -277,10 +307,17 @@ class Simulation:
         busy_until = agent.answers_nobody_until()
         self._air.busy_until[number] = 0.0 if busy_until is None else _mission_time(life, busy_until)
 
-    def _in_mission_time(self, runs: list[HandlerRun]) -> list[HandlerRun]:
+    def _say(self, number: int, life: Life) -> None:
+        """Send what the agent has to say."""
+        for sequence, message in life.agent.messages_to_send():
+            life.bytes_sent += datagram_bytes(message)
+            self._air.broadcast(self._now, number, sequence, message)
+
+    def _take_down(self, agent: Agent, mission_s: float) -> None:
+        runs = agent.trace()
         for run in runs:
-            run.t = self._now
-        return runs
+            run.t = mission_s
+        self._recorder.write(agent.agent_id, runs)
 
     # An agent's life
 
@@ -301,6 +338,7 @@ class Simulation:
         life = Life(agent, source, scenario.clocks.get(agent_id), self._now)
         self._lives[number].append(life)
         self._alive[number] = life
+        self._air.born_at[number] = self._now
         self._recorder.begin(life)
         self._expect_event(number, life)
 
@@ -313,35 +351,60 @@ class Simulation:
         life = self._alive[number]
         match what:
             case "kill":
+                if life is not None:
+                    self._hear(number, life)
                 self._alive[number] = None
-                self._air.busy_until[number] = 0.0
+                self._air.is_gone(number)
             case "restart":
                 self._start(number)
             case "pause" if life is not None:
+                self._hear(number, life)
                 life.waiting = []
+                self._air.paused_at[number] = self._now
             case "resume" if life is not None and life.waiting is not None:
                 self._resume(number, life, life.waiting)
 
-    def _resume(self, number: int, life: Life, waiting: list[Flight | Logged]) -> None:
-        """What has waited is handled as a process does it: what the socket holds, then timers, then events."""
-        life.waiting = None
-        for what in waiting:
-            if isinstance(what, Flight):
-                self._happen(number, life, what)
+    def _resume(self, number: int, life: Life, waiting: list[Happening]) -> None:
+        """What has waited is handled as a process does it: what the socket holds, then timers, then events.
+
+        What an agent asks while there is more in the socket may be answered by what came since.
+        """
+        life.waiting, life.resumed_at = None, self._now
+        place = self._air.place
+        for happening in waiting:
+            if isinstance(happening[3], Flight):
+                self._air.place = happening[:3]
+                self._happen(number, life, happening[3])
+        self._air.place = place
+        del self._air.paused_at[number]
+        self._hear(number, life)
         self._timer_ends(number, life)
-        for what in waiting:
-            if not isinstance(what, Flight):
-                self._happen(number, life, what)
+        for happening in waiting:
+            if not isinstance(happening[3], Flight):
+                self._happen(number, life, happening[3])
 
     # An agent's clock
 
-    def _local(self, life: Life) -> float:
-        """What the agent takes for mission time."""
+    def _local(self, life: Life, mission_s: float | None = None) -> float:
+        """What the agent takes for mission time: now, or at `mission_s`."""
         clock = life.clock
-        return self._now if clock is None else clock.offset_s + (1 + clock.drift) * self._now
+        now = self._now if mission_s is None else mission_s
+        return now if clock is None else clock.offset_s + (1 + clock.drift) * now
 
 
 def _mission_time(life: Life, local: float) -> float:
     """When the agent's clock shows `local`."""
     clock = life.clock
     return local if clock is None else (local - clock.offset_s) / (1 + clock.drift)
+
+
+@contextmanager
+def _without_collecting() -> Iterator[None]:
+    """Look for no garbage in cycles: there is none, and with traces the looking takes a third of the time."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()

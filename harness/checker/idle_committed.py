@@ -46,13 +46,13 @@ def _in_traces(evidence: Evidence) -> list[Finding]:
     findings = []
     for agent_id, trace in evidence.traces.items():
         for line, run, held in trace.steps():
-            if run.state.idle and (held.not_in_chain or held.size("deque") or held.size("stack")):
+            if run.state.idle and (held.not_in_chain or held.size["deque"] or held.size["stack"]):
                 waiting = next(iter(held.not_in_chain), None)
                 findings.append(
                     Finding(
                         agent_id,
                         f"trace line {line}, t={run.t:g} s: idle after {run.handler} with "
-                        f"{held.size('deque')} blocks to be committed and {held.size('stack')} on the reconcile stack",
+                        f"{held.size['deque']} blocks to be committed and {held.size['stack']} on the reconcile stack",
                         evidence.name(waiting) if waiting else None,
                         waiting,
                     )

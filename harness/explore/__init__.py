@@ -6,9 +6,12 @@ document.py  a scenario as a document that can be cut to pieces
 shrink.py    tries smaller documents, by delta debugging, on all cores
 smaller.py   what smaller means: fewer agents, events and fates, less time, less chance
 write.py     the smallest one as a scenario file, for people
+run.py       the story: all of these, one after the other
+words.py     what is said meanwhile, and at the end
 """
 
-from harness.explore.run import MAX_RUNS, Explored, explore
+from harness.explore.run import MAX_RUNS, Explored, Watcher, explore
 from harness.explore.search import Violation
+from harness.explore.words import in_words, watching
 
-__all__ = ["MAX_RUNS", "Explored", "Violation", "explore"]
+__all__ = ["MAX_RUNS", "Explored", "Violation", "Watcher", "explore", "in_words", "watching"]

@@ -41,14 +41,20 @@ def at(document: Document, key: str) -> Any:
     return value
 
 
-def scripted(document: Document, logged: list[Logged], fates: list[Document]) -> Document:
-    """With these events and no others, and nothing lost but by these fates."""
+def scripted(document: Document, logged: list[Logged], drops: list[Document]) -> Document:
+    """With these events and no others, and nothing lost but by these drops."""
     script = [event_of(event) for event in logged]
     network = _without_loss(document.get("network", {}))
     entries = [{**entry, **_silent(entry)} for entry in document.get("timeline", [])]
     document = with_key(with_key(document, "network", network), "timeline", [one for one in entries if len(one) > 1])
     document["events"] = {"source": "scripted", **({"script": script} if script else {})}
-    return with_key(document, "fates", fates)
+    return with_drops(document, drops)
+
+
+def with_drops(document: Document, drops: list[Document]) -> Document:
+    """With these drops instead of its own; what else it scripts stays."""
+    others = [fate for fate in document.get("fates", []) if "drop" not in fate]
+    return with_key(document, "fates", [*drops, *others])
 
 
 def event_of(event: Logged) -> Document:
@@ -91,15 +97,18 @@ def with_agents(document: Document, kept: Collection[int]) -> Document:
     """Without the other agents, and all that is said of them."""
     document = {**document, "agents": sorted(kept)}
     document = with_key(document, "events.script", [one for one in script(document) if one["agent"] in kept])
-    gone = lambda fate, key: fate.get(key) is not None and fate[key] not in kept  # noqa: E731
-    fates = [one for one in document.get("fates", []) if not gone(one, "sender") and not gone(one, "receiver")]
-    document = with_key(document, "fates", fates)
+    document = with_key(document, "fates", [one for one in document.get("fates", []) if _named_in(one) <= {*kept}])
     document = with_key(document, "timeline", [*filter(None, (_entry(one, kept) for one in timeline(document)))])
     for key in ("clocks", "network.receivers"):
         named = at(document, key) or {}
         document = with_key(document, key, {name: value for name, value in named.items() if int(name) in kept})
     links = [_of(link, ("from", "to"), kept) for link in at(document, "network.links") or []]
     return with_key(document, "network.links", [link for link in links if link["from"] and link["to"]])
+
+
+def _named_in(fate: Document) -> set[int]:
+    named = (fate.get("sender"), fate.get("receiver"), fate.get("block", "").partition(".")[0])
+    return {int(agent) for agent in named if agent}
 
 
 def _entry(entry: Document, kept: Collection[int]) -> Document | None:
@@ -118,11 +127,13 @@ def _of(entry: Document, keys: Collection[str], kept: Collection[int]) -> Docume
 
 
 def script(document: Document) -> list[Document]:
-    return at(document, "events.script") or []
+    events: list[Document] = at(document, "events.script") or []
+    return events
 
 
 def timeline(document: Document) -> list[Document]:
-    return document.get("timeline", [])
+    entries: list[Document] = document.get("timeline", [])
+    return entries
 
 
 def instants(document: Document) -> list[float]:

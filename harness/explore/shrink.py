@@ -49,6 +49,8 @@ class Shrinker:
 
     def first(self, candidates: Iterable[Document]) -> int | None:
         """Take the first candidate that violates; its index, or None. Raises BudgetSpentError."""
+        if self.runs >= self._max_runs:
+            raise BudgetSpentError
         jobs = self._jobs if self._pace_s > WORTH_FORKING_S else 1
         started, before = time.monotonic(), self.runs
         try:

@@ -1,0 +1,123 @@
+"""From a scenario to the smallest run that violates a characteristic: search, record, shrink, write."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from harness.checker.characteristic import Characteristic
+from harness.errors import INTERRUPTED, VIOLATED
+from harness.explore.document import Document, document_of
+from harness.explore.search import Judge, Searched, Violation, search, simulated, violated
+from harness.explore.shrink import BudgetSpentError, Shrinker
+from harness.explore.smaller import replays, scenario_of, shrink, size
+from harness.explore.tape import Recording, record
+from harness.explore.write import claim, evidence_lines, to_yaml, write
+from harness.scenario import Scenario
+
+MAX_RUNS = 5000
+
+
+@dataclass(frozen=True)
+class Shrunk:
+    """The smallest run that was found: where it is written, and how it came about."""
+
+    path: Path
+    seed: int
+    violated: dict[str, Characteristic]
+    words: str
+    replay: str
+
+
+@dataclass
+class Explored:
+    """`interrupted`: by Ctrl-C, in the search or while shrinking. `shrunk` is None if no run violated anything."""
+
+    searched: Searched
+    shrunk: Shrunk | None = None
+    interrupted: bool = False
+
+    @property
+    def exit_status(self) -> int:
+        if self.interrupted:
+            return INTERRUPTED
+        return VIOLATED if self.searched.violation or self.searched.failed else 0
+
+
+@dataclass(frozen=True)
+class Watcher:
+    """What is told meanwhile. `step` gets the number of runs so far, and the size in words."""
+
+    found: Callable[[Violation], None] = field(default=lambda violation: None)
+    step: Callable[[int, str], None] = field(default=lambda runs, words: None)
+    shown: bool = False
+
+
+def explore(
+    scenario: Scenario,
+    source: str,
+    seeds: range,
+    jobs: int,
+    out: Path | None = None,
+    *,
+    judge: Judge = simulated,
+    max_runs: int = MAX_RUNS,
+    watcher: Watcher | None = None,
+) -> Explored:
+    """Play `scenario`, which `source` names for people, with `seeds`, and shrink the first run that violates.
+
+    Raises HarnessError if the scenario cannot be played, or the file cannot be written.
+    """
+    watcher = watcher or Watcher()
+    path = claim(out, scenario.name)
+    searched = search(scenario, seeds, jobs, judge, shown=watcher.shown)
+    explored = Explored(searched, interrupted=searched.interrupted)
+    if searched.violation is None:
+        return explored
+    seed, number = searched.violation.seed, searched.violation.numbers[0]
+    watcher.found(searched.violation)
+
+    def still(candidate: Scenario) -> bool:
+        return number in violated(judge(candidate, seed))
+
+    def recorded(document: Document) -> Recording:
+        return record(scenario_of(document), seed)
+
+    original = document_of(scenario)
+    shrinker = Shrinker(
+        original, still, jobs=jobs, max_runs=max_runs, adopted=lambda it: watcher.step(it.runs, size(it.best))
+    )
+    how = "and nothing more could be left out"
+    first = size(original)
+    try:
+        shrinker.first(replays(original, recorded(original)))
+        first = size(shrinker.best)
+        shrink(shrinker, recorded)
+    except BudgetSpentError:
+        how = "when the bound was reached: it may not be the smallest"
+    except KeyboardInterrupt:
+        explored.interrupted = True
+        how = "when it was interrupted: it may not be the smallest"
+    words = f"{first} -> {size(shrinker.best)} in {shrinker.runs} runs, {how}"
+    explored.shrunk = _written(shrinker.best, path, source, seed, words, judge, recorded)
+    return explored
+
+
+def _written(
+    document: Document,
+    path: Path,
+    source: str,
+    seed: int,
+    words: str,
+    judge: Judge,
+    recorded: Callable[[Document], Recording],
+) -> Shrunk:
+    result = judge(scenario_of(document), seed)
+    found = {number: result.characteristics[number] for number in violated(result)}
+    replay = f"ucp-harness run {path} --backend sim --seed {seed}"
+    header = [
+        *evidence_lines(found),
+        f"Shrunk from {source}, seed {seed}: {words}.",
+        f"  {replay}",
+    ]
+    written = write(path, to_yaml(document, header, recorded(document)))
+    return Shrunk(written, seed, found, words, replay.replace(str(path), str(written)))

@@ -1,0 +1,54 @@
+"""What the command line says of an exploration: while it goes on, and at its end."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+from rich.console import Console
+
+from harness.explore.run import Explored, Watcher
+from harness.explore.search import Violation
+from harness.explore.write import evidence_lines
+
+LINE_EVERY_S = 10.0
+REDRAW_EVERY_S = 0.1
+CLEAR_LINE = "\r\x1b[2K"
+
+
+@contextlib.contextmanager
+def watching(console: Console) -> Iterator[Watcher]:
+    """Says what is found, and how shrinking goes: on one line of a terminal, else in a line now and then."""
+    every_s = REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S
+    last = 0.0
+
+    def found(violation: Violation) -> None:
+        numbers = " and ".join(violation.numbers)
+        console.print(f"seed {violation.seed} violates characteristic {numbers}; shrinking", highlight=False)
+
+    def step(runs: int, words: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= every_s:
+            last = time.monotonic()
+            if console.is_terminal:
+                console.file.write(f"{CLEAR_LINE}{words} after {runs} runs"[: console.width + len(CLEAR_LINE)])
+                console.file.flush()
+            else:
+                console.print(f"{words} after {runs} runs", highlight=False, soft_wrap=True)
+
+    try:
+        yield Watcher(found, step, shown=True)
+    finally:
+        if console.is_terminal:
+            console.file.write(CLEAR_LINE)
+
+
+def in_words(explored: Explored) -> Iterator[str]:
+    played = explored.searched.played
+    yield f"{played} seed{'' if played == 1 else 's'} played" + (
+        "" if explored.searched.violation else ": no characteristic is violated"
+    )
+    if explored.shrunk:
+        yield from evidence_lines(explored.shrunk.violated)
+        yield explored.shrunk.words
+        yield str(explored.shrunk.path)
+        yield explored.shrunk.replay

@@ -1,0 +1,50 @@
+"""A recorded run, scripted, is the very same run again."""
+
+from typing import Any
+
+import pytest
+
+from harness.explore.document import document_of
+from harness.explore.smaller import replays, scenario_of
+from harness.explore.tape import record
+from harness.simulate import simulate
+from tests.harness.virtual import scenario
+
+LOSS: list[dict[str, Any]] = [
+    {"network": {"loss": 0.3}},
+    {"network": {"loss": {"p": 0.1, "r": 0.3}}},
+    {"network": {"loss": 0.2, "delay": {"mean_s": 1, "jitter_s": 0.9}, "duplicate": 0.3, "reorder": 0.2}},
+    {"network": {"receivers": {3: {"loss": 0.9}}, "links": [{"from": 1, "to": 2, "loss": 0.5, "both": True}]}},
+    {"timeline": [{"at_s": 100, "loss": 0.5}, {"at_s": 200, "partition": [[1, 2]]}, {"at_s": 400, "heal": True}]},
+    {"network": {"loss": 0.2}, "timeline": [{"at_s": 100, "pause": [1]}, {"at_s": 300, "resume": [1]}]},
+    {"network": {"loss": 0.2}, "timeline": [{"at_s": 100, "kill": [1]}, {"at_s": 300, "restart": [1]}]},
+    {"network": {"loss": 0.2}, "quirks": {"ignore_commit": 0.3}},
+    {"network": {"loss": 0.2}, "clocks": {2: {"offset_s": 500, "drift": 0.01}}},
+    {"network": {"loss": 0.2}, "fates": [{"message": "Commit Block", "sender": 1, "delay_s": 3.0}]},
+]
+
+
+@pytest.mark.parametrize("keys", LOSS)
+def test_what_is_scripted_from_a_run_is_that_run(keys: dict[str, Any]) -> None:
+    asked = scenario(agents=4, duration_s=600, final_reconcile=True, **keys)
+    original = simulate(asked, 5, tracing=True)
+    faithful = scenario_of(next(replays(document_of(asked), record(asked, 5))))
+    again = simulate(faithful, 5, tracing=True)
+    uncounted = {"bytes"}  # events have other data, and blocks other hashes
+    assert again.result.figures.items() - uncounted == original.result.figures.items() - uncounted
+    for agent_id, trace in original.evidence.traces.items():
+        steps = [(run.t, run.handler, run.branch) for run in trace.runs if run.branch != "ignored by quirk"]
+        same = again.evidence.traces[agent_id].runs
+        assert [(run.t, run.handler, run.branch) for run in same] == steps
+    assert not again.played.unmatched_fates
+
+
+def test_a_recording_names_what_was_lost() -> None:
+    asked = scenario(
+        agents=[1, 2],
+        events={"source": "scripted", "script": [{"at_s": 1, "agent": 1}]},
+        settings={"max_block_bytes": 267},
+        fates=[{"message": "Commit Block", "drop": True}],
+    )
+    (lost,) = record(asked, 0).lost
+    assert (lost.message, lost.sender, lost.receiver, lost.count, lost.block) == ("Commit Block", 1, 2, 1, "1.1")
