@@ -33,6 +33,7 @@ from ucp.trace import HandlerRun
 
 ENGINE = "virtual time"
 SCRIPTED_EVENT_ID = 1
+ANY_LIFE = 0
 BREATH_S = 20.0
 """Mission seconds between two looks at whoever watches."""
 
@@ -140,7 +141,7 @@ class Simulation:
         for number in range(len(self.roster)):
             self._start(number)
         for event in self.scenario.events.script:
-            self._air.expect(event.at_s, self._number[event.agent], (SCRIPTED_EVENT_ID, bytes(event.bytes)))
+            self._air.expect(event.at_s, self._number[event.agent], (ANY_LIFE, SCRIPTED_EVENT_ID, bytes(event.bytes)))
 
     async def until(self, mission_s: float) -> None:
         if self._breathe is None:
@@ -264,9 +265,10 @@ class Simulation:
                     self._say(number, life)  # of the handlers of messages only a reconcile's touch timers
         elif what is None:
             self._timer_ends(number, life)
-        elif self._generating:
-            self._recorder.logged(self._now, life.agent.agent_id, len(what[1]))
-            life.agent.add_event(LoggableEvent(self.timestamp_us(life), *what), self._local(life))
+        elif self._generating and what[0] in (ANY_LIFE, len(self._lives[number])):
+            _, event_id, data = what
+            self._recorder.logged(self._now, life.agent.agent_id, len(data))
+            life.agent.add_event(LoggableEvent(self.timestamp_us(life), event_id, data), self._local(life))
             self._expect_event(number, life)
             self._after(number, life)
 
@@ -345,7 +347,8 @@ class Simulation:
     def _expect_event(self, number: int, life: Life) -> None:
         if self.scenario.events.source != "scripted":
             due, event_id, data = life.source.next()
-            self._air.expect(max(self._now, life.born_at + due), number, (event_id, data))
+            this_life = len(self._lives[number])
+            self._air.expect(max(self._now, life.born_at + due), number, (this_life, event_id, data))
 
     def _fault(self, what: FaultName, number: int) -> None:
         life = self._alive[number]

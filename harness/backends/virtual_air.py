@@ -74,8 +74,8 @@ class _Asked:
 Place = tuple[float, int, int]
 """(mission seconds, rank, number of the agent): where something stands in the order."""
 
-Logged = tuple[int, bytes]
-"""Event ID and data of an event that an agent is about to log."""
+Logged = tuple[int, int, bytes]
+"""An event that an agent is about to log: in which of its lives (0: whichever it is), event ID, data."""
 
 Happening = tuple[float, int, int, Flight | Logged | None]
 """(mission seconds, rank, number of the agent, what): a message, an event, or None for the end of a timer.

@@ -1,13 +1,16 @@
 """What a scenario can do to agents: kill, restart, pause, resume, and clocks that are wrong."""
 
 from itertools import pairwise
+from random import Random
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
+from harness.seeds import agent_seed
 from harness.simulate import Simulated, simulate
 from tests.harness.virtual import scenario
+from ucp.events import RandomEvents
 
 
 def played(timeline: list[dict[str, Any]], **keys: Any) -> Simulated:
@@ -46,6 +49,14 @@ def test_a_restarted_agent_begins_with_nothing_and_gets_everything_back() -> Non
     assert {run.changes[0][1] for run in first if run.branch == "full"}.isdisjoint(completed)
     assert len(simulated.evidence.exports[2].chain) >= 30
     assert verdicts(simulated) == {"holds"}
+
+
+def test_a_restarted_agent_logs_its_own_events_only() -> None:
+    """What its first life was about to log died with it."""
+    simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 300.5, "restart": [2]}])
+    source = RandomEvents(Random(agent_seed(4, 2, life=2)), mean_s=10)
+    expected = [t for t in (300.5 + source.next()[0] for _ in range(100)) if t <= 600]
+    assert [run.t for run in simulated.evidence.traces[2].runs if run.t > 300 and "event" in run.trigger] == expected
 
 
 def test_without_traces_a_restarted_agents_blocks_are_known_all_the_same() -> None:

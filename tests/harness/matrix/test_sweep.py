@@ -13,7 +13,7 @@ from harness.errors import MachineError
 from harness.sweep import Failed, sweep
 from tests.harness.command import DEADLINE_S
 
-INTERRUPTED = """
+INTERRUPTED = r"""
 import os, sys, time
 from pathlib import Path
 from harness.sweep import sweep
@@ -21,8 +21,8 @@ from harness.sweep import sweep
 def work(n):
     if n == 0:
         return n
-    print(os.getpid(), flush=True)
-    time.sleep(600)
+    os.write(1, b"%d\n" % os.getpid())  # two processes write whole lines
+    time.sleep(60)
 
 try:
     with sweep(range(10), work, 2) as outcomes:
