@@ -67,7 +67,9 @@ def faults(result: dict[str, Any]) -> list[tuple[str, str, str]]:
         at_s = number(fault, "at_s")
         known = mapping(fault) or {"what": fault}
         rest = {
-            key: value for key, value in known.items() if key not in ("at_s", "what", "detail", "agents") and value is not None
+            key: value
+            for key, value in known.items()
+            if key not in ("at_s", "what", "detail", "agents") and value is not None
         }
         details = [words.value(known["detail"])] if known.get("detail") else []
         details += [f"{words.label(key)}: {words.value(value)}" for key, value in rest.items()]

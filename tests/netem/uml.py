@@ -35,7 +35,7 @@ mount -t sysfs sysfs /sys
 mount -t tmpfs tmpfs /run
 mkdir -m 1777 /run/tmp && mkdir -p /run/modules/lib && ln -s {modules} /run/modules/lib/modules
 export HOME=/run/tmp TMPDIR=/run/tmp
-modprobe -d /run/modules -a bridge veth sch_netem sch_htb sch_ingress cls_basic cls_fw act_skbedit act_gact af_packet
+modprobe -d /run/modules -a bridge veth sch_netem sch_htb sch_ingress cls_matchall act_skbedit af_packet
 modprobe -d /run/modules -q -a nf_tables nft_numgen
 ip link set lo up
 cd {repository}
