@@ -3,7 +3,8 @@
 An agent that waits longer than its own timers say, waits for what will never happen.
 """
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,69 +37,70 @@ def _goes_on(run: HandlerRun) -> bool:
     return run.handler in RECONCILE_STEPS and run.branch not in NO_STEP
 
 
-@dataclass(frozen=True)
+VOTE_STEPS = frozenset(("process_next_deque_block", "vote_timer_expiration"))
+STEPS = RECONCILE_STEPS | VOTE_STEPS
+VOTE_TIMERS = ("vote_timeout_s",)
+RECONCILE_TIMERS = ("phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s")
+
+
+@dataclass(slots=True)
 class _Wait:
-    """What begins and ends with which handler run, and must not last longer than the settings of that name."""
+    """What must go on within `longest` mission seconds, and since when, from which trace line on, it has not."""
 
     what: str
-    begins: Callable[[HandlerRun], bool]
-    ends: Callable[[HandlerRun], bool]
-    timers: tuple[str, ...]
+    longest: float
+    line: int = 0
+    since: float = math.inf
+    """Infinity while nothing waits."""
 
-
-WAITS = (
-    _Wait(
-        "a vote began and did not end",
-        lambda run: run.handler == "process_next_deque_block" and run.branch == "proposed",
-        lambda run: run.handler == "vote_timer_expiration",
-        ("vote_timeout_s",),
-    ),
-    _Wait(
-        "a reconcile did not go on",
-        lambda run: _goes_on(run) and run.state.reconciling,
-        _goes_on,
-        ("phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s"),
-    ),
-)
+    def finding(self, agent_id: int) -> Finding:
+        where = f"trace line {self.line}, t={self.since:g} s"
+        return Finding(agent_id, f"{where}: {self.what} within {self.longest:g} s")
 
 
 def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
     """Every wait that lasted longer than the agent's own timers, while it was not paused."""
     for agent_id, trace in evidence.traces.items():
-        for wait in WAITS:
-            longest = _longest(trace, wait.timers)
-            if longest is not None:
-                yield from _of_one_kind(evidence, agent_id, trace, wait, longest)
+        vote_s, reconcile_s = _longest(trace, VOTE_TIMERS), _longest(trace, RECONCILE_TIMERS)
+        for life in trace.lives():
+            vote = _Wait("a vote began and did not end", vote_s)
+            reconcile = _Wait("a reconcile did not go on", reconcile_s)
+            yield from _in_life(evidence, agent_id, life, vote, reconcile)
+        if agent_id in evidence.exports and evidence.ended_at_s is not None:
+            yield from _overdue(evidence, agent_id, evidence.ended_at_s, vote, reconcile)
 
 
-def _of_one_kind(evidence: Evidence, agent_id: int, trace: Trace, wait: _Wait, longest: float) -> Iterator[Finding]:
-    since: tuple[int, float] | None = None
-
-    def too_long(now: float) -> Iterator[Finding]:
-        nonlocal since
-        if since is not None and now > since[1] + longest and not evidence.was_paused(agent_id, since[1], now):
-            where = f"trace line {since[0]}, t={since[1]:g} s"
-            yield Finding(agent_id, f"{where}: {wait.what} within {longest:g} s")
-            since = None
-
-    for life in trace.lives():
-        since = None
-        for line, run in life:
-            if wait.ends(run):
-                since = None
-            yield from too_long(run.t)
-            if wait.begins(run):
-                since = line, run.t
-    if agent_id in evidence.exports and evidence.ended_at_s is not None:
-        yield from too_long(evidence.ended_at_s)
+def _in_life(
+    evidence: Evidence, agent_id: int, life: Iterator[tuple[int, HandlerRun]], vote: _Wait, reconcile: _Wait
+) -> Iterator[Finding]:
+    for line, run in life:
+        step = run.handler in STEPS
+        if run.handler == "vote_timer_expiration":
+            vote.since = math.inf
+        elif step and _goes_on(run):
+            reconcile.since = math.inf
+        if run.t > vote.since + vote.longest or run.t > reconcile.since + reconcile.longest:
+            yield from _overdue(evidence, agent_id, run.t, vote, reconcile)
+        if run.branch == "proposed":
+            vote.line, vote.since = line, run.t
+        elif step and _goes_on(run) and run.state.reconciling:
+            reconcile.line, reconcile.since = line, run.t
 
 
-def _longest(trace: Trace, timers: tuple[str, ...]) -> float | None:
-    """The longest of these timers in mission seconds, with slack for the machine; None if the settings do not tell."""
+def _overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) -> Iterator[Finding]:
+    for wait in waits:
+        if now > wait.since + wait.longest:
+            if not evidence.was_paused(agent_id, wait.since, now):
+                yield wait.finding(agent_id)
+            wait.since = math.inf
+
+
+def _longest(trace: Trace, timers: tuple[str, ...]) -> float:
+    """The longest of these timers in mission seconds, with slack for the machine; infinity if that is not known."""
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):
-        return None
+        return math.inf
     speedup, drift = trace.header.clock.get("speedup", 1), trace.header.clock.get("drift", 0)
     if not isinstance(speedup, int | float) or not isinstance(drift, int | float) or drift <= -1:
-        return None
+        return math.inf
     return float(max(settings)) / (1 + drift) + SLACK_WALL_S * speedup
