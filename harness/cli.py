@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -21,11 +21,13 @@ from harness.doctor import examine
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, HarnessError
 from harness.matrix import outputs as matrix_outputs
 from harness.matrix import table as matrix_table
+from harness.matrix.record import MatrixRecord
 from harness.run import Run, run
-from harness.rundir import default_path
+from harness.rundir import claim, default_path
 from harness.scale import model as scale_model
 from harness.scale import outputs as scale_outputs
 from harness.scale import table as scale_table
+from harness.scale.record import ScaleRecord
 from harness.scenario import Scenario, load_scenario
 from harness.sweep import cores
 
@@ -140,19 +142,10 @@ def matrix_command(
     """Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated."""
     request = matrix.load_matrix(file)
     directory = (out or default_path(request.name)).absolute()
-    matrix_outputs.claim(directory)
+    claim(directory)
     finished = matrix.run_matrix(request, jobs or cores(), shown=True)
     matrix_outputs.write(finished, directory)
-    record = finished.record
-    if as_json:
-        _print_json(record.to_json())
-    else:
-        console = Console()
-        console.print(matrix_table.render(record))
-        console.print(f"{record.wall_s:.0f} s; {directory / 'matrix.svg'}", highlight=False, soft_wrap=True)
-    if record.outcome == "interrupted":
-        _complain(f"interrupted; the {record.runs} of {record.runs_asked} runs that had ended are in {directory}")
-    raise typer.Exit(record.exit_status)
+    _end_sweep(finished.record, None if as_json else matrix_table.render(finished.record), directory / "matrix.svg")
 
 
 @app.command("scale")
@@ -173,19 +166,10 @@ def scale_command(
     """Fit how messages, bytes and time grow with agents and blocks, in the simulation; by default about 4 minutes."""
     request = scale.read_request(agents, minutes, loss, seeds, settle)
     directory = (out or default_path("scale")).absolute()
-    matrix_outputs.claim(directory)
+    claim(directory)
     finished = scale.run_scale(request, jobs or cores(), shown=True)
     scale_outputs.write(finished, directory)
-    record = finished.record
-    if as_json:
-        _print_json(record.to_json())
-    else:
-        console = Console()
-        console.print(scale_table.render(record))
-        console.print(f"{record.wall_s:.0f} s; {directory / 'scale.svg'}", highlight=False, soft_wrap=True)
-    if record.outcome == "interrupted":
-        _complain(f"interrupted; the {record.runs} of {record.runs_asked} runs that had ended are in {directory}")
-    raise typer.Exit(record.exit_status)
+    _end_sweep(finished.record, None if as_json else scale_table.render(finished.record), directory / "scale.svg")
 
 
 @app.command("explore")
@@ -266,6 +250,20 @@ def _show_end(console: Console, finished: Run) -> None:
         _complain(f"vehicles {', '.join(slow)} did not keep up with the clock: choose a smaller --speedup")
     wall = f"{finished.wall_s:.0f}" if finished.wall_s >= 10 else f"{finished.wall_s:.1f}"
     console.print(f"{wall} s; report: {finished.report}", highlight=False, soft_wrap=True)
+
+
+def _end_sweep(record: MatrixRecord | ScaleRecord, table: RenderableType | None, picture: Path) -> NoReturn:
+    """Show what came out, as JSON if there is no table, and exit."""
+    if table is None:
+        _print_json(record.to_json())
+    else:
+        console = Console()
+        console.print(table)
+        console.print(f"{record.wall_s:.0f} s; {picture}", highlight=False, soft_wrap=True)
+    if record.outcome == "interrupted":
+        ended = f"the {record.runs} of {record.runs_asked} runs that had ended are in {picture.parent}"
+        _complain(f"interrupted; {ended}")
+    raise typer.Exit(record.exit_status)
 
 
 def _print_json(document: Any) -> None:

@@ -30,16 +30,7 @@ class RunDirectory:
         self.agents = self.path / "agents"
         self.vehicles = self.path / "vehicles"
         self.lab_log = self.path / "lab.log"
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            if any(self.path.iterdir()):
-                raise RunDirectoryError(f"{path} is not empty: choose another --out, nothing is overwritten")
-            self.agents.mkdir()
-            self.vehicles.mkdir()
-        except (FileExistsError, NotADirectoryError):
-            raise RunDirectoryError(f"{path} is not a directory: choose another --out") from None
-        except OSError as error:
-            raise RunDirectoryError(f"{path} cannot be made: {error.strerror}; choose another --out") from None
+        claim(path, self.agents, self.vehicles)
 
     def vehicle(self, vehicle_id: int) -> Path:
         path = self.vehicles / str(vehicle_id)
@@ -71,6 +62,23 @@ class RunDirectory:
                 f"{self.path / RUN_FILE} cannot be written: {error.strerror}; what the run left is there, and "
                 f"`ucp-harness check {self.path}` judges it"
             ) from None
+
+
+def claim(directory: Path, *inner: Path) -> None:
+    """Make the directory, or take an empty one, and directories in it.
+
+    Raises RunDirectoryError if it cannot be made, or holds anything already.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        if any(directory.iterdir()):
+            raise RunDirectoryError(f"{directory} is not empty: choose another --out, nothing is overwritten")
+        for path in inner:
+            path.mkdir()
+    except (FileExistsError, NotADirectoryError):
+        raise RunDirectoryError(f"{directory} is not a directory: choose another --out") from None
+    except OSError as error:
+        raise RunDirectoryError(f"{directory} cannot be made: {error.strerror}; choose another --out") from None
 
 
 def default_path(name: str) -> Path:

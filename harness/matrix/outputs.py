@@ -13,24 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from harness.checker.verdict import CHECKS
-from harness.errors import MachineError, RunDirectoryError
+from harness.errors import MachineError
 from harness.matrix.cell import Cell, Run
 from harness.matrix.metrics import METRICS
 from harness.matrix.picture import draw
 from harness.matrix.run import Finished
 from ucp.files import write_atomically, write_json_atomically
-
-
-def claim(directory: Path) -> None:
-    """Make the directory, or take an empty one. Raises RunDirectoryError if it holds anything already."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        if any(directory.iterdir()):
-            raise RunDirectoryError(f"{directory} is not empty: choose another --out, nothing is overwritten")
-    except (FileExistsError, NotADirectoryError):
-        raise RunDirectoryError(f"{directory} is not a directory: choose another --out") from None
-    except OSError as error:
-        raise RunDirectoryError(f"{directory} cannot be made: {error.strerror}; choose another --out") from None
 
 
 def write(finished: Finished, directory: Path) -> None:

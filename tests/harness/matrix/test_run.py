@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from harness.checker import Result
-from harness.errors import MachineError, RunDirectoryError
+from harness.errors import MachineError
 from harness.matrix import MatrixRecord, outputs, run_matrix, table
 from harness.matrix.picture import PANELS, draw
 from harness.matrix.thesis import BEGIN, END, OBSERVED, PAGE, put_between_markers
@@ -118,15 +118,6 @@ def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> N
     assert len(runs) == 8
     assert (runs[5]["loss"], runs[5]["seed"], runs[5]["characteristic_3"]) == ("0.5", "2", "violated")
     assert (runs[5]["bytes"], runs[5]["failed"]) == ("", ""), "unknown is empty"
-
-
-def test_a_directory_that_holds_anything_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "kept").touch()
-    with pytest.raises(RunDirectoryError, match="is not empty: choose another --out"):
-        outputs.claim(tmp_path)
-    with pytest.raises(RunDirectoryError, match="is not a directory"):
-        outputs.claim(tmp_path / "kept")
-    outputs.claim(tmp_path / "new" / "one")
 
 
 def test_the_table_fits_eighty_columns_and_names_what_was_violated() -> None:
