@@ -3,12 +3,15 @@
 A timeline is computed before the run from the scenario alone, so every backend plays the same.
 """
 
-from dataclasses import dataclass
-from itertools import groupby
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from itertools import groupby, product
 from typing import Any
 
 from harness.scenario import Scenario
-from harness.scenario.timeline import FaultName
+from harness.scenario.network import NetworkModel
+from harness.scenario.schedule import UNTOUCHED, Layer
+from harness.scenario.timeline import FaultName, TimelineEntry
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 
@@ -53,25 +56,65 @@ Change = NetworkChange | AgentFault
 
 def timeline_of(scenario: Scenario) -> list[Change]:
     """All that the scenario changes, in order; the first is the network's first state, at 0 s."""
-    network = scenario.network
+    faults: list[Change] = [
+        AgentFault(entry.at_s, *entry.fault) for entry in scenario.timeline_in_order() if entry.fault is not None
+    ]
+    first, *states = _network_states(scenario)
+    return [first, *sorted([*states, *faults], key=lambda change: change.at_s)]
+
+
+@dataclass
+class _Network:
+    """The network as it stands: what the scenario and its timeline say, and a layer for each schedule over it."""
+
+    model: NetworkModel
+    roster: tuple[int, ...]
+    layers: list[Layer]
     partition: tuple[frozenset[int], ...] = ()
-    played: list[Change] = [_change(0.0, "start", network.conditions())]
-    for entry in scenario.timeline_in_order():
-        if entry.fault is not None:
-            played.append(AgentFault(entry.at_s, *entry.fault))
-            continue
+
+    def conditions(self) -> NetworkConditions:
+        said: dict[str, Any] = {}
+        for layer in self.layers:
+            said |= {key: value for key in ("loss", "delay") if (value := getattr(layer, key)) is not None}
+        conditions = self.model.model_copy(update=said).conditions(self._cut_by_any())
+        cut = sorted(pair for layer in self.layers for pair in layer.cut)
+        severed = {pair: replace(conditions.link(*pair), loss=1.0) for pair in cut}
+        return replace(conditions, links={**conditions.links, **severed})
+
+    def _cut_by_any(self) -> tuple[frozenset[int], ...]:
+        """Groups whose members no partition keeps apart."""
+        partitions = [one for one in (self.partition, *(layer.partition for layer in self.layers)) if one]
+        if len(partitions) < 2:
+            return partitions[0] if partitions else ()
+        sides = [NetworkConditions(partition=one).groups(self.roster) for one in partitions]
+        together = (frozenset.intersection(*each) for each in product(*sides))
+        return tuple(group for group in together if group)
+
+    def play(self, entry: TimelineEntry) -> str:
+        """Make a change of the timeline; what it is, in a word."""
         if entry.loss is not None:
-            network, what = network.model_copy(update={"loss": entry.loss}), "loss"
-        elif entry.partition is not None:
-            partition, what = tuple(frozenset(group) for group in entry.partition), "partition"
-        else:
-            partition, what = (), "heal"
-        change = _change(entry.at_s, what, network.conditions(partition))
-        if entry.at_s == 0:
-            played[0] = change
-        else:
-            played.append(change)
-    return played
+            self.model = self.model.model_copy(update={"loss": entry.loss})
+            return "loss"
+        self.partition = tuple(frozenset(group) for group in entry.partition or ())
+        return "heal" if entry.partition is None else "partition"
+
+
+def _network_states(scenario: Scenario) -> list[Change]:
+    """Every state of the network; what begins in the same instant makes one state together."""
+    network = _Network(scenario.network, scenario.roster, [UNTOUCHED for _ in scenario.schedule])
+    entries = {entry.at_s: entry for entry in scenario.timeline if entry.fault is None}
+    steps: dict[float, list[tuple[int, str, Layer]]] = defaultdict(list)
+    for number, schedule in enumerate(scenario.schedule):
+        for at_s, what, layer in schedule.steps(scenario.roster, scenario.duration_s):
+            steps[at_s].append((number, what, layer))
+    states: list[Change] = []
+    for at_s in sorted({0.0, *entries, *steps}):
+        said = [network.play(entries[at_s])] if at_s in entries else []
+        for number, what, layer in steps.get(at_s, ()):
+            network.layers[number] = layer
+            said.append(what)
+        states.append(_change(at_s, ", ".join(dict.fromkeys(said)) or "start", network.conditions()))
+    return states
 
 
 def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -47,6 +47,7 @@ def scripted(document: Document, logged: list[Logged], drops: list[Document]) ->
     network = _without_loss(document.get("network", {}))
     entries = [{**entry, **_silent(entry)} for entry in document.get("timeline", [])]
     document = with_key(with_key(document, "network", network), "timeline", [one for one in entries if len(one) > 1])
+    document = with_key(document, "schedule", [_silent_schedule(one) for one in document.get("schedule", [])])
     document["events"] = {"source": "scripted", **({"script": script} if script else {})}
     return with_drops(document, drops)
 
@@ -93,17 +94,35 @@ def _silent(layer: Document) -> Document:
     return {"loss": dict(NEVER_IN_BURSTS) if isinstance(layer["loss"], dict) else 0.0}
 
 
+def _silent_schedule(schedule: Document) -> Document:
+    if "ramp" in schedule and "loss" in schedule["ramp"]:
+        return {**schedule, "ramp": {**schedule["ramp"], "loss": [0.0, 0.0]}}
+    return (
+        {**schedule, "repeat": {**schedule["repeat"], **_silent(schedule["repeat"])}}
+        if "repeat" in schedule
+        else schedule
+    )
+
+
 def with_agents(document: Document, kept: Collection[int]) -> Document:
     """Without the other agents, and all that is said of them."""
     document = {**document, "agents": sorted(kept)}
     document = with_key(document, "events.script", [one for one in script(document) if one["agent"] in kept])
     document = with_key(document, "fates", [one for one in document.get("fates", []) if _named_in(one) <= {*kept}])
     document = with_key(document, "timeline", [*filter(None, (_entry(one, kept) for one in timeline(document)))])
+    document = with_key(document, "schedule", [_schedule(one, kept) for one in document.get("schedule", [])])
     for key in ("clocks", "network.receivers"):
         named = at(document, key) or {}
         document = with_key(document, key, {name: value for name, value in named.items() if int(name) in kept})
     links = [_of(link, ("from", "to"), kept) for link in at(document, "network.links") or []]
     return with_key(document, "network.links", [link for link in links if link["from"] and link["to"]])
+
+
+def _schedule(schedule: Document, kept: Collection[int]) -> Document:
+    if "partition" not in schedule.get("repeat", {}):
+        return schedule
+    groups = [[agent for agent in group if agent in kept] for group in schedule["repeat"]["partition"]]
+    return {**schedule, "repeat": {**schedule["repeat"], "partition": [group for group in groups if group]}}
 
 
 def _named_in(fate: Document) -> set[int]:
@@ -146,7 +165,9 @@ def cut_after(document: Document, last_s: float) -> Document:
     document = {**document, "duration_s": max(1.0, last_s)}
     for key in ("events.script", "timeline"):
         document = with_key(document, key, [one for one in at(document, key) or [] if one["at_s"] <= last_s])
-    return document
+    schedule = [one for one in document.get("schedule", []) if one.get("from_s", 0.0) < last_s]
+    clipped = [{**one, "until_s": min(one["until_s"], last_s)} if "until_s" in one else one for one in schedule]
+    return with_key(document, "schedule", clipped)
 
 
 def moved(document: Document, to: Callable[[float], float]) -> Document:

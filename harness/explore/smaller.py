@@ -125,7 +125,7 @@ def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
 
 
 def _fewer_of_each(shrinker: Shrinker) -> None:
-    for key in ("timeline", "events.script", "fates", "network.links"):
+    for key in ("timeline", "schedule", "events.script", "fates", "network.links"):
         document = shrinker.best
         if at(document, key):
             shrinker.fewest(at(document, key), lambda kept, d=document, k=key: with_key(d, k, list(kept)))  # type: ignore[misc]
@@ -137,7 +137,7 @@ def _fewer_of_each(shrinker: Shrinker) -> None:
 
 def _plainer(shrinker: Shrinker) -> None:
     """What can be as by default; and if not, one latency for all messages."""
-    for key in ("settings", "quirks", "network", "settle", "timeline"):
+    for key in ("settings", "quirks", "network", "settle", "timeline", "schedule"):
         shrinker.first([with_key(shrinker.best, key, None)])
     for part in ("settings", "quirks", "network"):
         for key in list(at(shrinker.best, part) or ()):

@@ -22,6 +22,7 @@ ORDER = (
     "settings",
     "quirks",
     "timeline",
+    "schedule",
     "events",
     "fates",
     "settle",

@@ -11,6 +11,7 @@ from harness.scenario.events import Events
 from harness.scenario.fates import Fate
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
+from harness.scenario.schedule import NEEDED, Schedule
 from harness.scenario.timeline import FAULT_LEADS_TO, FAULT_NEEDS, TimelineEntry
 from harness.scenario.vehicles import Vehicles
 from netem.errors import ConditionsError
@@ -41,6 +42,7 @@ class Scenario(Model):
     speedup: Annotated[float, Field(gt=0, le=1000)] = 20.0
     network: NetworkModel = NetworkModel()
     timeline: Annotated[list[TimelineEntry], Field(max_length=10_000)] = []
+    schedule: Annotated[list[Schedule], Field(max_length=100)] = []
     events: Events = Events()
     vehicles: Vehicles = Vehicles()
     agent_command: Annotated[list[str], Field(min_length=1, max_length=100)] | None = None
@@ -117,6 +119,24 @@ class Scenario(Model):
             if entry.fault is not None:
                 what, agents = entry.fault
                 yield from ((f"timeline.{index}.{what}", agent) for agent in agents)
+
+    @model_validator(mode="after")
+    def _schedule_can_be_played(self) -> "Scenario":
+        for index, schedule in enumerate(self.schedule):
+            where = f"schedule.{index}"
+            for key in ("from_s", "until_s"):
+                at_s = getattr(schedule, key)
+                if at_s is not None and at_s > self.duration_s:
+                    raise ValueError(f"{where}.{key} {at_s:g} is after the mission's end at {self.duration_s:g} s")
+            if schedule.nemesis is not None and len(self.roster) < NEEDED[schedule.nemesis]:
+                raise ValueError(f"{where}.nemesis {schedule.nemesis!r} needs {NEEDED[schedule.nemesis]} vehicles")
+            try:
+                groups = tuple(frozenset(group) for group in (schedule.repeat and schedule.repeat.partition) or ())
+                self.network.conditions(groups).validate(self.roster)
+                schedule.steps(self.roster, self.duration_s)
+            except (ConditionsError, ValueError) as error:
+                raise ValueError(f"{where}: {error}") from None
+        return self
 
     @model_validator(mode="after")
     def _timeline_can_be_played(self) -> "Scenario":

@@ -1,0 +1,196 @@
+"""Schedules: what happens to the network again and again, little by little, or at random, as values that compose.
+
+    schedule:
+      - {ramp: {loss: [0, 0.5]}, from_s: 100, until_s: 400}
+      - {repeat: {partition: [[1, 2]]}, every_s: 120, for_s: 30}
+      - {nemesis: halves, every_s: 60, for_s: 20, seed: 7}
+
+Each is a layer over the network of the scenario and its timeline, and is worked out before the run: every backend plays
+the same. Where layers meet, the later one's loss and delay count, partitions cut all that any of them cuts, and a pair
+that one of them cuts is cut.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from harness.scenario.model import Instant, Model, Probability, Seconds, VehicleId
+from harness.scenario.network import DelaySeconds, Loss
+
+MAX_STEPS = 10_000
+"""More changes than this are a mistake, or another scenario."""
+
+Groups = Annotated[list[list[VehicleId]], Field(min_length=1)]
+Pairs = frozenset[tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What a schedule makes of the network for a while; None and nothing: it leaves it alone."""
+
+    loss: Loss | None = None
+    delay: DelaySeconds | None = None
+    partition: tuple[frozenset[int], ...] = ()
+    cut: Pairs = frozenset()
+    """Directed pairs, sender and receiver, between which nothing passes."""
+
+
+UNTOUCHED = Layer()
+
+Step = tuple[float, str, Layer]
+"""(mission seconds, what in a word or two, the layer from then on)."""
+
+
+class Ramp(Model):
+    """From the first value to the second, in equal steps."""
+
+    loss: tuple[Probability, Probability] | None = None
+    delay: tuple[DelaySeconds, DelaySeconds] | None = None
+
+    @model_validator(mode="after")
+    def _of_something(self) -> "Ramp":
+        if self.loss is None and self.delay is None:
+            raise ValueError("needs `loss` or `delay`: [from, to]")
+        return self
+
+
+class Repeated(Model):
+    """What is done for a while, and undone."""
+
+    loss: Loss | None = None
+    delay: DelaySeconds | None = None
+    partition: Groups | None = None
+
+    @model_validator(mode="after")
+    def _of_something(self) -> "Repeated":
+        if self.loss is None and self.delay is None and self.partition is None:
+            raise ValueError("needs at least one of `loss`, `delay` or `partition`")
+        return self
+
+
+Nemesis = Literal["halves", "isolate", "majorities ring", "bridge", "flapping"]
+
+
+class Schedule(Model):
+    """One of `ramp`, `repeat` or `nemesis`, from `from_s` until `until_s` (the mission's end).
+
+    `ramp`: a step every `every_s`, 10 s if not given; in the end it stays at its second value. `repeat`: every
+    `every_s`, for `for_s`, then undone. `nemesis`: the same with something drawn anew from `seed` each time: `halves`
+    parts the swarm into two random halves, `isolate` cuts off one vehicle, `majorities ring` lets every vehicle hear a
+    majority and no two the same one (Jepsen), `bridge` leaves one vehicle that hears both halves, `flapping` cuts one
+    pair of vehicles from each other.
+    """
+
+    ramp: Ramp | None = None
+    repeat: Repeated | None = None
+    nemesis: Nemesis | None = None
+    from_s: Instant = 0.0
+    until_s: Instant | None = None
+    every_s: Seconds | None = None
+    for_s: Seconds | None = None
+    seed: int = 0
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "Schedule":
+        if sum(kind is not None for kind in (self.ramp, self.repeat, self.nemesis)) != 1:
+            raise ValueError("needs exactly one of `ramp`, `repeat` or `nemesis`")
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(f"until_s {self.until_s:g} is not after from_s {self.from_s:g}")
+        if self.ramp is not None:
+            if self.for_s is not None:
+                raise ValueError("for_s is for `repeat` and `nemesis`: a ramp lasts until until_s")
+        elif self.every_s is None or self.for_s is None:
+            raise ValueError("needs `every_s` and `for_s`")
+        elif self.for_s >= self.every_s:
+            raise ValueError(
+                f"for_s {self.for_s:g} is not less than every_s {self.every_s:g}: it would never be undone"
+            )
+        return self
+
+    def vehicles(self) -> Iterator[int]:
+        """Every vehicle that is named."""
+        for group in (self.repeat.partition if self.repeat else None) or ():
+            yield from group
+
+    def steps(self, roster: Sequence[int], end_s: float) -> list[Step]:
+        """What happens when, in order. ValueError if it is more than anybody wants."""
+        until = end_s if self.until_s is None else self.until_s
+        every = self.every_s or 10.0
+        if (until - self.from_s) / every > MAX_STEPS:
+            raise ValueError(f"every_s {every:g} is more than {MAX_STEPS} steps")
+        if self.ramp is not None:
+            return _ramp(self.ramp, self.from_s, until, every)
+        rng = Random(f"{self.seed}/{self.nemesis}")
+        steps: list[Step] = []
+        count = 0
+        while (at_s := self.from_s + count * every) < until:
+            steps.append((at_s, self.nemesis or "repeat", self._layer(roster, rng)))
+            steps.append((min(at_s + (self.for_s or 0.0), until), "undone", UNTOUCHED))
+            count += 1
+        return steps
+
+    def _layer(self, roster: Sequence[int], rng: Random) -> Layer:
+        if self.repeat is not None:
+            partition = tuple(frozenset(group) for group in self.repeat.partition or ())
+            return Layer(self.repeat.loss, self.repeat.delay, partition)
+        assert self.nemesis is not None, "a schedule is one of three"
+        return NEMESES[self.nemesis](rng.sample(list(roster), len(roster)))
+
+
+def _ramp(ramp: Ramp, from_s: float, until: float, every: float) -> list[Step]:
+    count = max(1, round((until - from_s) / every))
+
+    def between(ends: tuple[float, float] | None, share: float) -> float | None:
+        return None if ends is None else ends[0] + (ends[1] - ends[0]) * share
+
+    steps: list[Step] = []
+    for number in range(count + 1):
+        share = number / count
+        layer = Layer(between(ramp.loss, share), between(ramp.delay, share))
+        steps.append((from_s + (until - from_s) * share, "ramp", layer))
+    return steps
+
+
+def _halves(shuffled: list[int]) -> Layer:
+    return Layer(partition=(frozenset(shuffled[: len(shuffled) // 2]), frozenset(shuffled[len(shuffled) // 2 :])))
+
+
+def _isolate(shuffled: list[int]) -> Layer:
+    return Layer(partition=(frozenset(shuffled[:1]),))
+
+
+def _majorities_ring(shuffled: list[int]) -> Layer:
+    """Each vehicle hears itself and its nearest on the ring, a majority in all; everybody's majority is another."""
+    size = len(shuffled)
+    reach = (size // 2 + 1) // 2
+    heard = {
+        (shuffled[(place + step) % size], shuffled[place]) for place in range(size) for step in range(-reach, reach + 1)
+    }
+    return Layer(cut=frozenset((a, b) for a in shuffled for b in shuffled if a != b and (a, b) not in heard))
+
+
+def _bridge(shuffled: list[int]) -> Layer:
+    _, *others = shuffled
+    one, other = others[: len(others) // 2], others[len(others) // 2 :]
+    return Layer(cut=frozenset(pair for a in one for b in other for pair in ((a, b), (b, a))))
+
+
+def _flapping(shuffled: list[int]) -> Layer:
+    pair = shuffled[:2]
+    return Layer(cut=frozenset(((pair[0], pair[1]), (pair[1], pair[0])) if len(pair) == 2 else ()))
+
+
+NEMESES: dict[Nemesis, Callable[[list[int]], Layer]] = {
+    "halves": _halves,
+    "isolate": _isolate,
+    "majorities ring": _majorities_ring,
+    "bridge": _bridge,
+    "flapping": _flapping,
+}
+"""From the vehicles in random order to what becomes of the network."""
+
+NEEDED: dict[Nemesis, int] = {"halves": 2, "isolate": 2, "majorities ring": 4, "bridge": 3, "flapping": 2}
+"""Vehicles without which it would be no fault."""
