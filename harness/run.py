@@ -15,7 +15,7 @@ from typing import Any
 
 from harness import checker, report
 from harness.backends.agent_process import agent_command
-from harness.backends.process import ProcessRun, refuse_what_needs_virtual_time
+from harness.backends.process import ProcessRun, refuse_what_needs_virtual_time, refuse_what_this_machine_cannot
 from harness.backends.simulation import refuse_what_needs_processes
 from harness.backends.vehicle_process import VehicleFailedError
 from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
@@ -109,6 +109,7 @@ def prepare(scenario: Scenario, seed: int, backend: Backend) -> Play:
         refuse_what_needs_processes(scenario)
         return lambda rundir, progress, interrupted: simulate_into(rundir, scenario, seed, progress, interrupted)
     refuse_what_needs_virtual_time(scenario)
+    refuse_what_this_machine_cannot(scenario)
     kind = choose_vehicles(scenario)
     agent_command(scenario)
     # Another run is another mission: its blocks must not be taken for this one's.

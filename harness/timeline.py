@@ -173,6 +173,12 @@ def _differences(link: LinkConditions, usual: LinkConditions) -> list[str]:
         words.append(f"duplicate {_percent(link.duplicate)}")
     if link.reorder != usual.reorder:
         words.append(f"reorder {_percent(link.reorder)}")
+    if link.corrupt != usual.corrupt:
+        words.append(f"corrupt {_percent(link.corrupt)}")
+    if link.rate != usual.rate:
+        words.append("no rate" if link.rate is None else f"rate {_rate(link.rate)}")
+    if link.limit != usual.limit:
+        words.append("no limit" if link.limit is None else f"limit {link.limit} packets")
     return words
 
 
@@ -196,6 +202,13 @@ def _delay(delay: Delay | None) -> str:
 
 def _duration(seconds: float) -> str:
     return f"{seconds:g} s" if seconds >= 1 else f"{seconds * 1000:g} ms"
+
+
+def _rate(bits_per_second: float) -> str:
+    for unit, size in (("Gbit/s", 1e9), ("Mbit/s", 1e6), ("kbit/s", 1e3)):
+        if bits_per_second >= size:
+            return f"{bits_per_second / size:g} {unit}"
+    return f"{bits_per_second:g} bit/s"
 
 
 def _percent(probability: float) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from netem.engine import Engine
 from netem.errors import EngineError
 from netem.fabric import Fabric
@@ -9,11 +11,12 @@ from netem.nft import NftablesEngine
 from netem.tc import NetemEngine
 
 
-def choose(preference: str | None, fabric: Fabric) -> tuple[Engine, str]:
+def choose(preference: str | None, fabric: Fabric, needs: Sequence[str] = ()) -> tuple[Engine, str]:
     """The engine to use on this machine, installed, and why it is this one.
 
-    Without a preference tc netem goes first, because it can do more. An engine is tried by installing
-    it: nothing else tells whether a kernel can. Raises EngineError with the way out if none works.
+    Without a preference tc netem goes first, because it can do more; `needs` are what conditions will ask beyond
+    loss and partition. An engine is tried by installing it: nothing else tells whether a kernel can. Raises
+    EngineError with what each one lacks if none works.
     """
     engines: dict[str, type[Engine]] = {kind.name: kind for kind in (NetemEngine, NftablesEngine)}
     if preference is not None and preference not in engines:
@@ -21,6 +24,9 @@ def choose(preference: str | None, fabric: Fabric) -> tuple[Engine, str]:
     refused: list[str] = []
     for name, kind in engines.items():
         if preference not in (None, name):
+            continue
+        if needs and not kind.has_queues:
+            refused.append(f"{name}: knows loss and partitions only")
             continue
         try:
             engine = kind(fabric)

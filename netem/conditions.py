@@ -10,9 +10,9 @@ off from everybody else.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import chain, islice
+from itertools import chain
 from typing import Any
 
 from netem.addresses import MAX_ID, MIN_ID
@@ -77,15 +77,22 @@ class NetworkConditions:
         return not self.partition and all(link.lossless for link in links)
 
     def needs(self) -> tuple[str, ...]:
-        """What these conditions ask beyond independent loss per receiver and partition, by key.
+        """What these conditions ask beyond independent loss and partition, by key.
 
-        Each key once, with the first place that asks for it: "delay", "receivers 3 reorder", "links 1>2".
+        Each key once, with the first place that asks for it: "delay", "receivers 3 reorder", "links 1>2 delay".
         """
         asked = {key: key for key in self.default.needs()}
         for vehicle, link in self.receivers.items():
             asked |= {key: f"receivers {vehicle} {key}" for key in link.needs() if key not in asked}
-        differing = (pair for pair, link in self.links.items() if link != self.receivers.get(pair[1], self.default))
-        return (*asked.values(), *(f"links {sender}>{receiver}" for sender, receiver in islice(differing, 1)))
+        for (sender, receiver), link in self.links.items():
+            asked |= {key: f"links {sender}>{receiver} {key}" for key in link.needs() if key not in asked}
+        return tuple(asked.values())
+
+    def differing_links(self) -> Iterator[tuple[int, int, LinkConditions]]:
+        """(sender, receiver, conditions) of the links that differ from what their receiver hears from others."""
+        for (sender, receiver), link in self.links.items():
+            if link != self.receivers.get(receiver, self.default):
+                yield sender, receiver, link
 
     def groups(self, vehicles: Iterable[int]) -> tuple[frozenset[int], ...]:
         """The groups that `vehicles` fall into, the rest last; one group when nothing is cut."""
@@ -101,6 +108,20 @@ class NetworkConditions:
     def healed(self) -> NetworkConditions:
         """The same conditions without a partition."""
         return replace(self, partition=())
+
+    def at_speed(self, speedup: float) -> NetworkConditions:
+        """These conditions of a mission, in seconds of a clock on which it runs `speedup` times as fast.
+
+        Shorter delays and higher rates: what a kernel, which knows one clock only, has to be asked for.
+        """
+        if speedup == 1:
+            return self
+        return replace(
+            self,
+            default=self.default.at_speed(speedup),
+            receivers={vehicle: link.at_speed(speedup) for vehicle, link in self.receivers.items()},
+            links={pair: link.at_speed(speedup) for pair, link in self.links.items()},
+        )
 
     def validate(self, vehicles: Iterable[int]) -> None:
         """Raise ConditionsError if a vehicle is named that is not one of `vehicles`."""

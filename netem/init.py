@@ -153,7 +153,7 @@ class Server:
             raise NetemError("The lab is open already")
         self._fabric = Fabric(message["vehicles"])
         try:
-            self._engine, reason = choice.choose(message["engine"], self._fabric)
+            self._engine, reason = choice.choose(message["engine"], self._fabric, message["needs"])
         except EngineError as error:
             return {"engine": None, "reason": str(error)}
         return {"engine": self._engine.name, "reason": reason}

@@ -35,8 +35,9 @@ from netem.errors import ConditionsError, LabError, LabUnavailable
 EngineName = Literal["netem", "nftables"]
 
 _WAYS_OUT: dict[EngineName, str] = {
-    "netem": "Use a kernel with sch_netem, sch_htb, sch_ingress, cls_matchall and act_skbedit (Debian: "
-    "linux-image-amd64; Ubuntu: linux-modules-extra-$(uname -r)).",
+    "netem": "Use a kernel with sch_netem, sch_htb, sch_ingress, cls_basic, cls_fw, act_skbedit and act_gact (Debian: "
+    "linux-image-amd64; Ubuntu: linux-modules-extra-$(uname -r); Fedora, RHEL: kernel-modules-extra; Arch: every "
+    "kernel; Alpine: linux-lts; WSL2: a kernel of your own, with CONFIG_NET_SCH_NETEM).",
     "nftables": "Install nftables (apt install nftables), on a kernel with nf_tables for bridges and nft_numgen.",
 }
 _OPEN_DEADLINE_S = 60.0
@@ -90,17 +91,20 @@ class Lab:
         self.engine_reason = ""
 
     @classmethod
-    async def open(cls, vehicles: Sequence[int], *, engine: EngineName | None = None, log: Path) -> Lab:
+    async def open(
+        cls, vehicles: Sequence[int], *, engine: EngineName | None = None, needs: Sequence[str] = (), log: Path
+    ) -> Lab:
         """Bring up a lab for these vehicle IDs (1..65535); `log` takes what its first process says.
 
-        Raises LabUnavailable if this machine cannot, or cannot with the engine asked for.
+        `needs` is what conditions will ask beyond loss and partition (`NetworkConditions.needs`). Raises
+        LabUnavailable if this machine cannot, or cannot with the engine asked for or with one that does all that.
         """
         ids = _checked(vehicles)
         word = ""
         for user_namespace in namespaces.ways_in():
             lab = await cls._enter(ids, user_namespace, log)
             try:
-                refusal = await asyncio.wait_for(lab._start(engine, log), _OPEN_DEADLINE_S)
+                refusal = await asyncio.wait_for(lab._start(engine, needs, log), _OPEN_DEADLINE_S)
             except TimeoutError:
                 await lab.close()
                 raise LabError(f"The lab was not up within {_OPEN_DEADLINE_S:g} s; see {log}") from None
@@ -142,7 +146,7 @@ class Lab:
             raise
         return cls(vehicles, process, Channel(ours, log))
 
-    async def _start(self, engine: EngineName | None, log: Path) -> str | None:
+    async def _start(self, engine: EngineName | None, needs: Sequence[str], log: Path) -> str | None:
         """Build the network; returns the word of the tool if it could not even get into namespaces."""
         if not await self._channel.inside():
             await self.close()
@@ -151,7 +155,7 @@ class Lab:
                 return word
             raise LabError(f"The lab's first process ended before it began ({word}); see {log}")
         try:
-            result, _ = await self._channel.ask("open", vehicles=self.vehicles, engine=engine)
+            result, _ = await self._channel.ask("open", vehicles=self.vehicles, engine=engine, needs=[*needs])
         except LabError as error:
             if not self._channel.open:
                 raise
@@ -161,10 +165,12 @@ class Lab:
                 "fabric",
             ) from error
         if result["engine"] is None:
-            wanted = [_WAYS_OUT[engine]] if engine else _WAYS_OUT.values()
-            raise LabUnavailable(
-                f"No engine {engine or 'at all'} works here ({result['reason']})", " Or: ".join(wanted), "engine"
-            )
+            wanted = [_WAYS_OUT[engine]] if engine else [_WAYS_OUT["netem"]] if needs else [*_WAYS_OUT.values()]
+            if needs:
+                wanted.append("play it in virtual time: --backend sim.")
+            work = f"No engine {engine} works" if engine else "No engine at all works"
+            reason = f"Nothing does {', '.join(needs)}" if needs else work
+            raise LabUnavailable(f"{reason} here ({result['reason']})", " Or: ".join(wanted), "engine")
         self.engine = result["engine"]
         self.engine_reason = result["reason"]
         return None

@@ -1,4 +1,4 @@
-"""What happens to packets on the way from one vehicle to another: loss, delay, duplicates, reordering.
+"""What happens to packets on the way from one vehicle to another: loss, delay, duplicates, reordering, and more.
 
 The words are those of tc-netem(8), and so is what they mean; every packet's lots are drawn on its own.
 JSON leaves out what is as if nobody had asked for it, so a plain loss reads {"loss": 0.1}.
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, get_args
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Literal, Self, get_args
 
 from netem.errors import ConditionsError
 
@@ -17,6 +17,9 @@ Distribution = Literal["uniform", "normal", "pareto", "paretonormal"]
 
 MAX_DELAY_S = 60.0
 """Six times the longest timer of UCP as the thesis sets it; a 32-bit count of netem's 64 ns ticks reaches 274 s."""
+
+MAX_LIMIT = 100_000
+"""Packets. Where the conditions do not say, a kernel has room for one more: a flood does not fill its memory."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class GilbertElliott:
     def mean(self) -> float:
         """The share of packets lost in the long run."""
         change = self.p + self.r
-        return (self.p * self.loss_bad + self.r * self.loss_good) / change if change else self.loss_good
+        return self.loss_good + (self.loss_bad - self.loss_good) * (self.p / change) if change else self.loss_good
 
     @property
     def lossless(self) -> bool:
@@ -82,6 +85,10 @@ class Delay:
         object.__setattr__(self, "mean_s", mean_s)
         object.__setattr__(self, "jitter_s", jitter_s)
 
+    def at_speed(self, speedup: float) -> Delay:
+        """The same delay where `speedup` seconds pass in one."""
+        return replace(self, mean_s=self.mean_s / speedup, jitter_s=self.jitter_s / speedup)
+
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
@@ -98,29 +105,59 @@ class LinkConditions:
     `loss` is the probability, 0..1, that a packet is dropped, drawn for each packet on its own, or a model
     of bursts. `duplicate` is the probability that a packet comes twice, `reorder` that it overtakes: it is
     sent at once, without delay, which needs a delay. A delay of 0 is none.
+
+    `corrupt` is the probability that one bit of a packet flips. The checksum of UDP finds it, so for its
+    receiver the message is lost. (netem flips bits of the whole Ethernet frame. An error in its 12 bytes of
+    addresses is below every checksum that a veth pair has, and a broadcast mostly arrives nevertheless.)
+
+    `rate` is in bits per second of Ethernet frames, which are 42 bytes longer than a UDP datagram's data;
+    every link, one sender to one receiver, has it for itself. Under a rate packets keep their order, and
+    jitter never makes one wait less than those before it. `limit` is how many packets may wait on a link,
+    be it for delay or for rate, of which it needs one; what comes when it is reached is lost.
     """
 
     loss: float | GilbertElliott = 0.0
     delay: Delay | None = None
     duplicate: float = 0.0
     reorder: float = 0.0
+    corrupt: float = 0.0
+    rate: float | None = None
+    limit: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.loss, GilbertElliott):
             object.__setattr__(self, "loss", probability("loss", self.loss))
-        object.__setattr__(self, "duplicate", probability("duplicate", self.duplicate))
-        object.__setattr__(self, "reorder", probability("reorder", self.reorder))
+        for key in ("duplicate", "reorder", "corrupt"):
+            object.__setattr__(self, key, probability(key, getattr(self, key)))
         if not isinstance(self.delay, Delay | None):
             raise ConditionsError(f"delay: {self.delay!r} is not a delay; allowed is a Delay or None")
         if self.delay is not None and self.delay.mean_s == 0.0:
             object.__setattr__(self, "delay", None)
         if self.reorder and self.delay is None:
             raise ConditionsError(f"reorder: {self.reorder!r} needs a delay to overtake; allowed is 0 without one")
+        if self.rate is not None:
+            allowed = "bits per second, 8 or more, or None"
+            rate = _number("rate", self.rate, allowed)
+            if not 8.0 <= rate < math.inf:
+                raise ConditionsError(f"rate: {self.rate!r} is out of range; allowed is {allowed}")
+            object.__setattr__(self, "rate", rate)
+        if self.limit is not None:
+            allowed = f"a whole number of packets, 1..{MAX_LIMIT}, or None"
+            if isinstance(self.limit, bool) or not isinstance(self.limit, int) or not 1 <= self.limit <= MAX_LIMIT:
+                raise ConditionsError(f"limit: {self.limit!r} is out of range; allowed is {allowed}")
+            if self.delay is None and self.rate is None:
+                raise ConditionsError(f"limit: {self.limit!r} needs a delay or a rate to wait for; allowed is None")
 
     @property
     def lossless(self) -> bool:
         """Nothing is ever lost."""
-        return self.loss.lossless if isinstance(self.loss, GilbertElliott) else self.loss == 0.0
+        lossless = self.loss.lossless if isinstance(self.loss, GilbertElliott) else self.loss == 0.0
+        return lossless and self.corrupt == 0.0 and self.limit is None
+
+    @property
+    def remembers(self) -> bool:
+        """What becomes of a packet depends on those before it on the same link, one sender to one receiver."""
+        return isinstance(self.loss, GilbertElliott) or self.rate is not None or self.limit is not None
 
     @property
     def independent_loss(self) -> float:
@@ -136,8 +173,19 @@ class LinkConditions:
             "delay": self.delay is not None,
             "duplicate": self.duplicate > 0.0,
             "reorder": self.reorder > 0.0,
+            "corrupt": self.corrupt > 0.0,
+            "rate": self.rate is not None,
+            "limit": self.limit is not None,
         }
         return tuple(key for key, needed in asked.items() if needed)
+
+    def at_speed(self, speedup: float) -> Self:
+        """The same conditions where `speedup` seconds pass in one: shorter delays, a higher rate."""
+        return replace(
+            self,
+            delay=self.delay and self.delay.at_speed(speedup),
+            rate=self.rate and self.rate * speedup,
+        )
 
     def to_json(self) -> dict[str, Any]:
         value: dict[str, Any] = {
@@ -145,6 +193,9 @@ class LinkConditions:
             "delay": self.delay and self.delay.to_json(),
             "duplicate": self.duplicate,
             "reorder": self.reorder,
+            "corrupt": self.corrupt,
+            "rate": self.rate,
+            "limit": self.limit,
         }
         return {key: asked for key, asked in value.items() if key == "loss" or asked}
 

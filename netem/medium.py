@@ -4,7 +4,7 @@ It is the third engine beside tc netem and nftables, for agents that run in no k
 packets. A broadcast is drawn for by every receiver on its own. Without a delay in the conditions a message takes 2 to
 50 ms, uniformly, as over a radio.
 
-Every sender has a random stream of its own for each concern: loss, latency, duplication, reordering. A fault that is
+Every sender has a random stream of its own for each concern: loss, latency, duplication, and so on. A fault that is
 added, or another sender that says more, changes none of the others' lots. Lots are words of 32 bits, and what they are
 compared with are whole numbers or tables of them, so that a seed means the same on every machine.
 
@@ -18,14 +18,13 @@ import sys
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from math import inf
 from random import Random
-from statistics import NormalDist
 from typing import Protocol
 
 from netem.conditions import NetworkConditions
-from netem.link import Delay, Distribution, GilbertElliott, LinkConditions
+from netem.distributions import SCALE, table
+from netem.link import Delay, GilbertElliott, LinkConditions
 
 LATENCY = Delay(mean_s=0.026, jitter_s=0.024)
 """How long messages take where the conditions do not say."""
@@ -33,7 +32,6 @@ LATENCY = Delay(mean_s=0.026, jitter_s=0.024)
 _WORD = 1 << 32
 _BROADCASTS_AT_ONCE = 64
 _TABLE_SIZE = 4096
-_TABLE_SCALE = 8192
 
 
 class Lots(Protocol):
@@ -56,7 +54,8 @@ class Medium:
         self._vehicles = tuple(vehicles)
         self._seed = seed
         self._words = [_Words(self._stream("loss", sender), self._stream("latency", sender)) for sender in vehicles]
-        self._rare = [(self._stream("duplication", sender), self._stream("reordering", sender)) for sender in vehicles]
+        concerns = ("duplication", "reordering", "corruption")
+        self._rare = [tuple(self._stream(concern, sender) for concern in concerns) for sender in vehicles]
         self._in_bad_state: set[tuple[int, int]] = set()  # (sender, receiver) by number
         self.soonest = LATENCY.mean_s
         self.latest = LATENCY.mean_s
@@ -87,7 +86,7 @@ class Medium:
         hears = [number != other and self.hears(number, other) for other in range(len(links))]
         if all(_is_plain(link) for link in set(links)):
             return _PlainAir(links, hears, self._words[number])
-        return _AnyAir(number, links, hears, self._in_bad_state, self._words[number], *self._rare[number])
+        return _AnyAir(number, links, hears, self._in_bad_state, self._words[number], self._rare[number])
 
     def _stream(self, concern: str, sender: int) -> Random:
         return Random(f"{self._seed}/{concern}/{sender}")
@@ -105,7 +104,7 @@ class _Air(Protocol):
 def _is_plain(link: LinkConditions) -> bool:
     """One lot each for loss and latency is all that it takes."""
     uniform = link.delay is None or link.delay.distribution == "uniform"
-    return uniform and not (link.duplicate or link.reorder or isinstance(link.loss, GilbertElliott))
+    return uniform and not (link.duplicate or link.reorder or link.corrupt or isinstance(link.loss, GilbertElliott))
 
 
 class _PlainAir:
@@ -207,16 +206,14 @@ class _AnyAir:
         hears: list[bool],
         in_bad_state: set[tuple[int, int]],
         words: _Words,
-        duplication: Random,
-        reordering: Random,
+        rare: tuple[Random, ...],
     ) -> None:
         self._number = number
         self._links = links
         self._hears = hears
         self._in_bad_state = in_bad_state
         self._words = words
-        self._duplication = duplication
-        self._reordering = reordering
+        self._duplication, self._reordering, self._corruption = rare
 
     def draw(self) -> Lots:
         delays = [self._delays(receiver, link) for receiver, link in enumerate(self._links)]
@@ -226,11 +223,12 @@ class _AnyAir:
         words = self._words
         at = words.take(2)
         lost = self._is_lost(receiver, link.loss, words.loss[at] / _WORD, words.loss[at + 1] / _WORD)
+        spoilt = self._corruption.random() < link.corrupt  # its receiver throws it away
         copies = 2 if self._duplication.random() < link.duplicate else 1
         overtakes = self._reordering.random() < link.reorder
         delay = link.delay or LATENCY
         first, second = sample(delay, words.latency[at] / _WORD), sample(delay, words.latency[at + 1] / _WORD)
-        if lost:
+        if lost or spoilt:
             return ()
         return (0.0 if overtakes else first, second)[:copies]
 
@@ -264,22 +262,5 @@ def sample(delay: Delay, lot: float) -> float:
     """The delay in seconds that falls to `lot`, uniform in 0..1 (exclusive)."""
     if delay.distribution == "uniform":
         return delay.mean_s + delay.jitter_s * (2 * lot - 1)
-    deviations = _table(delay.distribution)[int(lot * _TABLE_SIZE)] / _TABLE_SCALE
+    deviations = table(delay.distribution, _TABLE_SIZE)[int(lot * _TABLE_SIZE)] / SCALE
     return max(0.0, delay.mean_s + delay.jitter_s * deviations)
-
-
-@cache
-def _table(distribution: Distribution) -> tuple[int, ...]:
-    """Quantiles in 1/8192 of a standard deviation, as whole numbers: the form of netem's own tables.
-
-    Pareto is that of shape 3, shifted to mean 0; the mixed one is a quarter normal and three quarters Pareto.
-    """
-    at = [(index + 0.5) / _TABLE_SIZE for index in range(_TABLE_SIZE)]
-    normal = [NormalDist().inv_cdf(share) for share in at]
-    pareto = [((1 - share) ** (-1 / 3) - 1.5) * 4 / 3 for share in at]
-    deviations = {
-        "normal": normal,
-        "pareto": pareto,
-        "paretonormal": [0.25 * one + 0.75 * other for one, other in zip(normal, pareto, strict=True)],
-    }[distribution]
-    return tuple(min(round(deviation * _TABLE_SCALE), 32767) for deviation in deviations)

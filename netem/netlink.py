@@ -34,6 +34,7 @@ NEW = NLM_F_CREATE | NLM_F_EXCL
 
 _HEADER = struct.Struct("=IHHII")
 _BATCH = 50
+_BATCH_BYTES = 64 << 10  # a socket takes about three times as much at once
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Request:
 
     what: str
     type: int
-    message: Any  # a pyroute2 nlmsg
+    message: Any  # a pyroute2 nlmsg, or the bytes after the header
     flags: int = 0
 
 
@@ -66,12 +67,20 @@ class Netlink:
 
         Raises NetlinkError for the first one refused; those after it in its batch were tried too.
         """
-        for start in range(0, len(requests), _BATCH):
-            self._send(requests[start : start + _BATCH])
+        batch: list[Request] = []
+        encoded = bytearray()
+        for request in requests:
+            message = self._encode(request.message, request.type, request.flags | NLM_F_ACK)
+            if len(batch) == _BATCH or (batch and len(encoded) + len(message) > _BATCH_BYTES):
+                self._send(batch, encoded, self._sequence - len(batch))
+                batch, encoded = [], bytearray()
+            batch.append(request)
+            encoded += message
+        if batch:
+            self._send(batch, encoded, self._sequence - len(batch) + 1)
 
-    def _send(self, requests: Sequence[Request]) -> None:
-        first = self._sequence + 1
-        self._socket.send(b"".join(self._encode(r.message, r.type, r.flags | NLM_F_ACK) for r in requests))
+    def _send(self, requests: Sequence[Request], encoded: bytes | bytearray, first: int) -> None:
+        self._socket.send(encoded)
         error: NetlinkError | None = None
         waiting = len(requests)
         while waiting:
@@ -85,7 +94,7 @@ class Netlink:
             raise error
 
     def dump(self, what: str, kind: int, message: Any) -> list[Any]:
-        """Everything that the kernel lists for a GET request, decoded by the class of `message`."""
+        """Everything that the kernel lists for a GET request, decoded by the class of `message` (bytes stay bytes)."""
         self._socket.send(self._encode(message, kind, NLM_F_DUMP))
         found: list[Any] = []
         while True:
@@ -96,12 +105,13 @@ class Netlink:
                     if error := _refusal(what, flags, payload):
                         raise error
                     return found
-                decoded = type(message)(_HEADER.pack(16 + len(payload), kind, flags, 0, 0) + payload)
-                decoded.decode()
-                found.append(decoded)
+                found.append(payload if isinstance(message, bytes) else _decode(message, kind, flags, payload))
 
     def _encode(self, message: Any, kind: int, flags: int) -> bytes:
         self._sequence += 1
+        if isinstance(message, bytes):
+            length = _HEADER.size + len(message)
+            return _HEADER.pack(length, kind, flags | NLM_F_REQUEST, self._sequence, 0) + message
         header = message["header"]
         header["type"] = kind
         header["flags"] = flags | NLM_F_REQUEST
@@ -119,6 +129,12 @@ class Netlink:
             messages.append((kind, flags, sequence, data[offset + _HEADER.size : offset + length]))
             offset += (length + 3) & ~3
         return messages
+
+
+def _decode(example: Any, kind: int, flags: int, payload: bytes) -> Any:
+    decoded = type(example)(_HEADER.pack(_HEADER.size + len(payload), kind, flags, 0, 0) + payload)
+    decoded.decode()
+    return decoded
 
 
 def _refusal(what: str, flags: int, payload: bytes) -> NetlinkError | None:

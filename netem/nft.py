@@ -4,13 +4,18 @@ Rules stand in the forward hook of the bridge, which sees every packet whatever 
 receiver: the switch has copied a broadcast already, so each receiver draws its own lot. A packet is first
 marked with the group of the port it came from, then judged in its receiver's chain:
 
-    chain forward { meta mark set iifname map @group;  oifname vmap { "v7" : jump to_v7, ... } }
-    chain to_v7   { meta mark != 2 counter name "cut_v7" drop
-                    numgen random mod 1000000000 < 150000000 counter name "lost_v7" drop
+    chain forward { meta mark set iifname map @group
+                    oifname vmap { "v7" : jump cut_v7, ... }
+                    oifname vmap { "v7" : jump to_v7, ... } }
+    chain cut_v7  { meta mark != 2 counter name "cut_v7" drop }
+    chain to_v7   { iifname vmap { "v3" : goto to_v7_1, ... }
+                    goto to_v7_0 }
+    chain to_v7_0 { numgen random mod 1000000000 < 150000000 counter name "lost_v7" drop
                     counter name "passed_v7" }
 
-so the cost of a packet does not grow with the number of vehicles. A change is one nft transaction: no
-packet meets half of it. The counters are objects of their own and outlive the rules.
+so the cost of a packet does not grow with the number of vehicles. Chain 0 is for all senders but those whose
+loss differs; there is one more for each loss that differs. A change is one nft transaction: no packet meets
+half of it. The counters are objects of their own and outlive the rules.
 See nft(8) and libnftables-json(5).
 """
 
@@ -19,6 +24,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from collections.abc import Iterator
 from typing import Any
 
 from netem import addresses
@@ -26,9 +32,13 @@ from netem.conditions import NetworkConditions
 from netem.engine import Applied, Engine, ReceiverFigures
 from netem.errors import EngineError
 from netem.fabric import Fabric
+from netem.link import LinkConditions
 
 _TABLE = {"family": "bridge", "table": "air"}
 _MODULUS = 1_000_000_000
+_FROM = {"meta": {"key": "iifname"}}
+_TO = {"meta": {"key": "oifname"}}
+_STAGES = ("cut", "to")
 _COUNTERS = ("passed", "lost", "cut")
 _PATH = "/usr/sbin:/sbin:/usr/bin:/bin:/usr/local/sbin"  # an ordinary user's PATH has no sbin
 _STDIN = ["-f", "/proc/self/fd/0"]  # what "-" means to nft, /dev/stdin, is not there in every container
@@ -36,9 +46,10 @@ _DEADLINE_S = 20.0
 
 
 class NftablesEngine(Engine):
-    """Loss per receiver and partitions; neither delay nor anything else that needs a queue."""
+    """Independent loss per sender and receiver, and partitions; nothing that needs a queue or a memory."""
 
     name = "nftables"
+    has_queues = False
 
     def __init__(self, fabric: Fabric) -> None:
         super().__init__(fabric)
@@ -48,51 +59,61 @@ class NftablesEngine(Engine):
         self._tool = tool
         self._ports = [addresses.port(vehicle) for vehicle in self._vehicles]
         hook = {"type": "filter", "hook": "forward", "prio": 0, "policy": "accept"}
+        lookup = {"map": {"key": _FROM, "data": "@group"}}
         commands = [
             _add("table", family="bridge", name="air"),
             _add("map", **_TABLE, name="group", type="ifname", map="mark"),
             _add("chain", **_TABLE, name="forward", **hook),
+            _rule("forward", {"mangle": {"key": {"meta": {"key": "mark"}}, "value": lookup}}),
         ]
         for port in self._ports:
             commands += [_add("counter", **_TABLE, name=f"{kind}_{port}") for kind in _COUNTERS]
-            commands.append(_add("chain", **_TABLE, name=f"to_{port}"))
-        self._run(_STDIN, commands + self._rules(NetworkConditions()))
+            commands += [_add("chain", **_TABLE, name=f"{stage}_{port}") for stage in _STAGES]
+        for stage in _STAGES:
+            jumps = [[port, {"jump": {"target": f"{stage}_{port}"}}] for port in self._ports]
+            commands.append(_rule("forward", {"vmap": {"key": _TO, "data": {"set": jumps}}}))
+        self._run(_STDIN, commands)
+        self._lossy: NetworkConditions | None = None  # what the rules of loss stand for
+        self.change(NetworkConditions())
 
     def change(self, conditions: NetworkConditions) -> None:
-        emptied: list[dict[str, Any]] = [
-            {"flush": {"table": {"family": "bridge", "name": "air"}}},
-            {"flush": {"map": {**_TABLE, "name": "group"}}},
-        ]
-        self._run(_STDIN, emptied + self._rules(conditions))
+        lossy = conditions.healed()
+        commands = self._partition(conditions)
+        if lossy != self._lossy:  # a partition alone is quick
+            commands += self._loss(conditions)
+        self._run(_STDIN, commands)
+        self._lossy = lossy
 
-    def _rules(self, conditions: NetworkConditions) -> list[dict[str, Any]]:
+    def _partition(self, conditions: NetworkConditions) -> list[dict[str, Any]]:
         groups = conditions.groups(self._vehicles)
         mark = {vehicle: number for number, group in enumerate(groups, 1) for vehicle in group}
-        commands = []
-        if len(groups) > 1:
-            elements = [[addresses.port(vehicle), mark[vehicle]] for vehicle in self._vehicles]
-            commands.append(_add("element", **_TABLE, name="group", elem=elements))
-            lookup = {"map": {"key": {"meta": {"key": "iifname"}}, "data": "@group"}}
-            commands.append(_rule("forward", {"mangle": {"key": {"meta": {"key": "mark"}}, "value": lookup}}))
-        jumps = [[port, {"jump": {"target": f"to_{port}"}}] for port in self._ports]
-        key = {"meta": {"key": "oifname"}}
-        commands.append(_rule("forward", {"vmap": {"key": key, "data": {"set": jumps}}}))
+        elements = [[addresses.port(vehicle), mark[vehicle]] for vehicle in self._vehicles]
+        commands = [_flush("map", "group"), _add("element", **_TABLE, name="group", elem=elements)]
         for vehicle, port in zip(self._vehicles, self._ports, strict=True):
-            chain = f"to_{port}"
+            commands.append(_flush("chain", f"cut_{port}"))
             if len(groups) > 1:
                 other = _match("!=", {"meta": {"key": "mark"}}, mark[vehicle])
-                commands.append(_rule(chain, other, {"counter": f"cut_{port}"}, {"drop": None}))
-            # What is neither 0 nor 1 must not become it by rounding.
-            loss = conditions.link(vehicle, vehicle).independent_loss
-            threshold = round(loss * _MODULUS)
-            if loss == 1.0:
-                commands.append(_rule(chain, {"counter": f"lost_{port}"}, {"drop": None}))
-            elif loss > 0.0:
-                threshold = min(max(threshold, 1), _MODULUS - 1)
-                lot = {"numgen": {"mode": "random", "mod": _MODULUS, "offset": 0}}
-                drawn = _match("<", lot, threshold)
-                commands.append(_rule(chain, drawn, {"counter": f"lost_{port}"}, {"drop": None}))
-            commands.append(_rule(chain, {"counter": f"passed_{port}"}))
+                commands.append(_rule(f"cut_{port}", other, {"counter": f"cut_{port}"}, {"drop": None}))
+        return commands
+
+    def _loss(self, conditions: NetworkConditions) -> list[dict[str, Any]]:
+        differing: dict[int, dict[float, list[int]]] = {}
+        for sender, receiver, link in conditions.differing_links():
+            differing.setdefault(receiver, {}).setdefault(link.independent_loss, []).append(sender)
+        commands = []
+        for vehicle, port in zip(self._vehicles, self._ports, strict=True):
+            chain = f"to_{port}"
+            commands.append(_flush("chain", chain))
+            usual = conditions.link(vehicle, vehicle).independent_loss
+            losses = {usual: [], **differing.get(vehicle, {})}
+            elements = []
+            for number, (loss, senders) in enumerate(losses.items()):
+                lots = f"{chain}_{number}"
+                commands += [_add("chain", **_TABLE, name=lots), _flush("chain", lots), *_lots(lots, port, loss)]
+                elements += [[addresses.port(sender), {"goto": {"target": lots}}] for sender in senders]
+            if elements:
+                commands.append(_rule(chain, {"vmap": {"key": _FROM, "data": {"set": elements}}}))
+            commands.append(_rule(chain, {"goto": {"target": f"{chain}_0"}}))
         return commands
 
     def read(self) -> Applied:
@@ -107,15 +128,27 @@ class NftablesEngine(Engine):
                 marks = dict(mapping.get("elem", []))
             elif rule := item.get("rule"):
                 rules.setdefault(rule["chain"], []).append(rule["expr"])
-        judged = _judged(rules.get("forward", []))
+        # A chain that nothing jumps to does nothing, whatever it says.
+        jumps = set(_verdicts(rules.get("forward", [])))
+        marking = any("mangle" in expression for expressions in rules.get("forward", []) for expression in expressions)
+        senders = {addresses.port(sender): sender for sender in self._vehicles}
         receivers = {}
         for vehicle, port in zip(self._vehicles, self._ports, strict=True):
-            # A chain that nothing jumps to does nothing, whatever it says.
-            loss, mark = _translate(rules.get(f"to_{port}", []) if port in judged else [])
-            cut_from = [s for s in self._vehicles if mark is not None and marks[addresses.port(s)] != mark]
-            receivers[vehicle] = ReceiverFigures(
-                loss, tuple(cut_from), *(counts[f"{kind}_{port}"] for kind in _COUNTERS)
+            cut, own = (
+                rules.get(name, []) if (port, name) in jumps else []
+                for name in (f"{stage}_{port}" for stage in _STAGES)
             )
+            mark = _only_mark(cut) if marking else None
+            cut_from = [s for s in self._vehicles if mark is not None and marks[addresses.port(s)] != mark]
+            differing = dict(_verdicts(own))
+            usual = next((e["goto"]["target"] for expressions in own for e in expressions if "goto" in e), "")
+            held = {
+                sender: LinkConditions(_loss(rules.get(differing.get(name, usual), [])))
+                for name, sender in senders.items()
+                if name != port or len(senders) == 1
+            }
+            counted = (counts[f"{kind}_{port}"] for kind in _COUNTERS)
+            receivers[vehicle] = ReceiverFigures.of(held, tuple(cut_from), *counted)
         return Applied(self.name, receivers)
 
     def _run(self, arguments: list[str], commands: list[dict[str, Any]] | None = None) -> str:
@@ -141,6 +174,10 @@ def _add(kind: str, **what: Any) -> dict[str, Any]:
     return {"add": {kind: what}}
 
 
+def _flush(kind: str, name: str) -> dict[str, Any]:
+    return {"flush": {kind: {**_TABLE, "name": name}}}
+
+
 def _rule(chain: str, *expressions: dict[str, Any]) -> dict[str, Any]:
     return _add("rule", **_TABLE, chain=chain, expr=list(expressions))
 
@@ -149,29 +186,39 @@ def _match(operator: str, left: dict[str, Any], right: int) -> dict[str, Any]:
     return {"match": {"op": operator, "left": left, "right": right}}
 
 
-def _judged(forward: list[list[dict[str, Any]]]) -> set[str]:
-    """The ports whose packets are sent to their receiver's chain."""
-    return {
-        element[0]
-        for expressions in forward
-        for expression in expressions
-        if "vmap" in expression
-        for element in expression["vmap"]["data"]["set"]
-    }
+def _lots(chain: str, port: str, loss: float) -> list[dict[str, Any]]:
+    """Rules that lose packets to a port with this probability, and let the others through."""
+    drop: list[dict[str, Any]] = [{"counter": f"lost_{port}"}, {"drop": None}]
+    if loss == 1.0:
+        return [_rule(chain, *drop)]
+    rules = []
+    if loss > 0.0:
+        # What is neither 0 nor 1 must not become it by rounding.
+        threshold = min(max(round(loss * _MODULUS), 1), _MODULUS - 1)
+        lot = {"numgen": {"mode": "random", "mod": _MODULUS, "offset": 0}}
+        rules.append(_rule(chain, _match("<", lot, threshold), *drop))
+    return [*rules, _rule(chain, {"counter": f"passed_{port}"})]
 
 
-def _translate(rules: list[list[dict[str, Any]]]) -> tuple[float, int | None]:
-    """The loss that a receiver's rules make, and the mark of the only group they let in (None: all)."""
-    loss = 0.0
-    mark = None
+def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
+    """The chain that each port's packets are sent to by verdict maps."""
     for expressions in rules:
-        if not any("drop" in expression for expression in expressions):
-            continue
-        matches = [expression["match"] for expression in expressions if "match" in expression]
-        if not matches:
-            loss = 1.0
-        elif "numgen" in matches[0]["left"]:
-            loss = matches[0]["right"] / matches[0]["left"]["numgen"]["mod"]
-        else:
-            mark = matches[0]["right"]
-    return loss, mark
+        for expression in expressions:
+            if "vmap" in expression:
+                for port, verdict in expression["vmap"]["data"]["set"]:
+                    yield port, next(iter(verdict.values()))["target"]
+
+
+def _only_mark(rules: list[list[dict[str, Any]]]) -> int | None:
+    """The mark of the only group that a receiver's rules let in (None: all)."""
+    marks = [e["match"]["right"] for expressions in rules for e in expressions if "match" in e]
+    return marks[0] if marks else None
+
+
+def _loss(rules: list[list[dict[str, Any]]]) -> float:
+    """The loss that rules with lots make."""
+    for expressions in rules:
+        if any("drop" in expression for expression in expressions):
+            matches = [expression["match"] for expression in expressions if "match" in expression]
+            return matches[0]["right"] / matches[0]["left"]["numgen"]["mod"] if matches else 1.0
+    return 0.0

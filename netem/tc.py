@@ -1,33 +1,46 @@
 """Engine "netem": Linux netem at the switch ports, over netlink, where the kernel has sch_netem.
 
-On the port that leads to a receiver stands an HTB whose classes hold one netem each; the packet's
-priority picks the class. It is set where the packet enters the switch, by an action on its sender's port,
-and names the sender's *kind*: senders of one kind are treated alike by everybody. Today a kind is a group
-of a partition; conditions per pair would make kinds smaller, down to one per sender, without another
-shape. A class only exists for a kind that the receiver hears, and all else falls into the default class,
-whose netem loses everything:
+A packet is marked where it enters the switch, by its sender's port, with two numbers: the group of a partition that
+its sender is in, and the sender's *kind*: senders of one kind are treated alike by every receiver. On the port that
+leads to a receiver it passes two stages: what comes from another group is dropped, and then an HTB picks the class of
+its kind, which holds one netem:
 
-    v7 ingress  matchall  skbedit priority 1:2            vehicle 7 is of kind 2
-    v7 root     htb 1: default 7ffe
-                  class 1:2     netem loss 15 %           what 7 hears of its own group
-                  class 1:7ffe  netem loss 100 %          and of the others
+    v7 ingress  basic   skbedit priority 1:2 mark 1       vehicle 7 is of kind 2 and in group 1
+    v7 egress   fw 1    pass                              vehicle 7 hears group 1
+                basic   drop                              and nobody else
+    v7 root     htb 1:
+                  class 1:1     netem loss 15 %           what 7 hears of kind 1
+                  class 1:3     netem delay 100 ms        what 7 hears of kind 3
 
-A switch sees a packet once per receiver, so each receiver draws its own lot. A change of figures changes
-the netem in place. A change of kinds first adds the new classes, then moves the senders over one by one,
-then takes the old classes away: nobody is ever in no class.
-See tc-netem(8), tc-htb(8), tc-skbedit(8).
+A switch sees a packet once per receiver, so each receiver draws its own lot. Where a link remembers (bursts, rate,
+limit) every sender is a kind of its own, for its packets alone count.
+
+A change of figures changes the netem in place: its queue stays, and others are not touched. A change of kinds first
+adds the new classes, then moves the senders over one by one; the old classes go when the last packet has left them. A
+partition touches no class at all: receivers first hear the new groups too, then the senders move over one by one, then
+the old groups are heard no more. So each pair is at all times treated as before or as after, and time grows with the
+number of vehicles, not of pairs.
+
+Since 2025 (6.1.148, 6.6.102, 6.12.42, 6.16.1) Linux has a netem that duplicates stand alone at its port: duplication
+is then refused where a receiver does not hear all senders alike, and where links remember.
+See tc-netem(8), tc-htb(8), tc-skbedit(8), tc-fw(8).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from errno import ENOENT
 
-from netem.conditions import LinkConditions, NetworkConditions
+from netem.conditions import NetworkConditions
 from netem.engine import Applied, Engine, ReceiverFigures
 from netem.errors import EngineError, NetlinkError
 from netem.fabric import Fabric
+from netem.link import Distribution, LinkConditions
 from netem.netlink import Netlink, Request
-from netem.tc_requests import CUT, Counters, TrafficControl
+from netem.tc_requests import MAX_KIND, Class, TrafficControl
+
+_Numbers = dict[frozenset[int], int]
 
 
 @dataclass
@@ -38,28 +51,42 @@ class _Totals:
     lost: int = 0
 
 
+@dataclass
+class _Holds:
+    """What a class was last told; None if nobody knows, for the kernel refused. `distribution`: whose table it has."""
+
+    link: LinkConditions | None
+    distribution: Distribution = "uniform"
+
+
 class NetemEngine(Engine):
-    """Everything that netem can do, per kind of sender and receiver; today loss and partitions."""
+    """Everything that netem can do, per sender and receiver."""
 
     name = "netem"
+    has_queues = True
 
     def __init__(self, fabric: Fabric) -> None:
         super().__init__(fabric)
         self._netlink: Netlink = fabric.netlink
         self._ports = {vehicle: TrafficControl(fabric.port_index(vehicle)) for vehicle in self._vehicles}
         self._gone = {vehicle: _Totals() for vehicle in self._vehicles}
-        self._kinds: dict[frozenset[int], int] = {}
-        self._entrance: dict[int, int] = {}  # sender -> priority of its filter in force, 1 or 2
+        self._kinds: _Numbers = {}
+        self._groups: _Numbers = {}
+        self._figured: NetworkConditions | None = None  # what the classes stand for; None if nobody knows
+        # As the kernel has them: the kind and group of each sender, and the groups that each receiver hears.
+        self._marks: dict[int, tuple[int, int] | None] = dict.fromkeys(self._vehicles)
+        self._hears: dict[int, set[int]] = {vehicle: set() for vehicle in self._vehicles}
+        self._classes: dict[int, dict[int, _Holds]] = {vehicle: {} for vehicle in self._vehicles}
         first = self._ports[self._vehicles[0]]
         try:
             # One port first: a kernel that cannot is left as it was.
             try:
                 self._netlink.send([*first.install(), *first.add_class(1, LinkConditions())])
-                self._netlink.send([first.mark(1, priority=1)])
+                self._netlink.send([*first.guard(), first.hear(1), first.mark(1, group=1)])
             finally:
                 self._remove(first)
             for port in self._ports.values():
-                self._netlink.send(port.install())
+                self._netlink.send([*port.install(), *port.guard()])
         except NetlinkError as error:
             raise EngineError(f"this kernel cannot {error}") from error
         self.change(NetworkConditions())
@@ -75,74 +102,172 @@ class NetemEngine(Engine):
         try:
             self._change(conditions)
         except NetlinkError as error:
+            self._marks, heard = self._filters()
+            self._hears = {vehicle: groups for vehicle, (groups, _) in heard.items()}
             raise EngineError(f"The kernel refused a change: {error}") from error
 
     def _change(self, conditions: NetworkConditions) -> None:
-        old = {vehicle: kind for group, kind in self._kinds.items() for vehicle in group}
-        kinds = self._number(conditions.groups(self._vehicles))
-        new = {vehicle: kind for group, kind in kinds.items() for vehicle in group}
-        moved = [vehicle for vehicle in self._vehicles if old.get(vehicle) != new[vehicle]]
-        figures: list[Request] = []
-        for vehicle, port in self._ports.items():
-            link = conditions.link(vehicle, vehicle)
-            if vehicle in moved:
-                figures += port.add_class(new[vehicle], link)
-            else:
-                figures.append(port.change_class(new[vehicle], link))
-        self._netlink.send(figures)
-        if not moved:
+        groups = _number(conditions.groups(self._vehicles), self._groups, self._groups.values())
+        figures = conditions.healed()
+        if figures == self._figured:
+            self._move(self._kinds, groups)  # at once: this is a partition, and nothing else
             return
-        for vehicle in moved:
-            # The filter of priority 1 wins. Whether it is the new one that comes or the old one that
-            # goes, one request moves the sender over.
-            port, entrance = self._ports[vehicle], self._entrance.get(vehicle)
-            self._entrance[vehicle] = 2 if entrance == 1 else 1
-            requests = [port.mark(new[vehicle], self._entrance[vehicle])]
-            if entrance is not None:
-                requests.append(port.unmark(entrance))
-            self._netlink.send(requests)
-        self._kinds = kinds
-        self._retire({vehicle: old[vehicle] for vehicle in moved if vehicle in old})
+        self._figured = None
+        classes = {kind for held in self._classes.values() for kind in held}
+        kinds = _number(_kinds(conditions, self._vehicles), self._kinds, classes)
+        wanted = {vehicle: _classes(conditions, kinds, vehicle) for vehicle in self._vehicles}
+        alone = []
+        for receiver, links in wanted.items():
+            held = self._classes[receiver]
+            leaving = {kind: it.link for kind, it in held.items() if kind not in links and it.link is not None}
+            first = links
+            if leaving and any(link.duplicate for link in (*leaving.values(), *links.values())):
+                # New classes meet old ones, and a netem that duplicates would have to be alone (see the module):
+                # for the moment nobody duplicates, and the old ones do not wait for their last packet.
+                alone.append(receiver)
+                first = {kind: replace(link, duplicate=0.0) for kind, link in (leaving | links).items()}
+            self._set(receiver, first)
+        self._move(kinds, groups)
+        self._retire(lambda receiver, found: not found.waiting or receiver in alone)
+        for receiver in alone:
+            self._set(receiver, wanted[receiver])
+        self._figured = figures
 
-    def _number(self, groups: tuple[frozenset[int], ...]) -> dict[frozenset[int], int]:
-        """Kinds for groups: a group that stays keeps its number, and no number changes its meaning."""
-        taken = set(self._kinds.values())
-        free = (number for number in range(1, CUT) if number not in taken)
-        return {group: self._kinds[group] if group in self._kinds else next(free) for group in groups}
+    def _set(self, receiver: int, links: dict[int, LinkConditions]) -> None:
+        """Have the receiver's port treat each kind like this; asks the kernel only for what differs."""
+        port, held = self._ports[receiver], self._classes[receiver]
+        requests: list[Request] = []
+        changed: dict[int, _Holds] = {}
+        for kind, link in links.items():
+            before = held.get(kind)
+            if before is not None and before.link == link:
+                continue
+            shape = link.delay.distribution if link.delay and link.delay.jitter_s else None
+            known = before is not None and before.link is not None
+            table = shape is not None and not (before and known and before.distribution == shape)
+            request = port.change_class(kind, link, table=table)
+            requests += [request] if known else port.add_class(kind, link)
+            changed[kind] = _Holds(link, shape or (before.distribution if before else "uniform"))
+        held.update({kind: replace(it, link=None) for kind, it in changed.items()})
+        self._netlink.send(requests)
+        held.update(changed)
 
-    def _retire(self, classes: dict[int, int]) -> None:
-        """Remove classes that nobody uses any more, and remember what they counted."""
-        if not classes:
+    def _move(self, kinds: _Numbers, groups: _Numbers) -> None:
+        """Bring all senders from their old kinds and groups to the new ones."""
+        kind, group = _numbers(kinds), _numbers(groups)
+        new = {vehicle: (kind[vehicle], group[vehicle]) for vehicle in self._vehicles}
+        hears = [vehicle for vehicle in self._vehicles if group[vehicle] not in self._hears[vehicle]]
+        self._netlink.send([self._ports[vehicle].hear(group[vehicle]) for vehicle in hears])
+        moved = [vehicle for vehicle in self._vehicles if self._marks[vehicle] != new[vehicle]]
+        self._netlink.send([self._ports[vehicle].mark(*new[vehicle]) for vehicle in moved])
+        old = [(v, other) for v, heard in self._hears.items() for other in heard if other != group[v]]
+        self._netlink.send([self._ports[vehicle].hear_no_more(other) for vehicle, other in old])
+        self._kinds, self._groups, self._marks = kinds, groups, {**new}
+        self._hears = {vehicle: {group[vehicle]} for vehicle in self._vehicles}
+
+    def _retire(self, gone: Callable[[int, Class], bool]) -> None:
+        """Remove classes that nobody uses any more if they are `gone`, and remember what they counted."""
+        used = set(self._kinds.values())
+        unused = {v: unused for v, held in self._classes.items() if (unused := [k for k in held if k not in used])}
+        if not unused:
             return
-        counters = self._counters()
-        for vehicle, kind in classes.items():
-            count = counters[vehicle].get(kind, Counters())
-            self._gone[vehicle].passed += count.passed
-            self._gone[vehicle].lost += count.dropped
-        self._netlink.send([self._ports[vehicle].remove_class(kind) for vehicle, kind in classes.items()])
+        found = self._found()
+        for receiver, kinds in unused.items():
+            for kind in kinds:
+                counted = found[receiver].get(kind)
+                if counted is not None and not gone(receiver, counted):
+                    continue
+                try:
+                    self._netlink.send([self._ports[receiver].remove_class(kind)])
+                except NetlinkError as error:
+                    if error.errno != ENOENT:  # of a change that was refused, not everything came to be
+                        raise
+                del self._classes[receiver][kind]
+                if counted is not None:
+                    self._gone[receiver].passed += counted.passed
+                    self._gone[receiver].lost += counted.dropped
 
-    def _counters(self) -> dict[int, dict[int, Counters]]:
+    def _found(self) -> dict[int, dict[int, Class]]:
+        """What classes each receiver's port has."""
         found = TrafficControl.classes(self._netlink)
         return {vehicle: found.get(port.index, {}) for vehicle, port in self._ports.items()}
 
+    def _filters(self) -> tuple[dict[int, tuple[int, int] | None], dict[int, tuple[set[int], int]]]:
+        """What each port marks and hears."""
+        marks = {vehicle: port.marked(self._netlink) for vehicle, port in self._ports.items()}
+        return marks, {vehicle: port.heard(self._netlink) for vehicle, port in self._ports.items()}
+
     def read(self) -> Applied:
         try:
-            counters = self._counters()
-            kinds = {vehicle: port.marked(self._netlink) for vehicle, port in self._ports.items()}
+            self._retire(lambda _, found: not found.waiting)
+            found = self._found()
+            marks, heard = self._filters()
         except NetlinkError as error:
             raise EngineError(f"The kernel did not say what it holds: {error}") from error
-        receivers = {}
-        for vehicle in self._vehicles:
-            heard = {kind: count for kind, count in counters[vehicle].items() if kind != CUT}
-            cut_from = tuple(s for s in self._vehicles if s != vehicle and kinds[s] not in heard)
-            gone = self._gone[vehicle]
-            receivers[vehicle] = ReceiverFigures(
-                # One class per receiver while conditions are the receiver's; if there are more, the
-                # worst is the one to show.
-                loss=max((count.loss for count in heard.values()), default=1.0),
-                cut_from=cut_from,
-                passed=gone.passed + sum(count.passed for count in heard.values()),
-                lost=gone.lost + sum(count.dropped for count in heard.values()),
-                cut=counters[vehicle].get(CUT, Counters()).dropped,
-            )
-        return Applied(self.name, receivers)
+        return Applied(self.name, {v: self._figures(v, found[v], marks, *heard[v]) for v in self._vehicles})
+
+    def _figures(
+        self,
+        receiver: int,
+        classes: dict[int, Class],
+        marks: dict[int, tuple[int, int] | None],
+        groups: set[int],
+        cut: int,
+    ) -> ReceiverFigures:
+        held: dict[int, LinkConditions] = {}
+        cut_from = []
+        for sender, mark in marks.items():
+            if sender == receiver and len(marks) > 1:
+                continue
+            kind, group = mark or (0, 0)
+            if sender != receiver and group not in groups:
+                cut_from.append(sender)
+            if kind in classes:
+                held[sender] = self._with_distribution(classes[kind].link, receiver, kind)
+            else:
+                held[sender] = LinkConditions()  # an HTB passes what it has no class for
+        gone = self._gone[receiver]
+        passed = gone.passed + sum(one.passed for one in classes.values())
+        lost = gone.lost + sum(one.dropped for one in classes.values())
+        return ReceiverFigures.of(held, tuple(cut_from), passed, lost, cut)
+
+    def _with_distribution(self, link: LinkConditions, receiver: int, kind: int) -> LinkConditions:
+        """What the kernel says, and whose table it was given, of which it does not speak."""
+        holds = self._classes[receiver].get(kind)
+        if link.delay is None or not link.delay.jitter_s or holds is None or holds.distribution == "uniform":
+            return link
+        return replace(link, delay=replace(link.delay, distribution=holds.distribution))
+
+
+def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[frozenset[int]]:
+    """Senders whom every receiver treats alike, together."""
+    shared = (conditions.default, *conditions.receivers.values())
+    own: dict[int, list[object]] = {vehicle: [] for vehicle in vehicles}
+    for sender, receiver, link in conditions.differing_links():
+        own[sender].append((receiver, link))
+    memories = {sender for (sender, _), link in conditions.links.items() if link.remembers}
+    if any(link.remembers for link in shared):
+        memories = set(vehicles)
+    members: dict[object, set[int]] = {}
+    for vehicle, differing in own.items():
+        key = vehicle if vehicle in memories else tuple(differing)
+        members.setdefault(key, set()).add(vehicle)
+    return [frozenset(kind) for kind in members.values()]
+
+
+def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> dict[int, LinkConditions]:
+    """What a receiver does to each kind that it can hear; alone in the lab, to its own."""
+    senders = {number: next((v for v in kind if v != receiver), None) for kind, number in kinds.items()}
+    found = {n: conditions.link(sender, receiver) for n, sender in senders.items() if sender is not None}
+    return found or {n: conditions.link(receiver, receiver) for n in senders}
+
+
+def _number(sets: Iterable[frozenset[int]], before: _Numbers, taken: Iterable[int]) -> _Numbers:
+    """Numbers for sets of vehicles: a set that stays keeps its number, and no number changes its meaning."""
+    used = {*taken, *before.values()}
+    free = (number for number in range(1, MAX_KIND) if number not in used)
+    return {members: before[members] if members in before else next(free) for members in sets}
+
+
+def _numbers(sets: _Numbers) -> dict[int, int]:
+    return {vehicle: number for members, number in sets.items() for vehicle in members}

@@ -14,7 +14,7 @@ import struct
 from collections import deque
 from typing import Any
 
-MAX_MESSAGE = 4 << 20  # bytes; figures of the largest swarms stay far below
+MAX_MESSAGE = 32 << 20  # bytes; conditions of 10,000 links are about 3 MB
 
 _LENGTH = struct.Struct("!I")
 _MAX_DESCRIPTORS = 64

@@ -5,8 +5,10 @@ stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and s
 """
 
 import asyncio
+import tempfile
 import time
 from collections.abc import Coroutine
+from pathlib import Path
 from typing import Any
 
 from harness import mission
@@ -19,7 +21,7 @@ from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.timeline import Change, NetworkChange, describe, timeline_of
 from netem.conditions import NetworkConditions
-from netem.errors import LabUnavailable, NetemError
+from netem.errors import ConditionsError, LabUnavailable, NetemError
 from netem.lab import Lab
 from sitl.vehicle import Home, VehicleKind, home_in_field
 from ucp.clock import MICROSECONDS, MissionClock
@@ -32,17 +34,48 @@ START_DELAY_S = 0.05
 def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
     """Raises ScenarioError naming the keys that real processes cannot be given yet."""
     faults = dict.fromkeys(entry.fault[0] for entry in scenario.timeline if entry.fault)
-    conditions = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
     keys = [
         *(["fates"] if scenario.fates else []),
         *(["clocks"] if scenario.clocks else []),
         *(["events.source: scripted"] if scenario.events.source == "scripted" else []),
         *(f"timeline: {fault}" for fault in faults),
-        *(f"network: {need}" for need in dict.fromkeys(need for state in conditions for need in state.needs())),
     ]
     if keys:
         named = ", ".join(f"`{key}`" for key in keys)
         raise ScenarioError(f"{named} need{'s' if len(keys) == 1 else ''} virtual time: use --backend sim")
+
+
+def network_needs(scenario: Scenario) -> list[str]:
+    """What the scenario asks of the network beyond loss and partition, each once.
+
+    Raises ScenarioError for conditions that mean nothing on a clock that runs at the scenario's speedup.
+    """
+    states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
+    try:
+        return list(dict.fromkeys(need for state in states for need in state.at_speed(scenario.speedup).needs()))
+    except ConditionsError as error:
+        raise ScenarioError(f"`network` at `speedup` {scenario.speedup:g}: {error}") from None
+
+
+def refuse_what_this_machine_cannot(scenario: Scenario) -> None:
+    """Raises MachineError, with the way out, if no engine here does what the network asks.
+
+    Tried in a lab of its own, for a fraction of a second, and only if it asks for more than loss and partitions.
+    """
+    if not (needs := network_needs(scenario)):
+        return
+
+    async def attempt(folder: str) -> None:
+        async with await Lab.open((1, 2), needs=needs, log=Path(folder, "lab.log")):
+            pass
+
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            asyncio.run(attempt(folder))
+        except LabUnavailable as error:
+            raise MachineError(str(error)) from None
+        except NetemError as error:
+            raise MachineError(f"the lab could not be built: {error}") from None
 
 
 class ProcessRun:
@@ -80,7 +113,7 @@ class ProcessRun:
     async def play(self) -> Played:
         """Raises MachineError if this machine cannot build the lab; all else that goes wrong is in the answer."""
         try:
-            lab = await Lab.open(self.scenario.roster, log=self.rundir.lab_log)
+            lab = await Lab.open(self.scenario.roster, needs=network_needs(self.scenario), log=self.rundir.lab_log)
         except LabUnavailable as error:
             raise MachineError(str(error)) from None
         except NetemError as error:
@@ -165,7 +198,7 @@ class ProcessRun:
 
     async def apply(self, change: Change) -> None:
         assert isinstance(change, NetworkChange), "others are refused"
-        applied = await self._lab.apply(change.conditions)
+        applied = await self._lab.apply(change.conditions.at_speed(self.scenario.speedup))
         self.network = change.detail
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
         self.played.record(record)

@@ -22,7 +22,7 @@ from harness.scenario.fates import Fate
 from harness.scenario.scenario import Clock
 from harness.scenario.timeline import FaultName
 from harness.seeds import agent_seed
-from harness.timeline import Change, NetworkChange, disconnected_until
+from harness.timeline import Change, NetworkChange, disconnected_until, timeline_of
 from netem.medium import Medium
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS
@@ -40,10 +40,13 @@ BREATH_S = 20.0
 
 def refuse_what_needs_processes(scenario: Scenario) -> None:
     """Raises ScenarioError naming the keys that virtual time cannot give."""
+    states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
+    needs = dict.fromkeys(need for state in states for need in state.needs())
     asked = {
         "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
         "vehicles.binary": scenario.vehicles.binary is not None,
         "agent_command": scenario.agent_command is not None,
+        **{f"network: {need}": need.split()[-1] in ("rate", "limit") for need in needs},  # a queue, which it has not
     }
     keys = [f"`{key}`" for key, needed in asked.items() if needed]
     if keys:

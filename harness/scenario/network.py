@@ -7,14 +7,14 @@ written.
 
 from collections.abc import Iterator, Mapping
 from itertools import product
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
 from harness.scenario.model import MAX_AGENTS, Model, Probability, VehicleId, VehicleKey
 from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
 from netem.errors import ConditionsError
-from netem.link import MAX_DELAY_S
+from netem.link import MAX_DELAY_S, MAX_LIMIT
 
 
 class Bursts(Model):
@@ -56,6 +56,16 @@ def _number_or(mapping: type[Model], number: Any) -> BeforeValidator:
     return BeforeValidator(choose)
 
 
+def _or_none(number: Any) -> BeforeValidator:
+    """For a union with the word none: an error speaks of the number alone."""
+    numbers = TypeAdapter(number)
+    return BeforeValidator(lambda value: value if value == "none" else numbers.validate_python(value))
+
+
+BitsPerSecond = Annotated[float, Field(ge=8, allow_inf_nan=False)]
+Packets = Annotated[int, Field(ge=1, le=MAX_LIMIT, strict=True)]
+Rate = Annotated[BitsPerSecond | Literal["none"], _or_none(BitsPerSecond)]
+Limit = Annotated[Packets | Literal["none"], _or_none(Packets)]
 Loss = Annotated[Probability | Bursts, _number_or(Bursts, Probability)]
 DelayTime = Annotated[DelaySeconds | Jitter, _number_or(Jitter, DelaySeconds)]
 Vehicles = Annotated[
@@ -74,6 +84,9 @@ class Difference(Model):
     delay: DelayTime | None = None
     duplicate: Probability | None = None
     reorder: Probability | None = None
+    corrupt: Probability | None = None
+    rate: Rate | None = None
+    limit: Limit | None = None
 
 
 class Receiver(Difference):
@@ -110,6 +123,12 @@ class NetworkModel(Model):
     """The probability that a message comes twice."""
     reorder: Probability = 0.0
     """The probability that a message overtakes: it is sent at once, without the delay."""
+    corrupt: Probability = 0.0
+    """The probability that one bit of a message flips, which its receiver notices and throws it away."""
+    rate: Rate = "none"
+    """Bits per mission second from each sender to each receiver, headers included."""
+    limit: Limit = "none"
+    """How many messages from one sender to one receiver may wait for delay or rate; what exceeds it is lost."""
     receivers: dict[VehicleKey, Receiver] = {}
     links: Annotated[list[Link], Field(max_length=10_000)] = []
 
@@ -156,6 +175,7 @@ def _conditions(where: str, *layers: NetworkModel | Difference | None) -> LinkCo
             if (value := getattr(layer, key, None)) is not None:
                 last[key] = value
     loss, delay = last["loss"], last["delay"]
+    last |= {key: None for key in ("rate", "limit") if last[key] == "none"}
     last["loss"] = GilbertElliott(**loss.model_dump()) if isinstance(loss, Bursts) else loss
     last["delay"] = Delay(**delay.model_dump()) if isinstance(delay, Jitter) else Delay(delay)
     try:

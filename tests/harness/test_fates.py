@@ -83,6 +83,8 @@ def test_a_fate_picks_messages_by_block_and_by_when_they_are_sent() -> None:
     by_block = arrivals(played([{"block": "1.2", "sender": 1, "drop": True}], script), 2, "Block Add Request")
     by_time = arrivals(played([{"from_s": 20, "until_s": 30, "drop": True}], script), 2, "Block Add Request")
     assert len(by_block) == len(by_time) == 1
+    early = played([{"message": "Block Add Request", "until_s": 3, "drop": True}])  # the request is sent at 3
+    assert len(arrivals(early, 2, "Block Add Request")) == 1
 
 
 def test_a_message_can_be_delayed_and_everything_from_an_agent_held() -> None:
@@ -92,6 +94,8 @@ def test_a_message_can_be_delayed_and_everything_from_an_agent_held() -> None:
     assert arrivals(held, 2, "Block Add Request") == [(30.0, 1)]
     assert arrivals(held, 2, "Commit Block") == [(30.0, 1)]
     assert len(held.evidence.exports[2].chain) == 1
+    ((at_s, _),) = arrivals(played([{"message": "Block Add Request", "hold_until_s": 1}]), 2, "Block Add Request")
+    assert 3.002 <= at_s <= 3.05
 
 
 def test_two_responses_can_be_delivered_in_either_order() -> None:

@@ -28,6 +28,9 @@ def test_a_killed_agent_is_gone_with_all_that_it_held() -> None:
     assert simulated.played.agents["2"]["outcome"] == "killed"
     assert max(run.t for run in simulated.evidence.traces[2].runs) <= 300
     assert verdicts(simulated) == {"holds"}
+    blocks, left = simulated.result.figures["blocks"], len(simulated.evidence.exports[1].chain)
+    gone = f"; {blocks - left} more were gone with the agents that were killed" if blocks != left else ""  # type: ignore[operator]
+    assert simulated.result.characteristics["5"].reason == f"all {left} completed blocks are in every chain{gone}"
 
 
 def test_blocks_that_only_a_killed_agent_held_are_told_and_no_violation() -> None:
@@ -49,6 +52,15 @@ def test_a_restarted_agent_begins_with_nothing_and_gets_everything_back() -> Non
     assert {run.changes[0][1] for run in first if run.branch == "full"}.isdisjoint(completed)
     assert len(simulated.evidence.exports[2].chain) >= 30
     assert verdicts(simulated) == {"holds"}
+
+
+def test_a_restarted_agent_hears_nothing_that_was_sent_before() -> None:
+    slow = {"delay": 10.0}
+    simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 301, "restart": [2]}], network=slow)
+    heard = [run.t for run in simulated.evidence.traces[2].runs if "message" in run.trigger]
+    assert not [t for t in heard if 300 < t < 311]
+    assert [t for t in heard if t < 300 or t > 311]
+    assert agent_seed(4, 2) != agent_seed(4, 2, life=2)
 
 
 def test_a_restarted_agent_logs_its_own_events_only() -> None:
@@ -73,6 +85,14 @@ def test_a_paused_agent_handles_what_waited_when_it_resumes() -> None:
     times = [run.t for run in simulated.evidence.traces[3].runs]
     assert not [t for t in times if 200 < t < 320]
     assert times.count(320) > 5
+    assert verdicts(simulated) == {"holds"}
+
+
+def test_a_vote_may_last_longer_while_its_agent_is_paused() -> None:
+    script = [{"at_s": at_s, "agent": 1} for at_s in (1, 2, 3)]
+    pause = [{"at_s": 5, "pause": [1]}, {"at_s": 60, "resume": [1]}]
+    simulated = played(pause, events={"source": "scripted", "script": script}, duration_s=100)
+    assert [run.t for run in simulated.evidence.traces[1].runs if run.handler == "vote_timer_expiration"] == [60]
     assert verdicts(simulated) == {"holds"}
 
 

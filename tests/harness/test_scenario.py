@@ -36,7 +36,8 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nspeedpu: 3", "`speedpu` is unknown: there are name, about, agents"),
         (
             "name: x\nnetwork: {lost: 1}",
-            "`network.lost` is unknown: there are loss, delay, duplicate, reorder, receivers, links",
+            "`network.lost` is unknown: there are loss, delay, duplicate, reorder, corrupt, rate, limit, "
+            "receivers, links",
         ),
         ("name: x\ntimeline: [{at_s: 1, heel: true}]", "`timeline.0.heel` is unknown"),
         ("agents: 3", "`name` is missing"),
@@ -59,6 +60,13 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nnetwork: {duplicate: 2}", "`network.duplicate` is 2: it should be less than or equal to 1"),
         ("name: x\nnetwork: {reorder: 0.1}", "reorder: 0.1 needs a delay to overtake"),
         ("name: x\nnetwork: {delay: 1, reorder: 0.1, receivers: {3: {delay: 0}}}", "receivers.3: reorder: 0.1 needs"),
+        ("name: x\nnetwork: {corrupt: -1}", "`network.corrupt` is -1: it should be greater than or equal to 0"),
+        ("name: x\nnetwork: {rate: 0}", "`network.rate` is 0: it should be greater than or equal to 8"),
+        ("name: x\nnetwork: {rate: 1mbit}", "`network.rate` is '1mbit': it should be a valid number"),
+        ("name: x\nnetwork: {rate: 1000, limit: 0}", "`network.limit` is 0: it should be greater than or equal to 1"),
+        ("name: x\nnetwork: {rate: 1000, limit: 1.5}", "`network.limit` is 1.5: it should be a valid integer"),
+        ("name: x\nnetwork: {limit: 10}", "limit: 10 needs a delay or a rate to wait for"),
+        ("name: x\nnetwork: {rate: 9, limit: 9, receivers: {3: {rate: none}}}", "receivers.3: limit: 9 needs a delay"),
         ("name: x\nnetwork: {receivers: {3: {los: 0}}}", "`network.receivers.3.los` is unknown: there are loss, delay"),
         ("name: x\nnetwork: {links: [{from: 1}]}", "`network.links.0.to` is missing"),
         ("name: x\nnetwork: {links: [{from: 1, to: []}]}", "`network.links.0.to` is []: List should have at least 1"),
@@ -184,8 +192,22 @@ def test_what_a_receiver_or_a_link_does_not_name_it_takes_from_the_layer_below(t
     assert conditions.link(5, 4) == LinkConditions(0)
 
 
+def test_a_layer_may_have_no_rate_where_the_layer_below_has_one(tmp_path: Path) -> None:
+    network = "{corrupt: 0.1, rate: 1e5, limit: 50, receivers: {2: {rate: none, limit: none}, 3: {rate: 9600}}}"
+    conditions = conditions_of(tmp_path, network)
+    assert conditions.default == LinkConditions(corrupt=0.1, rate=100_000, limit=50)
+    assert conditions.link(1, 2) == LinkConditions(corrupt=0.1)
+    assert conditions.link(1, 3) == LinkConditions(corrupt=0.1, rate=9600, limit=50)
+    assert describe(conditions) == (
+        "loss 0 %, corrupt 10 %, rate 100 kbit/s, limit 50 packets, no rate to 2, no limit to 2, rate 9.6 kbit/s to 3"
+    )
+
+
 def test_a_scenario_as_resolved_means_the_same_when_read_again(tmp_path: Path) -> None:
-    text = "{loss: {p: 0.1, r: 0.2}, receivers: {3: {delay: 1}}, links: [{from: 1, to: 3, loss: 0.9, both: true}]}"
+    text = (
+        "{loss: {p: 0.1, r: 0.2}, rate: 9600, receivers: {3: {delay: 1, rate: none}},"
+        " links: [{from: 1, to: 3, loss: 0.9, both: true}]}"
+    )
     scenario = load_scenario(write(tmp_path, f"name: x\nnetwork: {text}"))
     for document in (scenario.model_dump(), scenario.model_dump(mode="json", by_alias=True)):
         again = Scenario.model_validate(document)

@@ -11,7 +11,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from harness import checker
-from harness.errors import ScenarioError
+from harness.errors import MachineError, ScenarioError
 from harness.exports import read_export
 from harness.progress import Silent
 from harness.run import run
@@ -19,6 +19,7 @@ from harness.scenario import load_scenario
 from harness.simulate import Simulated, simulate
 from tests.harness.command import Running, sentences, write_scenario
 from tests.harness.virtual import scenario
+from tests.machine import require, unavailable
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
@@ -159,6 +160,11 @@ def test_a_seed_means_the_same_run_on_every_machine(name: str, seed: int, expect
     assert digest(simulate(one, seed, tracing=True)) == expected
 
 
+def test_chains_that_differ_never_became_one() -> None:
+    assert simulate(scenario(network={"loss": 1.0}), 1).result.figures["uniform_at_s"] is None
+    assert simulate(scenario(), 1).result.figures["uniform_at_s"]
+
+
 def test_another_seed_is_another_run() -> None:
     one = scenario(duration_s=300)
     assert digest(simulate(one, 1)) == digest(simulate(one, 1)) != digest(simulate(one, 2))
@@ -201,6 +207,7 @@ def test_every_scenario_that_runs_as_processes_runs_in_virtual_time(path: Path) 
     ("keys", "sentence"),
     [
         ({"vehicles": {"kind": "ardupilot"}}, "`vehicles.kind: ardupilot` needs real processes"),
+        ({"network": {"receivers": {3: {"rate": 1e6}}}}, "`network: receivers 3 rate` needs real processes"),
         ({"vehicles": {"binary": "/bin/x"}, "agent_command": ["x"]}, "`vehicles.binary`, `agent_command` need real"),
     ],
 )
@@ -215,7 +222,6 @@ def test_what_virtual_time_cannot_give_is_refused_by_its_keys(keys: dict[str, An
         ({"fates": [{"sender": 1, "drop": True}]}, "`fates` needs"),
         ({"clocks": {1: {"drift": 0.1}}, "events": {"source": "scripted"}}, "`clocks`, `events.source: scripted` need"),
         ({"timeline": [{"at_s": 1, "kill": [1]}]}, "`timeline: kill` needs"),
-        ({"network": {"delay": 1}}, "`network: delay` needs"),
     ],
 )
 def test_what_processes_cannot_be_given_yet_is_refused_by_its_keys(
@@ -224,6 +230,23 @@ def test_what_processes_cannot_be_given_yet_is_refused_by_its_keys(
     with pytest.raises(ScenarioError, match=f"{named} virtual time: use --backend sim"):
         run(scenario(**keys), 1, tmp_path / "run", Silent(), "process")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.lab
+def test_what_this_machine_cannot_do_to_packets_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    require(None)
+    if unavailable("netem") is None:
+        pytest.skip("this kernel has netem")
+    network = {"delay": 1, "receivers": {2: {"rate": 9600}}}
+    with pytest.raises(MachineError, match=r"Nothing does delay, receivers 2 rate here .*--backend sim") as caught:
+        run(scenario(network=network), 1, tmp_path / "run", Silent(), "process")
+    assert caught.value.exit_status == 3
+    assert not (tmp_path / "run").exists()
+
+
+def test_conditions_that_mean_nothing_at_the_speedup_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"`network` at `speedup` 0\.5: delay\.mean_s: 100\.0 is out of range"):
+        run(scenario(network={"delay": 50}, speedup=0.5), 1, tmp_path / "run", Silent(), "process")
 
 
 def test_ctrl_c_ends_a_long_simulation_with_everything_kept(tmp_path: Path) -> None:

@@ -30,6 +30,13 @@ def engine(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
+@pytest.fixture
+def netem() -> str:
+    """The engine that knows all conditions."""
+    require("netem")
+    return "netem"
+
+
 class Program:
     """A program of `air.py` that runs in a vehicle."""
 
@@ -79,8 +86,8 @@ class Air:
         program = await self.start(vehicle, *arguments)
         assert await asyncio.wait_for(program.process.wait(), 4 * DEADLINE_S) == 0, program.output.read_text()
 
-    async def broadcast(self, vehicle: int, count: int, first: int = 0) -> None:
-        await self.run(vehicle, "broadcast", PORT, count, first, self.lab.broadcast)
+    async def broadcast(self, vehicle: int, count: int, first: int = 0, size: int = 12) -> None:
+        await self.run(vehicle, "broadcast", PORT, count, first, self.lab.broadcast, size)
 
 
 def play(story: Coroutine[Any, Any, None]) -> None:

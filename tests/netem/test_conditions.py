@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from netem import addresses
 from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
-from netem.engine import Applied, Engine
+from netem.engine import Applied, Engine, ReceiverFigures
 from netem.errors import ConditionsError, EngineError, NetemError
 
 
@@ -51,6 +51,21 @@ def test_a_loss_in_percent_is_told_how_to_write_it() -> None:
         (lambda: LinkConditions(reorder=2, delay=Delay(1)), r"^reorder: 2 is not a probability"),
         (lambda: LinkConditions(reorder=0.1), r"^reorder: 0\.1 needs a delay"),
         (lambda: LinkConditions(delay=Delay(0), reorder=0.1), r"^reorder: 0\.1 needs a delay"),
+        (lambda: LinkConditions(corrupt=-0.1), r"^corrupt: -0\.1 is not a probability"),
+        (lambda: LinkConditions(rate=0), r"^rate: 0 is out of range; allowed is bits per second, 8 or more, or None"),
+        (lambda: LinkConditions(rate=-1e6), r"^rate: -1000000\.0 is out of range"),
+        (lambda: LinkConditions(rate=math.inf), r"^rate: inf is out of range"),
+        (lambda: LinkConditions(rate=math.nan), r"^rate: nan is not a number"),
+        (lambda: LinkConditions(rate="1mbit"), r"^rate: '1mbit' is not a number; allowed is bits per second"),
+        (lambda: LinkConditions(rate=True), r"^rate: True is not a number"),
+        (lambda: LinkConditions(rate=1e6, limit=0), r"^limit: 0 is out of range; allowed is a whole number of packets"),
+        (lambda: LinkConditions(rate=1e6, limit=2.5), r"^limit: 2\.5 is out of range"),
+        (lambda: LinkConditions(rate=1e6, limit=True), r"^limit: True is out of range"),
+        (lambda: LinkConditions(rate=1e6, limit=100_001), r"^limit: 100001 is out of range; allowed is .*1\.\.100000"),
+        (lambda: LinkConditions(limit=10), r"^limit: 10 needs a delay or a rate to wait for; allowed is None"),
+        (lambda: LinkConditions(delay=Delay(0), limit=10), r"^limit: 10 needs a delay or a rate"),
+        (lambda: NetworkConditions(LinkConditions(rate=8)).at_speed(0.5), r"^rate: 4\.0 is out of range"),
+        (lambda: NetworkConditions(LinkConditions(delay=Delay(60))).at_speed(0.5), r"^delay\.mean_s: 120\.0 is out of"),
         (lambda: NetworkConditions(links={(1, 1): LinkConditions()}), "^links: 1>1 leads to itself"),
         (lambda: NetworkConditions(links={(1, 0): LinkConditions()}), "^links: 0 is not a vehicle ID"),
         (lambda: NetworkConditions.from_json({"links": {"1-2": {}}}), "^links: '1-2' is not a link; .* \"1>2\""),
@@ -85,6 +100,24 @@ def test_lossless_means_that_nothing_is_ever_lost() -> None:
     assert not LinkConditions(GilbertElliott(0.5, 0.5)).lossless
     assert not LinkConditions(GilbertElliott(0.5, 0, 0, loss_good=0.1)).lossless  # mean 0, but not at first
     assert not LinkConditions(0.1).lossless
+    assert LinkConditions(rate=1e6).lossless
+    assert not LinkConditions(rate=1e6, limit=1000).lossless
+    assert not LinkConditions(corrupt=0.1).lossless
+
+
+def test_a_link_remembers_where_packets_before_count() -> None:
+    bursts = LinkConditions(GilbertElliott(0.1, 0.1))
+    assert all(it.remembers for it in (bursts, LinkConditions(rate=1e6), LinkConditions(delay=Delay(1), limit=5)))
+    assert not LinkConditions(0.1, Delay(0.1, 0.1), 0.1, 0.1, 0.1).remembers
+
+
+def test_at_speed_delays_shrink_rates_grow_and_nothing_else_changes() -> None:
+    link = LinkConditions(0.1, Delay(2, 1, "pareto"), 0.1, 0.2, 0.3, 1e6, 50)
+    fast = LinkConditions(0.1, Delay(0.1, 0.05, "pareto"), 0.1, 0.2, 0.3, 2e7, 50)
+    slow = NetworkConditions(link, {1: link}, {(1, 2): link}, ({3},))
+    assert slow.at_speed(20) == NetworkConditions(fast, {1: fast}, {(1, 2): fast}, ({3},))
+    assert slow.at_speed(1) is slow
+    assert NetworkConditions(LinkConditions(0.1)).at_speed(20) == NetworkConditions(LinkConditions(0.1))
 
 
 def test_a_link_comes_before_its_receiver_and_that_before_the_default() -> None:
@@ -109,15 +142,29 @@ def test_needs_name_what_goes_beyond_loss_and_partition_once_and_where() -> None
         "receivers 3 loss in bursts",
         "receivers 3 duplicate",
     )
-    lossy = {(1, 2): LinkConditions(0.2), (1, 3): LinkConditions(0.2), (2, 3): LinkConditions(0.2)}
-    assert NetworkConditions(links=lossy).needs() == ("links 1>2",)
-    # A link that says the same as its receiver needs nothing.
-    assert NetworkConditions(receivers={2: LinkConditions(0.2)}, links=lossy).needs() == ("links 1>3",)
-    assert NetworkConditions(LinkConditions(0.2), links=lossy).needs() == ()
+    links = {(1, 2): LinkConditions(0.2), (1, 3): both, (2, 3): both}
+    assert NetworkConditions(late, links=links).needs() == (
+        "delay",
+        "reorder",
+        "links 1>3 loss in bursts",
+        "links 1>3 duplicate",
+    )
+    slow = LinkConditions(corrupt=0.1, rate=1e6, limit=5)
+    assert NetworkConditions(slow).needs() == ("corrupt", "rate", "limit")
+
+
+def test_links_differ_where_they_are_not_as_their_receiver_is() -> None:
+    lossy = {pair: LinkConditions(0.2) for pair in ((1, 2), (1, 3), (2, 3))}
+    assert [*NetworkConditions(receivers={2: LinkConditions(0.2)}, links=lossy).differing_links()] == [
+        (1, 3, LinkConditions(0.2)),
+        (2, 3, LinkConditions(0.2)),
+    ]
+    assert [*NetworkConditions(LinkConditions(0.2), links=lossy).differing_links()] == []
 
 
 class _Untouchable(Engine):
     name = "untouchable"
+    has_queues = False
 
     def change(self, conditions: NetworkConditions) -> None:
         raise AssertionError("changed")
@@ -129,10 +176,10 @@ class _Untouchable(Engine):
 @pytest.mark.parametrize(
     ("conditions", "need"),
     [
-        (NetworkConditions(LinkConditions(GilbertElliott(0.1, 0.1))), "not yet loss in bursts;"),
-        (NetworkConditions(LinkConditions(delay=Delay(0.1), reorder=0.1)), "not yet delay, reorder;"),
-        (NetworkConditions(receivers={2: LinkConditions(duplicate=0.1)}), "not yet receivers 2 duplicate;"),
-        (NetworkConditions(links={(1, 2): LinkConditions(0.1)}), "not yet links 1>2;"),
+        (NetworkConditions(LinkConditions(GilbertElliott(0.1, 0.1))), "not loss in bursts;"),
+        (NetworkConditions(LinkConditions(delay=Delay(0.1), reorder=0.1)), "not delay, reorder;"),
+        (NetworkConditions(receivers={2: LinkConditions(duplicate=0.1)}), "not receivers 2 duplicate;"),
+        (NetworkConditions(links={(1, 2): LinkConditions(rate=1e6)}), "not links 1>2 rate;"),
     ],
 )
 def test_an_engine_refuses_what_it_cannot_do_before_it_changes_anything(
@@ -141,6 +188,70 @@ def test_an_engine_refuses_what_it_cannot_do_before_it_changes_anything(
     engine = _Untouchable(SimpleNamespace(vehicles=(1, 2)))  # type: ignore[arg-type]
     with pytest.raises(EngineError, match=f"^Engine untouchable .* {need} .*--backend sim"):
         engine.apply(conditions)
+
+
+class _Forgetful(Engine):
+    """Holds what it is told, but for what is `refused`; `stuck`: and then nothing else any more."""
+
+    name = "forgetful"
+    has_queues = True
+    refused = LinkConditions(0.9)
+    stuck = False
+
+    def change(self, conditions: NetworkConditions) -> None:
+        if conditions.default == self.refused:
+            self._held = NetworkConditions(LinkConditions(0.5))
+            raise EngineError("The kernel said no")
+        if not (self.stuck and hasattr(self, "_held")):
+            self._held = conditions
+
+    def read(self) -> Applied:
+        held = {sender: self._held.link(sender, 1) for sender in (2, 3)}
+        return Applied(self.name, {1: ReceiverFigures.of(held, (), 0, 0, 0)})
+
+
+def test_a_change_that_the_kernel_refuses_is_taken_back_and_the_error_says_so() -> None:
+    engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
+    engine.apply(NetworkConditions(LinkConditions(0.1)))
+    with pytest.raises(EngineError, match=r"^The kernel said no\. Asked: .*0\.9.*; in force again: .*0\.1"):
+        engine.apply(NetworkConditions(LinkConditions(0.9)))
+    assert engine.read().receivers[1].loss == 0.1
+
+
+def test_a_change_that_cannot_be_taken_back_is_told_with_what_is_in_force() -> None:
+    engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
+    engine.apply(NetworkConditions(LinkConditions(0.1)))
+    engine.stuck = True
+    word = r"said no\. Asked: .*0\.9.* could not be put back \(.*asked .*0\.1.*in force .*0\.5.*\); in force: .*0\.5"
+    with pytest.raises(EngineError, match=word):
+        engine.apply(NetworkConditions(LinkConditions(0.9)))
+
+
+@pytest.mark.parametrize(
+    ("asked", "held", "differing"),
+    [
+        (LinkConditions(0.1), LinkConditions(0.1 + 1e-9), None),
+        (LinkConditions(0.1), LinkConditions(0.1 + 2e-9), "loss"),
+        (LinkConditions(0.1), LinkConditions(GilbertElliott(0.1, 0.1)), "loss"),
+        (LinkConditions(delay=Delay(0.1)), LinkConditions(delay=Delay(0.1, 0, "normal")), None),
+        (LinkConditions(delay=Delay(0.1, 0.1)), LinkConditions(delay=Delay(0.1, 0.1, "normal")), "delay.distribution"),
+        (LinkConditions(delay=Delay(0.1)), LinkConditions(), "delay.mean_s"),
+        (LinkConditions(rate=1e6 + 3), LinkConditions(rate=1e6), None),
+        (LinkConditions(rate=1e6 + 9), LinkConditions(rate=1e6), "rate"),
+        (LinkConditions(rate=1e6), LinkConditions(rate=1e6, limit=100), "limit"),
+    ],
+)
+def test_what_is_held_is_what_was_asked_within_the_resolution(
+    asked: LinkConditions, held: LinkConditions, differing: str | None
+) -> None:
+    engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
+    engine.stuck = True
+    engine._held = NetworkConditions(held)
+    if differing is None:
+        engine.apply(NetworkConditions(asked))
+    else:
+        with pytest.raises(EngineError, match=f"does not hold the {differing}"):
+            engine.apply(NetworkConditions(asked))
 
 
 def test_loss_belongs_to_the_receiver() -> None:
@@ -216,8 +327,10 @@ _bursts = st.builds(GilbertElliott, _shares, _shares, _shares, _shares)
 _delays = st.floats(0.001, 60).flatmap(
     lambda mean_s: st.builds(Delay, st.just(mean_s), st.floats(0, mean_s), st.sampled_from(get_args(Distribution)))
 )
-_links = st.builds(LinkConditions, _shares | _bursts, st.none(), _shares) | st.builds(
-    LinkConditions, _shares | _bursts, _delays, _shares, _shares
+_rates = st.none() | st.floats(8, 1e12)
+_limits = st.none() | st.integers(1, 100_000)
+_links = st.builds(LinkConditions, _shares | _bursts, st.none(), _shares, corrupt=_shares, rate=_rates) | st.builds(
+    LinkConditions, _shares | _bursts, _delays, _shares, _shares, _shares, _rates, _limits
 )
 _vehicles = st.integers(1, 65535)
 _pairs = st.tuples(_vehicles, _vehicles).filter(lambda pair: pair[0] != pair[1])

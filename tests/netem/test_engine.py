@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import itertools
+import time
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -12,7 +16,7 @@ from netem import addresses
 from netem.conditions import LinkConditions, NetworkConditions
 from netem.errors import ConditionsError
 from netem.lab import Lab
-from tests.netem.conftest import PACKETS, PORT, Air, assert_binomial, play
+from tests.netem.conftest import DEADLINE_S, PACKETS, PORT, Air, assert_binomial, play
 
 pytestmark = pytest.mark.lab
 
@@ -116,6 +120,95 @@ def test_nothing_crosses_a_partition_and_healing_restores_everything(engine: str
         assert await crossings(air, [1, 2, 3, 4]) == all_of([(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)])
 
     in_lab([1, 2, 3, 4], engine, tmp_path, story)
+
+
+def test_a_partition_cuts_every_protocol_in_both_directions_at_once(engine: str, tmp_path: Path) -> None:
+    took_ns: list[tuple[int, int]] = []
+
+    async def story(air: Air) -> None:
+        lab = air.lab
+        conditions = loss(0.0)
+        listeners = [await air.start_ready(vehicle, "listen") for vehicle in lab.vehicles]
+        streams = [await air.start_ready(vehicle, "stream", *ETHERTYPES) for vehicle in lab.vehicles]
+        rounds = []
+        for _ in range(5):
+            asked_ns = time.time_ns()
+            await lab.apply(conditions.with_partition([[1]]))
+            cut_ns = time.time_ns()
+            await asyncio.sleep(0.2)
+            heal_ns = time.time_ns()
+            await lab.apply(conditions)
+            rounds.append((asked_ns, cut_ns, heal_ns, time.time_ns()))
+            await asyncio.sleep(0.2)
+        for stream in streams:
+            await stream.process.terminate(DEADLINE_S)
+        heard = [(await listener.finish())["sent_ns"] for listener in listeners]
+        for receiver, sender in ((1, 2), (2, 1)):
+            times = heard[receiver - 1][addresses.mac(sender)]
+            assert times.keys() == ETHERTYPES.keys()
+            for sent_ns in times.values():
+                for index, (asked_ns, cut_ns, heal_ns, healed_ns) in enumerate(rounds):
+                    assert not any(cut_ns < at_ns < heal_ns for at_ns in sent_ns), "crossed a partition"
+                    end_ns = rounds[index + 1][0] if index + 1 < len(rounds) else healed_ns + 200_000_000
+                    assert any(healed_ns < at_ns < end_ns for at_ns in sent_ns), "nothing came after healing"
+                    before = [at_ns for at_ns in sent_ns if at_ns < heal_ns]
+                    took_ns.append((index, max(before, default=0) - asked_ns))
+
+    in_lab([1, 2], engine, tmp_path, story)
+    # The machine may be busy with something else at the moment of a command, but not at each of them.
+    slowest = {index: max(took for other, took in took_ns if other == index) for index, _ in took_ns}
+    assert min(slowest.values()) <= 50_000_000, f"packets crossed until {min(slowest.values()) / 1e6} ms later"
+
+
+def test_each_direction_of_each_pair_has_its_own_loss(engine: str, tmp_path: Path) -> None:
+    asked = {(1, 2): 0.5, (2, 1): 0.1, (1, 3): 1.0, (3, 1): 0.0}
+
+    async def story(air: Air) -> None:
+        links = {pair: LinkConditions(share) for pair, share in asked.items()}
+        conditions = NetworkConditions(LinkConditions(0.3), {1: LinkConditions(0.2)}, links)
+        applied = await air.lab.apply(conditions)
+        for sender, receiver in itertools.permutations(air.lab.vehicles, 2):
+            assert applied.receivers[receiver].from_sender(sender).loss == conditions.link(sender, receiver).loss
+        lost = dict.fromkeys(air.lab.vehicles, 0)
+        for sender in air.lab.vehicles:
+            others = [vehicle for vehicle in air.lab.vehicles if vehicle != sender]
+            got = await deliveries(air, sender, others, PACKETS)
+            for receiver, numbers in got.items():
+                missing = PACKETS - len(numbers)
+                assert_binomial(missing, PACKETS, conditions.link(sender, receiver).independent_loss)
+                lost[receiver] += missing
+        figures = (await air.lab.read()).receivers
+        assert {vehicle: figures[vehicle].lost for vehicle in lost} == lost
+        assert all(figures[vehicle].passed == 3 * PACKETS - lost[vehicle] for vehicle in lost)
+        # Back to what everybody shares, with a partition that comes and goes.
+        await air.lab.apply(conditions.with_partition([[1, 2], [3]]))
+        applied = await air.lab.apply(loss(0.0))
+        assert not any(figures.links for figures in applied.receivers.values())
+        assert (await deliveries(air, 1, [2, 3, 4], 100)) == {vehicle: set(range(100)) for vehicle in (2, 3, 4)}
+
+    in_lab([1, 2, 3, 4], engine, tmp_path, story)
+
+
+def test_a_hundred_vehicles_get_conditions_for_each_pair_in_seconds(engine: str, tmp_path: Path) -> None:
+    vehicles = range(1, 101)
+    random = Random(1)
+    pairs = {pair: LinkConditions(round(random.random(), 6)) for pair in itertools.permutations(vehicles, 2)}
+
+    async def story(air: Air) -> None:
+        began = time.monotonic()
+        conditions = NetworkConditions(links=pairs)
+        applied = await air.lab.apply(conditions)
+        first_s = time.monotonic() - began
+        for (sender, receiver), link in pairs.items():
+            assert applied.receivers[receiver].from_sender(sender).loss == pytest.approx(link.loss, abs=2e-9)
+        began = time.monotonic()
+        applied = await air.lab.apply(conditions.with_partition([range(1, 51)]))
+        partition_s = time.monotonic() - began
+        assert applied.receivers[1].cut_from == tuple(range(51, 101))
+        assert first_s < 30, first_s
+        assert partition_s < 10, partition_s
+
+    in_lab(vehicles, engine, tmp_path, story)
 
 
 def test_a_partition_leaves_the_loss_inside_its_groups_as_it_is(engine: str, tmp_path: Path) -> None:

@@ -79,6 +79,11 @@ def test_duplicates_come_twice_and_overtakers_at_once() -> None:
     assert sum(one[0] == 0.0 for one in heard) / len(heard) == pytest.approx(0.25, abs=0.012)
 
 
+def test_a_bit_error_is_a_loss_of_its_own() -> None:
+    assert lost(delays(medium(corrupt=0.2), 0, 1)) == pytest.approx(0.2, abs=0.012)
+    assert lost(delays(medium(corrupt=0.2, loss=0.5), 0, 1)) == pytest.approx(0.6, abs=0.012)
+
+
 def test_receivers_and_links_differ_in_one_direction_only() -> None:
     air = medium(
         conditions=NetworkConditions(

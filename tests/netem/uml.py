@@ -20,12 +20,13 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
 MODULES = Path("/usr/lib/uml/modules")
-DEADLINE_S = float(os.environ.get("UCP_UML_DEADLINE_S", "300"))
+DEADLINE_S = float(os.environ.get("UCP_UML_DEADLINE_S", "480"))
 MEMORY = "768M"
 
 # Without test_leftovers.py, which finds processes by their environment: this kernel does not show it.
 # What ends the lab is not netem's, and is tested on the host.
-_TESTS = ["-q", "-k", "not nftables", *(f"tests/netem/test_{name}.py" for name in ("engine", "lab", "machine"))]
+_FILES = ("engine", "links", "lab", "machine")
+_TESTS = ["-q", "-k", "not nftables", *(f"tests/netem/test_{name}.py" for name in _FILES)]
 
 _SCRIPT = """#!/bin/sh
 export PATH=/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8
@@ -35,7 +36,7 @@ mount -t sysfs sysfs /sys
 mount -t tmpfs tmpfs /run
 mkdir -m 1777 /run/tmp && mkdir -p /run/modules/lib && ln -s {modules} /run/modules/lib/modules
 export HOME=/run/tmp TMPDIR=/run/tmp
-modprobe -d /run/modules -a bridge veth sch_netem sch_htb sch_ingress cls_matchall act_skbedit af_packet
+modprobe -d /run/modules -a bridge veth sch_netem sch_htb sch_ingress cls_basic cls_fw act_skbedit act_gact af_packet
 modprobe -d /run/modules -q -a nf_tables nft_numgen
 ip link set lo up
 cd {repository}

@@ -1,0 +1,46 @@
+"""Netlink attributes (RFC 3549; linux/netlink.h) as bytes, for messages that are many or that pyroute2 does not know.
+
+A lab of 100 vehicles with a condition for each pair is 20,000 requests, and 10,000 answers when it is read back.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+
+_HEADER = struct.Struct("=HH")
+_NESTED = 0x8000
+_KIND = 0x3FFF
+
+
+def attribute(kind: int, payload: bytes) -> bytes:
+    return _HEADER.pack(_HEADER.size + len(payload), kind) + payload + bytes(-len(payload) % 4)
+
+
+def nested(kind: int, *attributes: bytes) -> bytes:
+    return attribute(kind | _NESTED, b"".join(attributes))
+
+
+def number(kind: int, value: int) -> bytes:
+    """An attribute of 32 bits."""
+    return attribute(kind, struct.pack("=I", value))
+
+
+def text(kind: int, value: str) -> bytes:
+    return attribute(kind, value.encode() + b"\0")
+
+
+def parse(data: bytes) -> dict[int, bytes]:
+    """Payloads by kind; of a kind that comes again, the last."""
+    found = {}
+    offset = 0
+    while offset + _HEADER.size <= len(data):
+        length, kind = _HEADER.unpack_from(data, offset)
+        found[kind & _KIND] = data[offset + _HEADER.size : offset + length]
+        offset += max(_HEADER.size, (length + 3) & ~3)
+    return found
+
+
+def parse_number(payload: bytes | None) -> int | None:
+    """The value of an attribute of 32 bits, if it is there."""
+    return None if payload is None else int.from_bytes(payload[:4], sys.byteorder)
