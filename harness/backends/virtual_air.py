@@ -67,8 +67,8 @@ class _Asked:
     """How many answers there were when it was last told of them."""
     next_at: float = 0.0
     """When the next of these comes."""
-    first: float = NEVER
-    """When the first answer of all arrives, where no other is wanted."""
+    first: tuple[float, int] = (NEVER, 0)
+    """When the first answer of all arrives, and its rank, where no other is wanted."""
 
 
 Place = tuple[float, int, int]
@@ -228,9 +228,9 @@ class VirtualAir:
     def _arrive_first(self, flights: Iterable[Flight], receiver: int, asked: _Asked) -> None:
         """Let that answer arrive that comes first, unless another comes before it."""
         first = self._first(flights, receiver, asked.since)
-        if first is not None and first[0] < asked.first:
+        if first is not None and first[:2] < asked.first:
             at, rank, flight = first
-            asked.first = at
+            asked.first = at, rank
             heappush(self._coming, (at, rank, receiver, flight))
 
     def _first(self, flights: Iterable[Flight], receiver: int, since: Place) -> tuple[float, int, Flight] | None:

@@ -92,6 +92,13 @@ def playable(timeline: list[dict[str, Any]]) -> bool:
 @given(
     network=networks,
     timeline=timelines.filter(playable),
+    schedule=st.sampled_from(
+        [
+            [],
+            [{"ramp": {"delay": [8.0, 0.0]}, "from_s": 100, "until_s": 200, "every_s": 50}],
+            [{"nemesis": "bridge", "every_s": 60, "for_s": 30}, {"ramp": {"loss": [0, 0.6], "delay": [0.0, 4.0]}}],
+        ]
+    ),
     agents=st.integers(3, 7),
     mean_s=st.sampled_from([1, 3, 10]),
     ignore_commit=probabilities,
@@ -102,6 +109,7 @@ def playable(timeline: list[dict[str, Any]]) -> bool:
 def test_what_is_not_delivered_would_have_changed_nothing(
     network: dict[str, Any],
     timeline: list[dict[str, Any]],
+    schedule: list[dict[str, Any]],
     agents: int,
     mean_s: int,
     ignore_commit: float,
@@ -115,6 +123,7 @@ def test_what_is_not_delivered_would_have_changed_nothing(
         duration_s=400,
         network=network,
         timeline=timeline,
+        schedule=schedule,
         events={"source": "random", "mean_s": mean_s},
         quirks={"ignore_commit": ignore_commit},
         clocks=clocks,
