@@ -20,7 +20,7 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
 MODULES = Path("/usr/lib/uml/modules")
-DEADLINE_S = float(os.environ.get("UCP_UML_DEADLINE_S", "480"))
+DEADLINE_S = float(os.environ.get("UCP_UML_DEADLINE_S", "720"))
 MEMORY = "768M"
 
 # Without test_leftovers.py, which finds processes by their environment: this kernel does not show it.
