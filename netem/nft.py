@@ -15,7 +15,8 @@ marked with the group of the port it came from, then judged in its receiver's ch
 
 so the cost of a packet does not grow with the number of vehicles. Chain 0 is for all senders but those whose
 loss differs; there is one more for each loss that differs. A change is one nft transaction: no packet meets
-half of it. The counters are objects of their own and outlive the rules.
+half of it. Only one with thousands of links, which is more than an ordinary user may send at once, goes
+receiver by receiver. The counters are objects of their own and outlive the rules.
 See nft(8) and libnftables-json(5).
 """
 
@@ -25,6 +26,7 @@ import json
 import shutil
 import subprocess
 from collections.abc import Iterator
+from itertools import chain
 from typing import Any
 
 from netem import addresses
@@ -43,6 +45,9 @@ _COUNTERS = ("passed", "lost", "cut")
 _PATH = "/usr/sbin:/sbin:/usr/bin:/bin:/usr/local/sbin"  # an ordinary user's PATH has no sbin
 _STDIN = ["-f", "/proc/self/fd/0"]  # what "-" means to nft, /dev/stdin, is not there in every container
 _DEADLINE_S = 20.0
+_TOO_LONG = "Message too long"
+_COMMANDS_AT_ONCE = 500
+"""About 200 KB, which is what net.core.wmem_max lets an ordinary user send at once."""
 
 
 class NftablesEngine(Engine):
@@ -78,10 +83,16 @@ class NftablesEngine(Engine):
 
     def change(self, conditions: NetworkConditions) -> None:
         lossy = conditions.healed()
-        commands = self._partition(conditions)
+        parts = [self._partition(conditions)]
         if lossy != self._lossy:  # a partition alone is quick
-            commands += self._loss(conditions)
-        self._run(_STDIN, commands)
+            parts += self._loss(conditions)
+        try:
+            self._run(_STDIN, [*chain.from_iterable(parts)])
+        except EngineError as error:
+            if _TOO_LONG not in str(error):
+                raise
+            for part in _grouped(parts):
+                self._run(_STDIN, part)
         self._lossy = lossy
 
     def _partition(self, conditions: NetworkConditions) -> list[dict[str, Any]]:
@@ -96,25 +107,26 @@ class NftablesEngine(Engine):
                 commands.append(_rule(f"cut_{port}", other, {"counter": f"cut_{port}"}, {"drop": None}))
         return commands
 
-    def _loss(self, conditions: NetworkConditions) -> list[dict[str, Any]]:
+    def _loss(self, conditions: NetworkConditions) -> list[list[dict[str, Any]]]:
+        """What to do for each receiver."""
         differing: dict[int, dict[float, list[int]]] = {}
         for sender, receiver, link in conditions.differing_links():
             differing.setdefault(receiver, {}).setdefault(link.independent_loss, []).append(sender)
-        commands = []
+        receivers = []
         for vehicle, port in zip(self._vehicles, self._ports, strict=True):
-            chain = f"to_{port}"
-            commands.append(_flush("chain", chain))
+            own = f"to_{port}"
+            commands = [_flush("chain", own)]
             usual = conditions.link(vehicle, vehicle).independent_loss
             losses = {usual: [], **differing.get(vehicle, {})}
             elements = []
             for number, (loss, senders) in enumerate(losses.items()):
-                lots = f"{chain}_{number}"
+                lots = f"{own}_{number}"
                 commands += [_add("chain", **_TABLE, name=lots), _flush("chain", lots), *_lots(lots, port, loss)]
                 elements += [[addresses.port(sender), {"goto": {"target": lots}}] for sender in senders]
             if elements:
-                commands.append(_rule(chain, {"vmap": {"key": _FROM, "data": {"set": elements}}}))
-            commands.append(_rule(chain, {"goto": {"target": f"{chain}_0"}}))
-        return commands
+                commands.append(_rule(own, {"vmap": {"key": _FROM, "data": {"set": elements}}}))
+            receivers.append([*commands, _rule(own, {"goto": {"target": f"{own}_0"}})])
+        return receivers
 
     def read(self) -> Applied:
         listing = json.loads(self._run(["list", "table", "bridge", "air"]))["nftables"]
@@ -168,6 +180,17 @@ class NftablesEngine(Engine):
             words = [line for line in done.stderr.splitlines() if "Error" in line or "rror:" in line]
             raise EngineError(f"nft refused: {words[0] if words else f'status {done.returncode}'}")
         return done.stdout
+
+
+def _grouped(parts: list[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
+    """The parts in order, as few together as an ordinary user's socket takes; none is divided."""
+    together: list[dict[str, Any]] = []
+    for part in parts:
+        if together and len(together) + len(part) > _COMMANDS_AT_ONCE:
+            yield together
+            together = []
+        together = [*together, *part]
+    yield together
 
 
 def _add(kind: str, **what: Any) -> dict[str, Any]:
