@@ -91,6 +91,7 @@ class NftablesEngine(Engine):
         except EngineError as error:
             if _TOO_LONG not in str(error):
                 raise
+            self._lossy = None  # half-way nobody knows
             for part in _grouped(parts):
                 self._run(_STDIN, part)
         self._lossy = lossy

@@ -1,1 +1,1 @@
-"""Backends: where the agents of a scenario run. The process backend is the real thing: processes and namespaces."""
+"""Backends: where the agents of a scenario run. Real processes in namespaces, or virtual time; see `harness.mission`."""

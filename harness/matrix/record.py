@@ -26,7 +26,7 @@ class MatrixRecord(BaseModel):
 
     schema_: Literal["ucp-matrix/1"] = Field(default="ucp-matrix/1", alias="schema")
     matrix: Matrix
-    backend: Literal["simulation"]
+    backend: Literal["sim"]
     versions: dict[str, str]
     started_at: str
     wall_s: float

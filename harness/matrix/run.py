@@ -53,7 +53,7 @@ def run_matrix(matrix: Matrix, jobs: int, judge: Judge | None = None, *, shown: 
     by_loss = {loss: [run for run in runs if run.loss == loss] for loss in matrix.loss}
     record = MatrixRecord(
         matrix=matrix,
-        backend="simulation",
+        backend="sim",
         versions=versions(),
         started_at=started_at.isoformat(timespec="seconds").replace("+00:00", "Z"),
         wall_s=round(time.monotonic() - started, 1),

@@ -38,7 +38,7 @@ class ScaleRecord(BaseModel):
 
     schema_: Literal["ucp-scale/1"] = Field(default="ucp-scale/1", alias="schema")
     scale: Scale
-    backend: Literal["simulation"]
+    backend: Literal["sim"]
     versions: dict[str, str]
     started_at: str
     wall_s: float

@@ -63,7 +63,7 @@ def run_scale(scale: Scale, jobs: int, judge: Judge | None = None, *, shown: boo
     cells = [sum_up(size, its_runs) for size, its_runs in by_size.items() if its_runs]
     record = ScaleRecord(
         scale=scale,
-        backend="simulation",
+        backend="sim",
         versions=versions(),
         started_at=started_at.isoformat(timespec="seconds").replace("+00:00", "Z"),
         wall_s=round(time.monotonic() - started, 1),

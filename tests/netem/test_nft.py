@@ -1,0 +1,57 @@
+"""nft is told no more at once than an ordinary user may send, and a change that stops half-way can be undone."""
+
+from typing import Any
+
+import pytest
+
+from netem import addresses
+from netem.conditions import LinkConditions, NetworkConditions
+from netem.errors import EngineError
+from netem.nft import NftablesEngine
+
+VEHICLES = range(1, 31)
+
+
+class Narrow(NftablesEngine):
+    """Its nft takes few commands at once, and fails after `lasts` transactions."""
+
+    def __init__(self) -> None:
+        self._vehicles = tuple(VEHICLES)
+        self._ports = [addresses.port(vehicle) for vehicle in VEHICLES]
+        self._lossy = NetworkConditions()
+        self.sent: list[int] = []
+        self.lasts = 1000
+
+    def _run(self, arguments: list[str], commands: list[dict[str, Any]] | None = None) -> str:
+        count = len(commands or ())
+        if count > 600:
+            raise EngineError("nft refused: netlink: Error: Could not process rule: Message too long")
+        if len(self.sent) == self.lasts:
+            raise EngineError("nft refused: Error: no more memory")
+        self.sent.append(count)
+        return ""
+
+
+def every_link() -> NetworkConditions:
+    pairs = [(a, b) for a in VEHICLES for b in VEHICLES if a != b]
+    return NetworkConditions(links={pair: LinkConditions(loss=(n + 1) / 1000) for n, pair in enumerate(pairs)})
+
+
+def test_what_is_too_long_for_one_transaction_goes_in_several() -> None:
+    engine = Narrow()
+    engine.change(every_link())
+    assert len(engine.sent) > 3
+    assert sum(engine.sent) > 3000
+
+
+def test_after_half_a_change_undoing_it_sets_every_loss_again() -> None:
+    engine = Narrow()
+    engine.lasts = 2
+    with pytest.raises(EngineError, match="no more memory"):
+        engine.change(every_link())
+    engine.sent.clear()
+    engine.change(NetworkConditions())
+    whole = sum(engine.sent)
+    engine.sent.clear()
+    engine.change(NetworkConditions())  # nothing differs any more: the partition's rules only
+    assert sum(engine.sent) < whole
