@@ -22,7 +22,8 @@ the old groups are heard no more. So each pair is at all times treated as before
 number of vehicles, not of pairs.
 
 Since 2025 (6.1.148, 6.6.102, 6.12.42, 6.16.1) Linux has a netem that duplicates stand alone at its port: duplication
-is then refused where a receiver does not hear all senders alike, and where links remember.
+is then refused where a receiver does not hear all senders alike, and where links remember. Newer kernels also hold a
+jitter of 2.1 s at most. `may_refuse` says whose network is worth a rehearsal.
 See tc-netem(8), tc-htb(8), tc-skbedit(8), tc-fw(8).
 """
 
@@ -41,6 +42,15 @@ from netem.netlink import Netlink, Request
 from netem.tc_requests import MAX_KIND, Class, TrafficControl
 
 _Numbers = dict[frozenset[int], int]
+
+_SURE_JITTER_S = (2**31 - 1) / 1e9
+"""What all kernels with netem can hold."""
+
+
+def may_refuse(conditions: NetworkConditions) -> bool:
+    """Whether these conditions are more than every kernel with netem can do (see the module)."""
+    links = (conditions.default, *conditions.receivers.values(), *conditions.links.values())
+    return any(link.duplicate or (link.delay and link.delay.jitter_s > _SURE_JITTER_S) for link in links)
 
 
 @dataclass

@@ -21,8 +21,9 @@ from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.timeline import Change, NetworkChange, describe, timeline_of
 from netem.conditions import NetworkConditions
-from netem.errors import ConditionsError, LabUnavailable, NetemError
+from netem.errors import ConditionsError, EngineError, LabUnavailable, NetemError
 from netem.lab import Lab
+from netem.tc import may_refuse
 from sitl.vehicle import Home, VehicleKind, home_in_field
 from ucp.clock import MICROSECONDS, MissionClock
 
@@ -50,30 +51,48 @@ def network_needs(scenario: Scenario) -> list[str]:
 
     Raises ScenarioError for conditions that mean nothing on a clock that runs at the scenario's speedup.
     """
+    return list(dict.fromkeys(need for state in _networks(scenario) for need in state.needs()))
+
+
+def _networks(scenario: Scenario) -> list[NetworkConditions]:
+    """Every state of the network, each once, without partitions, on a clock that runs at the scenario's speedup."""
     states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
-    try:
-        return list(dict.fromkeys(need for state in states for need in state.at_speed(scenario.speedup).needs()))
-    except ConditionsError as error:
-        raise ScenarioError(f"`network` at `speedup` {scenario.speedup:g}: {error}") from None
+    found: list[NetworkConditions] = []
+    for state in states:
+        try:
+            network = state.at_speed(scenario.speedup).healed()
+        except ConditionsError as error:
+            raise ScenarioError(f"`network` at `speedup` {scenario.speedup:g}: {error}") from None
+        if network not in found:
+            found.append(network)
+    return found
 
 
 def refuse_what_this_machine_cannot(scenario: Scenario) -> None:
     """Raises MachineError, with the way out, if no engine here does what the network asks.
 
-    Tried in a lab of its own, for a fraction of a second, and only if it asks for more than loss and partitions.
+    Tried in a lab of its own, for a fraction of a second, and only if it asks for more than loss and partitions; what
+    some kernels refuse although they have netem is rehearsed there.
     """
-    if not (needs := network_needs(scenario)):
+    needs = network_needs(scenario)
+    rehearsed = [network for network in _networks(scenario) if may_refuse(network)]
+    if not needs:
         return
 
     async def attempt(folder: str) -> None:
-        async with await Lab.open((1, 2), needs=needs, log=Path(folder, "lab.log")):
-            pass
+        async with await Lab.open(scenario.roster, needs=needs, log=Path(folder, "lab.log")) as lab:
+            for network in rehearsed:
+                await lab.apply(network)
 
     with tempfile.TemporaryDirectory() as folder:
         try:
             asyncio.run(attempt(folder))
         except LabUnavailable as error:
             raise MachineError(str(error)) from None
+        except EngineError as error:
+            raise MachineError(
+                f"this kernel cannot do what the network asks; play it in virtual time (--backend sim): {error}"
+            ) from None
         except NetemError as error:
             raise MachineError(f"the lab could not be built: {error}") from None
 

@@ -14,6 +14,9 @@ from typing import Any, get_args
 
 import pytest
 
+from harness.backends.process import refuse_what_this_machine_cannot
+from harness.errors import MachineError
+from harness.scenario import Scenario
 from netem.conditions import NetworkConditions
 from netem.errors import EngineError
 from netem.lab import Lab, LabUnavailable
@@ -253,6 +256,18 @@ def test_a_kernel_that_wants_duplicates_alone_says_so_and_changes_nothing(netem:
         assert applied.receivers[2].link == twice
 
     in_lab([1, 2, 3], netem, tmp_path, story)
+
+
+def test_what_some_kernels_with_netem_refuse_is_found_before_anything_starts(netem: str) -> None:
+    def scenario(jitter_s: float) -> Scenario:
+        ramp = {"at_s": 60, "loss": 0.1}
+        delay = {"mean_s": 6, "jitter_s": jitter_s, "distribution": "normal"}
+        links = [{"from": 1, "to": 2, "delay": delay}]
+        return Scenario(name="Far", agents=3, speedup=1, timeline=[ramp], network={"links": links})
+
+    refuse_what_this_machine_cannot(scenario(2.0))
+    with pytest.raises(MachineError, match=r"this kernel cannot do .*--backend sim.*delay\.jitter_s asked.* 1 to 2"):
+        refuse_what_this_machine_cannot(scenario(5.0))
 
 
 def test_what_an_engine_cannot_do_is_refused_before_anything_starts_with_the_way_out(tmp_path: Path) -> None:
