@@ -39,3 +39,7 @@ class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
 
 class SpawnError(LabError):
     """A program could not be started in the lab; the message carries the operating system's word."""
+
+
+class UmlError(NetemError):
+    """User Mode Linux is not here, did not boot, hung or panicked."""

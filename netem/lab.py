@@ -37,7 +37,8 @@ EngineName = Literal["netem", "nftables"]
 _WAYS_OUT: dict[EngineName, str] = {
     "netem": "Use a kernel with sch_netem, sch_htb, sch_ingress, cls_basic, cls_fw, act_skbedit and act_gact (Debian: "
     "linux-image-amd64; Ubuntu: linux-modules-extra-$(uname -r); Fedora, RHEL: kernel-modules-extra; Arch: every "
-    "kernel; Alpine: linux-lts; WSL2: a kernel of your own, with CONFIG_NET_SCH_NETEM).",
+    "kernel; Alpine: linux-lts; WSL2: a kernel of your own, with CONFIG_NET_SCH_NETEM), or run it "
+    "inside User Mode Linux: --kernel uml.",
     "nftables": "Install nftables (apt install nftables), on a kernel with nf_tables for bridges and nft_numgen.",
 }
 _OPEN_DEADLINE_S = 60.0
@@ -114,7 +115,10 @@ class Lab:
             if refusal is None:
                 return lab
             word = refusal
-        raise LabUnavailable(f"This machine does not let us make a private network ({word})", namespaces.way_out(word))
+        raise LabUnavailable(
+            f"This machine does not let us make a private network ({word})",
+            f"{namespaces.way_out(word)} Or run it inside User Mode Linux: --kernel uml.",
+        )
 
     @classmethod
     async def _enter(cls, vehicles: tuple[int, ...], user_namespace: bool, log: Path) -> Lab:

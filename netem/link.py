@@ -103,17 +103,21 @@ class LinkConditions:
     """What happens to packets on the way to one receiver, from everybody or from one sender.
 
     `loss` is the probability, 0..1, that a packet is dropped, drawn for each packet on its own, or a model
-    of bursts. `duplicate` is the probability that a packet comes twice, `reorder` that it overtakes: it is
-    sent at once, without delay, which needs a delay. A delay of 0 is none.
+    of bursts. `duplicate` is the probability that a packet is there twice, drawn together with its loss: of
+    one that is both lost and duplicated one copy is left; else the second copy has lots of its own, loss
+    among them, but is not duplicated again. `reorder` is the probability that a packet overtakes: it is sent
+    at once, without delay, which needs a delay. A delay of 0 is none.
 
     `corrupt` is the probability that one bit of a packet flips. The checksum of UDP finds it, so for its
     receiver the message is lost. (netem flips bits of the whole Ethernet frame. An error in its 12 bytes of
     addresses is below every checksum that a veth pair has, and a broadcast mostly arrives nevertheless.)
 
     `rate` is in bits per second of Ethernet frames, which are 42 bytes longer than a UDP datagram's data;
-    every link, one sender to one receiver, has it for itself. Under a rate packets keep their order, and
-    jitter never makes one wait less than those before it. `limit` is how many packets may wait on a link,
-    be it for delay or for rate, of which it needs one; what comes when it is reached is lost.
+    every link, one sender to one receiver, has it for itself. A packet leaves when it has had its delay and
+    the one before has left, and the rate then takes its time: packets keep their order, and jitter never
+    makes one wait less than those before it. `limit` is how many packets may wait on a link, be it for delay
+    or for rate, of which it needs one; what comes when it is reached is lost. What overtakes waits for
+    neither, and a corrupted packet takes its place like any other.
     """
 
     loss: float | GilbertElliott = 0.0

@@ -1,8 +1,12 @@
 """The air in virtual time: what becomes of a broadcast on its way to each receiver, drawn from a seed.
 
 It is the third engine beside tc netem and nftables, for agents that run in no kernel: the same conditions, and no
-packets. A broadcast is drawn for by every receiver on its own. Without a delay in the conditions a message takes 2 to
-50 ms, uniformly, as over a radio.
+packets. A broadcast is drawn for by every receiver on its own. Without a delay or a rate in the conditions a message
+takes 2 to 50 ms, uniformly, as over a radio; under a rate without a delay, as long as the rate makes it.
+
+A packet's way is that of Linux, netem_enqueue of net/sched/sch_netem.c: lots for duplication and loss together, then
+one for corruption, then the limit, then the second copy on a way of its own, then the delay and the rate. A partition
+stands before all of this.
 
 Every sender has a random stream of its own for each concern: loss, latency, duplication, and so on. A fault that is
 added, or another sender that says more, changes none of the others' lots. Lots are words of 32 bits, and what they are
@@ -18,6 +22,7 @@ import sys
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from math import inf
 from random import Random
 from typing import Protocol
@@ -27,8 +32,10 @@ from netem.distributions import SCALE, table
 from netem.link import Delay, GilbertElliott, LinkConditions
 
 LATENCY = Delay(mean_s=0.026, jitter_s=0.024)
-"""How long messages take where the conditions do not say."""
+"""How long messages take where the conditions give neither delay nor rate."""
 
+_AT_ONCE = Delay(0.0)
+_HEADERS = 42  # bytes of a frame beside the datagram's data: Ethernet, IPv4, UDP
 _WORD = 1 << 32
 _BROADCASTS_AT_ONCE = 64
 _TABLE_SIZE = 4096
@@ -56,14 +63,18 @@ class Medium:
         self._words = [_Words(self._stream("loss", sender), self._stream("latency", sender)) for sender in vehicles]
         concerns = ("duplication", "reordering", "corruption")
         self._rare = [tuple(self._stream(concern, sender) for concern in concerns) for sender in vehicles]
-        self._in_bad_state: set[tuple[int, int]] = set()  # (sender, receiver) by number
+        self._links: list[list[_Link]] = [[] for _ in vehicles]  # of each sender, to all; none where the air is plain
         self.soonest = LATENCY.mean_s
         self.latest = LATENCY.mean_s
         """No copy has ever arrived sooner or later after it was sent, or will under these conditions, in seconds."""
         self.apply(NetworkConditions())
 
     def apply(self, conditions: NetworkConditions) -> None:
-        """From now on broadcasts meet these conditions. Raises ConditionsError for an unknown vehicle."""
+        """From now on broadcasts meet these conditions. Raises ConditionsError for an unknown vehicle.
+
+        What is under way arrives as it would have. A link's queue lives on while its conditions remember; its bursts
+        begin in the good state whenever its conditions change, as a kernel has them.
+        """
         conditions.validate(self._vehicles)
         group = {
             vehicle: index for index, members in enumerate(conditions.groups(self._vehicles)) for vehicle in members
@@ -77,16 +88,22 @@ class Medium:
         """Whether no partition stands between the two, by their numbers."""
         return self._group[sender] == self._group[receiver]
 
-    def draw(self, sender: int) -> Lots:
-        """The lots of the next broadcast of the sender with this number."""
-        return self._air[sender].draw()
+    def draw(self, sender: int, now: float, data_bytes: int) -> Lots:
+        """The lots of a broadcast of the sender with this number: a UDP datagram that it sends at `now`, in seconds.
+
+        `data_bytes` is the length of the datagram's data; no sender's `now` is before its last.
+        """
+        return self._air[sender].draw(now, data_bytes)
 
     def _air_of(self, number: int, sender: int, conditions: NetworkConditions) -> _Air:
         links = [conditions.link(sender, receiver) for receiver in self._vehicles]
         hears = [number != other and self.hears(number, other) for other in range(len(links))]
         if all(_is_plain(link) for link in set(links)):
+            self._links[number] = []
             return _PlainAir(links, hears, self._words[number])
-        return _AnyAir(number, links, hears, self._in_bad_state, self._words[number], self._rare[number])
+        before: Sequence[_Link | None] = self._links[number] or [None] * len(links)
+        self._links[number] = [_Link(link, earlier) for link, earlier in zip(links, before, strict=True)]
+        return _AnyAir(self._links[number], hears, self._words[number], self._rare[number])
 
     def _stream(self, concern: str, sender: int) -> Random:
         return Random(f"{self._seed}/{concern}/{sender}")
@@ -98,13 +115,13 @@ class _Air(Protocol):
     soonest_of_all: float
     latest: float
 
-    def draw(self) -> Lots: ...
+    def draw(self, now: float, data_bytes: int) -> Lots: ...
 
 
 def _is_plain(link: LinkConditions) -> bool:
     """One lot each for loss and latency is all that it takes."""
     uniform = link.delay is None or link.delay.distribution == "uniform"
-    return uniform and not (link.duplicate or link.reorder or link.corrupt or isinstance(link.loss, GilbertElliott))
+    return uniform and not (link.duplicate or link.reorder or link.corrupt or link.remembers)
 
 
 class _PlainAir:
@@ -121,7 +138,7 @@ class _PlainAir:
         self.latest = max(delay.mean_s + delay.jitter_s for delay in delays)
         self._words = words
 
-    def draw(self) -> Lots:
+    def draw(self, now: float, data_bytes: int) -> Lots:
         words = self._words
         at = words.next
         if at + self.receivers > len(words.loss):
@@ -199,49 +216,93 @@ class _AnyAir:
     soonest_of_all = 0.0
     latest = inf
 
-    def __init__(
-        self,
-        number: int,
-        links: list[LinkConditions],
-        hears: list[bool],
-        in_bad_state: set[tuple[int, int]],
-        words: _Words,
-        rare: tuple[Random, ...],
-    ) -> None:
-        self._number = number
+    def __init__(self, links: list[_Link], hears: list[bool], words: _Words, rare: tuple[Random, ...]) -> None:
         self._links = links
         self._hears = hears
-        self._in_bad_state = in_bad_state
         self._words = words
         self._duplication, self._reordering, self._corruption = rare
 
-    def draw(self) -> Lots:
-        delays = [self._delays(receiver, link) for receiver, link in enumerate(self._links)]
-        return _DrawnLots([copies if hears else () for copies, hears in zip(delays, self._hears, strict=True)])
+    def draw(self, now: float, data_bytes: int) -> Lots:
+        bits = 8 * (data_bytes + _HEADERS)
+        return _DrawnLots([self._delays(receiver, now, bits) for receiver in range(len(self._links))])
 
-    def _delays(self, receiver: int, link: LinkConditions) -> tuple[float, ...]:
+    def _delays(self, receiver: int, now: float, bits: int) -> tuple[float, ...]:
         words = self._words
         at = words.take(2)
-        lost = self._is_lost(receiver, link.loss, words.loss[at] / _WORD, words.loss[at + 1] / _WORD)
-        spoilt = self._corruption.random() < link.corrupt  # its receiver throws it away
-        copies = 2 if self._duplication.random() < link.duplicate else 1
-        overtakes = self._reordering.random() < link.reorder
-        delay = link.delay or LATENCY
-        first, second = sample(delay, words.latency[at] / _WORD), sample(delay, words.latency[at + 1] / _WORD)
-        if lost or spoilt:
+        loss, turn, latency = words.loss[at] / _WORD, words.loss[at + 1] / _WORD, words.latency[at] / _WORD
+        first = loss, turn, self._corruption.random(), self._reordering.random(), latency
+        duplication = self._duplication.random()
+        if not self._hears[receiver]:
             return ()
-        return (0.0 if overtakes else first, second)[:copies]
+        link = self._links[receiver]
+        second = None
+        if duplication < link.conditions.duplicate:
+            own = Random(int(duplication * _WORD))
+            second = own.random(), own.random(), own.random(), own.random(), own.random()
+        return link.enqueue(now, bits, first, second)
 
-    def _is_lost(self, receiver: int, loss: float | GilbertElliott, lot: float, turn: float) -> bool:
+
+_Copy = tuple[float, float, float, float, float]
+"""The lots of one copy of a packet, each uniform in 0..1 (exclusive): loss, turn of its model's state, corruption,
+reordering, latency."""
+
+
+class _Link:
+    """From one sender to one receiver: what becomes of a packet, and what that means for those after it.
+
+    `before` is the link under the conditions before; a queue lives on from one that remembers to another.
+    """
+
+    def __init__(self, conditions: LinkConditions, before: _Link | None) -> None:
+        self.conditions = conditions
+        self._delay = conditions.delay or (LATENCY if conditions.rate is None else _AT_ONCE)
+        self._bad = False
+        self._last = -inf  # when the last packet leaves
+        self._departures: list[float] = []  # a heap of when the packets leave that wait; some may have left
+        if before is not None and conditions.remembers and before.conditions.remembers:
+            self._bad = before._bad and conditions == before.conditions
+            self._last, self._departures = before._last, before._departures
+
+    def enqueue(self, now: float, bits: int, lots: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
+        """The delays of a packet that comes at `now`, and of its second copy if it has one, as far as they arrive."""
+        conditions = self.conditions
+        loss, turn, corruption, reordering, latency = lots
+        lost = self._loses(loss, turn)
+        if lost and second is None:
+            return ()
+        if conditions.limit is not None and self._waiting(now) >= conditions.limit:
+            return ()
+        # The second copy goes first; and of a packet both lost and duplicated, one is left.
+        copies = self.enqueue(now, bits, second) if second is not None and not lost else ()
+        delay_s = 0.0 if reordering < conditions.reorder else self._wait(now, bits, latency)
+        if corruption < conditions.corrupt:  # its receiver throws it away
+            return copies
+        return (delay_s, *copies)
+
+    def _loses(self, lot: float, turn: float) -> bool:
+        loss, bad = self.conditions.loss, self._bad
         if not isinstance(loss, GilbertElliott):
             return lot < loss
-        link = (self._number, receiver)
-        bad = link in self._in_bad_state
-        if bad and turn < loss.r:
-            self._in_bad_state.discard(link)
-        elif not bad and turn < loss.p:
-            self._in_bad_state.add(link)
+        self._bad = turn >= loss.r if bad else turn < loss.p
         return lot < (loss.loss_bad if bad else loss.loss_good)
+
+    def _wait(self, now: float, bits: int, latency: float) -> float:
+        """Put a packet into the queue; how many seconds it stays there."""
+        at = now + sample(self._delay, latency)
+        if self.conditions.rate is not None:
+            if self._last > now:
+                at = max(at, self._last)
+            at += bits / self.conditions.rate
+        self._last = max(self._last, at)
+        heappush(self._departures, at)
+        self._waiting(now)
+        return max(0.0, at - now)
+
+    def _waiting(self, now: float) -> int:
+        """How many packets are in the queue."""
+        while self._departures and self._departures[0] <= now:
+            heappop(self._departures)
+        return len(self._departures)
 
 
 @dataclass
@@ -259,8 +320,8 @@ class _DrawnLots:
 
 
 def sample(delay: Delay, lot: float) -> float:
-    """The delay in seconds that falls to `lot`, uniform in 0..1 (exclusive)."""
+    """The delay in seconds that falls to `lot`, uniform in 0..1 (exclusive); below 0 is at once, as netem has it."""
     if delay.distribution == "uniform":
         return delay.mean_s + delay.jitter_s * (2 * lot - 1)
     deviations = table(delay.distribution, _TABLE_SIZE)[int(lot * _TABLE_SIZE)] / SCALE
-    return max(0.0, delay.mean_s + delay.jitter_s * deviations)
+    return delay.mean_s + delay.jitter_s * deviations

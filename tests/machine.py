@@ -1,7 +1,7 @@
 """What this machine can do, for tests that need more than Python.
 
-`UCP_REQUIRE` is a list of "lab", "netem", "nftables" and "browser" (comma between): what it names may not be missing,
-a test that would be skipped for the lack of it fails instead.
+`UCP_REQUIRE` is a list of "lab", "netem", "nftables", "uml" and "browser" (comma between): what it names may not be
+missing, a test that would be skipped for the lack of it fails instead.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from netem import uml
+from netem.errors import UmlError
 from netem.lab import Lab, LabUnavailable
 
 
@@ -42,3 +44,13 @@ def require(engine: str | None) -> None:
         pytest.fail(f"UCP_REQUIRE={os.environ['UCP_REQUIRE']}, but: {error}")
     elsewhere = "; `make test-netem` runs it in User Mode Linux" if engine == "netem" else ""
     pytest.skip(f"{error.reason}{elsewhere}")
+
+
+def require_uml() -> None:
+    """The same of User Mode Linux."""
+    try:
+        uml.find()
+    except UmlError as error:
+        if "uml" in os.environ.get("UCP_REQUIRE", "").split(","):
+            pytest.fail(f"UCP_REQUIRE={os.environ['UCP_REQUIRE']}, but: {error}")
+        pytest.skip(str(error))

@@ -69,7 +69,7 @@ class Air:
             vehicle,
             [sys.executable, "-S", str(AIR), *map(str, arguments)],
             cwd=self.folder,
-            env={"PATH": os.environ["PATH"]},
+            env={"PATH": os.environ["PATH"], "PYTHONPATH": str(AIR.parents[2])},
             stdout=output,
             stderr=output,
         )

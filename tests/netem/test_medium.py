@@ -1,6 +1,7 @@
 """The air in virtual time does what conditions ask: counted over many broadcasts of a fixed seed."""
 
 from collections import Counter
+from itertools import pairwise
 from statistics import fmean, stdev
 from typing import Any
 
@@ -8,9 +9,11 @@ import pytest
 
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 from netem.errors import ConditionsError
-from netem.medium import Medium, sample
+from netem.medium import Lots, Medium
 
 BROADCASTS = 20_000
+DATA_BYTES = 83  # makes a frame of 1000 bits
+CONSTANT = LinkConditions(delay=Delay(1.5))
 
 
 def medium(vehicles: int = 3, seed: int = 1, *, conditions: NetworkConditions | None = None, **link: Any) -> Medium:
@@ -19,9 +22,13 @@ def medium(vehicles: int = 3, seed: int = 1, *, conditions: NetworkConditions | 
     return air
 
 
+def draw(air: Medium, sender: int, now: float = 0.0) -> Lots:
+    return air.draw(sender, now, DATA_BYTES)
+
+
 def delays(air: Medium, sender: int, receiver: int, broadcasts: int = BROADCASTS) -> list[list[float]]:
     """The delays of the copies of each broadcast of one sender at one receiver, by their numbers."""
-    return [[delay for number, delay in air.draw(sender).to_all() if number == receiver] for _ in range(broadcasts)]
+    return [[delay for number, delay in draw(air, sender).to_all() if number == receiver] for _ in range(broadcasts)]
 
 
 def lost(copies: list[list[float]]) -> float:
@@ -31,9 +38,9 @@ def lost(copies: list[list[float]]) -> float:
 @pytest.mark.parametrize("loss", [0.0, 0.15, 0.5, 1.0])
 def test_every_receiver_loses_independently_what_was_asked(loss: float) -> None:
     air = medium(loss=loss)
-    heard = Counter(number for _ in range(BROADCASTS) for number, _ in air.draw(0).to_all())
+    heard = Counter(number for _ in range(BROADCASTS) for number, _ in draw(air, 0).to_all())
     assert [1 - heard[number] / BROADCASTS for number in (1, 2)] == [pytest.approx(loss, abs=0.012)] * 2
-    both = sum(len(air.draw(0).to_all()) == 2 for _ in range(BROADCASTS)) / BROADCASTS
+    both = sum(len(draw(air, 0).to_all()) == 2 for _ in range(BROADCASTS)) / BROADCASTS
     assert both == pytest.approx((1 - loss) ** 2, abs=0.012)
     assert heard[0] == 0  # nobody hears itself
 
@@ -68,15 +75,127 @@ def test_a_delay_has_its_mean_and_jitter(distribution: str) -> None:
 
 
 def test_no_delay_is_negative() -> None:
-    assert sample(Delay(0.1, 0.1, "normal"), 0.0001) == 0.0
+    taken = [delay for copies in delays(medium(delay=Delay(0.1, 0.1, "normal")), 0, 1) for delay in copies]
+    assert sum(delay == 0.0 for delay in taken) / len(taken) == pytest.approx(0.159, abs=0.012)
+    assert min(taken) == 0.0
 
 
-def test_duplicates_come_twice_and_overtakers_at_once() -> None:
-    copies = delays(medium(delay=Delay(1.0), duplicate=0.1, reorder=0.25, loss=0.2), 0, 1)
-    heard = [one for one in copies if one]
-    assert lost(copies) == pytest.approx(0.2, abs=0.012)
-    assert sum(len(one) == 2 for one in heard) / len(heard) == pytest.approx(0.1, abs=0.01)
-    assert sum(one[0] == 0.0 for one in heard) / len(heard) == pytest.approx(0.25, abs=0.012)
+@pytest.mark.parametrize(("loss", "duplicate"), [(0.2, 0.1), (0.4, 0.6), (1.0, 0.3)])
+def test_of_a_packet_lost_and_duplicated_one_is_left_and_a_second_copy_can_be_lost_itself(
+    loss: float, duplicate: float
+) -> None:
+    copies = Counter(map(len, delays(medium(loss=loss, duplicate=duplicate), 0, 1)))
+    expected = [
+        loss * (1 - duplicate),
+        (1 - loss) * (1 - duplicate) + loss * duplicate + (1 - loss) * duplicate * loss,
+        (1 - loss) * duplicate * (1 - loss),
+    ]
+    assert [copies[number] / BROADCASTS for number in range(3)] == [pytest.approx(one, abs=0.012) for one in expected]
+
+
+def test_overtakers_come_at_once_and_a_second_copy_takes_its_own_time() -> None:
+    copies = delays(medium(delay=Delay(1.0, 0.5), duplicate=0.3, reorder=0.25), 0, 1)
+    each = [delay for one in copies for delay in one]
+    assert sum(delay == 0.0 for delay in each) / len(each) == pytest.approx(0.25, abs=0.012)
+    twice = [one for one in copies if len(one) == 2]
+    assert sum(min(one) == 0.0 for one in twice) / len(twice) == pytest.approx(1 - 0.75**2, abs=0.03)
+    assert sum(one[0] == one[1] for one in twice) / len(twice) == pytest.approx(0.25**2, abs=0.02)
+
+
+def arrivals(air: Medium, sent_at: list[float], receiver: int = 1) -> list[list[float]]:
+    """When the copies of each broadcast of the first vehicle come."""
+    return [[at + delay for delay in draw(air, 0, at).copies_to(receiver)] for at in sent_at]
+
+
+def test_under_a_rate_a_packet_leaves_after_the_last_one_and_its_own_time() -> None:
+    """1000 bits at 1000 bit/s: a second each."""
+    assert arrivals(medium(rate=1000), [0.0, 0.25, 0.5, 5.0]) == [[1.0], [2.0], [3.0], [6.0]]
+    # The rate is waited for after the delay, or after whoever is before; the queue is empty again at 8.
+    air = medium(rate=1000, delay=Delay(2.0))
+    assert arrivals(air, [0.0, 0.25, 0.5, 4.75, 9.0]) == [[3.0], [4.0], [5.0], [7.75], [12.0]]
+    # Each frame has 42 bytes of headers.
+    assert medium(rate=8).draw(0, 0.0, 0).copies_to(1) == (42.0,)
+
+
+def test_each_directed_pair_has_a_queue_of_its_own() -> None:
+    air = medium(conditions=NetworkConditions(links={(1, 2): LinkConditions(rate=1000), (2, 1): CONSTANT}))
+    assert arrivals(air, [0.0, 0.0]) == [[1.0], [2.0]]
+    assert draw(air, 1).copies_to(0) == (1.5,)
+    assert arrivals(air, [0.0]) == [[3.0]]
+
+
+def test_jitter_reorders_without_a_rate_only() -> None:
+    sent_at = [index / 100 for index in range(500)]
+    jitter = Delay(1.0, 1.0, "normal")
+    free = [at for (at,) in arrivals(medium(delay=jitter), sent_at)]
+    ordered = [at for (at,) in arrivals(medium(delay=jitter, rate=1e6), sent_at)]
+    assert free != sorted(free)
+    assert all(later - before >= 0.000999 for before, later in pairwise(ordered))
+
+
+def test_what_comes_when_the_limit_is_reached_is_lost() -> None:
+    air = medium(rate=1000, limit=2)
+    # The first leaves at 1: at that moment there is room again.
+    assert arrivals(air, [0.0, 0.0, 0.5, 1.0, 1.5, 2.0]) == [[1.0], [2.0], [], [3.0], [], [4.0]]
+    air = medium(delay=Delay(1.5), limit=3)
+    assert arrivals(air, [0.0, 0.25, 0.5, 1.0, 1.5, 1.5]) == [[1.5], [1.75], [2.0], [], [3.0], []]
+
+
+def test_what_overtakes_leaves_at_once_and_takes_no_place() -> None:
+    air = medium(rate=1000, delay=Delay(2.0), reorder=1.0, limit=1)
+    assert arrivals(air, [0.0, 0.0, 0.5]) == [[0.0], [0.0], [0.5]]
+
+
+def test_what_is_corrupted_takes_its_place_in_the_queue_and_what_is_lost_takes_none() -> None:
+    found = arrivals(medium(rate=1000, corrupt=0.5), [0.0] * 100)
+    assert 20 < sum(map(len, found)) < 80
+    assert all(copies in ([], [at]) for at, copies in enumerate(found, 1))
+    heard = [at for copies in arrivals(medium(rate=1000, loss=0.5), [0.0] * 100) for at in copies]
+    assert heard == list(range(1, len(heard) + 1))
+
+
+def test_a_second_copy_goes_through_the_queue_before_the_first() -> None:
+    """And so a packet that finds one place left takes two."""
+    assert arrivals(medium(rate=1000, duplicate=1.0), [0.0, 0.0]) == [[2.0, 1.0], [4.0, 3.0]]
+    one_waits = medium(rate=1000, duplicate=1.0, limit=1)
+    assert arrivals(one_waits, [0.0, 0.0, 1.5, 2.0]) == [[2.0, 1.0], [], [], [4.0, 3.0]]
+
+
+def test_a_queue_lives_on_while_conditions_remember() -> None:
+    air = medium(rate=1000)
+    assert arrivals(air, [0.0, 0.0]) == [[1.0], [2.0]]
+    air.apply(NetworkConditions(LinkConditions(rate=2000, limit=3)))
+    assert arrivals(air, [0.5, 0.5]) == [[2.5], []]
+    air.apply(NetworkConditions(LinkConditions(delay=Delay(0.25), limit=3)))
+    assert arrivals(air, [0.5, 1.0, 1.0]) == [[], [1.25], []]
+    air.apply(NetworkConditions(LinkConditions(rate=1000)))
+    assert arrivals(air, [1.0]) == [[3.5]]
+    for forgetful in (CONSTANT, LinkConditions(delay=Delay(1.5, 0.0, "normal"))):
+        air.apply(NetworkConditions(forgetful))
+        assert arrivals(air, [1.0]) == [[2.5]]
+        air.apply(NetworkConditions(LinkConditions(rate=1000)))
+        assert arrivals(air, [1.0]) == [[2.0]]
+
+
+def test_a_partition_stands_before_the_queue() -> None:
+    air = medium(rate=1000)
+    open_ = NetworkConditions(LinkConditions(rate=1000))
+    assert arrivals(air, [0.0]) == [[1.0]]
+    air.apply(open_.with_partition([[1]]))
+    assert arrivals(air, [0.0, 0.0]) == [[], []]
+    air.apply(open_)
+    assert arrivals(air, [0.0]) == [[2.0]]
+
+
+def test_bursts_begin_in_the_good_state_whenever_the_conditions_change_but_not_with_a_partition() -> None:
+    bursts = NetworkConditions(LinkConditions(GilbertElliott(1, 0)))  # good for one packet, then bad for good
+    air = medium(conditions=bursts)
+    heard = [bool(draw(air, 0).copies_to(1)) for _ in range(2)]
+    air.apply(bursts.with_partition([[3]]))
+    heard.append(bool(draw(air, 0).copies_to(1)))
+    air.apply(NetworkConditions(LinkConditions(GilbertElliott(1, 0), Delay(1.0))))
+    heard.append(bool(draw(air, 0).copies_to(1)))
+    assert heard == [True, False, False, True]
 
 
 def test_a_bit_error_is_a_loss_of_its_own() -> None:
@@ -100,19 +219,19 @@ def test_nothing_crosses_a_partition_and_all_does_after_heal() -> None:
     air = medium(4)
     cut = NetworkConditions(partition=(frozenset({1, 2}),))
     air.apply(cut)
-    assert {number for number, _ in air.draw(0).to_all()} == {1}
-    assert {number for number, _ in air.draw(3).to_all()} == {2}
+    assert {number for number, _ in draw(air, 0).to_all()} == {1}
+    assert {number for number, _ in draw(air, 3).to_all()} == {2}
     assert (air.hears(0, 1), air.hears(0, 2)) == (True, False)
-    assert air.draw(0).copies_to(2) == ()
+    assert draw(air, 0).copies_to(2) == ()
     air.apply(cut.healed())
-    assert {number for number, _ in air.draw(0).to_all()} == {1, 2, 3}
+    assert {number for number, _ in draw(air, 0).to_all()} == {1, 2, 3}
 
 
 def test_lots_read_one_by_one_are_those_read_all_at_once() -> None:
     for link in ({"loss": 0.3}, {"loss": GilbertElliott(0.1, 0.5), "duplicate": 0.5}):
         one, other = medium(5, **link), medium(5, **link)
         for _ in range(200):
-            lots, all_ = one.draw(2), other.draw(2).to_all()
+            lots, all_ = draw(one, 2), draw(other, 2).to_all()
             assert [(number, delay) for number in range(5) for delay in lots.copies_to(number)] == all_
             assert all(delay <= lots.latest for _, delay in all_)
 
@@ -121,14 +240,15 @@ def test_streams_are_one_per_sender_and_concern() -> None:
     """Neither another sender's words nor more loss change how long a message takes."""
     quiet, busy, lossy = medium(), medium(), medium(loss=0.9)
     for _ in range(500):
-        busy.draw(1)
-        expected = dict(quiet.draw(0).to_all())
-        assert dict(busy.draw(0).to_all()) == expected
-        assert dict(lossy.draw(0).to_all()).items() <= expected.items()
+        draw(busy, 1)
+        expected = dict(draw(quiet, 0).to_all())
+        assert dict(draw(busy, 0).to_all()) == expected
+        assert dict(draw(lossy, 0).to_all()).items() <= expected.items()
 
 
 def test_a_seed_is_another_air() -> None:
-    assert medium(seed=1).draw(0).to_all() == medium(seed=1).draw(0).to_all() != medium(seed=2).draw(0).to_all()
+    one, same, other = (draw(medium(seed=seed), 0).to_all() for seed in (1, 1, 2))
+    assert one == same != other
 
 
 def test_an_unknown_vehicle_is_refused() -> None:

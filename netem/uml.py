@@ -1,0 +1,270 @@
+"""Runs one command inside User Mode Linux, a kernel that has netem and is an ordinary process.
+
+    status = uml.run(["my-command", "--flag"], cwd=Path.cwd(), env=os.environ)
+
+linux.uml (Debian: user-mode-linux) boots on the host's own files (hostfs), so the command finds every program and
+directory where it was, and writes with the caller's rights; it needs none beyond them, and is root inside. Only /run,
+with TMPDIR in it, is the guest's own. It has one processor, and a system call costs about twenty of the host's.
+
+What the command prints comes out here as it comes. Its terminal is a console of the guest, where Ctrl-C and SIGTERM
+are typed as Ctrl-C, and nothing else is. On another console the guest says an empty line every few seconds, and at
+last the command's exit status: without that last word there is an error, never a status.
+
+Whatever happens to the caller, nothing stays: User Mode Linux is one process group of the host, led by a shell that
+kills the group and removes its directory as soon as the caller closes its end of a pipe, or dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import BinaryIO
+
+from netem.errors import UmlError
+
+MODULES = Path("/usr/lib/uml/modules")
+SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
+MEMORY = "2G"
+"""At most: the host gives what is used."""
+
+BEAT_S = 5
+SILENCE_LIMIT_S = 90.0
+"""A guest from which nothing comes for so long hangs: it boots within a few seconds, and then beats."""
+
+POLL_S = 0.05
+INTERRUPTED = 128 + signal.SIGINT
+CTRL_C = b"\x03"
+
+_GUARD = """
+{ read -r _ <"/proc/self/fd/$UML_CALLER"; rm -rf "$UML_FOLDER"; kill -KILL 0; } &
+exec "$@"
+"""
+
+_INIT = """#!/bin/sh
+export PATH={path}
+mount -t proc proc /proc
+mount -t sysfs sysfs /sys
+mount -t tmpfs tmpfs /run
+mkdir -p /dev/shm && mount -t tmpfs tmpfs /dev/shm
+ln -s /proc/self/fd /dev/fd
+mkdir -m 1777 /run/tmp && mkdir -p /run/modules/lib && ln -s {modules} /run/modules/lib/modules
+modprobe -d /run/modules -a bridge veth sch_netem sch_htb sch_ingress cls_basic cls_fw act_skbedit act_gact af_packet
+modprobe -d /run/modules -q -a nf_tables nft_numgen
+ip link set lo up
+set -e
+exec 3</dev/tty1  # kept open, it keeps its size
+stty -F /dev/tty1 -echo -opost {size}
+stty -F /dev/tty2 -opost
+stty -F /dev/tty3 -opost
+# Where the caller's output is not a terminal, the command's is a pipe; not to its terminal, which ends with it.
+carriers=
+carry() {{ mkfifo "/run/$1"; cat "/run/$1" >"/dev/$1" & carriers="$carriers $!"; }}
+{carried}
+set +e
+setsid --ctty --wait sh {command} </dev/tty1 >{stdout} 2>{stderr}
+status=$?
+for carrier in $carriers; do wait "$carrier"; done
+sync
+echo "$status" >/dev/tty4
+exec sleep infinity
+"""
+
+_COMMAND = """
+trap : INT QUIT
+while echo; do sleep {beat_s}; done >/dev/tty4 2>&1 &
+cd {cwd} || exit
+env -i {environment} {argv}
+"""
+
+
+def inside() -> bool:
+    """Whether this is User Mode Linux."""
+    return "User Mode Linux" in Path("/proc/cpuinfo").read_text()
+
+
+def find() -> Path:
+    """The kernel. Raises UmlError, naming the packages, if it is not here, or a program that it needs."""
+    kernel = shutil.which("linux.uml")
+    path = os.pathsep.join([os.environ.get("PATH", ""), SYSTEM_PATH])
+    packages = {
+        "user-mode-linux": kernel is not None and MODULES.is_dir(),
+        "kmod": shutil.which("modprobe", path=path),
+        "iproute2": shutil.which("ip", path=path),
+    }
+    missing = [package for package, here in packages.items() if not here]
+    if kernel is None or missing:
+        raise UmlError(f"User Mode Linux is not installed (Debian, Ubuntu: apt install {' '.join(missing)})")
+    return Path(kernel)
+
+
+def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
+    """Run a command in a kernel of its own and return its exit status; of a signal 128 and its number, as shells do.
+
+    `env` is its environment but for TMPDIR. In the main thread, Ctrl-C and SIGTERM are the command's; before the guest
+    is up they end everything, with status 130. Raises UmlError if User Mode Linux is not here, does not boot, hangs or
+    panics.
+    """
+    kernel = find()
+    with tempfile.TemporaryDirectory(prefix="uml-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        (folder / "command").write_text(_command(argv, cwd, env))
+        (folder / "init").write_text(_init(folder / "command"))
+        (folder / "init").chmod(0o755)
+        guest = _Guest(kernel, folder)
+        try:
+            with _typing_ctrl_c(guest):
+                return guest.follow()
+        except KeyboardInterrupt:
+            return INTERRUPTED
+        finally:
+            guest.end()
+
+
+def _command(argv: Sequence[str], cwd: Path, env: Mapping[str, str]) -> str:
+    variables = {**env, "TMPDIR": "/run/tmp"}
+    return _COMMAND.format(
+        beat_s=BEAT_S,
+        cwd=shlex.quote(str(cwd)),
+        environment=shlex.join(f"{name}={value}" for name, value in variables.items()),
+        argv=shlex.join(argv),
+    )
+
+
+def _init(command: Path) -> str:
+    stdout = "/dev/tty1" if sys.stdout.isatty() else "/run/tty2"
+    stderr = "/dev/tty3" if sys.stderr.isatty() else "/run/tty3"
+    columns, rows = shutil.get_terminal_size()
+    return _INIT.format(
+        path=SYSTEM_PATH,
+        modules=MODULES,
+        size=f"rows {rows} columns {columns}",
+        carried="\n".join(f"carry {Path(path).name}" for path in (stdout, stderr) if path.startswith("/run")),
+        command=shlex.quote(str(command)),
+        stdout=stdout,
+        stderr=stderr,
+    )
+
+
+class _Guest:
+    """A User Mode Linux that has been started; `end` it.
+
+    Its consoles write to files of `folder`, which we read as they grow: where a pipe is full, this kernel's consoles
+    refuse to write instead of waiting.
+    """
+
+    def __init__(self, kernel: Path, folder: Path) -> None:
+        self.up = False
+        self._folder = folder
+        typed, self._keyboard = os.pipe()
+        caller, self._lifeline = os.pipe()
+        with contextlib.ExitStack() as stack:
+            kernel_log, terminal, stdout, stderr, word = (
+                stack.enter_context((folder / name).open("ab")).fileno()
+                for name in ("kernel", "stdout", "stdout", "stderr", "word")
+            )
+            options = [
+                f"mem={MEMORY}", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"init={folder / 'init'}",
+                f"uml_dir={folder}", "con=null", "con0=null,fd:1",
+                f"con1=fd:{typed},fd:{terminal}", f"con2=null,fd:{stdout}", f"con3=null,fd:{stderr}",
+                f"con4=null,fd:{word}", "quiet", "selinux=0", "panic=-1",
+            ]  # fmt: skip
+            self._process = subprocess.Popen(
+                ["sh", "-c", _GUARD, "sh", str(kernel), *options],
+                stdin=subprocess.DEVNULL,
+                stdout=kernel_log,
+                stderr=kernel_log,
+                env={**os.environ, "UML_CALLER": str(caller), "UML_FOLDER": str(folder)},
+                pass_fds=(typed, terminal, stdout, stderr, word, caller),
+                start_new_session=True,
+            )
+        os.close(typed)
+        os.close(caller)
+
+    def type(self, keys: bytes) -> None:
+        os.write(self._keyboard, keys)
+
+    def follow(self) -> int:
+        """Bring out what the command prints until it ends; its exit status. Raises UmlError."""
+        with contextlib.ExitStack() as stack:
+            stdout, stderr, word = (
+                stack.enter_context((self._folder / name).open("rb", buffering=0))
+                for name in ("stdout", "stderr", "word")
+            )
+            said = b""
+            heard = time.monotonic()
+            while True:
+                ended = self._process.poll() is not None
+                told = word.read()
+                said += told
+                came = [_copy(stdout, sys.stdout.buffer), _copy(stderr, sys.stderr.buffer)]
+                self.up = self.up or bool(said)
+                if told or any(came):
+                    heard = time.monotonic()
+                elif (status := _last_word(said)) is not None:
+                    return status
+                elif ended:
+                    raise self._failed("it ended" if self.up else "it did not boot")
+                elif time.monotonic() > heard + SILENCE_LIMIT_S:
+                    raise self._failed(f"nothing came from it for {SILENCE_LIMIT_S:g} s")
+                else:
+                    time.sleep(POLL_S)
+
+    def _failed(self, what: str) -> UmlError:
+        lines = (self._folder / "kernel").read_text(errors="replace").splitlines()
+        told = [line.strip() for line in lines if line.strip()] or ["nothing"]
+        last = next((line for line in told if "panic" in line), told[-1])
+        return UmlError(f"User Mode Linux failed: {what}; it last said: {last}")
+
+    def end(self) -> None:
+        """Kill all of it; may have ended by itself."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        os.close(self._keyboard)
+        os.close(self._lifeline)
+
+
+def _copy(source: io.FileIO, target: BinaryIO) -> bool:
+    """Write what is new in a growing file; whether anything was."""
+    if data := source.read():
+        target.write(data)
+        target.flush()
+    return bool(data)
+
+
+def _last_word(said: bytes) -> int | None:
+    """The exit status, once its line is whole; the lines before it are empty."""
+    *lines, _ = said.split(b"\n")
+    return next((int(line) for line in lines if line.strip()), None)
+
+
+@contextlib.contextmanager
+def _typing_ctrl_c(guest: _Guest) -> Iterator[None]:
+    """Have Ctrl-C and SIGTERM typed at the guest's console, as far as this thread may."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if not guest.up:
+            raise KeyboardInterrupt
+        guest.type(CTRL_C)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,265 @@
+"""One scenario means the same to a kernel and to the medium: the same broadcasts go through both, and are compared.
+
+The medium is told when each packet was really sent, so that what rates and limits do can be compared packet by packet.
+For the rest both drew lots: two-sample intervals, in which a right program fails one check in 100,000.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, compress, pairwise
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from netem.conditions import NetworkConditions
+from netem.link import Delay, Distribution, GilbertElliott, LinkConditions
+from netem.medium import Medium
+from tests.netem.conftest import PACKETS, PORT, Air
+from tests.netem.test_engine import in_lab
+from tests.netem.test_links import HEADERS, LATE_S, until_quiet
+
+pytestmark = pytest.mark.lab
+
+WITNESS = 2  # hears every packet after a constant delay, and so tells when it was sent and how late this machine is
+CONSTANT_S = 0.3
+CONSTANT = LinkConditions(delay=Delay(CONSTANT_S))
+DATA_BYTES = 1000
+EARLY_S = 0.001  # how far the clocks that stamp a packet's way may be apart
+SEEDS = range(1, 6)
+
+
+@dataclass
+class Heard:
+    """What a receiver heard of numbered packets."""
+
+    sent_at: list[float]
+    """Seconds, by number."""
+    delays: list[list[float]]
+    """Seconds, of each copy that came, by number."""
+
+    @property
+    def came(self) -> list[bool]:
+        return [bool(copies) for copies in self.delays]
+
+    @property
+    def all_delays(self) -> list[float]:
+        return [delay for copies in self.delays for delay in copies]
+
+    @property
+    def arrivals(self) -> list[float]:
+        """When each copy came, by number."""
+        return [at + delay for at, copies in zip(self.sent_at, self.delays, strict=True) for delay in copies]
+
+
+@dataclass
+class Both:
+    """What a receiver heard through the kernel, and through the medium with one seed after the other."""
+
+    kernel: Heard
+    medium: list[Heard]
+    late_s: float
+    """How late this machine may be: as late as the witness ever was, but always some."""
+
+    def agree_on_copies(self) -> None:
+        """As many packets are lost, come once, and come twice."""
+        for number in range(3):
+            kernel, medium = ([len(copies) == number for copies in one.delays] for one in self.sides)
+            assert_same_share(f"{number} copies", kernel, medium)
+        assert max(map(len, self.kernel.delays)) <= 2
+
+    def agree_on_delays(self) -> None:
+        """The distributions are the same, but for the lateness of this machine."""
+        kernel, medium = (one.all_delays for one in self.sides)
+        for at in statistics.quantiles(medium, n=20):
+            by_then = [delay <= at for delay in medium]
+            assert_no_more(f"sooner than {at:.3f} s", [delay <= at - EARLY_S for delay in kernel], by_then)
+            assert_no_more(f"later than {at:.3f} s", by_then, [delay <= at + self.late_s for delay in kernel])
+
+    def agree_on_arrivals(self) -> None:
+        """What comes through both comes at the same time, but for the lateness of this machine."""
+        pairs = zip(self.kernel.delays, self.medium[0].delays, strict=True)
+        later = statistics.quantiles(one[0] - other[0] for one, other in pairs if one and other)
+        assert all(-EARLY_S < late_s < LATE_S for late_s in later), later
+
+    @property
+    def sides(self) -> tuple[Heard, Heard]:
+        return self.kernel, self.pooled
+
+    @property
+    def pooled(self) -> Heard:
+        """All that the medium did."""
+        sent_at = [at for one in self.medium for at in one.sent_at]
+        return Heard(sent_at, [copies for one in self.medium for copies in one.delays])
+
+
+async def broadcast(
+    air: Air, conditions: NetworkConditions, sender: int, receivers: Iterable[int], at_once: int = PACKETS
+) -> dict[int, Both]:
+    """What each receiver hears of packets as fast as `sender` can, under conditions that the lab already has.
+
+    `at_once`: with a pause after so many, for what many receivers are due at one moment a kernel may drop.
+    """
+    receivers = sorted({WITNESS, *receivers})
+    listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in receivers}
+    for first in range(0, PACKETS, at_once):
+        await air.broadcast(sender, min(at_once, PACKETS - first), first, DATA_BYTES)
+    await until_quiet(air)
+    found = {vehicle: await listener.finish() for vehicle, listener in listeners.items()}
+    assert all(result["overflow"] == 0 for result in found.values()), "a receiver was too slow to judge by"
+    witness = found[WITNESS]
+    sent = zip(witness["numbers"], witness["at_s"], witness["delays_s"], strict=True)
+    sent_s = {number: at_s - delay_s for number, at_s, delay_s in sent}
+    assert len(sent_s) == PACKETS, "the machine was too slow to judge by: packets were lost that no condition loses"
+    sent_at = [sent_s[number] - sent_s[0] for number in range(PACKETS)]
+    in_kernel = {}
+    for receiver in receivers:
+        delays: list[list[float]] = [[] for _ in sent_at]
+        for number, delay_s in zip(found[receiver]["numbers"], found[receiver]["delays_s"], strict=True):
+            delays[number].append(delay_s)
+        in_kernel[receiver] = Heard(sent_at, delays)
+    vehicles = air.lab.vehicles
+    in_medium = [through_medium(vehicles, seed, conditions, vehicles.index(sender), sent_at) for seed in SEEDS]
+    late_s = max(LATE_S, max(witness["delays_s"]) - CONSTANT_S)
+    return {v: Both(in_kernel[v], [flown[vehicles.index(v)] for flown in in_medium], late_s) for v in receivers}
+
+
+def through_medium(
+    vehicles: Sequence[int], seed: int, conditions: NetworkConditions, sender: int, sent_at: list[float]
+) -> list[Heard]:
+    """What each vehicle hears; vehicles and `sender` by number."""
+    medium = Medium(vehicles, seed)
+    medium.apply(conditions)
+    flown = [Heard(sent_at, [[] for _ in sent_at]) for _ in vehicles]
+    for number, at in enumerate(sent_at):
+        for receiver, delay in medium.draw(sender, at, DATA_BYTES).to_all():
+            flown[receiver].delays[number].append(delay)
+    return flown
+
+
+def assert_no_more(what: str, one: Sequence[bool], other: Sequence[bool]) -> None:
+    """The share that is true of `one` is not larger than that of `other`, but by chance."""
+    share = (sum(one) + sum(other)) / (len(one) + len(other))
+    width = 4.42 * math.sqrt(share * (1 - share) * (1 / len(one) + 1 / len(other)))
+    more = sum(one) / len(one) - sum(other) / len(other)
+    assert more <= width, f"{what}: {sum(one)} of {len(one)}, {sum(other)} of {len(other)}; allowed is {width:.3f} more"
+
+
+def assert_same_share(what: str, one: Sequence[bool], other: Sequence[bool]) -> None:
+    assert_no_more(what, one, other)
+    assert_no_more(what, other, one)
+
+
+def test_lots_without_a_memory(netem: str, tmp_path: Path) -> None:
+    """Loss and duplicates together, corruption, overtaking, and delays of every shape."""
+    links = {
+        WITNESS: CONSTANT,
+        3: LinkConditions(loss=0.4, duplicate=0.6),
+        4: LinkConditions(corrupt=0.2),
+        5: LinkConditions(delay=Delay(0.3), reorder=0.25),
+        6: LinkConditions(0.2, Delay(0.3, 0.1, "normal"), duplicate=0.5, reorder=0.2, corrupt=0.2),
+        7: LinkConditions(delay=Delay(0.1, 0.1, "normal")),  # a sixth of it would be below 0
+    }
+    links |= {8 + i: LinkConditions(delay=Delay(0.5, 0.2, shape)) for i, shape in enumerate(get_args(Distribution))}
+    conditions = NetworkConditions(receivers=links)
+
+    async def story(air: Air) -> None:
+        await air.lab.apply(conditions)
+        found = await broadcast(air, conditions, 1, links, at_once=250)
+        found[WITNESS].agree_on_arrivals()
+        for receiver, both in found.items():
+            both.agree_on_copies()
+            if links[receiver].delay is not None:
+                both.agree_on_delays()
+
+    in_lab([1, *links], netem, tmp_path, story)
+
+
+def test_bursts_and_each_direction_of_a_pair(netem: str, tmp_path: Path) -> None:
+    links = {
+        WITNESS: CONSTANT,
+        3: LinkConditions(GilbertElliott(0.05, 0.25)),
+        4: LinkConditions(GilbertElliott(1, 1, loss_bad=0.9, loss_good=0.2)),  # good and bad by turns
+    }
+    pairs = {(1, 5): LinkConditions(0.6), (5, 1): LinkConditions(0.2)}
+    conditions = NetworkConditions(receivers=links, links=pairs)
+
+    async def story(air: Air) -> None:
+        await air.lab.apply(conditions)
+        found = await broadcast(air, conditions, 1, [3, 4, 5])
+        # Mean loss and mean length of bursts follow from how often losses begin, and how often they end.
+        for before in (True, False):
+            kernel, medium = ([now for last, now in pairwise(one.came) if last == before] for one in found[3].sides)
+            assert_same_share(f"comes where the one before came: {before}", kernel, medium)
+        for turn in (0, 1):
+            kernel, medium = (one.came[turn::2] for one in found[4].sides)
+            assert_same_share(f"comes by turn {turn}", kernel, medium)
+        found[5].agree_on_copies()
+        (await broadcast(air, conditions, 5, [1]))[1].agree_on_copies()
+
+    in_lab(range(1, 6), netem, tmp_path, story)
+
+
+def test_rates_and_limits(netem: str, tmp_path: Path) -> None:
+    each_s = 2.0 / PACKETS  # so long takes a packet at the rate
+    rate = (DATA_BYTES + HEADERS) * 8 / each_s
+    limit = 40
+    jitter = Delay(CONSTANT_S, 0.1, "normal")
+    links = {
+        WITNESS: CONSTANT,
+        3: LinkConditions(rate=rate),
+        4: LinkConditions(delay=Delay(CONSTANT_S), rate=rate),
+        5: LinkConditions(rate=rate, corrupt=0.4),
+        6: LinkConditions(delay=jitter, rate=rate),
+        7: LinkConditions(delay=Delay(CONSTANT_S), rate=rate, reorder=0.25),
+        8: LinkConditions(rate=rate, limit=limit),
+        9: LinkConditions(delay=Delay(1.5), limit=limit),
+    }
+    conditions = NetworkConditions(receivers=links)
+
+    async def story(air: Air) -> None:
+        await air.lab.apply(conditions)
+        found = await broadcast(air, conditions, 1, links)
+        for receiver in (3, 4, 5, 8, 9):
+            found[receiver].agree_on_arrivals()
+        for receiver in (3, 4, 5, 6, 7):
+            found[receiver].agree_on_copies()
+        assert_jitter_keeps_order(found[6], 3 * jitter.jitter_s)
+        assert_overtakers_take_no_time(found[7], each_s)
+        passed = [list(accumulate(one.came)) for one in (found[8].kernel, found[8].medium[0])]
+        assert max(abs(one - other) for one, other in zip(*passed, strict=True)) <= 1 + found[8].late_s / each_s
+        before_one_left = [at < 1.5 for at in found[9].kernel.sent_at]
+        for one in (found[9].kernel, found[9].medium[0]):
+            assert list(compress(one.came, before_one_left)) == [n < limit for n in range(sum(before_one_left))]
+
+    in_lab([1, *links], netem, tmp_path, story)
+
+
+def assert_jitter_keeps_order(both: Both, spread_s: float) -> None:
+    """Under a rate, and does not add up."""
+    heard = [one.arrivals for one in (both.kernel, *both.medium)]
+    assert all(map(in_order, heard))
+    ends = [arrivals[-1] for arrivals in heard]
+    assert max(ends) - min(ends) < spread_s, ends
+
+
+def assert_overtakers_take_no_time(both: Both, each_s: float) -> None:
+    """Under a rate: as many come at once, and the others in order, one after another."""
+    assert_same_share("overtakes", *([delay < CONSTANT_S / 2 for delay in one.all_delays] for one in both.sides))
+    for one in (both.kernel, *both.medium):
+        copies = zip(one.sent_at, one.arrivals, strict=True)
+        others = [(sent_at, at) for sent_at, at in copies if at - sent_at > CONSTANT_S / 2]
+        assert in_order([at for _, at in others])
+        leaves_at = 0.0
+        for sent_at, _ in others:
+            leaves_at = max(leaves_at, sent_at + CONSTANT_S) + each_s
+        assert others[-1][1] == pytest.approx(leaves_at, abs=both.late_s)
+
+
+def in_order(arrivals: list[float]) -> bool:
+    """As far as the clocks tell."""
+    return all(later > before - EARLY_S for before, later in pairwise(arrivals))

@@ -1,0 +1,264 @@
+"""What was asked beside what is measured: the statistics, the questions, and that a wrong network is found out."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from netem import estimates
+from netem.conditions import NetworkConditions
+from netem.engine import Applied, ReceiverFigures
+from netem.estimates import Estimate, Heard, Lateness
+from netem.lab import EngineName, Lab
+from netem.link import Delay, GilbertElliott, LinkConditions
+from netem.measure import Measured, Question, Study, measure, studies
+from netem.observers import Arrival, DisturbedError, check, in_lab, in_medium
+from tests.machine import require
+from tests.netem.conftest import PORT, Air, play
+
+NEVER_LATE = Lateness([0.0] * 10_000, [0.0] * 10)
+SOME = 3000
+Z = 3.2905267314919255  # of 99.9 %, two-sided
+
+
+def heard(arrivals: list[tuple[int, float]], sent_s: list[float], lateness: Lateness = NEVER_LATE) -> Heard:
+    return Heard(sent_s, sorted(arrivals, key=lambda arrival: arrival[1]), lateness)
+
+
+# Statistics
+
+
+def test_a_share_has_wilsons_interval() -> None:
+    assert estimates.share(0, 10_000) == Estimate(0.0, 0.0, pytest.approx(Z**2 / (10_000 + Z**2)), 10_000)
+    assert estimates.share(100, 100).high == 1.0
+    half = estimates.share(50, 100)
+    assert half.high - 0.5 == pytest.approx(Z / (2 * math.sqrt(100 + Z**2)))
+    assert 0.5 - half.low == pytest.approx(half.high - 0.5)
+    quarter_worth = estimates.share(200, 400, worth=0.25)
+    assert (quarter_worth.low, quarter_worth.high) == pytest.approx((half.low, half.high))
+    assert estimates.share(0, 0) == Estimate(0, 0, 0, 0)
+
+
+def test_a_mean_and_a_deviation_have_normal_intervals() -> None:
+    mean = estimates.mean([1.0, 2.0, 3.0, 4.0, 5.0])
+    margin = Z * math.sqrt(2.5 / 5)
+    assert (mean.measured, mean.low, mean.high) == pytest.approx((3, 3 - margin, 3 + margin))
+    deviation = estimates.deviation([-1.0, 1.0] * 50)
+    assert (deviation.measured, deviation.low, deviation.high) == pytest.approx((1, 1, 1))
+    random = Random(1)
+    normal = estimates.deviation([random.gauss(0, 2) for _ in range(20_000)])
+    assert normal.low < 2 < normal.high
+    assert normal.high - normal.low == pytest.approx(2 * Z * 2 / math.sqrt(2 * 20_000), rel=0.05)
+
+
+def test_the_interval_of_losses_in_bursts_knows_that_they_come_together() -> None:
+    bursts, count = GilbertElliott(0.05, 0.25), 2000
+    random = Random(2)
+    outside = {"chain": 0, "independent": 0, "length": 0}
+    for _ in range(400):
+        bad = False
+        arrivals = []
+        for number in range(count):
+            if not bad:
+                arrivals.append((number, float(number)))
+            bad = random.random() >= bursts.r if bad else random.random() < bursts.p
+        one = heard(arrivals, [0.0] * count)
+        for key, estimate, asked in (
+            ("chain", estimates.lost_in_bursts(one), bursts.mean),
+            ("independent", estimates.lost(one), bursts.mean),
+            ("length", estimates.burst_length(one), 1 / bursts.r),
+        ):
+            outside[key] += not estimate.low <= asked <= estimate.high
+    assert outside["chain"] <= 4
+    assert outside["length"] <= 8  # 83 bursts are few for a normal interval
+    assert outside["independent"] > 20
+
+
+def test_bursts_are_counted_whole() -> None:
+    gone = {2, 3, 4, 7, 9, 10, 17, 18, 19}
+    one = heard([(number, 0.0) for number in range(20) if number not in gone], [0.0] * 20)
+    assert estimates.burst_length(one).measured == 2.0  # 3, 1 and 2: the last one goes on
+
+
+def test_delays_are_measured_without_what_the_machine_takes_itself() -> None:
+    way_s = [0.001, 0.004] * 50
+    sent_s = [float(number) for number in range(100)]
+    arrivals = [(number, sent_s[number] + 0.1 + way_s[number]) for number in range(100)]
+    mean = estimates.delay_mean(heard(arrivals, sent_s, Lateness(way_s, [0.002, 0.002])))
+    assert (mean.measured, mean.high) == pytest.approx((0.1, 0.1))
+    assert mean.low == pytest.approx(0.098)  # timers may have been late by so much
+    deviation = estimates.delay_deviation(heard(arrivals, sent_s, Lateness(way_s, [0.0, 0.0])))
+    assert (deviation.low, deviation.high) == pytest.approx((0, 0), abs=1e-9)
+    jittered = [(number, sent_s[number] + (0.09, 0.11)[number % 2]) for number in range(100)]
+    deviation = estimates.delay_deviation(heard(jittered, sent_s, Lateness([0.0] * 100, [0.0, 0.004])))
+    assert (deviation.measured, deviation.high) == pytest.approx((0.01, 0.01))
+    assert deviation.low == pytest.approx(math.sqrt(0.01**2 - 0.002**2))  # timers may have added theirs
+
+
+def test_a_rate_is_measured_while_packets_wait_for_each_other() -> None:
+    # Five that queue for 10 ms each; a pause; and two more.
+    sent_s = [0.0, 0.001, 0.002, 0.003, 0.004, 1.0, 1.001]
+    at_s = [0.01, 0.02, 0.03, 0.04, 0.05, 1.01, 1.02]
+    found = estimates.rate(heard(list(enumerate(at_s)), sent_s), packet_bits=1000)
+    assert (found.measured, found.packets) == (pytest.approx(100_000), 5)
+    late = Lateness([0.0, 0.003], [0.001])
+    found = estimates.rate(heard(list(enumerate(at_s)), sent_s, late), packet_bits=1000)
+    assert (found.low, found.high) == pytest.approx((4000 / 0.044, 4000 / 0.036))
+
+
+def test_a_limit_is_what_waits_when_a_packet_is_lost() -> None:
+    sent_s = [number * 0.01 for number in range(100)]
+    came: list[tuple[int, float]] = []
+    for number, now in enumerate(sent_s):  # each waits 95 ms; three may
+        if sum(at > now for _, at in came) < 3:
+            came.append((number, now + 0.095))
+    found = estimates.waiting_when_lost(heard(came, sent_s), delay_s=0.095)
+    assert (found.low, found.measured, found.high) == (3, 3, 3)
+    late = [(number, at + 0.01) for number, at in came]  # a fourth seems to wait still, now and then
+    found = estimates.waiting_when_lost(heard(late, sent_s), delay_s=0.095)
+    assert found.low <= 3 <= found.high
+    rarely = [(number, at + 0.01 * (number < 9)) for number, at in came]
+    found = estimates.waiting_when_lost(heard(rarely, sent_s), delay_s=0.095)
+    assert (found.low, found.high) == (3, 3)
+
+
+# Questions and answers
+
+
+def one_question(asked: float) -> Study:
+    question = Question(1, 4, "loss", "lost", asked, estimates.lost)
+    return Study(NetworkConditions(LinkConditions(asked), {3: LinkConditions()}), (question,))
+
+
+def losing(*shares: float) -> tuple[list[tuple[Study, int]], Measured]:
+    """What is asked of an observer that loses such shares, one stream after the other, and what comes of it."""
+    asked: list[tuple[Study, int]] = []
+    kept = iter(shares)
+
+    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+        asked.append((study, packets))
+        first = round(next(kept) * packets)
+        stream = heard([(number, 0.0) for number in range(first, packets)], [0.0] * packets)
+        return {(1, receiver): stream for receiver in study.receivers}
+
+    other = Question(1, 5, "nothing", "lost", shares[0], estimates.lost)
+    study = replace(one_question(0.15), questions=(*one_question(0.15).questions, other))
+    return asked, measure("test", [study], observe, 1000)
+
+
+def test_what_lies_outside_is_asked_once_more_and_both_answers_are_kept() -> None:
+    asked, measured = losing(0.3, 0.15)
+    assert [[question.receiver for question in study.questions] for study, _ in asked] == [[4, 5], [4]]
+    assert asked[1][0].conditions == asked[0][0].conditions
+    row, other = measured.rows
+    assert measured.ok
+    assert row.before is not None
+    assert (row.answer.measured, row.before.measured) == pytest.approx((0.15, 0.3))
+    assert other.before is None
+    as_json = row.to_json()
+    assert (as_json["ok"], as_json["measured"], as_json["before"]["measured"]) == (True, 0.15, 0.3)
+
+
+def test_what_lies_outside_twice_is_not_ok() -> None:
+    asked, measured = losing(0.3, 0.3)
+    assert len(asked) == 2
+    assert [row.ok for row in measured.rows] == [False, True]
+    assert not measured.ok
+
+
+def test_in_virtual_time_everything_is_as_asked() -> None:
+    measured = measure("medium", studies("medium"), in_medium(seed=5))
+    assert [row for row in measured.rows if not row.ok] == []
+    quantities = {row.question.condition.split()[0] for row in measured.rows}
+    assert quantities == {"loss", "delay", "reorder", "corrupt", "rate", "limit", "duplicate", "partition"}
+    assert {row.answer.packets for row in measured.rows} == {10_000}
+
+
+WRONG = {
+    "loss 0.15": LinkConditions(0.17),
+    "loss in bursts, p 0.05, r 0.25": LinkConditions(GilbertElliott(0.05, 0.2)),
+    "delay 100 ms": LinkConditions(delay=Delay(0.101)),
+    "delay 100 ± 20 ms uniform": LinkConditions(delay=Delay(0.1, 0.021)),
+    "delay 100 ± 20 ms normal": LinkConditions(delay=Delay(0.1, 0.02, "pareto")),
+    "delay 100 ± 20 ms pareto": LinkConditions(delay=Delay(0.1, 0.023, "pareto")),
+    "delay 100 ± 20 ms paretonormal": LinkConditions(delay=Delay(0.1, 0.02, "normal")),
+    "reorder 0.25, delay 100 ms": LinkConditions(delay=Delay(0.1), reorder=0.3),
+    "corrupt 0.2": LinkConditions(corrupt=0.25),
+    "rate 500 kbit/s": LinkConditions(rate=501_000),
+    "limit 50, delay 100 ms": LinkConditions(delay=Delay(0.1), limit=51),
+    "duplicate 0.3": LinkConditions(duplicate=0.35),
+}
+
+
+@pytest.mark.parametrize("condition", WRONG)
+def test_whatever_is_wrong_is_found(condition: str) -> None:
+    everything = [question for study in studies("medium") for question in study.questions]
+    questions = tuple(replace(question, receiver=4) for question in everything if question.condition == condition)
+    wrong = NetworkConditions(receivers={4: WRONG[condition]})
+    assert not measure("medium", [Study(wrong, questions)], in_medium(seed=6)).ok
+
+
+# Real packets
+
+
+@pytest.mark.lab
+def test_real_packets_fare_as_asked(engine: EngineName) -> None:
+    measured = measure(engine, studies(engine), in_lab(engine))
+    assert [row.to_json() for row in measured.rows if not row.ok] == []
+    # A busy machine is sent packets so slowly that few wait for a rate.
+    assert all(row.answer.packets >= 5000 for row in measured.rows if row.question.quantity != "rate")
+
+
+@pytest.mark.lab
+def test_a_network_that_loses_more_than_asked_is_found(engine: EngineName) -> None:
+    study = replace(one_question(0.15), conditions=NetworkConditions(LinkConditions(0.2), {3: LinkConditions()}))
+    (row,) = measure(engine, [study], in_lab(engine), SOME).rows
+    assert not row.ok
+    assert row.answer.measured == pytest.approx(0.2, abs=0.04)
+
+
+@pytest.mark.lab
+def test_a_network_that_delays_longer_than_asked_is_found(netem: EngineName) -> None:
+    question = Question(1, 4, "delay 100 ms", "mean", 0.1, estimates.delay_mean)
+    study = Study(NetworkConditions(receivers={4: LinkConditions(delay=Delay(0.11))}), (question,))
+    (row,) = measure(netem, [study], in_lab(netem), SOME).rows
+    assert not row.ok
+    assert row.answer.measured == pytest.approx(0.11, abs=0.005)
+
+
+@pytest.mark.lab
+def test_a_receiver_says_how_many_packets_it_had_no_room_for(tmp_path: Path) -> None:
+    require(None)
+    count = 15_000
+
+    async def story() -> None:
+        async with await Lab.open([1, 2], log=tmp_path / "lab.log") as lab:
+            air = Air(lab, tmp_path)
+            listener = await air.start_ready(2, "receive", PORT)
+            await listener.process.send_signal(signal.SIGSTOP)
+            await air.run(1, "broadcast", PORT, count, 0, lab.broadcast, 12, 0)
+            await listener.process.send_signal(signal.SIGCONT)
+            found = await listener.finish()
+            assert found["overflow"] > 0
+            assert len(found["numbers"]) + found["overflow"] == count
+
+    play(story())
+
+
+def test_packets_that_the_machine_lost_are_an_error_unless_corruption_hides_them() -> None:
+    study = one_question(0.15)
+    one, two = (Applied("test", {4: ReceiverFigures.of({}, (), passed, 0, 0)}) for passed in (1, 2))
+    came = {(1, 4): [Arrival(0, 0.0, 0.1)]}
+    check(study, {4: {"overflow": 0}}, came, one)
+    with pytest.raises(DisturbedError, match="itself lost 1 of the packets to vehicle 4"):
+        check(study, {4: {"overflow": 0}}, came, two)
+    with pytest.raises(DisturbedError, match="overflowed"):
+        check(study, {4: {"overflow": 1}}, came, one)
+    corrupting = replace(study, conditions=NetworkConditions(LinkConditions(corrupt=0.2)))
+    check(corrupting, {4: {"overflow": 0}}, came, two)
