@@ -15,14 +15,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from sitl.vehicle import Home, Launch, NoBinaryError, UnusableBinaryError, VehicleError, check_launch
+from sitl.installed import BINARIES, DEFAULTS, current, install_command
+from sitl.vehicle import Home, Launch, NoBinaryError, UnusableBinaryError, VehicleError, VehicleType, check_launch
 
-BINARY = "arducopter"
-DEFAULTS = "copter.parm"  # of ArduPilot's Tools/autotest/default_params
+MODELS: dict[VehicleType, str] = {"copter": "+", "plane": "plane", "rover": "rover"}
 OWN_DEFAULTS = "vehicle.parm"
-ENVIRONMENT = "ARDUPILOT_SITL"  # a directory that holds BINARY and, better, DEFAULTS
+ENVIRONMENT = "ARDUPILOT_SITL"  # a directory that holds binaries and, better, their default parameters
 
-WAY_OUT = "give the path of an ArduPilot SITL arducopter, or fly embedded vehicles"
+WAY_OUT = "give the path of an ArduPilot SITL binary, or fly embedded vehicles"
 
 # ELF header: e_machine, a u16 at offset 18, by what platform.machine() calls it. A 64-bit machine may run its 32-bit
 # sister's programs.
@@ -38,39 +38,49 @@ _ELF_NAMES = {number: name for machines in _ELF_MACHINES.values() for number, na
 
 @dataclass(frozen=True)
 class ArduPilot:
-    """The `VehicleKind` of real copters: an executable and, when it has any beside it, its default parameters."""
+    """The `VehicleKind` of real vehicles: an executable and, when it has any beside it, its default parameters."""
 
     binary: Path
     defaults: Path | None = None
+    vehicle_type: VehicleType = "copter"
     name: str = "ardupilot"
 
     @classmethod
-    def find(cls, binary: Path | None, environ: Mapping[str, str]) -> ArduPilot:
-        """The binary that the scenario names, else that of ARDUPILOT_SITL, else `arducopter` on PATH.
+    def find(cls, binary: Path | None, environ: Mapping[str, str], vehicle_type: VehicleType = "copter") -> ArduPilot:
+        """The binary that the scenario names, else the type's own in ARDUPILOT_SITL, on PATH, or installed.
 
         Raises UnusableBinaryError when one is named and will not do, NoBinaryError when none is named or found.
         """
+        program = BINARIES[vehicle_type]
         if binary is not None:
-            return cls._checked(binary, "the scenario")
+            return cls._checked(binary, "the scenario", vehicle_type)
         if named := environ.get(ENVIRONMENT):
             directory = Path(named)
             if not directory.is_dir():
                 raise UnusableBinaryError(
-                    f"{ENVIRONMENT} is {named}, which is no directory: set it to the directory that holds {BINARY}"
+                    f"{ENVIRONMENT} is {named}, which is no directory: set it to the directory that holds {program}"
                 )
-            return cls._checked(directory / BINARY, ENVIRONMENT)
-        if on_path := shutil.which(BINARY, path=environ.get("PATH", "")):
-            return cls._checked(Path(on_path), "PATH")
+            present = [name for name in BINARIES.values() if (directory / name).exists()]
+            if program in present or not present:  # a directory with nothing in it is a mistake
+                return cls._checked(directory / program, ENVIRONMENT, vehicle_type)
+        if on_path := shutil.which(program, path=environ.get("PATH", "")):
+            return cls._checked(Path(on_path), "PATH", vehicle_type)
+        if installed := current(vehicle_type, environ):
+            return cls._checked(installed.binary, "the cache", vehicle_type)
         raise NoBinaryError(
-            f"no ArduPilot: the scenario names none, {ENVIRONMENT} is not set, and no {BINARY} is on PATH; {WAY_OUT}"
+            f"no ArduPilot {vehicle_type}: the scenario names none, {ENVIRONMENT} "
+            f"{'has none' if named else 'is not set'}, no {program} is on PATH, and none is installed; "
+            f"run {install_command(vehicle_type)}, {WAY_OUT}"
         )
 
     @classmethod
-    def _checked(cls, binary: Path, source: str) -> ArduPilot:
+    def _checked(cls, binary: Path, source: str, vehicle_type: VehicleType) -> ArduPilot:
         subject = f"the ArduPilot binary {binary} (from {source})"
         try:
             if binary.is_dir():
-                raise UnusableBinaryError(f"{subject} is a directory: name the file in it, usually {BINARY}")
+                raise UnusableBinaryError(
+                    f"{subject} is a directory: name the file in it, usually {BINARIES[vehicle_type]}"
+                )
             if not binary.exists():
                 raise UnusableBinaryError(f"{subject} does not exist: {WAY_OUT}")
             if not binary.is_file():
@@ -83,25 +93,26 @@ class ArduPilot:
             raise UnusableBinaryError(f"{subject} {problem}: {WAY_OUT}")
         if not os.access(binary, os.X_OK):
             raise UnusableBinaryError(f"{subject} is not executable: run chmod +x {binary}")
-        beside = binary.resolve().parent / DEFAULTS
-        return cls(binary.absolute(), beside if beside.is_file() else None)
+        beside = binary.resolve().parent / DEFAULTS[vehicle_type]
+        return cls(binary.absolute(), beside if beside.is_file() else None, vehicle_type)
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """Write the vehicle's parameters into `directory`. Raises VehicleError."""
-        check_launch(sysid, speedup)
+        check_launch(sysid, home, speedup)
         # names, not paths: ArduPilot takes a comma in a path for the end of it
         files = [OWN_DEFAULTS]
         try:
             if self.defaults is not None:
-                shutil.copyfile(self.defaults, directory / DEFAULTS)
-                files.insert(0, DEFAULTS)
+                defaults = DEFAULTS[self.vehicle_type]
+                shutil.copyfile(self.defaults, directory / defaults)
+                files.insert(0, defaults)
             (directory / OWN_DEFAULTS).write_text(_own_defaults(sysid))
         except OSError as error:
             raise VehicleError(f"vehicle {sysid}: cannot write its parameters into {directory}: {error}") from None
         return Launch(
             [
                 str(self.binary),
-                *("--model", "+"),
+                *("--model", MODELS[self.vehicle_type]),
                 *("--home", str(home)),
                 *("-I", "0"),
                 *("--defaults", ",".join(files)),

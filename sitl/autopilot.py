@@ -1,297 +1,332 @@
-"""The embedded vehicle's autopilot: MAVLink in, MAVLink out, no socket and no clock.
+"""The embedded vehicle's autopilot: modes, arming, flight and missions; no socket, no clock, no parser.
 
-`Autopilot` is the vehicle: mode, arming, flight. `Channel` is one client's view of it: its own parser, sequence
-numbers and message intervals, as each serial port of an ArduPilot has. Times are simulated seconds since boot.
+`Autopilot` is the vehicle. Who talks to it does so through a `Channel` (channel.py), and what it says about itself at
+intervals is in streams.py. Times are simulated seconds since boot.
 
-It answers as an ArduCopter does where a client can tell the difference: arming is refused until the position is known,
-take-off until armed and in GUIDED, and a mode set in the first seconds after boot is acknowledged and then undone.
+It answers as ArduPilot does where a client can tell the difference: arming is refused until the position is known, a
+mode set in the first seconds after boot is acknowledged and then undone, a copter begins a mission when it is told to,
+a plane and a rover as soon as they are armed in AUTO. What moves it is a course of closed formulas, and whatever begins
+where something ends begins at that very second, however coarse the steps of `advance`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.kinematics import Copter, Phase
-from sitl.vehicle import Home
-
-# ArduCopter flight modes (parameter FLTMODE1)
-STABILIZE, GUIDED, LAND = 0, 4, 9
-MODE_NAMES = {STABILIZE: "STABILIZE", GUIDED: "GUIDED", LAND: "LAND"}
+from sitl.kinematics import Course, Fall, Motion, Point, Rest, Segment, end_of
+from sitl.models import MODELS
+from sitl.modes import BOOT_MODES, MODES
+from sitl.vehicle import READY_S, Home, VehicleType
 
 MODE_SWITCH_READ_S = 3.0  # ArduPilot reads its mode switch about now, and undoes a mode set earlier
-READY_S = 10.0  # the simulated GPS has a fix
 
-HEARTBEAT_INTERVAL_S = 1.0
-DEFAULT_INTERVAL_S = 1.0
-MIN_INTERVAL_S = 0.02
-
-BATTERY_FULL_MAH, BATTERY_FULL_MV, BATTERY_EMPTY_MV = 10_000.0, 16_800, 13_200
+BATTERY_FULL_MAH = 10_000.0
 CURRENT_ARMED_A, CURRENT_IDLE_A = 10.0, 0.3
 
-SENSORS = (
-    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    | mavlink.MAV_SYS_STATUS_SENSOR_GPS
-    | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
-    | mavlink.MAV_SYS_STATUS_PREARM_CHECK
-)
-NOT_YET = mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+MAX_ALTITUDE_M = 10_000.0
+MAX_SPEED_MS = 100.0
+RTL_ALTITUDE_M: dict[VehicleType, float] = {"copter": 15.0, "plane": 100.0, "rover": 0.0}  # RTL_ALT, RTL_ALTITUDE
+TKOFF_ALT_M = 50.0  # ArduPlane's parameter TKOFF_ALT, the altitude of mode TAKEOFF
+
+ACCEPTED, FAILED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_FAILED)
+
+
+class Listener(Protocol):
+    """One who hears what the vehicle says unasked."""
+
+    def send(self, message: Any) -> None: ...
 
 
 class Autopilot:
     """One vehicle. `epoch_us` is the time of its boot, microseconds since the Unix epoch."""
 
-    def __init__(self, sysid: int, home: Home, epoch_us: int) -> None:
+    def __init__(self, sysid: int, home: Home, epoch_us: int, vehicle_type: VehicleType = "copter") -> None:
         self.sysid = sysid
         self.home = home
         self.epoch_us = epoch_us
-        self.copter = Copter(home.heading_deg)
-        self.mode = STABILIZE
+        self.vehicle_type: VehicleType = vehicle_type
+        self.mode = BOOT_MODES[vehicle_type]
         self.armed = False
+        self.airborne = False
         self.now_s = 0.0
         self.used_mah = 0.0
-        self.channels: list[Channel] = []
+        self.take_off_altitude_m = TKOFF_ALT_M
+        self.listeners: list[Listener] = []
+        self.mission: Sequence[Any] = ()  # MISSION_ITEM_INTs; the first is home, as ArduPilot has it
+        self.current_item = 0
+        self._model = MODELS[vehicle_type]
+        self._speed_ms = self._model.cruise_ms
+        self._in_mission = False
+        self._then: Callable[[], None] = self._stand
+        self._course = Course(0.0, [Rest(Motion(yaw_rad=math.radians(home.heading_deg)))])
 
     @property
     def ready(self) -> bool:
         return self.now_s >= READY_S
 
+    @property
+    def motion(self) -> Motion:
+        return self._course.at(self.now_s)
+
     def advance(self, now_s: float) -> None:
         """Let the time until `now_s` pass."""
-        before_s, self.now_s = self.now_s, max(self.now_s, now_s)
+        before_s, until_s = self.now_s, max(self.now_s, now_s)
         current_a = CURRENT_ARMED_A if self.armed else CURRENT_IDLE_A
-        self.used_mah = min(BATTERY_FULL_MAH, self.used_mah + current_a * (self.now_s - before_s) / 3.6)
-        if before_s < MODE_SWITCH_READ_S <= self.now_s:
-            self.mode = STABILIZE
-        if before_s < READY_S <= self.now_s:
+        self.used_mah = min(BATTERY_FULL_MAH, self.used_mah + current_a * (until_s - before_s) / 3.6)
+        if before_s < MODE_SWITCH_READ_S <= until_s:
+            self.mode = BOOT_MODES[self.vehicle_type]
+        if before_s < READY_S <= until_s:
             self.say(mavlink.MAV_SEVERITY_INFO, "Position known, ready to arm")
-        was = self.copter.phase
-        self.copter.advance(self.now_s)
-        if was is Phase.LAND and self.copter.phase is Phase.GROUND:
-            self._disarm()
+        while self._course.end_s <= until_s:
+            self.now_s = self._course.end_s
+            self._then()
+        self.now_s = until_s
 
     def say(self, severity: int, text: str) -> None:
         """Tell every client: a STATUSTEXT."""
-        for channel in self.channels:
-            channel.send(mavlink.MAVLink_statustext_message(severity, text.encode()))
+        self._tell(mavlink.MAVLink_statustext_message(severity, text.encode()))
 
-    def arm_or_disarm(self, arm: bool) -> int:
-        if arm == self.armed:
-            return int(mavlink.MAV_RESULT_ACCEPTED)
-        if not arm and self.copter.phase is not Phase.GROUND:
-            return self._refuse("Disarm refused: in flight")
-        if arm and not self.ready:
+    def _tell(self, message: Any) -> None:
+        for listener in self.listeners:
+            listener.send(message)
+
+    # Commands: each answers with a MAV_RESULT, and says why when it refuses
+
+    def arm(self) -> int:
+        if self.armed:
+            return ACCEPTED
+        if not self.ready:
             return self._refuse("PreArm: Need Position Estimate")
-        if arm and self.mode == LAND:
-            return self._refuse("Arm: LAND mode not armable")
-        if arm:
-            self.armed = True
-            self.say(mavlink.MAV_SEVERITY_INFO, "Arming motors")
-        else:
+        if self.airborne:
+            return self._refuse("Arm: falling")
+        if self.vehicle_type == "copter" and self.mode in ("AUTO", "RTL", "LAND"):
+            return self._refuse(f"Arm: {self.mode} mode not armable")
+        self.armed = True
+        self.say(mavlink.MAV_SEVERITY_INFO, "Arming motors")
+        if self.mode in ("AUTO", "TAKEOFF"):
+            self._act()
+        return ACCEPTED
+
+    def disarm(self, force: bool = False) -> int:
+        """With `force` (MAV_CMD_COMPONENT_ARM_DISARM, param2 21196) in flight, too: then it falls."""
+        if self.airborne and self.armed and not force:
+            return self._refuse("Disarm refused: in flight")
+        if self.armed:
             self._disarm()
-        return int(mavlink.MAV_RESULT_ACCEPTED)
+            if self.airborne:
+                fall = Fall(self.motion)
+                self._begin([fall], lambda: self._hit_ground(fall.impact_ms))
+            else:
+                self._stand()
+        return ACCEPTED
 
     def take_off(self, altitude_m: float) -> int:
+        """MAV_CMD_NAV_TAKEOFF of a copter; what it does then, until told otherwise, is the model's `idle`."""
+        if self.vehicle_type != "copter":
+            return self._refuse(f"Take-off refused: a {self.vehicle_type} does not take off in GUIDED")
         if not self.armed:
             return self._refuse("Take-off refused: not armed")
-        if self.mode != GUIDED:
-            return self._refuse(f"Take-off refused: mode is {MODE_NAMES[self.mode]}, not GUIDED")
-        if self.copter.phase is not Phase.GROUND:
+        if self.mode != "GUIDED":
+            return self._refuse(f"Take-off refused: mode is {self.mode}, not GUIDED")
+        if self.airborne:
             return self._refuse("Take-off refused: already flying")
-        if not (math.isfinite(altitude_m) and 0 < altitude_m <= 10_000):
+        if not 0 < altitude_m <= MAX_ALTITUDE_M:
             return self._refuse("Take-off refused: no such altitude")
-        self.copter.take_off(altitude_m, self.now_s)
-        return int(mavlink.MAV_RESULT_ACCEPTED)
+        self._lift_off(altitude_m, self._idle)
+        return ACCEPTED
 
-    def set_mode(self, mode: float) -> int:
-        if mode not in MODE_NAMES:
+    def set_mode(self, number: float) -> int:
+        mode = next((name for name, known in MODES[self.vehicle_type].items() if known == number), None)
+        if mode is None:
             return self._refuse("Mode change refused: no such mode")
-        if mode == STABILIZE and self.copter.phase is not Phase.GROUND:
+        if mode == BOOT_MODES[self.vehicle_type] and self.airborne:
             return self._refuse("Mode change refused: nobody has the sticks")
-        self.mode = int(mode)
-        if mode == LAND:
-            self.copter.land(self.now_s)
-        elif mode == GUIDED:
-            self.copter.hold(self.now_s)
-        return int(mavlink.MAV_RESULT_ACCEPTED)
+        if mode == "AUTO" and len(self.mission) < 2:
+            return self._refuse("Mode change to AUTO failed: no mission")
+        if mode == self.mode:
+            return ACCEPTED
+        self.mode = mode
+        self._speed_ms = self._model.cruise_ms
+        if self.armed:
+            self._act()
+        return ACCEPTED
 
-    def _disarm(self) -> None:
-        self.armed = False
-        self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
+    def start_mission(self) -> int:
+        """MAV_CMD_MISSION_START."""
+        if not self.armed or len(self.mission) < 2:
+            return self._refuse("Mission start refused: not armed, or no mission")
+        if self.mode != "AUTO":
+            self.set_mode(MODES[self.vehicle_type]["AUTO"])
+        if not self._in_mission:
+            self._begin_item(max(1, self.current_item))
+        return ACCEPTED
+
+    def set_speed(self, speed_ms: float) -> int:
+        """MAV_CMD_DO_CHANGE_SPEED: from the next place on."""
+        if not 0 < speed_ms <= MAX_SPEED_MS:
+            return FAILED
+        self._speed_ms = speed_ms
+        return ACCEPTED
+
+    def go_to(self, place: Point) -> int:
+        """In GUIDED: go there and stay."""
+        if self.mode != "GUIDED" or not self.armed or not (self.airborne or self.vehicle_type == "rover"):
+            return FAILED
+        if not all(map(math.isfinite, place)) or abs(place.up_m) > MAX_ALTITUDE_M:
+            return FAILED
+        self._begin(self._model.loiter(self.motion, place, self._speed_ms, math.inf), self._stand)
+        return ACCEPTED
+
+    def load(self, mission: Sequence[Any]) -> None:
+        """Replace the mission; one that is being flown goes on with the items that have the same numbers."""
+        self.mission = mission
+        if not self._in_mission:
+            self.current_item = 0
 
     def _refuse(self, text: str) -> int:
         self.say(mavlink.MAV_SEVERITY_CRITICAL, text)
-        return int(mavlink.MAV_RESULT_FAILED)
+        return FAILED
 
-    # What the vehicle says about itself, one method per message of `STREAMS`.
+    # What it is doing
 
-    def heartbeat(self) -> Any:
-        base_mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        if self.armed:
-            base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-        flying = self.copter.phase is not Phase.GROUND
-        return mavlink.MAVLink_heartbeat_message(
-            mavlink.MAV_TYPE_QUADROTOR,
-            mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-            base_mode,
-            self.mode,
-            mavlink.MAV_STATE_ACTIVE if flying else mavlink.MAV_STATE_STANDBY,
-            3,  # MAVLink 2 still says 3 here
-        )
+    def _begin(self, segments: Sequence[Segment], then: Callable[[], None]) -> None:
+        """Move like this from now on, and do `then` where it ends."""
+        self._course, self._then = Course(self.now_s, segments), then
 
-    def sys_status(self) -> Any:
-        left = 1 - self.used_mah / BATTERY_FULL_MAH
-        return mavlink.MAVLink_sys_status_message(
-            onboard_control_sensors_present=SENSORS,
-            onboard_control_sensors_enabled=SENSORS,
-            onboard_control_sensors_health=SENSORS if self.ready else SENSORS & ~NOT_YET,
-            load=50,
-            voltage_battery=round(BATTERY_EMPTY_MV + left * (BATTERY_FULL_MV - BATTERY_EMPTY_MV)),
-            current_battery=round(100 * (CURRENT_ARMED_A if self.armed else CURRENT_IDLE_A)),
-            battery_remaining=round(100 * left),
-            drop_rate_comm=0,
-            errors_comm=0,
-            errors_count1=0,
-            errors_count2=0,
-            errors_count3=0,
-            errors_count4=0,
-        )
-
-    def system_time(self) -> Any:
-        return mavlink.MAVLink_system_time_message(self.epoch_us + round(self.now_s * 1e6), self._boot_ms())
-
-    def attitude(self) -> Any:
-        motion = self.copter.motion
-        yaw = (motion.yaw_rad + math.pi) % math.tau - math.pi
-        return mavlink.MAVLink_attitude_message(
-            self._boot_ms(), motion.roll_rad, 0.0, yaw, 0.0, 0.0, motion.yaw_rate_rads
-        )
-
-    def global_position_int(self) -> Any:
-        motion = self.copter.motion
-        # as ArduPilot before its first fix: nowhere
-        place = self.home.offset(motion.north_m, motion.east_m) if self.ready else Home(0.0, 0.0)
-        return mavlink.MAVLink_global_position_int_message(
-            self._boot_ms(),
-            round(place.lat_deg * 1e7),
-            round(place.lon_deg * 1e7),
-            round((self.home.alt_m + motion.up_m) * 1e3),
-            round(motion.up_m * 1e3),
-            round(motion.north_ms * 100),
-            round(motion.east_ms * 100),
-            round(-motion.up_ms * 100),
-            round(math.degrees(motion.yaw_rad) * 100) % 36_000,
-        )
-
-    def _boot_ms(self) -> int:
-        return int(self.now_s * 1e3) & 0xFFFFFFFF
-
-
-STREAMS: dict[int, Callable[[Autopilot], Any]] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: Autopilot.heartbeat,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: Autopilot.sys_status,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: Autopilot.system_time,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: Autopilot.attitude,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Autopilot.global_position_int,
-}
-
-
-class Channel:
-    """One client of an autopilot, from connection to disconnection."""
-
-    def __init__(self, autopilot: Autopilot) -> None:
-        self._autopilot = autopilot
-        self._mav = mavlink.MAVLink(None, srcSystem=autopilot.sysid, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
-        self._mav.robust_parsing = True  # garbage is reported as BAD_DATA, not raised
-        self._out = bytearray()
-        self._interval_s = dict.fromkeys(STREAMS, DEFAULT_INTERVAL_S)
-        self._interval_s[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = HEARTBEAT_INTERVAL_S
-        self._due_s = dict.fromkeys(STREAMS, autopilot.now_s)
-        autopilot.channels.append(self)
-
-    def close(self) -> None:
-        self._autopilot.channels.remove(self)
-
-    def receive(self, data: bytes) -> None:
-        """Take bytes from the client, in any pieces, with anything in them."""
-        for message in self._mav.parse_buffer(data) or ():
-            if message.get_type() == "COMMAND_LONG":
-                self._command(message)
-        # the parser frees its buffer only when a read ends with a message
-        del self._mav.buf[: self._mav.buf_index]
-        self._mav.buf_index = 0
-
-    def send(self, message: Any) -> None:
-        self._out += message.pack(self._mav)
-        self._mav.seq = (self._mav.seq + 1) % 256
-
-    def send_due(self) -> None:
-        """Send every message whose interval has passed, once: a client behind schedule gets the latest, not a burst."""
-        now_s = self._autopilot.now_s
-        for message_id, due_s in self._due_s.items():
-            if due_s <= now_s:
-                self.send(STREAMS[message_id](self._autopilot))
-                self._due_s[message_id] = max(due_s + self._interval_s[message_id], now_s)
-
-    def next_due_s(self) -> float:
-        return min(self._due_s.values())
-
-    def take(self) -> bytes:
-        """What is to be sent to the client."""
-        data = bytes(self._out)
-        self._out.clear()
-        return data
-
-    def _command(self, message: Any) -> None:
-        vehicle = self._autopilot
-        if message.target_system not in (0, vehicle.sysid):
-            return
-        if message.target_component not in (0, mavlink.MAV_COMP_ID_AUTOPILOT1):
-            return
-        match message.command:
-            case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
-                result = vehicle.arm_or_disarm(message.param1 == 1)
-            case mavlink.MAV_CMD_NAV_TAKEOFF:
-                result = vehicle.take_off(message.param7)
-            case mavlink.MAV_CMD_NAV_LAND:
-                result = vehicle.set_mode(LAND)
-            case mavlink.MAV_CMD_DO_SET_MODE:
-                result = vehicle.set_mode(message.param2)
-            case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-                result = self._set_interval(message.param1, message.param2)
-            case mavlink.MAV_CMD_REQUEST_MESSAGE:
-                result = self._request(message.param1)
+    def _act(self) -> None:
+        """Do, armed, what the mode has just been set for."""
+        self._in_mission = False
+        match self.mode:
+            case "AUTO" if self.airborne or self.vehicle_type != "copter":
+                self._begin_item(max(1, self.current_item))
+            case "TAKEOFF" if not self.airborne:
+                self._lift_off(self.take_off_altitude_m, self._idle)
+            case "RTL":
+                self._return_home(self._stay)
+            case "LAND" if self.airborne:
+                self._land(self.motion.point)
             case _:
-                result = mavlink.MAV_RESULT_UNSUPPORTED
-        self.send(
-            mavlink.MAVLink_command_ack_message(
-                message.command,
-                result,
-                target_system=message.get_srcSystem(),
-                target_component=message.get_srcComponent(),
-            )
-        )
+                self._stay()
 
-    def _set_interval(self, message_id: float, interval_us: float) -> int:
-        """MAV_CMD_SET_MESSAGE_INTERVAL: microseconds; 0 is the default interval, -1 is never."""
-        if message_id not in STREAMS or not math.isfinite(interval_us):
-            return int(mavlink.MAV_RESULT_FAILED)
-        if interval_us < 0:
-            interval_s = math.inf
-        elif interval_us == 0:
-            interval_s = DEFAULT_INTERVAL_S
+    def _lift_off(self, altitude_m: float, then: Callable[[], None]) -> None:
+        self.airborne = True
+        self._begin(self._model.take_off(self.motion, altitude_m), then)
+
+    def _idle(self) -> None:
+        self._begin(self._model.idle(self.motion), self._stand)
+
+    def _stay(self) -> None:
+        if self.airborne:
+            self._begin(self._model.loiter(self.motion, self.motion.point, self._speed_ms, math.inf), self._stand)
         else:
-            interval_s = max(MIN_INTERVAL_S, interval_us / 1e6)
-        self._interval_s[int(message_id)] = interval_s
-        self._due_s[int(message_id)] = self._autopilot.now_s + interval_s
-        return int(mavlink.MAV_RESULT_ACCEPTED)
+            self._stand()
 
-    def _request(self, message_id: float) -> int:
-        if message_id not in STREAMS:
-            return int(mavlink.MAV_RESULT_FAILED)
-        self.send(STREAMS[int(message_id)](self._autopilot))
-        return int(mavlink.MAV_RESULT_ACCEPTED)
+    def _stand(self) -> None:
+        self._begin([Rest(self.motion)], self._stand)
+
+    def _land(self, place: Point) -> None:
+        self._begin(self._model.land(self.motion, place), self._landed)
+
+    def _landed(self) -> None:
+        self.airborne = False
+        self._disarm()
+        self._stand()
+
+    def _hit_ground(self, impact_ms: float) -> None:
+        self.airborne = False
+        self.say(mavlink.MAV_SEVERITY_INFO, f"SIM Hit ground at {impact_ms:f} m/s")
+        self._stand()
+
+    def _disarm(self) -> None:
+        self.armed = self._in_mission = False
+        self.current_item = 0
+        self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
+
+    def _return_home(self, then: Callable[[], None]) -> None:
+        """RTL: up, home, and, a copter, down."""
+        if not self.airborne and self.vehicle_type != "rover":
+            self._stand()
+            return
+        altitude_m = max(self.motion.up_m, RTL_ALTITUDE_M[self.vehicle_type])
+        home = Point(0.0, 0.0, altitude_m if self.airborne else self.motion.up_m)
+        if self.vehicle_type == "copter":
+            up = self._model.take_off(self.motion, altitude_m)
+            self._begin([*up, *self._model.go_to(end_of(up), home, self._speed_ms)], lambda: self._land(home))
+        else:
+            self._begin(self._model.go_to(self.motion, home, self._speed_ms), then)
+
+    # The mission
+
+    def _begin_item(self, number: int) -> None:
+        """Fly the mission from this item on; what takes no time is done at once."""
+        self._in_mission = True
+        while number < len(self.mission) and self.mission[number].command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
+            self.set_speed(self.mission[number].param2)
+            number += 1
+        if number >= len(self.mission):
+            self._end_mission()
+            return
+        item, self.current_item = self.mission[number], number
+        grounded = self.vehicle_type != "rover" and not self.airborne
+        if grounded and item.command != mavlink.MAV_CMD_NAV_TAKEOFF:
+            self._in_mission = False
+            self.say(mavlink.MAV_SEVERITY_CRITICAL, "Auto: Missing Takeoff Cmd")
+            return
+        self.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {number} {ITEM_NAMES[item.command]}")
+        place = self.place(item.frame, item.x, item.y, item.z)
+        match item.command:
+            case mavlink.MAV_CMD_NAV_TAKEOFF if not self.airborne:
+                self._lift_off(item.z, self._item_reached)
+            case mavlink.MAV_CMD_NAV_TAKEOFF:  # again, after a pause
+                self._begin(self._model.take_off(self.motion, item.z), self._item_reached)
+            case mavlink.MAV_CMD_NAV_WAYPOINT:
+                self._begin(self._model.go_to(self.motion, place, self._speed_ms), self._item_reached)
+            case mavlink.MAV_CMD_NAV_LOITER_TIME:
+                self._begin(self._model.loiter(self.motion, place, self._speed_ms, item.param1), self._item_reached)
+            case mavlink.MAV_CMD_NAV_LOITER_UNLIM:
+                self._begin(self._model.loiter(self.motion, place, self._speed_ms, math.inf), self._item_reached)
+            case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
+                self._return_home(self._stay)
+            case mavlink.MAV_CMD_NAV_LAND:
+                self._land(place)
+
+    def _item_reached(self) -> None:
+        number = self.current_item
+        self._tell(mavlink.MAVLink_mission_item_reached_message(number))
+        self.say(mavlink.MAV_SEVERITY_INFO, f"Reached command #{number}")
+        self._begin_item(number + 1)
+
+    def _end_mission(self) -> None:
+        """A copter and a rover stay, a plane goes home."""
+        self._in_mission, self.current_item = False, 0
+        if self.vehicle_type == "plane":
+            self.set_mode(MODES["plane"]["RTL"])
+        else:
+            self._stay()
+
+    def place(self, frame: int, lat_e7: int, lon_e7: int, alt_m: float) -> Point:
+        """A place as MAVLink names it, in one of `FRAMES`; latitude and longitude 0 are where the vehicle is."""
+        up_m = alt_m - self.home.alt_m if frame in ABSOLUTE_FRAMES else alt_m
+        if lat_e7 == lon_e7 == 0:
+            return self.motion.point._replace(up_m=up_m)
+        north_m, east_m, _ = self.home.metres_to(lat_e7 / 1e7, lon_e7 / 1e7, 0.0)
+        return Point(north_m, east_m, up_m)
+
+
+ABSOLUTE_FRAMES = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
+FRAMES = (*ABSOLUTE_FRAMES, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT)
+
+ITEM_NAMES: dict[int, str] = {
+    mavlink.MAV_CMD_NAV_WAYPOINT: "WP",
+    mavlink.MAV_CMD_NAV_LOITER_UNLIM: "LoitUnlim",
+    mavlink.MAV_CMD_NAV_LOITER_TIME: "LoitTime",
+    mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: "RTL",
+    mavlink.MAV_CMD_NAV_LAND: "Land",
+    mavlink.MAV_CMD_NAV_TAKEOFF: "Takeoff",
+    mavlink.MAV_CMD_DO_CHANGE_SPEED: "ChangeSpeed",
+}
+"""The mission items that it can fly, as ArduPilot names them in its texts."""

@@ -1,6 +1,6 @@
 """The embedded vehicle: what flies where no ArduPilot binary is at hand.
 
-    python -m sitl.embedded --sysid 3 --home -35.363262,149.165237,584,270 --speedup 20
+    python -m sitl.embedded --type plane --sysid 3 --home -35.363262,149.165237,584,270 --speedup 20
 
 A small process (one thread, standard library and a MAVLink dialect) that listens on 127.0.0.1 on ArduPilot SITL's two
 ports and answers like one, so that the same pilot flies both. Its clock runs `speedup` times as fast as ours; what it
@@ -15,29 +15,42 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
 from sitl.autopilot import Autopilot
 from sitl.port import Port
-from sitl.vehicle import AGENT_PORT, PILOT_PORT, Home, Launch, VehicleError, check_launch
+from sitl.vehicle import (
+    AGENT_PORT,
+    PILOT_PORT,
+    VEHICLE_TYPES,
+    Home,
+    Launch,
+    VehicleError,
+    VehicleType,
+    check_launch,
+)
 
 MIN_BATCH_INTERVAL_S = 0.05  # of our time: however fast simulated time runs, telemetry is sent 20 times a second
 MAX_SLEEP_S = 1.0  # a client may have turned off everything; landing and status texts still happen on time
 MAX_DELAY_S = 0.25  # a sleep that takes longer than it should by more was no sleep: the process was stopped
 
 
+@dataclass(frozen=True)
 class Embedded:
     """The `VehicleKind` that needs nothing but this package."""
 
-    name = "embedded"
+    vehicle_type: VehicleType = "copter"
+    name: str = "embedded"
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """The embedded vehicle keeps no files: `directory` stays as it is. Raises VehicleError."""
-        check_launch(sysid, speedup)
+        check_launch(sysid, home, speedup)
         return Launch(
             [
                 *(sys.executable, "-P", "-m", "sitl.embedded"),
+                *("--type", self.vehicle_type),
                 *("--sysid", str(sysid)),
                 f"--home={home}",  # one word: a southern latitude begins with a minus sign
                 *("--speedup", f"{speedup:g}"),
@@ -53,6 +66,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = _Parser(prog="sitl.embedded", description="A small MAVLink vehicle that flies without ArduPilot.")
+    parser.add_argument("--type", choices=VEHICLE_TYPES, default="copter")
     parser.add_argument("--sysid", type=int, required=True, help="MAVLink system ID, 1 to 255")
     parser.add_argument("--home", required=True, metavar="LAT,LON,ALT,HDG", help="degrees, metres above sea level")
     parser.add_argument("--speedup", type=float, default=1.0, help="simulated seconds per second")
@@ -66,7 +80,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     arguments = parser.parse_args(words)
     try:
         arguments.home = Home.parse(arguments.home)
-        check_launch(arguments.sysid, arguments.speedup)
+        check_launch(arguments.sysid, arguments.home, arguments.speedup)
     except VehicleError as error:
         parser.error(str(error))
     return arguments
@@ -77,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     arguments = _arguments(argv)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    autopilot = Autopilot(arguments.sysid, arguments.home, time.time_ns() // 1000)
+    autopilot = Autopilot(arguments.sysid, arguments.home, time.time_ns() // 1000, arguments.type)
     selector = selectors.DefaultSelector()
     ports = []
     for number in (arguments.pilot_port, arguments.agent_port):

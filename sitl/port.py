@@ -10,7 +10,8 @@ import contextlib
 import selectors
 import socket
 
-from sitl.autopilot import Autopilot, Channel
+from sitl.autopilot import Autopilot
+from sitl.channel import Channel
 
 READ_BYTES = 65_536
 MAX_UNSENT_BYTES = 65_536

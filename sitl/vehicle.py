@@ -11,13 +11,18 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol, get_args
+
+VehicleType = Literal["copter", "plane", "rover"]
+VEHICLE_TYPES: tuple[VehicleType, ...] = get_args(VehicleType)
 
 PILOT_PORT = 5760  # ArduPilot SITL: serial0
 AGENT_PORT = 5762  # ArduPilot SITL: serial1
 
 METRES_PER_DEGREE = 111_319.5  # of latitude; ArduPilot's own scale (WGS 84 equatorial radius)
 SPACING_M = 5.0
+
+READY_S = 10.0  # simulated seconds from the boot of an embedded vehicle until it knows where it is and can be armed
 
 MAX_SYSID = 255  # MAVLink: u8 system ID, 0 is "everybody"
 
@@ -78,6 +83,13 @@ class Home:
         lon = self.lon_deg + east_m / (METRES_PER_DEGREE * max(math.cos(math.radians(self.lat_deg)), 1e-6))
         return Home(max(-90.0, min(90.0, lat)), (lon + 180.0) % 360.0 - 180.0, self.alt_m, self.heading_deg)
 
+    def metres_to(self, lat_deg: float, lon_deg: float, alt_m: float) -> tuple[float, float, float]:
+        """How far north, east and above this place that one is. The inverse of `offset`, and as flat."""
+        north_m = (lat_deg - self.lat_deg) * METRES_PER_DEGREE
+        degrees_east = (lon_deg - self.lon_deg + 180.0) % 360.0 - 180.0
+        east_m = degrees_east * METRES_PER_DEGREE * max(math.cos(math.radians(self.lat_deg)), 1e-6)
+        return north_m, east_m, alt_m - self.alt_m
+
 
 @dataclass(frozen=True)
 class Launch:
@@ -95,6 +107,9 @@ class VehicleKind(Protocol):
     @property
     def name(self) -> str: ...
 
+    @property
+    def vehicle_type(self) -> VehicleType: ...
+
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """Prepare `directory`, which exists and is the vehicle's working directory, and say how to start it.
 
@@ -102,19 +117,26 @@ class VehicleKind(Protocol):
         """
 
 
-def check_launch(sysid: int, speedup: float) -> None:
-    """Raise VehicleError for a system ID or a speedup that no vehicle can have."""
+def check_launch(sysid: int, home: Home, speedup: float) -> None:
+    """Raise VehicleError for a system ID, a home or a speedup that no vehicle can have."""
     if not 1 <= sysid <= MAX_SYSID:
         raise VehicleError(f"vehicle {sysid}: a MAVLink system ID is 1 to {MAX_SYSID}")
+    if home.lat_deg == home.lon_deg == 0:
+        raise VehicleError(f"vehicle {sysid}: a home at 0,0 is ArduPilot's word for no position: move it by a metre")
     if not (math.isfinite(speedup) and speedup > 0):
         raise VehicleError(f"vehicle {sysid}: speedup {speedup} is not a positive number")
 
 
-def home_in_field(index: int, centre: Home) -> Home:
-    """The home of the index-th vehicle (from 0): a sunflower's seeds, no two closer than about SPACING_M.
+def place_in_field(index: int, spacing_m: float = SPACING_M) -> tuple[float, float]:
+    """Metres north and east of the field's centre, for the index-th vehicle (from 0): a sunflower's seeds.
 
-    Any number of vehicles fits, and adding one moves none of the others.
+    No two are closer than about `spacing_m`, any number of vehicles fits, and adding one moves none of the others.
     """
-    radius = SPACING_M * math.sqrt(index)
+    radius = spacing_m * math.sqrt(index)
     bearing = index * math.pi * (3 - math.sqrt(5))  # the golden angle
-    return centre.offset(radius * math.cos(bearing), radius * math.sin(bearing))
+    return radius * math.cos(bearing), radius * math.sin(bearing)
+
+
+def home_in_field(index: int, centre: Home, spacing_m: float = SPACING_M) -> Home:
+    """The home of the index-th vehicle (from 0) of a field, at `place_in_field`."""
+    return centre.offset(*place_in_field(index, spacing_m))

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.vehicle import Home
+from sitl.vehicle import Home, VehicleType
 
 HOME = Home(-35.363262, 149.165237, 584.0, 270.0)
 DEADLINE_S = 20.0  # generous, for a machine that does other things too; nobody waits that long
@@ -64,10 +64,10 @@ class Vehicle:
 
 
 @contextlib.contextmanager
-def embedded(sysid: int = 3, speedup: float = 100.0) -> Iterator[Vehicle]:
+def embedded(sysid: int = 3, speedup: float = 100.0, vehicle_type: VehicleType = "copter") -> Iterator[Vehicle]:
     pilot_port, agent_port = free_ports(2)
     ports = ("--pilot-port", str(pilot_port), "--agent-port", str(agent_port))
-    process = subprocess.Popen(embedded_argv(*ports, sysid=sysid, speedup=speedup))
+    process = subprocess.Popen(embedded_argv("--type", vehicle_type, *ports, sysid=sysid, speedup=speedup))
     try:
         yield Vehicle(process, pilot_port, agent_port)
     finally:

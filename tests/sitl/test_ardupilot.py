@@ -110,3 +110,24 @@ def test_parameters_beside_the_binary_come_along_and_ours_have_the_last_word(tmp
 def test_a_directory_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match="cannot write its parameters into"):
         ArduPilot(program(tmp_path / "arducopter")).launch(7, HOME, 1.0, tmp_path / "gone")
+
+
+def test_each_type_has_its_binary_its_parameters_and_its_model(tmp_path: Path) -> None:
+    for name in ("arducopter", "arduplane", "ardurover"):
+        program(tmp_path / "bin" / name)
+        (tmp_path / "bin" / "plane.parm").write_text("AIRSPEED_CRUISE 22\n")
+    environ = {"ARDUPILOT_SITL": str(tmp_path / "bin")}
+    plane, rover = ArduPilot.find(None, environ, "plane"), ArduPilot.find(None, environ, "rover")
+    assert (plane.binary.name, rover.binary.name) == ("arduplane", "ardurover")
+    flown = plane.launch(7, HOME, 1.0, tmp_path).argv
+    assert flown[flown.index("--model") + 1] == "plane"
+    assert flown[flown.index("--defaults") + 1] == "plane.parm,vehicle.parm"
+    driven = rover.launch(8, HOME, 1.0, tmp_path).argv
+    assert driven[driven.index("--model") + 1] == "rover"
+    assert driven[driven.index("--defaults") + 1] == "vehicle.parm"
+
+
+def test_binaries_of_other_types_only_are_a_miss_not_a_mistake(tmp_path: Path) -> None:
+    program(tmp_path / "arducopter")
+    with pytest.raises(NoBinaryError, match=r"no ArduPilot plane: .* ARDUPILOT_SITL has none, no arduplane"):
+        ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path), "PATH": ""}, "plane")

@@ -10,6 +10,7 @@ import time
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from tests.sitl.cockpit import Cockpit
 from tests.sitl.flying import DEADLINE_S, HOME, Client, connect, embedded, embedded_argv, until
 
 ACCEPTED, UNSUPPORTED, FAILED = (
@@ -132,7 +133,7 @@ def test_messages_come_at_the_interval_asked_for_or_when_asked_for() -> None:
 def test_a_client_that_turns_everything_off_is_still_answered() -> None:
     with embedded() as vehicle:
         client = Client(vehicle.pilot_port)
-        for message_id in (0, 1, 2, 30, 33):
+        for message_id in (0, 1, 2, 30, 33, 42):
             assert client.command(SET_INTERVAL, message_id, -1) == ACCEPTED
         assert client.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_HEARTBEAT) == ACCEPTED
 
@@ -243,6 +244,8 @@ def test_a_port_in_use_is_one_sentence_and_status_2() -> None:
     [
         ("--home", "here", "LAT,LON,ALT,HDG"),
         ("--home", "-95,0,0,0", "latitude"),
+        ("--home", "0,0,584,0", "no position"),
+        ("--type", "boat", "copter"),
         ("--sysid", "300", "1 to 255"),
         ("--speedup", "0", "positive"),
         ("--speedup", "fast", "--speedup"),
@@ -251,3 +254,14 @@ def test_a_port_in_use_is_one_sentence_and_status_2() -> None:
 )
 def test_a_bad_argument_is_one_sentence_and_status_2(option: str, value: str, problem: str) -> None:
     assert problem in refusal(*embedded_argv("--pilot-port", "0", "--agent-port", "0", option, value))
+
+
+def test_who_asks_again_and_again_postpones_nothing() -> None:
+    cockpit = Cockpit()
+    attitudes = 0
+    for second in range(20):
+        cockpit.vehicle.advance(float(second))
+        assert cockpit.command(SET_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, 4e6) == ACCEPTED
+        cockpit.channel.send_due()
+        attitudes += sum(message.get_type() == "ATTITUDE" for message in cockpit.listen())
+    assert attitudes == 5

@@ -1,89 +1,129 @@
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.kinematics import CIRCLE_RADIUS_M, CIRCLE_SPEED_MS, CLIMB_MS, DESCENT_MS, Copter, Motion, Phase
+from sitl.kinematics import Arc, Climbing, Course, Fall, Line, Motion, Point, Rest, Segment, Spiral, end_of
+from sitl.models import MODELS
+from sitl.vehicle import VehicleType
 
-steps = st.lists(st.floats(0.001, 30.0), min_size=1, max_size=30)
-
-
-def flying(altitude_m: float = 20.0, heading_deg: float = 270.0) -> Copter:
-    copter = Copter(heading_deg)
-    copter.take_off(altitude_m, 0.0)
-    return copter
+metres = st.floats(-2000, 2000)
+heights = st.floats(1, 300)
+places = st.builds(Point, metres, metres, heights)
 
 
 def distance(a: Motion, b: Motion) -> float:
-    return math.dist((a.north_m, a.east_m, a.up_m), (b.north_m, b.east_m, b.up_m))
+    return math.dist(a.point, b.point)
 
 
-def test_a_copter_on_the_ground_stays_there() -> None:
-    copter = Copter(90.0)
-    copter.advance(1000.0)
-    assert copter.motion == Motion(yaw_rad=math.radians(90.0))
+def test_a_line_speeds_up_keeps_its_speed_and_slows_down() -> None:
+    line = Line(Motion(), Point(100, 0, 0), speed_ms=10, accel_ms2=2)
+    assert line.duration_s == pytest.approx(5 + 50 / 10 + 5)
+    assert (line.at(5).north_m, line.at(5).north_ms) == pytest.approx((25, 10))
+    assert line.at(10).north_m == pytest.approx(75)
+    assert line.at(15) == Motion(100, 0, 0)
 
 
-def test_it_climbs_at_the_climb_rate_to_the_altitude_and_no_higher() -> None:
-    copter = flying(20.0)
-    copter.advance(4.0)
-    assert copter.motion.up_m == pytest.approx(4 * CLIMB_MS)
-    copter.advance(1000.0)
-    assert copter.motion.up_m == pytest.approx(20.0)
+def test_a_short_line_never_gets_to_its_speed() -> None:
+    line = Line(Motion(), Point(0, 8, 0), speed_ms=10, accel_ms2=2)
+    assert line.duration_s == pytest.approx(4)
+    assert line.at(2).east_ms == pytest.approx(4)
 
 
-def test_it_circles_home_and_never_stands_still() -> None:
-    copter = flying()
-    copter.advance(100.0)
-    assert math.hypot(copter.motion.north_m, copter.motion.east_m) == pytest.approx(CIRCLE_RADIUS_M)
-    assert math.hypot(copter.motion.north_ms, copter.motion.east_ms) == pytest.approx(CIRCLE_SPEED_MS)
-    before = copter.motion
-    copter.advance(102.0)
-    assert distance(before, copter.motion) > CIRCLE_SPEED_MS
+@given(places, st.floats(0.5, 30), st.floats(0.5, 5), st.floats(0, 1), st.floats(0, 1))
+def test_a_line_goes_as_fast_as_it_says(end: Point, speed: float, accel: float, begins: float, ends: float) -> None:
+    line = Line(Motion(up_m=end.up_m), end._replace(north_m=2000), speed, accel, begins * speed, ends * speed)
+    for part in (0.1, 0.5, 0.9):
+        at_s = part * line.duration_s
+        before, after = line.at(at_s - 1e-3), line.at(at_s + 1e-3)
+        says = math.hypot(line.at(at_s).north_ms, line.at(at_s).east_ms, line.at(at_s).up_ms)
+        assert distance(before, after) / 2e-3 == pytest.approx(says, abs=accel * 2e-3 + 1e-4)
+        assert says <= speed + 1e-9
 
 
-def test_landing_ends_on_the_ground_below() -> None:
-    copter = flying()
-    copter.land(60.0)
-    above = copter.motion
-    copter.advance(60.0 + 20.0 / DESCENT_MS + 1.0)
-    assert copter.phase is Phase.GROUND
-    assert copter.motion.up_m == 0.0
-    assert (copter.motion.north_m, copter.motion.east_m) == (above.north_m, above.east_m)
+@pytest.mark.parametrize(("turn", "end"), [(math.pi, (0, 20)), (-math.pi, (0, -20))])
+def test_an_arc_clockwise_turns_right(turn: float, end: tuple[float, float]) -> None:
+    heading_north = Motion()
+    arc = Arc(heading_north, (0, math.copysign(10, turn)), turn, speed_ms=5)
+    assert arc.at(0).yaw_rad % math.tau == pytest.approx(0, abs=1e-9)
+    assert arc.at(arc.duration_s).point[:2] == pytest.approx(end, abs=1e-9)
+    assert arc.at(arc.duration_s).north_ms == pytest.approx(-5)
+    assert math.copysign(1, arc.at(1).roll_rad) == math.copysign(1, turn)
 
 
-def test_it_takes_off_again_from_where_it_landed() -> None:
-    copter = flying()
-    copter.land(60.0)
-    copter.take_off(10.0, 100.0)
-    copter.advance(200.0)
-    assert copter.motion.up_m == pytest.approx(10.0)
+def test_climbing_goes_on_level_at_its_altitude() -> None:
+    climb = Climbing(Line(Motion(up_m=10), Point(100, 0, 10), 10, 100), up_m=20, rate_ms=2)
+    assert (climb.at(2).up_m, climb.at(2).up_ms) == (14, 2)
+    assert (climb.at(9).up_m, climb.at(9).up_ms) == (20, 0)
 
 
-@given(steps, st.floats(0, 359), st.lists(st.sampled_from(["land", "hold", "nothing"]), max_size=30))
-def test_it_never_jumps_nor_goes_underground(waits: list[float], heading: float, wishes: list[str]) -> None:
-    copter, now = flying(20.0, heading), 0.0
-    fastest = math.hypot(CIRCLE_SPEED_MS, CIRCLE_SPEED_MS, CLIMB_MS)
-    for wait, wish in zip(waits, [*wishes, *["nothing"] * len(waits)], strict=False):
-        if wish == "land":
-            copter.land(now)
-        elif wish == "hold":
-            copter.hold(now)
-        before, now = copter.motion, now + wait
-        copter.advance(now)
-        assert distance(before, copter.motion) <= fastest * wait + 1e-6
-        assert copter.motion.up_m >= 0.0
+def test_a_fall_ends_on_the_ground_at_the_speed_of_free_fall() -> None:
+    fall = Fall(Motion(up_m=100, north_ms=3))
+    assert fall.at(fall.duration_s).point == pytest.approx((3 * fall.duration_s, 0, 0))
+    assert fall.impact_ms == pytest.approx(math.sqrt(2 * 9.81 * 100))
 
 
-@given(steps)
-def test_the_track_does_not_depend_on_the_steps(waits: list[float]) -> None:
-    fine, coarse = flying(), flying()
-    now = 0.0
-    for wait in waits:
-        now += wait
-        fine.advance(now)
-    coarse.advance(now)
-    assert distance(fine.motion, coarse.motion) < 1e-6
+def test_a_spiral_ends_in_its_circle() -> None:
+    spiral = Spiral(Motion(up_m=20), radius_m=30, speed_ms=5)
+    assert math.hypot(*spiral.at(100).point[:2]) == pytest.approx(30)
+    assert math.hypot(spiral.at(100).north_ms, spiral.at(100).east_ms) == pytest.approx(5)
+
+
+def test_a_course_is_its_segments_one_after_another() -> None:
+    line = Line(Motion(), Point(10, 0, 0), 10, 10)
+    course = Course(100, [Rest(Motion(), 5), line, Rest(end_of([line]))])
+    assert course.at(0) == course.at(104.9) == Motion()
+    assert course.at(105 + line.duration_s / 2).north_m == pytest.approx(5)
+    assert course.at(1e6).north_m == 10
+    assert course.end_s == math.inf
+
+
+FASTEST_MS = 23.0  # a plane that climbs
+STEPS = 50
+WISHES = ("go_to", "loiter", "land", "idle")
+
+
+@settings(max_examples=50)
+@given(
+    st.sampled_from(["copter", "plane", "rover"]),
+    st.floats(0, 6.28),
+    st.lists(st.tuples(st.sampled_from(WISHES), places, st.floats(0.1, 60)), max_size=6),
+)
+def test_nothing_jumps_nor_goes_underground(
+    vehicle_type: VehicleType, yaw: float, wishes: list[tuple[str, Point, float]]
+) -> None:
+    """Whatever is wished for, wherever it is broken off: what begins, begins where the vehicle is."""
+    model = MODELS[vehicle_type]
+    segments = model.take_off(Motion(yaw_rad=yaw), 20)
+    now, motion = 0.0, end_of(segments)
+    for wish, place, seconds in wishes:
+        if wish == "go_to":
+            segments = model.go_to(motion, place, model.cruise_ms)
+        elif wish == "loiter":
+            segments = model.loiter(motion, place, model.cruise_ms, seconds)
+        elif wish == "idle":
+            segments = model.idle(motion)
+        else:
+            segments = model.land(motion, motion.point)
+        course = Course(now, segments)
+        assert distance(course.at(now), motion) < 1e-6
+        fine = [course.at(now + seconds * step / STEPS) for step in range(STEPS + 1)]
+        for before, after in itertools.pairwise(fine):
+            assert distance(before, after) <= FASTEST_MS * seconds / STEPS + 1e-6
+            assert after.up_m >= -1e-6
+        now, motion = now + seconds, fine[-1]
+        if vehicle_type == "plane" and wish == "land":
+            return
+
+
+@given(places, metres, metres, st.floats(0, 6.28))
+def test_a_plane_comes_close_to_every_place(place: Point, north: float, east: float, yaw: float) -> None:
+    start = Motion(north, east, 50, 22 * math.cos(yaw), 22 * math.sin(yaw), yaw_rad=yaw)
+    there = end_of(MODELS["plane"].go_to(start, place, 22))
+    assert math.dist(there.point[:2], place[:2]) <= 50 + 1e-3
+    circle: list[Segment] = [*MODELS["plane"].loiter(start, place, 22, 30)]
+    assert math.dist(end_of(circle).point[:2], place[:2]) == pytest.approx(80)

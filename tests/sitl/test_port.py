@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.autopilot import Autopilot
 from sitl.port import MAX_UNSENT_BYTES, Port
+from sitl.streams import heartbeat
 from tests.sitl.flying import DEADLINE_S, HOME, free_ports
 
 
@@ -43,7 +44,7 @@ def test_a_client_that_reads_nothing_costs_bounded_memory_and_later_gets_whole_m
     while unsent_since is None or unsent_since < 1000:  # the kernel's own buffers fill first
         assert time.monotonic() < deadline
         for _ in range(200):
-            port.channel.send(port.channel._autopilot.heartbeat())
+            port.channel.send(heartbeat(port.channel._autopilot))
         port.send()
         turn(selector)
         most = max(most, len(port._unsent))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sitl.embedded import Embedded
-from sitl.vehicle import METRES_PER_DEGREE, Home, VehicleError, VehicleKind, home_in_field
+from sitl.vehicle import METRES_PER_DEGREE, Home, VehicleError, VehicleKind, home_in_field, place_in_field
 from tests.sitl.flying import HOME
 
 
@@ -22,6 +22,18 @@ def test_a_hundred_homes_are_metres_apart_and_in_one_field() -> None:
     closest = min(metres_apart(a, b) for at, a in enumerate(homes) for b in homes[:at])
     assert closest > 4.0
     assert max(metres_apart(HOME, home) for home in homes) < 60.0
+
+
+def test_homes_are_as_far_apart_as_asked_and_where_the_field_says() -> None:
+    homes = [home_in_field(index, HOME, 50.0) for index in range(20)]
+    assert min(metres_apart(a, b) for at, a in enumerate(homes) for b in homes[:at]) > 40.0
+    for index, home in enumerate(homes):
+        assert HOME.metres_to(home.lat_deg, home.lon_deg, 584.0)[:2] == pytest.approx(place_in_field(index, 50.0))
+
+
+def test_a_home_that_is_nowhere_for_ardupilot_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match="vehicle 3: a home at 0,0 is ArduPilot's word for no position"):
+        Embedded().launch(3, Home(0.0, 0.0), 1.0, tmp_path)
 
 
 def test_home_reads_what_it_writes() -> None:
@@ -52,11 +64,12 @@ def test_a_home_at_the_date_line_stays_on_earth() -> None:
 
 
 def test_the_embedded_kind_starts_this_interpreter(tmp_path: Path) -> None:
-    kind: VehicleKind = Embedded()
+    kind: VehicleKind = Embedded("plane")
     launch = kind.launch(7, HOME, 20.0, tmp_path)
-    assert kind.name == "embedded"
+    assert (kind.name, kind.vehicle_type) == ("embedded", "plane")
     assert launch.argv[0] == sys.executable
     assert f"--home={HOME}" in launch.argv
+    assert launch.argv[launch.argv.index("--type") + 1] == "plane"
     assert (launch.pilot_port, launch.agent_port) == (5760, 5762)
     assert list(tmp_path.iterdir()) == []
 

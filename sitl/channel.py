@@ -1,0 +1,188 @@
+"""One client's view of the embedded vehicle, as one serial port of an ArduPilot: MAVLink in, MAVLink out, no socket.
+
+A `Channel` has its own parser, sequence numbers, message intervals and half-received mission.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from sitl.autopilot import FRAMES, MAX_ALTITUDE_M, Autopilot
+from sitl.mission_inbox import MissionInbox
+from sitl.modes import MODES
+from sitl.streams import STREAMS
+
+DEFAULT_INTERVAL_S = 1.0
+MIN_INTERVAL_S = 0.02
+
+FORCE = 21196  # param2 of MAV_CMD_COMPONENT_ARM_DISARM
+NO_POSITION = (
+    mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
+)
+TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # the one parameter that it has
+
+
+class Channel:
+    """One client of an autopilot, from connection to disconnection."""
+
+    def __init__(self, autopilot: Autopilot) -> None:
+        self._autopilot = autopilot
+        self._mav = mavlink.MAVLink(None, srcSystem=autopilot.sysid, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
+        self._mav.robust_parsing = True  # garbage is reported as BAD_DATA, not raised
+        self._out = bytearray()
+        self._mission = MissionInbox(autopilot)
+        self._interval_s = dict.fromkeys(STREAMS, DEFAULT_INTERVAL_S)
+        self._due_s = dict.fromkeys(STREAMS, autopilot.now_s)
+        autopilot.listeners.append(self)
+
+    def close(self) -> None:
+        self._autopilot.listeners.remove(self)
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the client, in any pieces, with anything in them."""
+        for message in self._mav.parse_buffer(data) or ():
+            kind = message.get_type()
+            if getattr(message, "target_system", None) not in (0, self._autopilot.sysid):
+                continue  # BAD_DATA and heartbeats, too, which name nobody
+            if getattr(message, "target_component", 0) not in (0, mavlink.MAV_COMP_ID_AUTOPILOT1):
+                continue
+            if kind in ("COMMAND_LONG", "COMMAND_INT"):
+                self._acknowledge(message, self._command(message))
+            elif kind == "SET_POSITION_TARGET_GLOBAL_INT":
+                self._position_target(message)
+            elif kind == "PARAM_SET":
+                self._set_parameter(message)
+            elif kind.startswith("MISSION_"):
+                for answer in self._mission.receive(kind, message):
+                    self.send(answer)
+        # the parser frees its buffer only when a read ends with a message
+        del self._mav.buf[: self._mav.buf_index]
+        self._mav.buf_index = 0
+
+    def send(self, message: Any) -> None:
+        self._out += message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) % 256
+
+    def send_due(self) -> None:
+        """Send every message whose interval has passed, once: a client behind schedule gets the latest, not a burst."""
+        now_s = self._autopilot.now_s
+        for message_id, due_s in self._due_s.items():
+            if due_s <= now_s:
+                self.send(STREAMS[message_id](self._autopilot))
+                self._due_s[message_id] = max(due_s + self._interval_s[message_id], now_s)
+
+    def next_due_s(self) -> float:
+        return min(self._due_s.values())
+
+    def take(self) -> bytes:
+        """What is to be sent to the client."""
+        data = bytes(self._out)
+        self._out.clear()
+        return data
+
+    def _acknowledge(self, message: Any, result: int) -> None:
+        self.send(
+            mavlink.MAVLink_command_ack_message(
+                message.command,
+                result,
+                target_system=message.get_srcSystem(),
+                target_component=message.get_srcComponent(),
+            )
+        )
+
+    def _command(self, message: Any) -> int:
+        """Do what a COMMAND_LONG or COMMAND_INT asks; the MAV_RESULT."""
+        vehicle = self._autopilot
+        match message.command:
+            case mavlink.MAV_CMD_COMPONENT_ARM_DISARM if message.param1 == 1:
+                return vehicle.arm()
+            case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
+                return vehicle.disarm(force=message.param2 == FORCE)
+            case mavlink.MAV_CMD_DO_FLIGHTTERMINATION if message.param1 > 0.5:
+                return vehicle.disarm(force=True)
+            case mavlink.MAV_CMD_NAV_TAKEOFF:
+                return vehicle.take_off(_seventh(message))
+            case mavlink.MAV_CMD_NAV_LAND:
+                return self._set_mode("LAND")
+            case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
+                return self._set_mode("RTL")
+            case mavlink.MAV_CMD_DO_SET_MODE:
+                return vehicle.set_mode(message.param2)
+            case mavlink.MAV_CMD_MISSION_START:
+                return vehicle.start_mission()
+            case mavlink.MAV_CMD_DO_CHANGE_SPEED:
+                return vehicle.set_speed(message.param2)
+            case mavlink.MAV_CMD_DO_REPOSITION:
+                return self._reposition(message)
+            case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+                return self._set_interval(message.param1, message.param2)
+            case mavlink.MAV_CMD_REQUEST_MESSAGE:
+                return self._request(message.param1)
+        return int(mavlink.MAV_RESULT_UNSUPPORTED)
+
+    def _set_mode(self, name: str) -> int:
+        number = MODES[self._autopilot.vehicle_type].get(name)
+        return int(mavlink.MAV_RESULT_UNSUPPORTED) if number is None else self._autopilot.set_mode(number)
+
+    def _reposition(self, message: Any) -> int:
+        """MAV_CMD_DO_REPOSITION: param1 is the speed, -1 or 0 the present one; with `MODE` in param2, go to GUIDED."""
+        vehicle = self._autopilot
+        if message.get_type() != "COMMAND_INT":
+            return int(mavlink.MAV_RESULT_COMMAND_INT_ONLY)
+        if message.frame not in FRAMES:
+            return int(mavlink.MAV_RESULT_DENIED)
+        if math.isfinite(message.param2) and int(message.param2) & mavlink.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE:
+            self._set_mode("GUIDED")
+        if message.param1 > 0:
+            vehicle.set_speed(message.param1)
+        return vehicle.go_to(vehicle.place(message.frame, message.x, message.y, message.z))
+
+    def _position_target(self, message: Any) -> None:
+        """Only whole positions; a plane does not listen to these, as ArduPlane does not. Nothing is answered."""
+        vehicle = self._autopilot
+        whole = not message.type_mask & NO_POSITION and message.coordinate_frame in FRAMES
+        if whole and vehicle.vehicle_type != "plane":
+            vehicle.go_to(vehicle.place(message.coordinate_frame, message.lat_int, message.lon_int, message.alt))
+
+    def _set_parameter(self, message: Any) -> None:
+        vehicle = self._autopilot
+        if message.param_id != TAKE_OFF_ALTITUDE or vehicle.vehicle_type != "plane":
+            return
+        if 0 < message.param_value <= MAX_ALTITUDE_M:
+            vehicle.take_off_altitude_m = message.param_value
+        self.send(
+            mavlink.MAVLink_param_value_message(
+                TAKE_OFF_ALTITUDE.encode(), vehicle.take_off_altitude_m, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0
+            )
+        )
+
+    def _set_interval(self, message_id: float, interval_us: float) -> int:
+        """MAV_CMD_SET_MESSAGE_INTERVAL: microseconds; 0 is the default interval, -1 is never."""
+        if message_id not in STREAMS or not math.isfinite(interval_us):
+            return int(mavlink.MAV_RESULT_FAILED)
+        if interval_us < 0:
+            interval_s = math.inf
+        elif interval_us == 0:
+            interval_s = DEFAULT_INTERVAL_S
+        else:
+            interval_s = max(MIN_INTERVAL_S, interval_us / 1e6)
+        self._interval_s[int(message_id)] = interval_s
+        next_s = self._autopilot.now_s + interval_s
+        self._due_s[int(message_id)] = next_s if interval_us < 0 else min(next_s, self._due_s[int(message_id)])
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _request(self, message_id: float) -> int:
+        if message_id not in STREAMS:
+            return int(mavlink.MAV_RESULT_FAILED)
+        self.send(STREAMS[int(message_id)](self._autopilot))
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+
+def _seventh(message: Any) -> float:
+    """Parameter 7, the altitude, which a COMMAND_INT calls z."""
+    return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

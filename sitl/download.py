@@ -1,0 +1,197 @@
+"""Files over HTTP, bounded in size and in silence; a large one goes on where an earlier attempt broke off.
+
+What has come of a file stands beside its place in `NAME.part`, and what the server said of it in `NAME.part.json`: its
+size, and the validator by which the server knows it again (ETag, or Last-Modified). The rest is asked for with Range
+and If-Range (RFC 9110, sections 13.1.5 and 14.2) and taken only if the answer fits what is there; otherwise all is
+fetched anew. Proxies are those of the environment (`https_proxy`, `no_proxy`: urllib.request.getproxies).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import re
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any
+from urllib.parse import urlsplit
+
+from sitl.vehicle import VehicleError
+
+STALL_S = 20.0
+"""A server that sends nothing for so many seconds is given up."""
+
+CHUNK = 1 << 16  # bytes
+
+Progress = Callable[[int, int], None]
+"""Told bytes that are here, and bytes in all."""
+
+
+class DownloadError(VehicleError):
+    """A file could not be fetched."""
+
+
+class NotThereError(DownloadError):
+    """The server has no such file (404 or 410)."""
+
+
+class UnreachableError(DownloadError):
+    """There is no way to the server from here."""
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """What the server said of the file whose beginning is here."""
+
+    size: int
+    validator: str
+
+
+def download(url: str, target: Path, limit: int, progress: Progress, stall_s: float = STALL_S) -> None:
+    """Fetch `url`, of at most `limit` bytes, into `target`; a broken download is gone on with, if the file is the same.
+
+    Raises DownloadError, and OSError if the disk does not take it; `target` is written whole or not at all.
+    """
+    part, noted = target.with_name(f"{target.name}.part"), target.with_name(f"{target.name}.part.json")
+    kept = _kept(part, noted)
+    have, origin = kept or (0, None)
+    with _answer(url, {"Range": f"bytes={have}-", "If-Range": origin.validator} if origin else {}, stall_s) as answer:
+        if answer.status == http.HTTPStatus.PARTIAL_CONTENT and origin and _fits(answer, have, origin):
+            size = origin.size
+        elif answer.status == http.HTTPStatus.OK:
+            have, size = 0, _size(url, answer, limit)
+            part.unlink(missing_ok=True)
+            noted.unlink(missing_ok=True)
+            if validator := _validator(answer):
+                noted.write_text(json.dumps(asdict(_Origin(size, validator))))
+        else:
+            answer.close()
+            if origin is None:
+                raise DownloadError(f"{url} was answered with status {answer.status}, which is no file: try again")
+            part.unlink(missing_ok=True)
+            download(url, target, limit, progress, stall_s)
+            return
+        with part.open("ab") as file:
+            for chunk in _chunks(url, answer, stall_s):
+                file.write(chunk)
+                have += len(chunk)
+                progress(have, size)
+    if have != size:
+        raise _broken_off(url)
+    part.replace(target)
+    noted.unlink(missing_ok=True)
+
+
+def fetch_text(url: str, limit: int, stall_s: float = STALL_S) -> str:
+    """The small text at `url`, of at most `limit` bytes. Raises DownloadError."""
+    content = bytearray()
+    with _answer(url, {}, stall_s) as answer:
+        for chunk in _chunks(url, answer, stall_s):
+            content += chunk
+            if len(content) > limit:
+                raise DownloadError(f"{url} is larger than {megabytes(limit)}, so it is not what it should be")
+    return content.decode(errors="replace")
+
+
+def megabytes(number: int) -> str:
+    """Bytes for a reader: `7.0 MB`."""
+    return f"{number / 1e6:.1f} MB"
+
+
+class StayEncrypted(urllib.request.HTTPRedirectHandler):
+    """Follows redirects, but never from https to anything that a third party could have changed on the way."""
+
+    def redirect_request(
+        self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: Any, newurl: str
+    ) -> urllib.request.Request | None:
+        if req.type == "https" and urlsplit(newurl).scheme != "https":
+            raise DownloadError(f"{req.full_url} leads to {newurl}, which is not encrypted: use another --url")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+@contextlib.contextmanager
+def _answer(url: str, headers: Mapping[str, str], stall_s: float) -> Iterator[Any]:
+    """The server's answer, a success or 416 (Range Not Satisfiable), while its body is read. Raises DownloadError."""
+    host = urlsplit(url).netloc
+    request = urllib.request.Request(url, headers={"User-Agent": "ucp-harness", **headers})  # noqa: S310 - http(s) only
+    opener = urllib.request.build_opener(StayEncrypted)
+    try:
+        answer = opener.open(request, timeout=stall_s)
+    except urllib.error.HTTPError as error:
+        if error.code in (http.HTTPStatus.NOT_FOUND, http.HTTPStatus.GONE):
+            raise NotThereError(f"{url} does not exist") from None
+        if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+            raise DownloadError(f"{host} answers {error.code} ({error.reason}) to {url}: try again later") from None
+        answer = error
+    except (OSError, http.client.HTTPException) as error:
+        reason = getattr(error, "reason", error)
+        raise UnreachableError(f"{host} cannot be reached ({getattr(reason, 'strerror', None) or reason})") from None
+    with answer:
+        yield answer
+
+
+def _chunks(url: str, answer: Any, stall_s: float) -> Iterator[bytes]:
+    """The body as it comes. Raises DownloadError if it does not come, or not whole."""
+    left: int | None = answer.length
+    if left is None and not answer.chunked:
+        raise _endless(url)
+    while left != 0:
+        try:
+            chunk = answer.read1(CHUNK if left is None else min(CHUNK, left))
+        except TimeoutError:
+            raise DownloadError(
+                f"{urlsplit(url).netloc} sent nothing for {stall_s:g} s: run the same command again to go on"
+            ) from None
+        except (OSError, http.client.HTTPException):
+            raise _broken_off(url) from None
+        if not chunk and left is None:
+            return
+        if not chunk:
+            raise _broken_off(url)
+        left = None if left is None else left - len(chunk)
+        yield chunk
+
+
+def _broken_off(url: str) -> DownloadError:
+    return DownloadError(f"{url} broke off before its end: run the same command again to go on")
+
+
+def _endless(url: str) -> DownloadError:
+    """For an answer of which nobody could tell whether it was cut."""
+    return DownloadError(f"{urlsplit(url).netloc} does not say how large {url} is: use another --url")
+
+
+def _kept(part: Path, noted: Path) -> tuple[int, _Origin] | None:
+    """How many bytes an earlier attempt left, and of which file; None if there is nothing to go on with."""
+    try:
+        have, origin = part.stat().st_size, _Origin(**json.loads(noted.read_text()))
+        return (have, origin) if have else None
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def _fits(answer: Any, have: int, origin: _Origin) -> bool:
+    """Whether a partial answer is the rest of the file whose first `have` bytes are here."""
+    said = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+)", answer.headers.get("Content-Range", ""))
+    wanted = (have, origin.size - 1, origin.size)
+    return said is not None and tuple(map(int, said.groups())) == wanted and _validator(answer) == origin.validator
+
+
+def _validator(answer: Any) -> str | None:
+    """By what the server knows this file again: a strong ETag, else Last-Modified, else nothing."""
+    etag: str = answer.headers.get("ETag", "")
+    return etag if etag.startswith('"') else answer.headers.get("Last-Modified")
+
+
+def _size(url: str, answer: Any, limit: int) -> int:
+    """The size that the server announces. Raises DownloadError if it announces none, or more than `limit`."""
+    size: int | None = answer.length
+    if size is None:
+        raise _endless(url)
+    if size > limit:
+        raise DownloadError(f"{url} has {megabytes(size)}, more than {megabytes(limit)}: use another --url")
+    return size

@@ -1,0 +1,269 @@
+"""Installing ArduPilot's own SITL binaries, for Linux on x86-64, into the cache (sitl/installed.py).
+
+What the firmware server has, at VEHICLE/RELEASE/SITL_x86_64_linux_gnu/: the binary, statically linked, and
+`git-version.txt`, which names the commit and the version that it was built from. RELEASE is stable, beta, latest, or
+stable-4.6.3. The vehicle's default parameters are taken from ArduPilot's source tree at that very commit: a tag would
+not do, for `latest` has none, and the binary of 4.6.3 was built from the commit before its tag. A mirror (`base`)
+replaces both hosts; the paths stay as they are.
+
+This was written without a way to the server, from ArduPilot's build scripts and from files and listings of the server
+that others have published. Not verified, hence not relied on: which validators the server sends (a download is resumed
+if it sends any), whether it answers ranges (it is begun anew otherwise), and the exact form of its listings (they only
+help to name versions when one is not there). It publishes no checksum.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Protocol
+from urllib.parse import urlsplit
+
+from sitl.download import STALL_S, DownloadError, NotThereError, UnreachableError, download, fetch_text
+from sitl.installed import BINARIES, CURRENT, DEFAULTS, File, Installed, Manifest, cache
+from sitl.vehicle import VehicleError, VehicleType
+
+FIRMWARE = "https://firmware.ardupilot.org"
+SOURCE = "https://raw.githubusercontent.com"
+PLATFORM = "SITL_x86_64_linux_gnu"
+
+LIMIT = 100_000_000  # bytes; a binary has about 7 MB
+TEXT_LIMIT = 1_000_000  # bytes
+
+# Where the source tree keeps a vehicle's defaults; the plane's have moved.
+_AUTOTEST = "Tools/autotest"
+_PARAMETERS: dict[VehicleType, tuple[str, ...]] = {
+    "copter": ("default_params/copter.parm",),
+    "plane": ("models/plane.parm", "default_params/plane.parm"),
+    "rover": ("default_params/rover.parm",),
+}
+_NEWEST_NAMED = 10  # versions
+
+_NUMBER = re.compile(r"\d+\.\d+\.\d+")
+_ELF_X86_64 = re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL)  # 64 bits, little endian; e_machine 62
+
+
+class RequestError(VehicleError):
+    """There is no such version, or no such address."""
+
+
+class CacheError(VehicleError):
+    """The cache cannot be written."""
+
+
+class Watcher(Protocol):
+    """Somebody who looks on."""
+
+    def waits(self) -> None:
+        """Another install of this vehicle is under way, and has to end first."""
+
+    def downloads(self, done: int, total: int) -> None:
+        """So many bytes of the binary are here."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is installed now, and whether it was before."""
+
+    installed: Installed
+    already: bool
+
+
+@dataclass(frozen=True)
+class _Build:
+    """What `git-version.txt` says of a binary."""
+
+    version: str
+    commit: str
+
+    @property
+    def name(self) -> str:
+        """Its directory: two development builds may bear the same version."""
+        return self.version if _NUMBER.fullmatch(self.version) else f"{self.version}-{self.commit[:8]}"
+
+
+def install(
+    vehicle: VehicleType,
+    version: str,
+    environ: Mapping[str, str],
+    watcher: Watcher,
+    base: str | None = None,
+    stall_s: float = STALL_S,
+) -> Outcome:
+    """Fetch a vehicle's binary and default parameters into the cache, unless they are there, and make them current.
+
+    `version` is `stable`, `beta`, `latest` or a number such as 4.6.3, which asks no server if it is here. An install
+    that was interrupted, in whatever way, goes on where it stopped.
+
+    Raises RequestError for a version or a `base` that does not exist, DownloadError if it cannot be fetched,
+    CacheError if it cannot be written, VehicleError if this machine could not run it.
+    """
+    if not re.fullmatch(r"[a-z0-9][\w.-]*", version, re.ASCII):
+        raise RequestError(f"{version!r} is no version: give stable, beta, latest or a number such as 4.6.3")
+    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        raise VehicleError(
+            f"this installs binaries for Linux on x86_64, and this is {sys.platform} on {platform.machine()}: "
+            "build ArduPilot SITL from source and set ARDUPILOT_SITL to its directory"
+        )
+    server = _Server(vehicle, version, base, stall_s)
+    home = cache(environ) / vehicle
+    with _ways_out(home), _locked(home, watcher):
+        number = version.removeprefix("stable-")
+        if _NUMBER.fullmatch(number) and _intact(vehicle, home / number):
+            return _use(Installed(vehicle, home / number), already=True)
+        build = server.build()
+        place = home / build.name
+        if _intact(vehicle, place):
+            return _use(Installed(vehicle, place), already=True)
+        part = home / f".{build.name}.part"
+        part.mkdir(exist_ok=True)
+        files = {
+            BINARIES[vehicle]: server.fetch_binary(part, watcher),
+            DEFAULTS[vehicle]: server.fetch_parameters(part, build),
+        }
+        fetched_at = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+        Manifest(vehicle, build.version, build.commit, fetched_at, files).write(part)
+        shutil.rmtree(place, ignore_errors=True)  # damaged
+        part.rename(place)
+        return _use(Installed(vehicle, place), already=False)
+
+
+class _Server:
+    """One release of one vehicle, as ArduPilot or a mirror publishes it. Raises RequestError for a bad `base`."""
+
+    def __init__(self, vehicle: VehicleType, version: str, base: str | None, stall_s: float) -> None:
+        self._vehicle, self._version, self._stall_s = vehicle, version, stall_s
+        firmware, self._source = (_checked(base),) * 2 if base else (FIRMWARE, SOURCE)
+        self._releases = f"{firmware}/{vehicle.title()}/"
+        self._release = f"{self._releases}{f'stable-{version}' if version[0].isdigit() else version}/{PLATFORM}/"
+
+    def build(self) -> _Build:
+        """What the release is at present."""
+        url = f"{self._release}git-version.txt"
+        try:
+            text = fetch_text(url, TEXT_LIMIT, self._stall_s)
+        except NotThereError:
+            raise self._no_such_version() from None
+        commit = re.search(r"^commit ([0-9a-f]{40})\b", text, re.MULTILINE)
+        version = re.search(r"^APMVERSION: .*V(\d[\w.-]{0,40})\s*$", text, re.MULTILINE | re.ASCII)
+        if not (commit and version):
+            raise DownloadError(f"{url} does not name a commit and a version: is this ArduPilot's server, or a mirror?")
+        return _Build(version[1], commit[1])
+
+    def fetch_binary(self, directory: Path, watcher: Watcher) -> File:
+        """The binary, fetched or found whole in `directory`, executable."""
+        path = directory / BINARIES[self._vehicle]
+        url = self._release + path.name
+        if not path.exists():
+            try:
+                download(url, path, LIMIT, watcher.downloads, self._stall_s)
+            except NotThereError:
+                raise self._no_such_version() from None
+        with path.open("rb") as file:
+            head = file.read(20)
+        if not _ELF_X86_64.match(head):
+            path.unlink()
+            raise DownloadError(
+                f"{url} is no program for Linux on x86_64, it begins with {head[:12]!r}: does a proxy answer for it?"
+            )
+        path.chmod(0o755)
+        return File.of(path, url)
+
+    def fetch_parameters(self, directory: Path, build: _Build) -> File:
+        """The default parameters at the commit of the binary."""
+        path = directory / DEFAULTS[self._vehicle]
+        for name in _PARAMETERS[self._vehicle]:
+            url = f"{self._source}/ArduPilot/ardupilot/{build.commit}/{_AUTOTEST}/{name}"
+            try:
+                text = fetch_text(url, TEXT_LIMIT, self._stall_s)
+            except NotThereError:
+                continue
+            if not re.search(r"^[A-Z][A-Z0-9_]*[\s,=]+-?[\d.]", text, re.MULTILINE):
+                raise DownloadError(f"{url} has no ArduPilot parameters in it: does a proxy answer for it?")
+            path.write_text(text, encoding="utf-8")
+            return File.of(path, url)
+        raise DownloadError(f"{url} does not exist: install another --version")
+
+    def _no_such_version(self) -> RequestError:
+        """The error for a release that is not there, with those that are if the server lists them."""
+        try:
+            listing = fetch_text(self._releases, TEXT_LIMIT, self._stall_s)
+        except DownloadError:
+            listing = ""
+        names = set(re.findall(r'href="[^"]*?\b(stable-\d+\.\d+\.\d+|stable|beta|latest)/?"', listing))
+        numbers = [name.removeprefix("stable-") for name in names if name.startswith("stable-")]
+        numbers.sort(key=lambda number: tuple(map(int, number.split("."))), reverse=True)
+        known = [name for name in ("stable", "beta", "latest") if name in names] + numbers[:_NEWEST_NAMED]
+        way_out = f"there are {', '.join(known)}" if known else f"look at {self._releases} for those that there are"
+        return RequestError(f"there is no {self._vehicle} {self._version} at {self._release}: {way_out}")
+
+
+def _checked(base: str) -> str:
+    """A mirror's address without its last slash. Raises RequestError."""
+    try:
+        parts = urlsplit(base)
+        plain = re.fullmatch(r"[!-~]+", base) and parts.username is None
+        if plain and parts.scheme in ("http", "https") and parts.hostname and parts.port != 0:
+            return base.rstrip("/")
+    except ValueError:
+        pass
+    raise RequestError(f"{base!r} is no address of a mirror: give http(s)://HOST[:PORT][/PATH], without a password")
+
+
+def _intact(vehicle: VehicleType, directory: Path) -> bool:
+    return directory.is_dir() and Installed(vehicle, directory).damage is None
+
+
+def _use(installed: Installed, already: bool) -> Outcome:
+    """Make it the current one, and remove what other installs left unfinished."""
+    home = installed.directory.parent
+    link = home / f".{CURRENT}"
+    link.unlink(missing_ok=True)
+    link.symlink_to(installed.directory.name)
+    link.replace(home / CURRENT)
+    for left in home.glob(".*.part"):
+        shutil.rmtree(left, ignore_errors=True)
+    return Outcome(installed, already)
+
+
+@contextlib.contextmanager
+def _locked(home: Path, watcher: Watcher) -> Iterator[None]:
+    """One install of a vehicle at a time (flock(2): a process that dies lets go)."""
+    home.mkdir(parents=True, exist_ok=True)
+    with (home / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            watcher.waits()
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+@contextlib.contextmanager
+def _ways_out(home: Path) -> Iterator[None]:
+    """Says what to do without a network, and raises CacheError for what the disk refuses."""
+    try:
+        yield
+    except UnreachableError as error:
+        raise UnreachableError(
+            f"{error}: if there is a mirror, give its address with --url; else install on a machine that can reach it, "
+            "copy the directory that `ucp-harness sitl path` names there to this one, and set ARDUPILOT_SITL to it"
+        ) from None
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise CacheError(
+                f"the disk of {home} is full: make room and run the same command again, it goes on where it stopped"
+            ) from None
+        raise CacheError(
+            f"{error.filename or home} cannot be written ({error.strerror}): make it writable, or set XDG_CACHE_HOME "
+            "to a directory that is"
+        ) from None

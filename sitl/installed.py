@@ -1,0 +1,144 @@
+"""The cache of ArduPilot SITL binaries: what `ucp-harness sitl install` left, and whether it is still that.
+
+    $XDG_CACHE_HOME/ucp-harness/sitl/copter/4.6.3/arducopter      (XDG Base Directory Specification; else ~/.cache)
+                                                  copter.parm     ArduPilot's default parameters of that commit
+                                                  manifest.json   `Manifest`
+                                           current -> 4.6.3       the one that runs use
+
+ArduPilot's server publishes no checksums, so the SHA-256 of what came over TLS is recorded, and compared before use.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+
+from sitl.vehicle import UnusableBinaryError, VehicleError, VehicleType
+
+BINARIES: dict[VehicleType, str] = {"copter": "arducopter", "plane": "arduplane", "rover": "ardurover"}
+DEFAULTS: dict[VehicleType, str] = {"copter": "copter.parm", "plane": "plane.parm", "rover": "rover.parm"}
+"""Parameters of ArduPilot's Tools/autotest (default_params, models), beside the binary."""
+
+MANIFEST = "manifest.json"
+CURRENT = "current"
+
+
+@dataclass(frozen=True)
+class File:
+    """One file as it was fetched; its size in bytes."""
+
+    url: str
+    size: int
+    sha256: str
+
+    @classmethod
+    def of(cls, path: Path, url: str) -> File:
+        return cls(url, path.stat().st_size, _sha256(path))
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What was fetched, and when: ArduPilot's version and git commit, ISO 8601 time in UTC; files by name."""
+
+    vehicle: str
+    version: str
+    commit: str
+    fetched_at: str
+    files: dict[str, File]
+
+    def write(self, directory: Path) -> None:
+        (directory / MANIFEST).write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def read(cls, directory: Path) -> Manifest:
+        """Raises OSError, ValueError, TypeError, LookupError or AttributeError if there is none that makes sense."""
+        document = json.loads((directory / MANIFEST).read_text())
+        files = {
+            name: File(str(file["url"]), int(file["size"]), str(file["sha256"]))
+            for name, file in document["files"].items()
+        }
+        return cls(**{**document, "files": files})
+
+
+@dataclass(frozen=True)
+class Installed:
+    """One version of one vehicle in the cache."""
+
+    vehicle: VehicleType
+    directory: Path
+
+    @property
+    def binary(self) -> Path:
+        return self.directory / BINARIES[self.vehicle]
+
+    @property
+    def is_current(self) -> bool:
+        """Whether it is the one that runs use."""
+        with contextlib.suppress(OSError):
+            return (self.directory.parent / CURRENT).readlink() == Path(self.directory.name)
+        return False
+
+    @cached_property
+    def manifest(self) -> Manifest | None:
+        """None if it cannot be read."""
+        with contextlib.suppress(OSError, ValueError, TypeError, LookupError, AttributeError):
+            return Manifest.read(self.directory)
+        return None
+
+    @cached_property
+    def damage(self) -> str | None:
+        """What is no longer as it was fetched, or None. Reads every file."""
+        if self.manifest is None:
+            return f"{MANIFEST} is missing or cannot be read"
+        for name in (self.binary.name, DEFAULTS[self.vehicle]):
+            recorded = self.manifest.files.get(name)
+            try:
+                if recorded is None or _sha256(self.directory / name) != recorded.sha256:
+                    return f"{name} is not the file that was fetched (SHA-256)"
+            except OSError as error:
+                return f"{name} cannot be read ({error.strerror})"
+        return None if os.access(self.binary, os.X_OK) else f"{self.binary.name} is not executable"
+
+
+def cache(environ: Mapping[str, str]) -> Path:
+    """The directory with one directory per vehicle. Raises VehicleError if the environment names no place for it."""
+    for base in (Path(environ.get("XDG_CACHE_HOME", "")), Path(environ.get("HOME", "")) / ".cache"):
+        if base.is_absolute():
+            return base / "ucp-harness" / "sitl"
+    raise VehicleError("there is no place for a cache: set XDG_CACHE_HOME to the absolute path of a directory")
+
+
+def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[Installed]:
+    """Every version in the cache, in the order of their names."""
+    try:
+        directories = sorted(path for path in (cache(environ) / vehicle).iterdir() if not path.name.startswith("."))
+    except (OSError, VehicleError):
+        return []
+    return [Installed(vehicle, path) for path in directories if path.is_dir() and not path.is_symlink()]
+
+
+def current(vehicle: VehicleType, environ: Mapping[str, str]) -> Installed | None:
+    """The version that was installed last, or None. Raises UnusableBinaryError if it is damaged."""
+    try:
+        directory = (cache(environ) / vehicle / CURRENT).resolve(strict=True)
+    except (OSError, VehicleError):
+        return None
+    found = Installed(vehicle, directory)
+    if found.damage:
+        raise UnusableBinaryError(f"{directory} is damaged, {found.damage}: run {install_command(vehicle)}")
+    return found
+
+
+def install_command(vehicle: VehicleType) -> str:
+    return f"`ucp-harness sitl install --vehicle {vehicle}`"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,39 @@
+"""How each type of vehicle moves: a `MotionModel` turns a wish and the present motion into segments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from sitl.copter import Copter
+from sitl.kinematics import Motion, Point, Segment
+from sitl.plane import Plane
+from sitl.rover import Rover
+from sitl.vehicle import VehicleType
+
+
+class MotionModel(Protocol):
+    """Speeds are metres per second over the ground, places metres from home. Nothing jumps: what begins, begins here.
+
+    Every answer has at least one segment.
+    """
+
+    @property
+    def cruise_ms(self) -> float:
+        """The speed of one who was given none."""
+
+    def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]: ...
+
+    def go_to(self, start: Motion, place: Point, speed_ms: float) -> Sequence[Segment]: ...
+
+    def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
+        """Stay at `place` for so many seconds after having come there, which may be infinite."""
+
+    def land(self, start: Motion, place: Point) -> Sequence[Segment]:
+        """Come down at `place`, and stand there."""
+
+    def idle(self, start: Motion) -> Sequence[Segment]:
+        """What it does in the air when it has taken off and has been told nothing since, for ever."""
+
+
+MODELS: dict[VehicleType, MotionModel] = {"copter": Copter(), "plane": Plane(), "rover": Rover()}

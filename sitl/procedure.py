@@ -1,0 +1,87 @@
+"""What all flights have in common: steps, and the question which one comes next.
+
+A flight is not a script. At every heartbeat the pilot asks: what is the next step that this vehicle has not made? A
+vehicle that acknowledges a mode and undoes it, or disarms itself while the machine was busy, both of which ArduPilot
+does, is simply asked again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.link import Link
+from sitl.modes import MODES
+from sitl.vehicle import VehicleType
+
+STEP_LIMIT_S = 60.0
+READY_LIMIT_S = 180.0  # ArduPilot calibrates, and waits for its estimates to agree
+
+
+@dataclass(frozen=True)
+class Step:
+    """Something to wait for, as an error names it, and for how many simulated seconds, all attempts together."""
+
+    name: str
+    limit_s: float = STEP_LIMIT_S
+
+
+HEARTBEAT = Step("the first heartbeat")
+READY = Step("ready to arm", READY_LIMIT_S)
+ARM = Step("arming")
+
+
+class HopelessError(Exception):
+    """The flight cannot go on; the message says why."""
+
+
+class Procedure(Protocol):
+    """One thing that a pilot makes a vehicle do, `purpose` in words."""
+
+    purpose: str
+
+    def next_step(self) -> Step | None:
+        """The first step that is not made, None when all are. Raises HopelessError."""
+
+    def ask(self, step: Step) -> None:
+        """Ask the vehicle for a step; called once at every heartbeat while it is not made."""
+
+
+class Commander:
+    """The requests that every procedure makes."""
+
+    def __init__(self, link: Link, vehicle_type: VehicleType) -> None:
+        self.link = link
+        self.state = link.state
+        self.vehicle_type: VehicleType = vehicle_type
+
+    def in_mode(self, name: str) -> bool:
+        return self.state.mode == MODES[self.vehicle_type][name]
+
+    def set_mode(self, name: str) -> None:
+        number, kind = MODES[self.vehicle_type][name], mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, kind, float(number))
+        if self.link.acks.get(mavlink.MAV_CMD_DO_SET_MODE) == mavlink.MAV_RESULT_UNSUPPORTED:  # ArduCopter 3.5
+            self.link.send(mavlink.MAVLink_set_mode_message(self.link.sysid, kind, number))
+
+    def arming(self) -> Step | None:
+        """The step towards being armed that is not made."""
+        if self.state.armed:
+            return None
+        return ARM if self.state.ready_to_arm else READY
+
+    def arm(self) -> None:
+        self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+
+    def accepted(self, command: int) -> bool:
+        return self.link.acks.get(command) == int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def refused(self, commands: Sequence[int]) -> bool:
+        """Whether one of these was answered with MAV_RESULT_FAILED; each answer counts once."""
+        failed = [command for command in commands if self.link.acks.get(command) == int(mavlink.MAV_RESULT_FAILED)]
+        for command in failed:
+            del self.link.acks[command]
+        return bool(failed)

@@ -1,0 +1,35 @@
+"""How a rover moves. The figures are those of ArduRover's SITL (rover.parm) and its defaults, parameters by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from sitl.kinematics import Line, Motion, Point, Rest, Segment, end_of
+
+CRUISE_MS = 5.0  # CRUISE_SPEED
+ACCEL_MS2 = 1.0  # ATC_ACCEL_MAX
+
+
+class Rover:
+    """The `MotionModel` of a rover: straight from place to place on level ground, with a stop at each."""
+
+    cruise_ms = CRUISE_MS
+
+    def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        """It cannot, and stays."""
+        return [Rest(start, 0.0)]
+
+    def go_to(self, start: Motion, place: Point, speed_ms: float) -> Sequence[Segment]:
+        return [Line(start, place._replace(up_m=start.up_m), speed_ms, ACCEL_MS2)]
+
+    def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
+        there = self.go_to(start, place, speed_ms)
+        return [*there, Rest(end_of(there), seconds)]
+
+    def land(self, start: Motion, place: Point) -> Sequence[Segment]:
+        """It never left the ground, and stays."""
+        return [Rest(start, 0.0)]
+
+    def idle(self, start: Motion) -> Sequence[Segment]:
+        return [Rest(start, math.inf)]

@@ -1,0 +1,49 @@
+"""What a vehicle last said about itself, as its pilot keeps it."""
+
+from __future__ import annotations
+
+import collections
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a vehicle says it is: degrees, metres above sea level, metres above home.
+
+    And how it moves: metres per second north, east and up, and the heading in degrees clockwise from north, if known.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    relative_alt_m: float
+    north_ms: float = 0.0
+    east_ms: float = 0.0
+    up_ms: float = 0.0
+    heading_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Battery:
+    """Volts, and what is left, 0 to 1; None: it does not know."""
+
+    voltage_v: float | None
+    left: float | None
+
+
+@dataclass
+class VehicleState:
+    """None is "not yet"."""
+
+    mode: int | None = None  # ArduPilot's custom_mode
+    armed: bool = False
+    ready_to_arm: bool | None = None
+    position: Position | None = None  # not before it has one
+    battery: Battery | None = None
+    time_s: float | None = None  # simulated, since boot
+    item: int | None = None  # of the mission, where it is heading
+    reached: int | None = None  # the last item of the mission that it says it has reached
+    texts: collections.deque[str] = field(default_factory=lambda: collections.deque(maxlen=20))  # latest last
+    messages: int = 0
+    garbage: int = 0  # stretches of bytes that were no message
+    log_error: str | None = None  # why the telemetry log ends early, when it does

@@ -1,0 +1,547 @@
+"""Installing ArduPilot's binaries from a server on loopback that serves well, and that misbehaves."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import io
+import json
+import os
+import platform
+import stat
+import threading
+import urllib.request
+from collections.abc import Iterator
+from email.message import Message
+from pathlib import Path
+
+import pytest
+
+from sitl.ardupilot import ArduPilot
+from sitl.download import DownloadError, NotThereError, StayEncrypted, UnreachableError, download, fetch_text
+from sitl.firmware import CacheError, Outcome, RequestError, install
+from sitl.installed import Installed, all_installed, cache, current
+from sitl.vehicle import NoBinaryError, UnusableBinaryError, VehicleError
+from tests.sitl.firmware_server import (
+    BINARY,
+    COMMIT,
+    PARAMETERS,
+    RELEASE,
+    FirmwareServer,
+    Resource,
+    git_version,
+    serving,
+)
+
+pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="installs binaries for x86_64")
+
+BINARY_PATH = f"{RELEASE}arducopter"
+PARAMETERS_PATH = f"/ArduPilot/ardupilot/{COMMIT}/Tools/autotest/default_params/copter.parm"
+HALF = len(BINARY) // 2
+
+
+@pytest.fixture(autouse=True)
+def _no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+
+
+@pytest.fixture
+def server() -> Iterator[FirmwareServer]:
+    with serving() as state:
+        yield state
+
+
+class Onlooker:
+    """Notes what a watcher is told, and may end a download as Ctrl-C or a full disk does."""
+
+    def __init__(self, end: BaseException | None = None) -> None:
+        self.waited = threading.Event()
+        self.seen: list[tuple[int, int]] = []
+        self._end = end
+
+    def waits(self) -> None:
+        self.waited.set()
+
+    def downloads(self, done: int, total: int) -> None:
+        self.seen.append((done, total))
+        if self._end:
+            raise self._end
+
+
+@pytest.fixture
+def environ(tmp_path: Path) -> dict[str, str]:
+    return {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+
+
+def install_copter(
+    server: FirmwareServer, environ: dict[str, str], version: str = "stable", watcher: Onlooker | None = None
+) -> Outcome:
+    return install("copter", version, environ, watcher or Onlooker(), server.url, stall_s=0.2)
+
+
+def the_binary(environ: dict[str, str]) -> bytes:
+    found = current("copter", environ)
+    assert found is not None
+    return found.binary.read_bytes()
+
+
+def test_an_install_leaves_an_executable_its_parameters_and_where_they_came_from(
+    server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    watcher = Onlooker()
+    outcome = install_copter(server, environ, watcher=watcher)
+    directory = outcome.installed.directory
+    assert not outcome.already
+    assert directory == cache(environ) / "copter" / "4.6.3"
+    assert (directory / "arducopter").read_bytes() == BINARY
+    assert (directory / "arducopter").stat().st_mode & stat.S_IXUSR
+    assert (directory / "copter.parm").read_bytes() == PARAMETERS
+    manifest = json.loads((directory / "manifest.json").read_text())
+    assert (manifest["version"], manifest["commit"]) == ("4.6.3", COMMIT)
+    assert manifest["files"]["arducopter"]["url"] == server.url + BINARY_PATH
+    assert manifest["files"]["arducopter"]["size"] == len(BINARY)
+    assert sorted(path.name for path in directory.iterdir()) == ["arducopter", "copter.parm", "manifest.json"]
+    assert watcher.seen[-1] == (len(BINARY), len(BINARY))
+    assert current("copter", environ) == outcome.installed
+
+
+def test_a_second_install_fetches_nothing_again_and_says_so(server: FirmwareServer, environ: dict[str, str]) -> None:
+    install_copter(server, environ)
+    server.asked.clear()
+    assert install_copter(server, environ).already
+    assert [path for path, _ in server.asked] == [f"{RELEASE}git-version.txt"]  # has stable moved on?
+
+
+@pytest.mark.parametrize("version", ["4.6.3", "stable-4.6.3"])
+def test_a_number_that_is_here_asks_nobody(version: str, server: FirmwareServer, environ: dict[str, str]) -> None:
+    install_copter(server, environ)
+    server.asked.clear()
+    assert install_copter(server, environ, version).already
+    assert server.asked == []
+
+
+def test_a_number_is_looked_for_among_the_stable_releases(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.files = {path.replace("/stable/", "/stable-4.6.3/"): file for path, file in server.files.items()}
+    assert install_copter(server, environ, "4.6.3").installed.directory.name == "4.6.3"
+
+
+def test_when_stable_has_moved_on_the_new_one_is_current_and_the_old_one_stays(
+    server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    old = install_copter(server, environ).installed
+    server.change(f"{RELEASE}git-version.txt", content=git_version("4.7.0"))
+    server.change(BINARY_PATH, content=BINARY + b"new")
+    new = install_copter(server, environ).installed
+    assert [one.directory.name for one in all_installed("copter", environ)] == ["4.6.3", "4.7.0"]
+    assert current("copter", environ) == new
+    assert old.damage is None
+    assert install_copter(server, environ, "4.6.3").already  # and back
+    assert the_binary(environ) == BINARY
+
+
+def test_two_development_builds_of_one_version_are_two(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(f"{RELEASE}git-version.txt", content=git_version("4.8.0-dev"))
+    assert install_copter(server, environ).installed.directory.name == f"4.8.0-dev-{COMMIT[:8]}"
+
+
+def test_a_plane_takes_its_parameters_from_where_they_were_before(
+    server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    release = RELEASE.replace("Copter", "Plane")
+    server.files = {
+        f"{release}git-version.txt": Resource(git_version("4.0.9")),
+        f"{release}arduplane": Resource(BINARY),
+        PARAMETERS_PATH.replace("copter", "plane"): Resource(b"ARSPD_FBW_MAX 30\n"),
+    }
+    installed = install("plane", "stable", environ, Onlooker(), server.url).installed
+    assert (installed.directory / "plane.parm").read_bytes() == b"ARSPD_FBW_MAX 30\n"
+
+
+# What breaks off goes on, if it is the same file.
+
+
+def test_a_broken_download_goes_on_where_it_stopped(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, cut_after=HALF)
+    with pytest.raises(DownloadError, match="broke off before its end: run the same command again"):
+        install_copter(server, environ)
+    assert current("copter", environ) is None
+    server.change(BINARY_PATH, cut_after=None)
+    install_copter(server, environ)
+    assert server.ranges_of("arducopter") == [None, f"bytes={HALF}-"]
+    assert server.statuses_of("arducopter") == [200, 206]
+    assert the_binary(environ) == BINARY
+    assert not list(cache(environ).glob("**/*.part*"))
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full")], ids=["Ctrl-C", "full disk"])
+def test_ctrl_c_and_a_full_disk_keep_what_came(
+    end: BaseException, server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    with pytest.raises((KeyboardInterrupt, CacheError)):
+        install_copter(server, environ, watcher=Onlooker(end))
+    (part,) = cache(environ).glob("**/*.part/*.part")
+    came = part.stat().st_size
+    assert 0 < came < len(BINARY)
+    install_copter(server, environ)
+    assert server.ranges_of("arducopter") == [None, f"bytes={came}-"]
+    assert the_binary(environ) == BINARY
+
+
+def test_a_server_that_ignores_ranges_sends_all_of_it_again(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, cut_after=HALF, ranges=False)
+    with pytest.raises(DownloadError):
+        install_copter(server, environ)
+    server.change(BINARY_PATH, cut_after=None)
+    install_copter(server, environ)
+    assert the_binary(environ) == BINARY
+
+
+@pytest.mark.parametrize("heeds_if_range", [True, False])
+@pytest.mark.parametrize("new", [BINARY[::-1], BINARY + b"more", BINARY[: HALF - 1]], ids=["same size", "more", "less"])
+def test_a_file_that_changed_in_between_is_fetched_anew(
+    new: bytes, heeds_if_range: bool, server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    new = BINARY[:64] + new[64:]
+    server.change(BINARY_PATH, cut_after=HALF)
+    with pytest.raises(DownloadError):
+        install_copter(server, environ)
+    server.change(BINARY_PATH, content=new, cut_after=None, heeds_if_range=heeds_if_range)
+    install_copter(server, environ)
+    assert the_binary(environ) == new
+
+
+def test_a_part_that_was_not_asked_for_is_not_taken(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, cut_after=HALF)
+    with pytest.raises(DownloadError):
+        install_copter(server, environ)
+    server.change(BINARY_PATH, cut_after=None, range_from=HALF + 1)
+    install_copter(server, environ)
+    assert server.ranges_of("arducopter") == [None, f"bytes={HALF}-", None]
+    assert the_binary(environ) == BINARY
+
+
+def test_a_part_that_is_not_all_of_the_rest_is_not_the_end(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, cut_after=HALF)
+    with pytest.raises(DownloadError):
+        install_copter(server, environ)
+    server.change(BINARY_PATH, cut_after=None, announced=1000)
+    with pytest.raises(DownloadError, match="broke off"):
+        install_copter(server, environ)
+    server.change(BINARY_PATH, announced=None)
+    install_copter(server, environ)
+    assert server.ranges_of("arducopter")[-1] == f"bytes={HALF + 1000}-"
+    assert the_binary(environ) == BINARY
+
+
+def test_without_a_validator_nothing_is_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, cut_after=HALF, etag=False)
+    with pytest.raises(DownloadError):
+        install_copter(server, environ)
+    server.change(BINARY_PATH, cut_after=None)
+    install_copter(server, environ)
+    assert server.ranges_of("arducopter") == [None, None]
+    assert the_binary(environ) == BINARY
+
+
+def test_a_date_will_do_where_there_is_no_strong_etag(server: FirmwareServer, tmp_path: Path) -> None:
+    dated = {"Last-Modified": "Mon, 03 Nov 2025 03:38:46 GMT", "ETag": 'W/"weak"'}
+    server.change(BINARY_PATH, cut_after=HALF, etag=False, headers=dated)
+    with pytest.raises(DownloadError):
+        download(server.url + BINARY_PATH, tmp_path / "b", 10**9, Onlooker().downloads)
+    assert json.loads((tmp_path / "b.part.json").read_text())["validator"] == dated["Last-Modified"]
+
+
+@pytest.mark.parametrize("note", ["", "[]", "{}", '{"size": 1, "validator": "x"}', '{"size": "a", "validator": 3}'])
+def test_a_partial_file_with_a_damaged_note_is_not_built_on(note: str, server: FirmwareServer, tmp_path: Path) -> None:
+    (tmp_path / "b.part").write_bytes(b"rubbish")
+    (tmp_path / "b.part.json").write_text(note)
+    download(server.url + BINARY_PATH, tmp_path / "b", 10**9, Onlooker().downloads)
+    assert (tmp_path / "b").read_bytes() == BINARY
+
+
+# Servers that misbehave.
+
+
+def test_a_version_that_is_not_there_names_those_that_are(server: FirmwareServer, environ: dict[str, str]) -> None:
+    with pytest.raises(RequestError, match=r"there are stable, latest, 4\.10\.0, 4\.6\.3$"):
+        install_copter(server, environ, "4.5.1")
+    del server.files["/Copter/"]
+    with pytest.raises(RequestError, match=r"look at http://.*/Copter/ for those that there are"):
+        install_copter(server, environ, "4.5.1")
+
+
+@pytest.mark.parametrize("version", ["", "..", "../..", "a/b", "4.6.3?", "ä", "-4"])
+def test_what_can_be_no_version_asks_nobody(version: str, server: FirmwareServer, environ: dict[str, str]) -> None:
+    with pytest.raises(RequestError, match="is no version"):
+        install_copter(server, environ, version)
+    assert server.asked == []
+
+
+@pytest.mark.parametrize(
+    "base", ["ftp://x", "x", "http://", "http://u:secret@x", "http://x:0", "http://x:y", "http://ä x"]
+)
+def test_what_can_be_no_mirror_is_refused(base: str, environ: dict[str, str]) -> None:
+    with pytest.raises(RequestError, match="is no address of a mirror"):
+        install("copter", "stable", environ, Onlooker(), base)
+
+
+def test_a_server_that_falls_silent_is_given_up_and_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, silent_after=HALF)
+    with pytest.raises(DownloadError, match=r"127\.0\.0\.1:\d+ sent nothing for 0\.2 s"):
+        install_copter(server, environ)
+    server.change(BINARY_PATH, silent_after=None)
+    install_copter(server, environ)
+    assert server.ranges_of("arducopter")[1] is not None
+    assert the_binary(environ) == BINARY
+
+
+def test_a_redirect_is_followed(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.files["/elsewhere"] = server.files[BINARY_PATH]
+    server.files[BINARY_PATH] = Resource(b"", 302, {"Location": "/elsewhere"})
+    install_copter(server, environ)
+    assert the_binary(environ) == BINARY
+
+
+def test_a_redirect_never_leaves_encryption() -> None:
+    request, headers = urllib.request.Request("https://a.example/x"), Message()
+    with pytest.raises(DownloadError, match=r"leads to http://b\.example/x, which is not encrypted"):
+        StayEncrypted().redirect_request(request, io.BytesIO(), 302, "Found", headers, "http://b.example/x")
+    followed = StayEncrypted().redirect_request(request, io.BytesIO(), 302, "Found", headers, "https://b.example/x")
+    assert followed is not None
+
+
+def test_a_web_page_is_not_taken_for_a_binary_nor_kept(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, content=b"<!DOCTYPE html><html>Please log in</html>")
+    with pytest.raises(DownloadError, match="is no program for Linux on x86_64, it begins with b'<!DOCTYPE"):
+        install_copter(server, environ)
+    server.change(BINARY_PATH, content=BINARY)
+    install_copter(server, environ)
+    assert the_binary(environ) == BINARY
+
+
+def test_a_program_for_another_processor_is_refused(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, content=BINARY[:18] + b"\xb7" + BINARY[19:])
+    with pytest.raises(DownloadError, match="is no program for Linux on x86_64"):
+        install_copter(server, environ)
+
+
+@pytest.mark.parametrize("path", [f"{RELEASE}git-version.txt", PARAMETERS_PATH])
+def test_a_web_page_is_not_taken_for_a_text_either(path: str, server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(path, content=b"<!DOCTYPE html>\n<html>Please log in\n</html>")
+    with pytest.raises(DownloadError, match=r"does not name a commit|has no ArduPilot parameters"):
+        install_copter(server, environ)
+
+
+def test_parameters_that_break_off_are_an_error(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(PARAMETERS_PATH, cut_after=30)
+    with pytest.raises(DownloadError, match="broke off"):
+        install_copter(server, environ)
+    assert current("copter", environ) is None
+
+
+def test_parameters_that_are_nowhere_name_the_last_place(server: FirmwareServer, environ: dict[str, str]) -> None:
+    del server.files[PARAMETERS_PATH]
+    with pytest.raises(DownloadError, match=r"default_params/copter\.parm does not exist: install another --version"):
+        install_copter(server, environ)
+
+
+def test_a_file_that_is_too_large_is_refused_before_it_comes(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, announced=100_000_001)
+    with pytest.raises(DownloadError, match=r"has 100\.0 MB, more than 100\.0 MB"):
+        install_copter(server, environ)
+    assert not list(cache(environ).glob("**/arducopter*"))
+
+
+def test_a_text_without_end_is_given_up(server: FirmwareServer) -> None:
+    server.files["/text"] = Resource(b"x" * 3000)
+    with pytest.raises(DownloadError, match="is larger than"):
+        fetch_text(f"{server.url}/text", 2000)
+
+
+@pytest.mark.parametrize("how", [{"sized": False}, {"chunked": True}], ids=["until closed", "chunked"])
+def test_a_binary_of_unknown_size_is_refused(
+    how: dict[str, bool], server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    server.change(BINARY_PATH, **how)
+    with pytest.raises(DownloadError, match="does not say how large"):
+        install_copter(server, environ)
+
+
+def test_a_text_may_come_in_chunks_but_not_without_an_end(server: FirmwareServer) -> None:
+    server.files["/text"] = Resource(PARAMETERS, chunked=True)
+    assert fetch_text(f"{server.url}/text", 1000).encode() == PARAMETERS
+    server.change("/text", cut_after=20)
+    with pytest.raises(DownloadError, match="broke off"):
+        fetch_text(f"{server.url}/text", 1000)
+    server.files["/text"] = Resource(PARAMETERS, sized=False)
+    with pytest.raises(DownloadError, match="does not say how large"):
+        fetch_text(f"{server.url}/text", 1000)
+
+
+def test_an_error_of_the_server_is_said(server: FirmwareServer, environ: dict[str, str]) -> None:
+    server.change(BINARY_PATH, status=503)
+    with pytest.raises(DownloadError, match=r"answers 503 \(Service Unavailable\)"):
+        install_copter(server, environ)
+
+
+def test_a_file_that_is_gone_is_its_own_error(server: FirmwareServer, tmp_path: Path) -> None:
+    with pytest.raises(NotThereError):
+        download(f"{server.url}/nowhere", tmp_path / "b", 1000, Onlooker().downloads)
+
+
+def test_without_a_network_the_way_out_is_another_machine(environ: dict[str, str]) -> None:
+    with serving() as server:
+        pass  # nobody listens there any more
+    with pytest.raises(UnreachableError, match=r"cannot be reached \(Connection refused\).*set ARDUPILOT_SITL to it$"):
+        install_copter(server, environ)
+
+
+# The cache.
+
+
+def test_a_cache_that_cannot_be_made_names_the_way_out(server: FirmwareServer, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CacheError, match=r"cannot be written \(Not a directory\).*set XDG_CACHE_HOME"):
+        install_copter(server, {"XDG_CACHE_HOME": str(tmp_path / "file")})
+
+
+def test_a_read_only_cache_names_the_way_out(
+    server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read_only(path: Path, *_: object, **__: object) -> None:  # root may write anywhere, so it is played
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", read_only)
+    with pytest.raises(CacheError, match=r"/copter cannot be written \(Read-only file system\)"):
+        install_copter(server, environ)
+
+
+def test_a_full_disk_is_said(server: FirmwareServer, environ: dict[str, str]) -> None:
+    part = cache(environ) / "copter" / ".4.6.3.part"
+    part.mkdir(parents=True)
+    (part / "copter.parm").symlink_to("/dev/full")
+    with pytest.raises(CacheError, match="is full: make room and run the same command again"):
+        install_copter(server, environ)
+    (part / "copter.parm").unlink()
+    install_copter(server, environ)
+    assert server.ranges_of("arducopter") == [None]  # the binary was there
+
+
+def test_no_home_is_no_place_for_a_cache() -> None:
+    for environ in ({}, {"XDG_CACHE_HOME": "relative"}, {"HOME": ""}):
+        with pytest.raises(VehicleError, match="set XDG_CACHE_HOME"):
+            cache(environ)
+        assert current("copter", environ) is None
+    assert cache({"HOME": "/h", "XDG_CACHE_HOME": "relative"}) == Path("/h/.cache/ucp-harness/sitl")
+
+
+@pytest.mark.parametrize("name", ["arducopter", "copter.parm", "manifest.json"])
+@pytest.mark.parametrize("harm", ["changed", "gone"])
+def test_what_is_not_as_it_was_fetched_is_not_used_and_is_mended(
+    name: str, harm: str, server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    directory = install_copter(server, environ).installed.directory
+    if harm == "gone":
+        (directory / name).unlink()
+    else:
+        with (directory / name).open("r+b") as file:
+            file.write(b"X")
+    with pytest.raises(UnusableBinaryError, match=f"damaged, {name} .*run `ucp-harness sitl install --vehicle copter`"):
+        current("copter", environ)
+    assert not install_copter(server, environ).already
+    assert the_binary(environ) == BINARY
+
+
+@pytest.mark.parametrize("manifest", ["3", "{}", '{"files": []}', '{"files": {"arducopter": 3}}', '{"files": {}}'])
+def test_a_manifest_that_makes_no_sense_is_damage(manifest: str, tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text(manifest)
+    assert Installed("copter", tmp_path).damage == "manifest.json is missing or cannot be read"
+
+
+def test_a_file_that_the_manifest_does_not_vouch_for_is_damage(server: FirmwareServer, environ: dict[str, str]) -> None:
+    directory = install_copter(server, environ).installed.directory
+    manifest = json.loads((directory / "manifest.json").read_text())
+    del manifest["files"]["arducopter"]
+    (directory / "manifest.json").write_text(json.dumps(manifest))
+    assert Installed("copter", directory).damage == "arducopter is not the file that was fetched (SHA-256)"
+
+
+def test_a_binary_that_is_not_executable_is_damage(server: FirmwareServer, environ: dict[str, str]) -> None:
+    installed = install_copter(server, environ).installed
+    installed.binary.chmod(0o644)
+    assert Installed("copter", installed.directory).damage == "arducopter is not executable"
+
+
+def test_an_install_waits_for_another_one_and_finds_its_work_done(
+    server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    home = cache(environ) / "copter"
+    install_copter(server, environ)
+    server.asked.clear()
+    watcher, outcomes = Onlooker(), list[Outcome]()
+    waiting = threading.Thread(
+        target=lambda: outcomes.append(install_copter(server, environ, watcher=watcher)), daemon=True
+    )
+    with (home / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        waiting.start()
+        assert watcher.waited.wait(10)
+        assert server.asked == []
+    waiting.join(10)
+    assert outcomes[0].already
+
+
+def test_many_installs_at_once_fetch_the_binary_once(server: FirmwareServer, environ: dict[str, str]) -> None:
+    outcomes: list[Outcome] = []
+    threads = [
+        threading.Thread(target=lambda: outcomes.append(install_copter(server, environ)), daemon=True) for _ in range(5)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    assert sorted(outcome.already for outcome in outcomes) == [False, True, True, True, True]
+    assert server.ranges_of("arducopter") == [None]
+
+
+def test_what_other_installs_left_unfinished_is_removed(server: FirmwareServer, environ: dict[str, str]) -> None:
+    left = cache(environ) / "copter" / ".4.8.0-dev-01234567.part"
+    left.mkdir(parents=True)
+    (left.parent / ".current").symlink_to("nowhere")
+    install_copter(server, environ)
+    assert sorted(path.name for path in left.parent.iterdir()) == [".lock", "4.6.3", "current"]
+
+
+def test_another_machine_is_told_what_it_can_do(environ: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    with pytest.raises(VehicleError, match="this is linux on aarch64: build ArduPilot SITL from source"):
+        install("copter", "stable", environ, Onlooker(), "http://127.0.0.1:1")
+
+
+# Flying what is installed.
+
+
+def test_what_is_installed_flies_where_nothing_else_is_named(server: FirmwareServer, environ: dict[str, str]) -> None:
+    with pytest.raises(NoBinaryError, match="none is installed; run `ucp-harness sitl install --vehicle copter`"):
+        ArduPilot.find(None, environ)
+    directory = install_copter(server, environ).installed.directory
+    found = ArduPilot.find(None, environ)
+    assert found.binary.samefile(directory / "arducopter")
+    assert found.defaults is not None and found.defaults.samefile(directory / "copter.parm")
+
+
+def test_the_environment_and_path_go_before_what_is_installed(
+    server: FirmwareServer, environ: dict[str, str], tmp_path: Path
+) -> None:
+    install_copter(server, environ)
+    other = tmp_path / "arducopter"
+    other.write_text("#!/bin/sh\n")
+    other.chmod(0o755)
+    for variable in ("PATH", "ARDUPILOT_SITL"):
+        assert ArduPilot.find(None, {**environ, variable: str(tmp_path)}).binary == other
+
+
+def test_what_is_installed_and_damaged_does_not_fly(server: FirmwareServer, environ: dict[str, str]) -> None:
+    install_copter(server, environ).installed.binary.write_bytes(BINARY[:-1])
+    with pytest.raises(UnusableBinaryError, match="is damaged, arducopter is not the file that was fetched"):
+        ArduPilot.find(None, environ)

@@ -1,0 +1,280 @@
+"""Plans flown by the real pilot: embedded vehicles over TCP, and puppets that do what no vehicle should."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import random
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink
+
+import sitl.autopilot
+import sitl.mission
+import sitl.mission_inbox
+import sitl.pilot
+from sitl.modes import MODES
+from sitl.pilot import Pilot
+from sitl.plan import By, GoTo, Land, Loiter, Plan, PlanError, TakeOff
+from sitl.track import track
+from sitl.vehicle import FlightError, VehicleType
+from tests.sitl.flying import DEADLINE_S, HOME, connect, embedded
+from tests.sitl.puppet import Puppet, message_id, on_strings
+
+SPEEDUP = 100.0
+PLAN = Plan((TakeOff(30), GoTo(150, 0, speed_ms=10), Loiter(10), GoTo(0, 100, altitude_m=40), GoTo(0, 0), Land()))
+DRIVE = Plan((GoTo(100, 0), Loiter(10), GoTo(0, 0)))
+TYPES: list[VehicleType] = ["copter", "plane", "rover"]
+
+
+def plan_of(vehicle_type: VehicleType) -> Plan:
+    return DRIVE if vehicle_type == "rover" else PLAN
+
+
+def flown(vehicle_type: VehicleType, by: By, tlog: Path) -> Pilot:
+    async def fly(port: int) -> Pilot:
+        pilot = Pilot(3, connect(port), tlog, SPEEDUP, vehicle_type)
+        await pilot.start()
+        try:
+            await pilot.fly(plan_of(vehicle_type), by, HOME)
+        finally:
+            await pilot.close()
+        return pilot
+
+    with embedded(speedup=SPEEDUP, vehicle_type=vehicle_type) as vehicle:
+        return asyncio.run(fly(vehicle.pilot_port))
+
+
+def places(tlog: Path) -> Iterator[tuple[float, tuple[float, float, float]]]:
+    """(seconds since boot, metres from home) of a telemetry log."""
+    log = mavutil.mavlink_connection(str(tlog))
+    while (message := log.recv_match(type="GLOBAL_POSITION_INT")) is not None:
+        if message.lat:
+            yield message.time_boot_ms / 1e3, HOME.metres_to(message.lat / 1e7, message.lon / 1e7, message.alt / 1e3)
+
+
+@pytest.mark.parametrize("vehicle_type", TYPES)
+def test_a_mission_flown_in_auto_is_the_computed_track(vehicle_type: VehicleType, tmp_path: Path) -> None:
+    """Within a metre at every second, once the starts are laid on one another."""
+    tlog = tmp_path / "3.tlog"
+    pilot = flown(vehicle_type, "mission", tlog)
+    assert pilot.state.armed is (vehicle_type == "rover")
+    assert pilot.state.reached is not None
+    computed = track(vehicle_type, plan_of(vehicle_type), heading_deg=HOME.heading_deg)
+    samples = list(places(tlog))
+    moving = next(index for index, (_, place) in enumerate(samples) if math.dist(place, (0, 0, 0)) > 1)
+    shifts = [samples[moving][0] - tenth / 10 for tenth in range(100, 400)]
+
+    def apart(shift_s: float, count: int) -> float:
+        return max(math.dist(computed.at(at_s - shift_s), place) for at_s, place in samples[moving : moving + count])
+
+    rough_s = min(shifts, key=lambda shift_s: apart(shift_s, 5))
+    shift_s = min((rough_s + hundredth / 100 for hundredth in range(-10, 11)), key=lambda shift_s: apart(shift_s, 5))
+    assert apart(shift_s, len(samples)) < 1.0
+
+
+@pytest.mark.parametrize("vehicle_type", TYPES)
+def test_a_plan_flown_in_guided_gets_to_its_places(vehicle_type: VehicleType, tmp_path: Path) -> None:
+    tlog = tmp_path / "3.tlog"
+    pilot = flown(vehicle_type, "guided", tlog)
+    assert pilot.state.armed is (vehicle_type == "rover")
+    near = {"copter": 2.0, "plane": 120.0, "rover": 5.0}[vehicle_type]
+    way = [place for _, place in places(tlog)]
+    for leg in plan_of(vehicle_type).legs:
+        if isinstance(leg, GoTo):
+            assert min(math.dist(place[:2], (leg.north_m, leg.east_m)) for place in way) <= near
+    assert math.dist(way[-1][:2], (0, 0)) < (100 if vehicle_type == "plane" else 6)
+
+
+def test_a_plan_that_the_type_cannot_fly_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path, "rover") as (pilot, _):
+            with pytest.raises(PlanError, match="a rover neither takes off"):
+                await pilot.fly(PLAN, "mission", HOME)
+
+    asyncio.run(fly())
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(DEADLINE_S):
+        while not condition():
+            await asyncio.sleep(0.001)
+
+
+def puppet_flown(
+    tmp_path: Path, strings: Callable[[Puppet], None], vehicle_type: VehicleType = "copter", by: By = "mission"
+) -> Pilot:
+    """Fly the plan on a puppet whose `strings` are pulled beforehand."""
+
+    async def fly() -> Pilot:
+        async with on_strings(tmp_path, vehicle_type) as (pilot, puppet):
+            strings(puppet)
+            async with asyncio.timeout(DEADLINE_S):
+                await pilot.fly(plan_of(vehicle_type), by, HOME)
+            return pilot
+
+    return asyncio.run(fly())
+
+
+def failure(tmp_path: Path, strings: Callable[[Puppet], None], after_m: float = 25.0, by: By = "mission") -> str:
+    """Why the flight of a copter fails whose `strings` are pulled when it is `after_m` high."""
+
+    async def fly() -> str:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            flight = asyncio.create_task(pilot.fly(PLAN, by, HOME))
+            await until(lambda: pilot.state.position is not None and pilot.state.position.relative_alt_m >= after_m)
+            strings(puppet)
+            with pytest.raises(FlightError) as error:
+                async with asyncio.timeout(DEADLINE_S):
+                    await flight
+            return str(error.value)
+
+    return asyncio.run(fly())
+
+
+def without(monkeypatch: pytest.MonkeyPatch, *ids: int) -> Callable[[Puppet], None]:
+    """From now on these messages, or all, do not come, and the pilot is impatient."""
+
+    def strings(puppet: Puppet) -> None:
+        monkeypatch.setattr(sitl.pilot, "SILENCE_S", 0.3)
+        puppet.tamper = lambda frame: b"" if not ids or message_id(frame) in ids else frame
+
+    return strings
+
+
+@pytest.mark.parametrize("by", ["mission", "guided"])
+@pytest.mark.parametrize(
+    ("lost", "said"),
+    [
+        ((), "it has been silent for "),
+        ((mavlink.MAVLINK_MSG_ID_HEARTBEAT,), "it has sent no heartbeat for "),
+        ((mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,), "it has sent no position for "),
+    ],
+)
+def test_a_vehicle_that_stops_talking_in_flight_is_given_up(
+    lost: tuple[int, ...], said: str, by: By, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    message = failure(tmp_path, without(monkeypatch, *lost), by=by)
+    assert message.startswith("vehicle 3 did not fly its plan: waiting for ")
+    assert said in message and "its last words: '" in message
+
+
+def test_a_vehicle_that_leaves_in_flight_is_given_up_at_once(tmp_path: Path) -> None:
+    assert "it ended the connection" in failure(tmp_path, Puppet.leave)
+
+
+@pytest.mark.parametrize("by", ["mission", "guided"])
+def test_a_vehicle_that_loses_its_motors_is_given_up_with_the_leg(by: By, tmp_path: Path) -> None:
+    message = failure(tmp_path, lambda puppet: puppet.vehicle.disarm(force=True) and None, after_m=39.0, by=by)
+    assert "it disarmed on leg" in message and "of 6 (" in message
+
+
+def test_a_vehicle_that_hangs_on_a_leg_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sitl.pilot, "LEAST_WAIT_S", 0.1)
+    message = failure(tmp_path, lambda puppet: puppet.vehicle._stay(), after_m=5.0)
+    assert "waiting for leg 1 of 6 (take off to 30 m), 240 simulated seconds were not enough" in message
+
+
+def test_garbage_in_the_stream_is_survived_and_counted(tmp_path: Path) -> None:
+    rng = random.Random(1)
+
+    def strings(puppet: Puppet) -> None:
+        puppet.tamper = lambda frame: rng.randbytes(rng.randrange(20)) + frame if rng.random() < 0.1 else frame
+
+    pilot = puppet_flown(tmp_path, strings)
+    assert pilot.state.garbage > 0
+    assert not pilot.state.armed
+
+
+def test_a_mode_that_is_undone_in_flight_is_asked_for_again(tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            flight = asyncio.create_task(pilot.fly(PLAN, "mission", HOME))
+            await until(lambda: puppet.vehicle.airborne and puppet.vehicle.motion.up_m > 29)
+            puppet.vehicle.set_mode(MODES["copter"]["GUIDED"])
+            async with asyncio.timeout(DEADLINE_S):
+                await flight
+            assert pilot.state.reached is not None and not puppet.vehicle.armed
+
+    asyncio.run(fly())
+
+
+def test_a_mission_that_is_acknowledged_and_forgotten_is_uploaded_again(tmp_path: Path) -> None:
+    """As by ArduCopter 3.5 while it boots."""
+    forgotten: list[int] = []
+
+    def strings(puppet: Puppet) -> None:
+        load = puppet.vehicle.load
+
+        def forgetful(mission: object) -> None:
+            forgotten.append(1)
+            load([] if len(forgotten) == 1 else mission)  # type: ignore[arg-type]
+
+        puppet.vehicle.load = forgetful  # type: ignore[method-assign]
+
+    assert not puppet_flown(tmp_path, strings).state.armed
+    assert len(forgotten) == 2
+
+
+def test_a_request_that_is_lost_begins_the_upload_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sitl.mission, "RESEND_S", 0.1)
+    lost: list[bytes] = []
+
+    def strings(puppet: Puppet) -> None:
+        def lossy(frame: bytes) -> bytes:
+            if message_id(frame) == mavlink.MAVLINK_MSG_ID_MISSION_REQUEST_INT and len(lost) < 3:
+                lost.append(frame)
+                return b""
+            return frame
+
+        puppet.tamper = lossy
+
+    assert not puppet_flown(tmp_path, strings).state.armed
+    assert len(lost) == 3
+
+
+def test_a_mission_that_is_refused_ends_the_flight_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sitl.mission_inbox, "MAX_ITEMS", 2)
+    with pytest.raises(FlightError, match="it refused its mission with MAV_MISSION_NO_SPACE"):
+        puppet_flown(tmp_path, lambda puppet: None)
+
+
+def test_a_vehicle_that_spins_and_never_gets_ready_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sitl.autopilot, "READY_S", math.inf)
+    monkeypatch.setattr(sitl.pilot, "LEAST_WAIT_S", 0.1)
+    with pytest.raises(FlightError, match="ready to arm, 180 simulated seconds were not enough; it never said why"):
+        puppet_flown(tmp_path, lambda puppet: None)
+
+
+@pytest.mark.parametrize("by", ["mission", "guided"])
+def test_a_flight_is_terminated_in_the_air_and_ends_without_an_error(by: By, tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            flight = asyncio.create_task(pilot.fly(PLAN, by, HOME))
+            await until(lambda: puppet.vehicle.motion.up_m > 29)
+            async with asyncio.timeout(DEADLINE_S):
+                await pilot.terminate_flight()
+                await flight
+            assert not puppet.vehicle.armed
+            assert puppet.vehicle.motion.up_m == 0
+            await until(lambda: any(text.startswith("SIM Hit ground") for text in pilot.state.texts))
+            await pilot.stay_in_touch()  # nobody is waited for any more
+
+    asyncio.run(fly())
+
+
+def test_after_its_flight_a_vehicle_is_still_listened_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def listen() -> str:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            await pilot.take_off(10.0)
+            without(monkeypatch)(puppet)
+            with pytest.raises(FlightError) as error:
+                await pilot.stay_in_touch()
+            return str(error.value)
+
+    assert "vehicle 3 did not stay in touch: waiting for its next word, it has been silent" in asyncio.run(listen())

@@ -1,0 +1,112 @@
+"""The computed track beside the embedded vehicle's flight and beside recorded flights of a real ArduCopter."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sitl.plan import GoTo, Land, Loiter, Plan, PlanError, TakeOff
+from sitl.track import Track, track
+from sitl.vehicle import READY_S, VehicleType
+from tests.sitl.cockpit import Cockpit
+from tests.sitl.flying import HOME
+from tests.sitl.real_flight import SQUARE
+
+TRACKS = Path(__file__).parent / "tracks"
+ROUND_TRIP = Plan((TakeOff(30), GoTo(300, -100, altitude_m=60), Loiter(45), GoTo(0, 200, speed_ms=12), GoTo(0, 0)))
+DRIVE = Plan((GoTo(100, 0, speed_ms=3), Loiter(45), GoTo(0, 200), GoTo(0, 0)))
+
+
+@pytest.mark.parametrize(
+    ("vehicle_type", "plan"),
+    [
+        ("copter", ROUND_TRIP),
+        ("copter", SQUARE),
+        ("plane", ROUND_TRIP),
+        ("plane", Plan((*ROUND_TRIP.legs, Land()))),
+        ("rover", DRIVE),
+    ],
+)
+def test_the_track_is_what_the_embedded_vehicle_flies_in_auto(vehicle_type: VehicleType, plan: Plan) -> None:
+    """Places go over the wire in 1e-7 degrees, about a centimetre; a plane makes some more of it in its turns."""
+    cockpit = Cockpit(vehicle_type)
+    began_s = cockpit.begin(plan)
+    computed = track(vehicle_type, plan, heading_deg=HOME.heading_deg, begin_s=began_s - READY_S)
+    for second in range(0, 400, 3):
+        cockpit.fly(began_s + second)
+        assert math.dist(cockpit.place, computed.at(began_s + second)) < 0.1, f"{second} s after the start"
+
+
+def test_it_stands_until_it_is_ready_and_stays_where_it_ends() -> None:
+    square = track("copter", SQUARE, begin_s=5.0)
+    assert square.at(0.0) == square.at(5.0 + READY_S) == (0, 0, 0)
+    assert square.at(5.0 + READY_S + 1.0)[2] > 0
+    assert square.at(1e6) == (0, 0, 0)
+    circling = track("plane", ROUND_TRIP)
+    assert math.hypot(*circling.at(5000)[:2]) == pytest.approx(80)
+    assert circling.at(5000) != circling.at(5001)
+
+
+def test_a_place_in_the_field_is_that_beside_home() -> None:
+    square = track("copter", SQUARE, home_offset=(7.0, -3.0))
+    assert square.in_field(30.0) == pytest.approx((square.at(30.0)[0] + 7, square.at(30.0)[1] - 3, square.at(30.0)[2]))
+
+
+def test_a_vehicle_in_no_plan_circles_and_a_rover_stays() -> None:
+    copter = track("copter", None, takeoff_altitude_m=15)
+    assert (math.hypot(*copter.at(300)[:2]), copter.at(300)[2]) == pytest.approx((30, 15))
+    assert track("rover", None).at(300) == (0, 0, 0)
+
+
+def test_a_plan_that_the_type_cannot_fly_is_refused() -> None:
+    with pytest.raises(PlanError):
+        track("rover", SQUARE)
+
+
+def recorded(by: str) -> list[tuple[float, float, float, float]]:
+    document = json.loads((TRACKS / f"arducopter_3.5.7_{by}.json").read_text())
+    return [tuple(point) for point in document["points"]]
+
+
+def climbed_s(points: list[tuple[float, float, float, float]], altitude_m: float) -> float:
+    """When a climb first passed an altitude."""
+    for (before_s, *_, low_m), (after_s, *_, high_m) in itertools.pairwise(points):
+        if low_m < altitude_m <= high_m:
+            return before_s + (altitude_m - low_m) / (high_m - low_m) * (after_s - before_s)
+    raise AssertionError("it never climbed")
+
+
+def arrivals_s(points: list[tuple[float, float, float, float]]) -> list[float]:
+    """When the corners of the square, and the ground, were first within 5 m, in this order."""
+    corners = [(100, 0, 20), (100, 100, 20), (0, 100, 20), (0, 0, 20), (0, 0, 0)]
+    remaining, arrivals = iter(points), []
+    for corner in corners:
+        arrivals.append(next(time_s for time_s, *place in remaining if math.dist(place, corner) < 5))
+    return arrivals
+
+
+def as_points(computed: Track) -> list[tuple[float, float, float, float]]:
+    return [(tenth / 10, *computed.at(tenth / 10)) for tenth in range(round(computed.course.end_s * 10))]
+
+
+@pytest.mark.parametrize("by", ["mission", "guided"])
+def test_the_square_of_a_real_copter_is_the_computed_one(by: str) -> None:
+    """Within 2 m of the line everywhere, and each side, and the landing, takes as long but for one sample of 1.2 s.
+
+    Times count from the middle of the take-off: a real copter takes its time to spin up its motors.
+    """
+    real, model = recorded(by), as_points(track("copter", SQUARE))
+    line = [place for _, *place in model]
+    assert max(min(math.dist(place, near) for near in line) for _, *place in real) < 2.0
+    real_s, model_s = (list(legs_s(points)) for points in (real, model))
+    assert real_s == pytest.approx(model_s, abs=1.2)
+
+
+def legs_s(points: list[tuple[float, float, float, float]]) -> Iterator[float]:
+    for before_s, after_s in itertools.pairwise([climbed_s(points, 10), *arrivals_s(points)]):
+        yield after_s - before_s
