@@ -62,6 +62,7 @@ from ucp.messages import (
     encode,
 )
 from ucp.settings import Quirks, Settings
+from ucp.store import Holdings
 from ucp.timers import Timer
 from ucp.trace import HandlerRun, Sent, State
 
@@ -243,6 +244,28 @@ class Agent:
             timer.stop()
             self._handle(now, {"timer": timer.name}, ON_TIMER[timer.name])
 
+    def boot(self, found: Holdings, now: float) -> None:
+        """Go on from what a former life left on its vehicle's disk; before any other input.
+
+        Timers, votes and the block being built are gone. A reconcile that was going on ends as if nobody had answered
+        (Algorithm 20): what is left of the stack goes back on top, and then the deque's front is proposed again.
+        """
+        self.now = now
+        self.reconcile_in_progress = True
+        self.completed.extend(found.completed)
+        if self._tracing:
+            self._changes.extend(("complete", block_hash.hex()) for block_hash in found.completed)
+        for block in found.blocks():
+            if block.agent_id == self.agent_id:
+                self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
+        for block in found.chain:
+            self.commit(block)
+        for block in found.deque:
+            self._push_onto_deque(block)
+        for block in found.stack:
+            self._push_onto_stack(block)
+        self._handle(now, {"boot": len(self.chain)}, reconcile.reconcile_finalize)
+
     def begin_reconcile(self, now: float) -> None:
         """Reconcile because the operator asks (a final reconcile at the depot, Section 5.1)."""
         self._handle(now, {"operator": "reconcile"}, reconcile.reconcile_begin)
@@ -290,6 +313,9 @@ class Agent:
         self.completed.append(block.block_hash)
         self.newest_block_timestamp_us = block.timestamp_us
         self._changed("complete", block)
+        self._push_onto_deque(block)
+
+    def _push_onto_deque(self, block: Block) -> None:
         self.blocks_to_be_committed.append(block)
         self._held_aside.add(block.block_hash)
         self._changed("deque+", block)
@@ -311,6 +337,9 @@ class Agent:
         block = self.chain.pop()
         self.chain_changed_at = self.now
         self._changed("chain-", block)
+        self._push_onto_stack(block)
+
+    def _push_onto_stack(self, block: Block) -> None:
         self.reconcile_stack.append(block)
         self._held_aside.add(block.block_hash)
         self._changed("stack+", block)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from ucp.block import MAX_AGENT_ID
 from ucp.events import MEAN_TIME_BETWEEN_EVENTS_S
 from ucp.settings import Quirks, Settings
+from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
 SCHEMA = "ucp-mission/1"
 MAX_MISSION_BYTES = 4 * 1024 * 1024
@@ -38,6 +39,7 @@ class EventSource:
     source: Literal["random", "mavlink", "none"] = "random"
     mean_s: float = MEAN_TIME_BETWEEN_EVENTS_S
     position_interval_s: float = 10.0
+    log: tuple[EventKind, ...] = DEFAULT_LOG
     vehicle_host: str = "127.0.0.1"
     vehicle_port: int = 5762
 
@@ -46,7 +48,8 @@ class EventSource:
 class Mission:
     """`epoch_us` is the mission's start, microseconds since the Unix epoch; None waits for the command `start`.
 
-    `speedup` is how many mission seconds pass in one second of wall time.
+    `speedup` is how many mission seconds pass in one second of wall time. `store` is the file in which the agent keeps
+    what it holds, as seen from the mission file's directory; None keeps nothing.
     """
 
     agent_id: int
@@ -59,6 +62,7 @@ class Mission:
     seed: int
     speedup: float
     epoch_us: int | None
+    store: str | None = None
 
 
 def load_mission(path: Path) -> Mission:
@@ -92,6 +96,9 @@ def parse_mission(document: Any) -> Mission:
     epoch_us = document.get("epoch_us")
     if epoch_us is not None and (not isinstance(epoch_us, int) or epoch_us < 0):
         raise MissionError("`epoch_us` must be microseconds since the Unix epoch, or null to wait for `start`")
+    store = document.get("store")
+    if store is not None and (not isinstance(store, str) or not store):
+        raise MissionError("`store` must be the path of a file, or null to keep nothing on disk")
     return Mission(
         agent_id=agent_id,
         roster=tuple(roster),
@@ -103,6 +110,7 @@ def parse_mission(document: Any) -> Mission:
         seed=_integer(document, "seed", 0, 2**64 - 1),
         speedup=_positive(document, "speedup"),
         epoch_us=epoch_us,
+        store=store,
     )
 
 
@@ -151,9 +159,16 @@ def _event_source(document: dict[str, Any]) -> EventSource:
         document["source"],
         max(1.0, _positive(document, "mean_s")),
         _positive(document, "position_interval_s"),
+        _log(document["log"]),
         _get(document, "vehicle_host", str),
         _integer(document, "vehicle_port", 1, 65535),
     )
+
+
+def _log(kinds: Any) -> tuple[EventKind, ...]:
+    if not isinstance(kinds, list | tuple) or not all(isinstance(kind, str) and kind in EVENT_KINDS for kind in kinds):
+        raise MissionError(f"`events.log` must list kinds of events ({', '.join(EVENT_KINDS)}), not {kinds!r}")
+    return tuple(kinds)
 
 
 def _settings(document: Any) -> Settings:

@@ -2,7 +2,8 @@
 
 It drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source, and leaves its files beside
 the mission file: `<id>.chain.json`, `<id>.trace.jsonl`, `<id>.log`, and the control socket `<id>.control` while it
-runs. SIGTERM exports the chain and ends it. CONTRACT.md says what any agent under test must do; this is the default.
+runs; and its store, if the mission names one. SIGTERM exports the chain and ends it. CONTRACT.md says what any agent
+under test must do; this is the default.
 """
 
 import asyncio
@@ -25,7 +26,9 @@ from ucp.events import LoggableEvent, RandomEvents
 from ucp.export import export_chain
 from ucp.files import TraceFile, write_json_atomically
 from ucp.mission import Mission, MissionError, load_mission
-from ucp.trace import header_line
+from ucp.store import Store, StoreError
+from ucp.telemetry import TelemetryEvents, follow
+from ucp.trace import HandlerRun, header_line
 
 MAX_READ_BYTES = 65536
 DATAGRAMS_PER_TURN = 64
@@ -35,7 +38,7 @@ log = logging.getLogger("ucp.node")
 
 
 class Node:
-    """Files go to `directory`. Raises OSError if the port or a file cannot be had."""
+    """Files go to `directory`. Raises OSError if the port or a file cannot be had, StoreError for another's store."""
 
     def __init__(self, mission: Mission, directory: Path) -> None:
         self.mission = mission
@@ -46,9 +49,10 @@ class Node:
         self.handled = 0
         self.bytes_sent = 0
         self.send_failures = 0
+        self._born_s = 0.0  # mission seconds at which the agent joined a mission that was under way
         self._directory = directory
         self._trace = TraceFile(directory / f"{mission.agent_id}.trace.jsonl")
-        self._trace_problem_told = False
+        self._store = Store(directory / mission.store, self.agent) if mission.store else None
         self._socket = _broadcast_socket(mission)
         self._timer: asyncio.TimerHandle | None = None
         self._source: asyncio.Task[None] | None = None
@@ -86,6 +90,8 @@ class Node:
             log.error("could not export the chain: %s", error.strerror)
             status = 1
         self._trace.close()
+        if self._store is not None:
+            self._store.close()
         self._control.close()
         log.info("agent %d ended", self.mission.agent_id)
         return status
@@ -123,8 +129,14 @@ class Node:
         self._drive(self.agent.handle_timer)
 
     def _drive(self, feed: Callable[[float], None]) -> None:
-        """Give the agent one input, then do what it says: broadcast, trace, and arm its next timer."""
+        """Give the agent one input, then do what it says: store, trace, broadcast, and arm its next timer.
+
+        What it has is on disk, and what it sends on record, before anybody hears of it: it can be killed in between.
+        """
         feed(self.clock.now())
+        runs = self.agent.trace()
+        self.handled += len(runs)
+        self._keep(runs)
         for datagram in self.agent.datagrams_to_send():
             try:
                 self._socket.sendto(datagram, (self.mission.network.broadcast, self.mission.network.port))
@@ -132,12 +144,6 @@ class Node:
             except OSError as error:  # a radio that cannot send loses the message, as radios do
                 self.send_failures += 1
                 log.warning("could not broadcast: %s", error.strerror)
-        runs = self.agent.trace()
-        self.handled += len(runs)
-        self._trace.write("".join(run.to_line() for run in runs))
-        if self._trace.problem and not self._trace_problem_told:
-            self._trace_problem_told = True
-            log.error("the trace ends here: %s", self._trace.problem)
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -146,10 +152,22 @@ class Node:
             delay = self.clock.wall_s(deadline - self.clock.now())
             self._timer = asyncio.get_running_loop().call_later(max(0.0, delay), self._handle_timer)
 
+    def _keep(self, runs: list[HandlerRun]) -> None:
+        if self._store is not None and self._store.problem is None:
+            self._store.write([change for run in runs for change in run.changes])
+            if self._store.problem:
+                log.error("the store ends here: %s", self._store.problem)
+        if self._trace.problem is None:
+            self._trace.write("".join(run.to_line() for run in runs))
+            if self._trace.problem:
+                log.error("the trace ends here: %s", self._trace.problem)
+
     # Event sources
 
     def _begin(self, epoch_us: int) -> None:
         self.clock.start(epoch_us)
+        if self.mission.epoch_us is not None:
+            self._born_s = self.clock.now()
         self._trace.write(
             header_line(
                 self.mission.agent_id,
@@ -158,6 +176,9 @@ class Node:
                 {"epoch_us": epoch_us, "speedup": self.mission.speedup},
             )
         )
+        if self._store is not None and self._store.found is not None:
+            self._drive(partial(self.agent.boot, self._store.found))
+            log.info("went on from a store of %d blocks", len(self.agent.chain))
         if self.mission.events.source != "none":
             self.generating = True
             source = self._random_events if self.mission.events.source == "random" else self._vehicle_events
@@ -169,19 +190,18 @@ class Node:
         source = RandomEvents(Random(self.mission.seed), self.mission.events.mean_s)
         while True:
             due, event_id, data = source.next()
-            await asyncio.sleep(self.clock.wall_s(due - self.clock.now()))
+            await asyncio.sleep(self.clock.wall_s(self._born_s + due - self.clock.now()))
             self._log_event(event_id, data)
 
     async def _vehicle_events(self) -> None:
-        from ucp import telemetry  # pymavlink: only where a vehicle is
-
-        events = telemetry.TelemetryEvents(self.mission.events.position_interval_s, Random(self.mission.seed))
+        source = self.mission.events
+        events = TelemetryEvents(source.position_interval_s, Random(self.mission.seed), source.log)
 
         def sink(data: bytes) -> None:
             for event_id, event_data in events.receive(data, self.clock.now()):
                 self._log_event(event_id, event_data)
 
-        await telemetry.follow(self.mission.events.vehicle_host, self.mission.events.vehicle_port, sink)
+        await follow(source.vehicle_host, source.vehicle_port, sink)
 
     def _source_ended(self, task: "asyncio.Task[None]") -> None:
         if not task.cancelled() and task.exception() is not None:
@@ -286,6 +306,9 @@ def main(arguments: list[str]) -> int:
             filename=path.parent / f"{mission.agent_id}.log", format="%(asctime)s %(message)s", level=logging.INFO
         )
         return asyncio.run(run())
+    except StoreError as error:
+        sys.stderr.write(f"{error}\n")
+        return WRONG_MISSION
     except OSError as error:
         what = f"UDP port {mission.network.port}: " if error.filename is None else ""
         message = f"agent {mission.agent_id}: {what}{error.strerror}{f': {error.filename}' if error.filename else ''}"

@@ -38,8 +38,8 @@ class HandlerRun:
     """One run of one of the 20 handlers.
 
     t: mission seconds.
-    trigger: {"event": id}, {"message": name, "from": agent, "seq": n}, {"timer": name}, {"local": handler} or
-        {"operator": command}.
+    trigger: {"event": id}, {"message": name, "from": agent, "seq": n}, {"timer": name}, {"local": handler},
+        {"operator": command}, or {"boot": blocks in the chain that was found on disk}.
     changes: (operation, block hash); operations are `complete`, and `chain`, `deque`, `stack` with + or -.
     state: what holds after the run.
     """

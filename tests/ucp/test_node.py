@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -20,7 +21,10 @@ from harness.agents import AgentControl, AgentRefusedError, AgentSilentError
 from harness.exports import read_export
 from harness.traces import read_trace
 from ucp.block import Block
-from ucp.messages import RequestForBlock, encode
+from ucp.messages import BlockAddRequest, RequestForBlock, decode, encode
+from ucp.mission import parse_mission
+from ucp.node import Node
+from ucp.store import Store
 
 DEADLINE_S = 10.0
 
@@ -204,6 +208,7 @@ def test_a_port_in_use_is_one_sentence_and_status_2(agent: AgentUnderTest, tmp_p
         ({"events": {"source": "dice"}}, "random, mavlink or none"),
         ({"quirks": {"ignore_commit": 2}}, "`quirks`"),
         ({"initial_data": "!"}, "not base64"),
+        ({"store": 7}, "`store` must be the path of a file"),
     ],
 )
 def test_a_wrong_mission_file_is_one_sentence_and_status_2(
@@ -282,6 +287,84 @@ sys.exit(agent.process.wait(10))
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("No space left on device") == 2
+
+
+def test_a_killed_agent_with_a_store_goes_on_from_it(directory: Path, tmp_path: Path) -> None:
+    """Wherever it is killed: it has what it had completed, and joins the mission that is under way."""
+    epoch_us = round(time.time() * 1e6)
+    document = mission(events={"source": "random", "mean_s": 1.0}, epoch_us=epoch_us, store="../7.store")
+    known: list[str] = []
+    for life in range(1, 4):
+        lived_in = directory / str(life)
+        lived_in.mkdir()
+        agent = AgentUnderTest(lived_in, {**document, "seed": life, "network": mission()["network"]})
+        enough = len(known) + 2
+        agent.wait_for(lambda agent=agent, enough=enough: agent.ask("status")["completed"] >= enough)
+        agent.process.kill()
+        agent.process.communicate()
+        trace = read_trace(lived_in / "7.trace.jsonl")
+        assert trace is not None
+        if known:
+            first = trace.runs[0]
+            assert (first.handler, set(first.trigger)) == ("reconcile_finalize", {"boot"})
+            assert [block for operation, block in first.changes if operation == "complete"] == known
+            assert first.t > 1.0
+        known = trace.completed()
+        assert len(set(known)) == len(known) >= 2 * life
+    assert [path.name for path in directory.iterdir() if path.is_file()] == ["7.store"]
+
+
+def test_what_an_agent_sends_is_traced_and_stored_before(tmp_path: Path) -> None:
+    """It can be killed in between, and others have heard it then."""
+    sent = []
+
+    class Radio:
+        def sendto(self, datagram: bytes, address: Any) -> None:
+            _, sequence, message = decode(datagram)
+            assert isinstance(message, BlockAddRequest)
+            trace = read_trace(tmp_path / "7.trace.jsonl")
+            assert trace is not None
+            assert sequence in {said.seq for run in trace.runs for said in run.sent}
+            found = Store(tmp_path / "7.store", node.agent).found
+            assert found is not None
+            assert [block.block_hash for block in found.deque] == [message.block_hash]
+            sent.append(message)
+
+    async def fly() -> None:
+        node._socket.close()
+        node._socket = Radio()  # type: ignore[assignment]
+        node._begin(round(time.time() * 1e6))
+        node.generating = True
+        for _ in range(3):
+            node._log_event(1, bytes(256))
+
+    node = Node(parse_mission(mission(store="7.store")), tmp_path)
+    asyncio.run(fly())
+    assert len(sent) == 1
+
+
+def test_an_agent_that_joins_late_logs_no_events_of_before(directory: Path) -> None:
+    """Else it would log a whole mission's at once."""
+    epoch_us = round((time.time() - 100) * 1e6)
+    agent = AgentUnderTest(directory, mission(events={"source": "random", "mean_s": 20.0}, epoch_us=epoch_us))
+    agent.wait_for(lambda: agent.ask("status")["handled"] > 3)
+    agent.process.kill()
+    agent.process.communicate()
+    trace = read_trace(directory / "7.trace.jsonl")
+    assert trace is not None
+    events = [run.t for run in trace.runs if "event" in run.trigger]
+    assert min(events) > 10_000
+    assert all(later > earlier for earlier, later in pairwise(events))
+
+
+def test_a_file_that_is_no_store_is_one_sentence_and_status_2(tmp_path: Path) -> None:
+    (tmp_path / "7.store").write_text("precious\n")
+    agent = AgentUnderTest(tmp_path, mission(store="7.store"))
+    assert agent.process.wait(DEADLINE_S) == 2
+    assert agent.process.stderr is not None
+    said = agent.process.stderr.read()
+    assert "7.store does not begin as a store: move it away" in said
+    assert said.count("\n") == 1
 
 
 def test_a_silent_agent_is_noticed(agent: AgentUnderTest) -> None:

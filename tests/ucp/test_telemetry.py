@@ -13,7 +13,19 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
 from ucp import telemetry
-from ucp.telemetry import ARMED, DISARMED, MODE_CHANGE, POSITION, STATUS_TEXT, TelemetryEvents, describe, follow
+from ucp.telemetry import (
+    ARMED,
+    DISARMED,
+    EVENT_KINDS,
+    FAILSAFE,
+    MODE_CHANGE,
+    POSITION,
+    STATUS_TEXT,
+    TelemetryEvents,
+    describe,
+    follow,
+    position_of,
+)
 
 STABILIZE, GUIDED = 0, 4
 
@@ -120,7 +132,7 @@ def test_a_position_holds_attitude_battery_and_mode() -> None:
     ((event_id, data),) = events.receive(frames(place()), 100.0)
     assert event_id == POSITION
     assert len(data) == 64
-    fields = telemetry._POSITION.unpack(data)
+    fields = telemetry.Position.unpack(data)
     assert fields[:10] == (
         60_000,
         1_700_000_000_000_000,
@@ -199,28 +211,31 @@ _KINDS = (
     mavlink.MAVLink_attitude_message,
     mavlink.MAVLink_global_position_int_message,
     mavlink.MAVLink_statustext_message,
+    mavlink.MAVLink_mission_item_reached_message,
 )
 
 
 @given(st.data(), st.lists(st.sampled_from(_KINDS), min_size=1, max_size=12))
 def test_well_formed_messages_with_any_values_make_readable_events(data: st.DataObject, kinds: list[Any]) -> None:
-    events = source()
+    events = TelemetryEvents(10.0, random.Random(1), EVENT_KINDS)
     for at, kind in enumerate(kinds):
         message = any_message(kind, lambda name: data.draw(_FIELDS[name]))
         for event_id, event_data in events.receive(frames(message), at * 100.0):
             assert 1 <= event_id <= 254
             assert len(event_data) <= telemetry.MAX_DATA_BYTES
             unreadable = describe(event_id, event_data) == "unreadable"
-            assert not unreadable or event_id == STATUS_TEXT  # MAV_SEVERITY ends at 7
+            assert not unreadable or event_id in (STATUS_TEXT, FAILSAFE)  # MAV_SEVERITY ends at 7, MAV_STATE at 8
 
 
 @given(st.integers(-5, 300), st.binary(max_size=300))
 def test_anything_can_be_described(event_id: int, data: bytes) -> None:
     described = describe(event_id, data)
     assert described.isprintable()
+    position = position_of(event_id, data)
+    assert position is None or abs(position.lat_e7) <= 90e7
 
 
-@pytest.mark.parametrize("event_id", [0, 1, 2, 3, 4, 5, 6, 254])
+@pytest.mark.parametrize("event_id", [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 254])
 def test_what_is_no_event_of_ours_is_unreadable(event_id: int) -> None:
     assert describe(event_id, b"\x00") == "unreadable"
 

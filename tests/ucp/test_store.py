@@ -1,0 +1,190 @@
+"""What an agent keeps on its vehicle's disk, and how it goes on from there."""
+
+import errno
+import os
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from tests.ucp.air import INITIAL_DATA, Air, assert_characteristics_2_to_4, uniform_latency
+from ucp.agent import Agent
+from ucp.block import Block
+from ucp.store import Holdings, Store, StoreError
+
+
+class StoringAir(Air):
+    """Agent 1 keeps a store."""
+
+    def __init__(self, path: Path, loss: float) -> None:
+        super().__init__([1, 2, 3], uniform_latency(Random(1), loss=loss))
+        self.store = Store(path, self.agents[1])
+
+    def flush(self, agent_id: int) -> None:
+        before = len(self.runs[agent_id])
+        super().flush(agent_id)
+        if agent_id == 1:
+            self.store.write([change for run in self.runs[1][before:] for change in run.changes])
+
+
+def a_store(path: Path, blocks: int = 5) -> Agent:
+    """The agent whose store it is: it has completed and committed so many blocks, and completed one more."""
+    agent = Agent(1, [1, 2], INITIAL_DATA)
+    store = Store(path, agent)
+    for number in range(blocks + 1):
+        agent.complete(Block(1, number, bytes([number])))
+        if number < blocks:
+            agent.commit(agent.take_from_deque())
+        changes, agent._changes = agent._changes, []
+        store.write(changes)
+    store.close()
+    return agent
+
+
+def found(path: Path) -> Holdings | None:
+    return Store(path, Agent(1, [1, 2], INITIAL_DATA)).found
+
+
+def test_at_every_moment_the_store_holds_what_the_agent_holds(tmp_path: Path) -> None:
+    air = StoringAir(tmp_path / "store", loss=0.4)
+    air.generate_events(seed=1, mean_s=5.0)
+    kinds = set()
+    for step in range(1, 3000):
+        air.step()
+        agent = air.agents[1]
+        if step % 40 == 0 and (agent.reconcile_stack or step % 400 == 0):
+            stored = Store(tmp_path / "store", Agent(1, [1, 2, 3], INITIAL_DATA)).found
+            assert stored == Holdings.of(agent)
+            kinds |= {kind for kind in ("chain", "deque", "stack") if getattr(stored, kind)}
+    assert kinds == {"chain", "deque", "stack"}
+
+
+def test_an_agent_that_boots_has_what_it_held_and_commits_what_it_had_completed() -> None:
+    """Brown-outs at any moment of a lossy mission, amid votes and reconciles: nothing is lost or doubled."""
+    air = Air([1, 2, 3], uniform_latency(Random(2), loss=0.3))
+    air.generate_events(seed=2, mean_s=5.0)
+    rng = Random(3)
+    aside = 0
+    for _ in range(40):
+        for _ in range(rng.randrange(1, 80)):
+            air.step()
+        before = Holdings.of(air.agents[1])
+        aside += len(before.stack) + len(before.deque)
+        air.agents[1] = Agent(1, [1, 2, 3], INITIAL_DATA)
+        air.agents[1].boot(before, air.now)
+        air.flush(1)
+        assert not air.agents[1].idle or not (before.stack or before.deque)
+        assert {block.block_hash for block in Holdings.of(air.agents[1]).blocks()} == {
+            block.block_hash for block in before.blocks()
+        }
+        completed_by = {agent_id: set(agent.completed) for agent_id, agent in air.agents.items()}
+        assert_characteristics_2_to_4(air.agents[1], completed_by)
+    assert aside > 20
+    air.stop_events()
+    air.settle()
+    assert_characteristics_2_to_4(
+        air.agents[1], {agent_id: set(agent.completed) for agent_id, agent in air.agents.items()}
+    )
+
+
+def test_the_first_run_after_a_boot_names_all_that_was_found() -> None:
+    agent = Agent(1, [1, 2], INITIAL_DATA)
+    mine, other, waiting, popped = Block(1, 1, b"a"), Block(2, 2, b"b"), Block(1, 3, b"c"), Block(2, 1, b"d")
+    agent.boot(Holdings([mine.block_hash, waiting.block_hash], [mine, other], [waiting], [popped]), 60.0)
+    first, second = agent.trace()
+    assert (first.handler, first.trigger, first.branch) == ("reconcile_finalize", {"boot": 2}, "done")
+    hashes = {name: block.block_hash.hex() for name, block in locals().items() if isinstance(block, Block)}
+    assert first.changes == [
+        ("complete", hashes["mine"]),
+        ("complete", hashes["waiting"]),
+        ("chain+", hashes["mine"]),
+        ("chain+", hashes["other"]),
+        ("deque+", hashes["waiting"]),
+        ("stack+", hashes["popped"]),
+        ("stack-", hashes["popped"]),
+        ("chain+", hashes["popped"]),
+    ]
+    assert (second.handler, second.branch) == ("process_next_deque_block", "proposed")
+    assert agent.newest_block_timestamp_us == 3
+
+
+def test_wherever_the_last_write_is_torn_the_blocks_before_it_are_found(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    agent = a_store(path)
+    whole = path.read_bytes()
+    assert found(path) == Holdings.of(agent)
+    last = whole.rfind(b"\n", 0, -1) + 1
+    for end in range(last, len(whole) - 1):
+        path.write_bytes(whole[:end])
+        stored = found(path)
+        assert stored is not None
+        assert (len(stored.completed), len(stored.chain), len(stored.deque)) == (5, 5, 0)
+
+
+def test_a_damaged_byte_ends_what_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    a_store(path)
+    lines = path.read_bytes().splitlines(keepends=True)
+    rng = Random(1)
+    for number in range(2, len(lines)):
+        damaged = bytearray(lines[number])
+        damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
+        path.write_bytes(b"".join([*lines[:number], bytes(damaged), *lines[number + 1 :]]))
+        stored = found(path)
+        assert stored is not None
+        assert len(stored.chain) == number - 1
+
+
+def test_a_store_that_lost_its_end_is_good_again_from_the_first_thing_that_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    a_store(path)
+    path.write_bytes(path.read_bytes()[:-10])
+    agent = Agent(1, [1, 2], INITIAL_DATA)
+    store = Store(path, agent)
+    assert store.found is not None
+    agent.boot(store.found, 1.0)
+    agent.complete(Block(1, 100, b"later"))
+    store.write([*(change for run in agent.trace() for change in run.changes), *agent._changes])
+    assert found(path) == Holdings.of(agent)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_another_agent_s_store_or_another_mission_s_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    a_store(path)
+    for other in (Agent(2, [1, 2], INITIAL_DATA), Agent(1, [1, 2], b"another mission")):
+        with pytest.raises(StoreError, match=r"is the store of agent 1 in another mission.*name another file"):
+            Store(path, other)
+
+
+def test_a_file_that_is_no_store_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "precious"
+    path.write_text("data\n")
+    with pytest.raises(StoreError, match=r"precious does not begin as a store: move it away"):
+        found(path)
+    assert path.read_text() == "data\n"
+    path.write_text("")
+    assert found(path) is None
+
+
+def test_a_full_disk_ends_the_store_and_leaves_what_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "store"
+    agent = a_store(path)
+    before = path.read_bytes()
+
+    def refuse(_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    again = Agent(1, [1, 2], INITIAL_DATA)
+    store = Store(path, again)
+    assert store.found is not None
+    monkeypatch.setattr(os, "fdatasync", refuse)
+    again.boot(store.found, 1.0)
+    store.write([change for run in again.trace() for change in run.changes])
+    assert store.problem == "No space left on device"
+    assert path.read_bytes() == before
+    assert not list(tmp_path.glob(".*"))
+    assert found(path) == Holdings.of(agent)

@@ -1,0 +1,193 @@
+"""Waypoints, failsafes and battery levels: what of a vehicle's stream becomes an event, and how it reads."""
+
+import random
+import struct
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
+from tests.ucp.test_telemetry import frames, place
+from ucp.telemetry import (
+    ARMED,
+    BATTERY,
+    EVENT_KINDS,
+    FAILSAFE,
+    POSITION,
+    STATUS_TEXT,
+    WAYPOINT,
+    EventKind,
+    Position,
+    TelemetryEvents,
+    describe,
+    position_of,
+)
+
+STANDBY, ACTIVE, CRITICAL, EMERGENCY = 3, 4, 5, 6
+RADIO = mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+FENCE = mavlink.MAV_SYS_STATUS_GEOFENCE
+ALL = RADIO | FENCE | mavlink.MAV_SYS_STATUS_AHRS | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+
+
+def source(*log: EventKind) -> TelemetryEvents:
+    return TelemetryEvents(10.0, random.Random(1), log)
+
+
+def heartbeat(state: int, armed: bool = True) -> Any:
+    return mavlink.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, 4, state, 3)
+
+
+def status(unhealthy: int = 0, left: int = -1, millivolt: int = 0xFFFF, enabled: int = ALL) -> Any:
+    return mavlink.MAVLink_sys_status_message(
+        ALL, enabled, ALL & ~unhealthy, 0, millivolt, 1_000, left, 0, 0, 0, 0, 0, 0
+    )
+
+
+def said(events: TelemetryEvents, *messages: Any) -> list[str]:
+    return [describe(event_id, data) for event_id, data in events.receive(frames(*messages), 0.0)]
+
+
+def test_a_mission_item_reached_is_an_event() -> None:
+    events = source("waypoint")
+    ((event_id, data),) = events.receive(frames(place(7_500), mavlink.MAVLink_mission_item_reached_message(300)), 0.0)
+    assert (event_id, data) == (WAYPOINT, struct.pack(">IH", 7_500, 300))
+    assert describe(event_id, data) == "[7.5 s] reached mission item 300"
+
+
+def test_an_item_reached_again_is_an_event_again() -> None:
+    """A mission may jump back."""
+    reached = mavlink.MAVLink_mission_item_reached_message(2)
+    assert len(said(source("waypoint"), reached, reached)) == 2
+
+
+def test_a_failsafe_is_an_event_when_it_begins_gets_worse_and_ends() -> None:
+    events = source("failsafe")
+    assert said(events, heartbeat(STANDBY, armed=False), heartbeat(ACTIVE)) == []
+    assert said(events, heartbeat(CRITICAL)) == ["[0.0 s] failsafe, critical"]
+    assert said(events, heartbeat(CRITICAL)) == []
+    assert said(events, heartbeat(EMERGENCY)) == ["[0.0 s] failsafe, emergency"]
+    assert said(events, heartbeat(ACTIVE)) == ["[0.0 s] failsafe over, active"]
+    assert said(events, heartbeat(STANDBY)) == []
+
+
+def test_what_failed_is_named_and_its_data_is_as_documented() -> None:
+    events = source("failsafe")
+    events.receive(frames(place(9_000), heartbeat(ACTIVE), status()), 0.0)
+    ((event_id, data),) = events.receive(frames(status(RADIO)), 0.0)
+    assert (event_id, data) == (FAILSAFE, struct.pack(">IBI", 9_000, ACTIVE, RADIO))
+    assert describe(event_id, data) == "[9.0 s] failsafe, active: RC receiver"
+    assert said(events, heartbeat(CRITICAL)) == ["[9.0 s] failsafe, critical: RC receiver"]
+    assert said(events, status(ALL)) == ["[9.0 s] failsafe, critical: RC receiver, geofence, AHRS, battery"]
+    assert said(events, status(), heartbeat(ACTIVE)) == ["[9.0 s] failsafe, critical", "[9.0 s] failsafe over, active"]
+
+
+def test_a_breached_fence_is_a_failsafe_although_it_is_not_critical() -> None:
+    assert said(source("failsafe"), heartbeat(ACTIVE), status(FENCE)) == ["[0.0 s] failsafe, active: geofence"]
+
+
+def test_what_is_unhealthy_on_the_ground_or_not_enabled_has_not_failed() -> None:
+    events = source("failsafe")
+    assert said(events, heartbeat(STANDBY, armed=False), status(ALL)) == []
+    assert said(source("failsafe"), heartbeat(ACTIVE), status(ALL, enabled=0)) == []
+
+
+def test_a_sensor_that_is_no_failsafe_is_none() -> None:
+    gyro = mavlink.MAVLink_sys_status_message(ALL | 1, ALL | 1, ALL, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
+    assert said(source("failsafe"), heartbeat(ACTIVE), gyro) == []
+
+
+def levels(percentages: Iterable[int]) -> list[int]:
+    """The percentages at which there is an event."""
+    events = source("battery")
+    return [left for left in percentages if events.receive(frames(status(left=left)), 0.0)]
+
+
+def test_the_battery_is_logged_every_10_percent_and_every_5_when_low() -> None:
+    assert levels(range(100, -1, -1)) == [100, 90, 80, 70, 60, 50, 40, 30, 20, 15, 10, 5, 0]
+
+
+def test_a_level_that_was_jumped_over_is_logged_once_and_noise_around_it_not_again() -> None:
+    assert levels([77, 76, 41, 40, 41, 40, 42, 39, 12, 13, 12]) == [77, 41, 40, 12]
+
+
+def test_a_battery_that_was_changed_is_logged() -> None:
+    assert levels([30, 29, 39, 40, 41, 100, 100, 90]) == [30, 40, 100, 90]
+
+
+def test_a_battery_that_does_not_know_its_percentage_is_not_logged() -> None:
+    assert levels([-1, -1, 50, -1, 50]) == [50]
+
+
+def test_a_battery_event_reads_as_documented() -> None:
+    ((event_id, data),) = source("battery").receive(frames(status(left=15, millivolt=14_320)), 0.0)
+    assert (event_id, data) == (BATTERY, struct.pack(">IHhb", 0, 14_320, 1_000, 15))
+    assert describe(event_id, data) == "[0.0 s] battery 15 %, 14.3 V, 10.0 A"
+    assert describe(BATTERY, struct.pack(">IHhb", 500, 0xFFFF, -1, 15)) == "[0.5 s] battery 15 %"
+
+
+@pytest.mark.parametrize(
+    ("vehicle_type", "mode", "name"),
+    [(2, 5, "LOITER"), (1, 12, "LOITER"), (10, 4, "HOLD"), (2, 200, "200"), (6, 0, "0")],
+)
+def test_modes_have_the_names_of_their_vehicle(vehicle_type: int, mode: int, name: str) -> None:
+    message = mavlink.MAVLink_heartbeat_message(vehicle_type, 3, 0, mode, ACTIVE, 3)
+    assert said(source("mode"), message) == [f"[0.0 s] mode {name}"]
+
+
+def test_the_default_is_what_was_always_logged() -> None:
+    events = TelemetryEvents(10.0, random.Random(1))
+    reached = mavlink.MAVLink_mission_item_reached_message(2)
+    made = [event_id for event_id, _ in events.receive(frames(heartbeat(CRITICAL), status(ALL, 50), reached), 0.0)]
+    assert made == [1, ARMED]
+    text = mavlink.MAVLink_statustext_message(6, b"hello")
+    made += [
+        event_id for event_id, _ in events.receive(frames(place()), 0.0) + events.receive(frames(place(), text), 99.0)
+    ]
+    assert made == [1, ARMED, POSITION, STATUS_TEXT]
+
+
+@pytest.mark.parametrize("kind", EVENT_KINDS)
+def test_a_kind_that_was_not_chosen_is_not_logged(kind: EventKind) -> None:
+    """And choosing it alone gives the same events as choosing all, without the others."""
+    stream = [
+        frames(heartbeat(CRITICAL), status(ALL, 50), mavlink.MAVLink_mission_item_reached_message(2), place()),
+        frames(heartbeat(ACTIVE, armed=False), status(), mavlink.MAVLink_statustext_message(6, b"hello"), place()),
+    ]
+
+    def logged(log: Iterable[EventKind]) -> list[tuple[int, bytes]]:
+        events = TelemetryEvents(10.0, random.Random(1), log)
+        return [event for at, data in enumerate(stream) for event in events.receive(data, at * 99.0)]
+
+    alone = logged([kind])
+    assert {event_id for event_id, _ in alone} == set(EVENT_KINDS[kind])
+    assert alone == [event for event in logged(EVENT_KINDS) if event[0] in EVENT_KINDS[kind]]
+
+
+def test_every_kind_has_event_ids_of_its_own() -> None:
+    assert sorted(event_id for ids in EVENT_KINDS.values() for event_id in ids) == list(range(1, 9))
+
+
+FIELDS = st.tuples(
+    *(st.integers(0, 2**32 - 1), st.integers(0, 2**64 - 1)),
+    *(st.integers(-(10**9), 10**9) for _ in range(4)),
+    *(st.integers(-(2**15), 2**15 - 1) for _ in range(3)),
+    st.integers(0, 2**16 - 1),
+    *(st.floats(width=32, allow_nan=False) for _ in range(3)),
+    *(st.integers(-(2**15), 2**15 - 1) for _ in range(3)),
+    *(st.integers(0, 2**16 - 1), st.integers(-(2**15), 2**15 - 1), st.integers(-128, 127)),
+    *(st.integers(0, 2**32 - 1), st.integers(0, 255)),
+)
+
+
+@given(FIELDS)
+def test_a_position_record_comes_back_as_it_was(fields: tuple[Any, ...]) -> None:
+    position = Position(*fields)
+    assert len(position.pack()) == 64
+    assert Position.unpack(position.pack()) == position
+    on_earth = abs(position.lat_e7) <= 900_000_000
+    assert position_of(POSITION, position.pack()) == (position if on_earth else None)
+    assert position_of(STATUS_TEXT, position.pack()) is None
+    assert position_of(POSITION, position.pack()[:-1]) is None

@@ -1,0 +1,211 @@
+"""An agent's store: what it holds, kept on its vehicle's disk, so that after a brown-out it can go on from there.
+
+The store is a journal. An entry is a line: the CRC-32 of the rest in eight hex digits, a space, and JSON. The first
+says whose store it is; each of the others says what one input changed, as a trace does, with the blocks that are new.
+An entry is on disk before anybody hears of what it says, and holds all that the input changed: whatever is read makes a
+state that the agent was in. Reading ends where the first line is torn or damaged.
+
+An agent that boots begins its journal anew, with all that it found, and puts it in the place of the old one only when
+it is on disk: at every moment there is one that is good.
+"""
+
+import base64
+import contextlib
+import errno
+import json
+import os
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from ucp.block import Block
+
+if TYPE_CHECKING:
+    from ucp.agent import Agent
+
+SCHEMA = "ucp-store/1"
+
+Change = tuple[str, str]
+"""Operation and block hash, as in a trace."""
+
+
+class StoreError(Exception):
+    """A store that this agent must not touch: one sentence."""
+
+
+@dataclass(slots=True)
+class Holdings:
+    """What an agent holds where, and the hashes of the blocks that it completed.
+
+    Blocks of the chain are oldest first, of the deque front first, of the stack top last.
+    """
+
+    completed: list[bytes] = field(default_factory=list)
+    chain: list[Block] = field(default_factory=list)
+    deque: list[Block] = field(default_factory=list)
+    stack: list[Block] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, agent: "Agent") -> "Holdings":
+        return cls(
+            list(agent.completed), list(agent.chain), list(agent.blocks_to_be_committed), list(agent.reconcile_stack)
+        )
+
+    def blocks(self) -> Iterator[Block]:
+        yield from self.chain
+        yield from self.deque
+        yield from self.stack
+
+    def _change(self, operation: str, block: Block) -> None:
+        """Make a change of a trace."""
+        match operation:
+            case "complete":
+                self.completed.append(block.block_hash)
+            case "chain+":
+                self.chain.append(block)
+            case "chain-":
+                self.chain.pop()
+            case "deque+":
+                self.deque.append(block)
+            case "deque-":
+                self.deque.pop(0)
+            case "stack+":
+                self.stack.append(block)
+            case "stack-":
+                self.stack.remove(block)
+
+    def replay(self, entry: dict[str, Any], known: dict[str, Block]) -> None:
+        """Make all changes of an entry; `known` are the blocks of the entries before, by hash, and get this one's."""
+        for agent_id, timestamp_us, event_data in entry["blocks"]:
+            block = Block(agent_id, timestamp_us, base64.b64decode(event_data))
+            known[block.block_hash.hex()] = block
+        for operation, block_hash in entry["changes"]:
+            self._change(operation, known[block_hash])
+
+
+class Store:
+    """The store of `agent` in the file `path`. Raises OSError, or StoreError for a file that is not this agent's store.
+
+    `found` is what an earlier life left; None if there was none.
+    """
+
+    def __init__(self, path: Path, agent: "Agent") -> None:
+        self.problem: str | None = None
+        """Why the store ends early, once the disk refuses it."""
+        self._path = path
+        self._agent = agent
+        self._header = {
+            "schema": SCHEMA,
+            "agent_id": agent.agent_id,
+            "inception": agent.chain.inception.block_hash.hex(),
+        }
+        self._written: set[str] = set()
+        self._file: BinaryIO | None = None
+        self.found = self._read()
+
+    def _read(self) -> Holdings | None:
+        entries = _entries(self._path)
+        header = next(entries, None)
+        if header is None:
+            if self._path.exists() and self._path.stat().st_size:
+                raise StoreError(
+                    f"{self._path} does not begin as a store: move it away or name another file as `store`"
+                )
+            return None
+        if header != self._header:
+            raise StoreError(
+                f"{self._path} is the store of agent {header.get('agent_id')} in another mission, or of another "
+                "version: name another file as `store`"
+            )
+        found, known = Holdings(), dict[str, Block]()
+        for entry in entries:
+            found.replay(entry, known)
+        return found
+
+    def write(self, changes: list[Change]) -> None:
+        """Have these changes, of one input to the agent, on disk. The first of a life name all that was found."""
+        if self.problem is not None or not changes:
+            return
+        new = dict.fromkeys(block_hash for _, block_hash in changes if block_hash not in self._written)
+        blocks = [self._block(block_hash) for block_hash in new]
+        entry = {"changes": changes, "blocks": [[one.agent_id, one.timestamp_us, _base64(one)] for one in blocks]}
+        try:
+            if self._file is None:
+                self._file = self._begin(_line(self._header) + _line(entry))
+            else:
+                _append(self._file, _line(entry))
+        except OSError as error:
+            self.problem = error.strerror or str(error)
+        self._written.update(new)
+
+    def _begin(self, lines: bytes) -> BinaryIO:
+        """A journal that begins with these lines, in the place of what was there."""
+        beside = self._path.with_name(f".{self._path.name}.new")
+        file = beside.open("wb", buffering=0)
+        try:
+            _append(file, lines)
+            beside.replace(self._path)
+            _sync_directory(self._path.parent)
+        except BaseException:
+            file.close()
+            with contextlib.suppress(OSError):
+                beside.unlink()
+            raise
+        return file
+
+    def _block(self, block_hash: str) -> Block:
+        agent = self._agent
+        held = agent.chain.get(bytes.fromhex(block_hash))
+        if held is not None:
+            return held
+        aside = (*agent.blocks_to_be_committed, *agent.reconcile_stack)
+        return next(block for block in aside if block.block_hash.hex() == block_hash)
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+
+
+def _line(document: dict[str, Any]) -> bytes:
+    text = json.dumps(document, separators=(",", ":")).encode("ascii")
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _append(file: BinaryIO, lines: bytes) -> None:
+    """Have the lines on disk, or raise OSError."""
+    if file.write(lines) != len(lines):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    os.fdatasync(file.fileno())
+
+
+def _sync_directory(path: Path) -> None:
+    """Have on disk what the files in it are called."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _entries(path: Path) -> Iterator[dict[str, Any]]:
+    """The entries of a store up to the first that is not whole; none if there is no store. Raises OSError."""
+    try:
+        file = path.open("rb")
+    except FileNotFoundError:
+        return
+    with file:
+        for line in file:
+            checksum, _, text = line.partition(b" ")
+            try:
+                whole = int(checksum, 16) == zlib.crc32(text.removesuffix(b"\n"))
+            except ValueError:
+                return
+            if not whole:
+                return
+            yield json.loads(text)
+
+
+def _base64(block: Block) -> str:
+    return base64.b64encode(block.event_data).decode("ascii")

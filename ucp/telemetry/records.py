@@ -1,0 +1,87 @@
+"""Event IDs of the `mavlink` source and the layout of their data; the package's docstring has them as a table."""
+
+import struct
+from typing import Literal, NamedTuple
+
+MODE_CHANGE, ARMED, DISARMED, STATUS_TEXT, POSITION, WAYPOINT, FAILSAFE, BATTERY = range(1, 9)
+
+EventKind = Literal["mode", "arming", "text", "waypoint", "failsafe", "position", "battery"]
+"""What a mission can choose to log."""
+
+EVENT_KINDS: dict[EventKind, tuple[int, ...]] = {
+    "mode": (MODE_CHANGE,),
+    "arming": (ARMED, DISARMED),
+    "text": (STATUS_TEXT,),
+    "waypoint": (WAYPOINT,),
+    "failsafe": (FAILSAFE,),
+    "position": (POSITION,),
+    "battery": (BATTERY,),
+}
+"""The event IDs of each kind."""
+
+DEFAULT_LOG: tuple[EventKind, ...] = ("mode", "arming", "text", "position")
+
+MAX_DATA_BYTES = 256  # longer data is cut
+
+UNKNOWN_MODE = 0xFFFFFFFF
+UNKNOWN_HEADING = UNKNOWN_VOLTAGE = 0xFFFF
+
+CRITICAL_STATES = frozenset({5, 6, 8})
+"""MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY, MAV_STATE_FLIGHT_TERMINATION."""
+
+SENSORS = {1 << 16: "RC receiver", 1 << 20: "geofence", 1 << 21: "AHRS", 1 << 25: "battery"}
+"""The bits of MAV_SYS_STATUS_SENSOR that a failsafe event can hold, and what they are called."""
+
+MODE_CHANGE_DATA = struct.Struct(">IBII")
+ARMING_DATA = struct.Struct(">II")
+STATUS_TEXT_DATA = struct.Struct(">IB")
+WAYPOINT_DATA = struct.Struct(">IH")
+FAILSAFE_DATA = struct.Struct(">IBI")
+BATTERY_DATA = struct.Struct(">IHhb")
+
+_POSITION_DATA = struct.Struct(">IQiiiihhhHfffhhhHhbIB")
+
+
+class Position(NamedTuple):
+    """A position record, in the order and the units of its data: `>IQiiiihhhHfffhhhHhbIB`, 64 bytes."""
+
+    vehicle_ms: int
+    clock_us: int  # the vehicle's clock, microseconds since the Unix epoch; 0: unknown
+    lat_e7: int  # 1e-7 degrees
+    lon_e7: int
+    alt_mm: int  # above mean sea level
+    relative_alt_mm: int  # above home
+    north_cms: int  # velocity, cm/s
+    east_cms: int
+    down_cms: int
+    heading_cdeg: int  # 0.01 degrees; 65535: unknown
+    roll_rad: float  # NaN: unknown
+    pitch_rad: float
+    yaw_rad: float
+    roll_mrads: int  # rates, mrad/s
+    pitch_mrads: int
+    yaw_mrads: int
+    battery_mv: int  # 65535: unknown
+    battery_ca: int  # 0.01 A; -1: unknown
+    battery_percent: int  # left; -1: unknown
+    mode: int
+    armed: int  # 1 when armed
+
+    def pack(self) -> bytes:
+        return _POSITION_DATA.pack(*self)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> "Position":
+        """Raises struct.error for anything but 64 bytes."""
+        return cls._make(_POSITION_DATA.unpack(data))
+
+
+def position_of(event_id: int, data: bytes) -> Position | None:
+    """The position that an event holds; None if it is another event, unreadable, or nowhere on Earth."""
+    if event_id != POSITION:
+        return None
+    try:
+        position = Position.unpack(data)
+    except struct.error:
+        return None
+    return position if abs(position.lat_e7) <= 90e7 and abs(position.lon_e7) <= 180e7 else None
