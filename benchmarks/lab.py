@@ -1,47 +1,153 @@
-"""How long the lab takes to come up and go away: `python -m benchmarks.lab [--rounds R] [--json] [N ...]`."""
+"""How long the lab takes to come up and go away: `python -m benchmarks.lab [--rounds R] [--json] [--mininet] [N ...]`.
+
+With `--mininet` (root; Debian packages mininet and bridge-utils) Mininet builds as many hosts on one Linux bridge, in
+turn with the lab, round by round: `build` and `start` against `Lab.open`, `stop` against `Lab.close`; ratios are of the
+same round. Of the lab the start of its first process counts too, of Mininet only what it does itself.
+
+With `--pairs` it is instead `Lab.apply` that is measured, with each engine that works here: every directed pair of
+vehicles gets a loss of its own (`first`), and then another (`change`).
+"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import json
-import statistics
+import os
+import shutil
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any, get_args
 
-from netem.lab import Lab
+from benchmarks.rounds import Spread, show
+from netem import namespaces
+from netem.conditions import LinkConditions, NetworkConditions
+from netem.lab import EngineName, Lab, LabError, LabUnavailable
+
+_PYTHON = "/usr/bin/python3"  # Debian's, which has Debian's Mininet
+_MININET = Path(__file__).with_name("mininet_network.py")
+_MININET_DEADLINE_S = 600.0
+_PAUSE_S = 0.5  # the kernel takes the last namespaces away in the background
+
+_SECONDS = ("up", "mininet_up", "down", "mininet_down", "first", "change")
+_FORMS = {**{f"{key}_s": ".3f" for key in _SECONDS}, "up_ratio": ".1f", "down_ratio": ".1f"}
+
+_Row = dict[str, Any]
 
 
-async def once(vehicles: int, log: Path) -> tuple[float, float, str]:
-    """Seconds up, seconds down, and the engine, for a lab of so many vehicles."""
+class _CannotError(Exception):
+    """This machine lacks something; the message is a sentence that says what."""
+
+
+async def lab_once(vehicles: int, log: Path) -> _Row:
+    """Seconds that a lab of so many vehicles takes to come up and to go, and its engine."""
     start = time.perf_counter()
     lab = await Lab.open(range(1, vehicles + 1), log=log)
     up = time.perf_counter()
     await lab.close()
-    return up - start, time.perf_counter() - up, lab.engine
+    return {"engine": lab.engine, "up_s": up - start, "down_s": time.perf_counter() - up}
+
+
+def mininet_once(hosts: int) -> _Row:
+    """Seconds that Mininet takes for as many hosts, in namespaces that take with them what it leaves behind."""
+    argv = namespaces.command([_PYTHON, str(_MININET), str(hosts)], user_namespace=False)
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=_MININET_DEADLINE_S, check=False)
+    if done.returncode != 0:
+        raise SystemExit(f"Mininet failed with {hosts} hosts:\n{done.stderr}")
+    found: _Row = json.loads(done.stdout)
+    return found
+
+
+def check_mininet() -> None:
+    if os.geteuid() != 0:
+        raise _CannotError("Mininet needs root: run this as root, or without --mininet.")
+    importable = subprocess.run([_PYTHON, "-c", "import mininet.net"], capture_output=True, check=False).returncode == 0
+    if not (importable and shutil.which("brctl")):
+        raise _CannotError(
+            "Mininet is not installed (Debian: apt install --no-install-recommends mininet bridge-utils)."
+        )
+
+
+def up_and_down(vehicles: int, rounds: int, mininet: bool, log: Path) -> _Row:
+    labs, networks = [], []
+    for _ in range(rounds):
+        labs.append(asyncio.run(lab_once(vehicles, log)))
+        time.sleep(_PAUSE_S)
+        if mininet:
+            networks.append(mininet_once(vehicles))
+            time.sleep(_PAUSE_S)
+    row: _Row = {"vehicles": vehicles, "engine": labs[0]["engine"]}
+    for key in ("up", "down"):
+        ours = [lab[f"{key}_s"] for lab in labs]
+        row[f"{key}_s"] = Spread.of(ours)
+        if mininet:
+            theirs = [network[f"{key}_s"] for network in networks]
+            row[f"mininet_{key}_s"] = Spread.of(theirs)
+            row[f"{key}_ratio"] = Spread.of_ratios(theirs, ours)
+    return row
+
+
+def pairs(vehicles: int, rounds: int, log: Path) -> list[_Row]:
+    """A row for each engine that works here."""
+    rows, refusals = [], []
+    for engine in get_args(EngineName):
+        try:
+            found = [asyncio.run(pairs_once(vehicles, engine, log)) for _ in range(rounds)]
+        except LabUnavailable as error:
+            refusals.append(error)
+            sys.stderr.write(f"Left out: {error.reason}\n")
+            continue
+        first, change = (Spread.of(seconds) for seconds in zip(*found, strict=True))
+        links = vehicles * (vehicles - 1)
+        rows.append({"vehicles": vehicles, "links": links, "engine": engine, "first_s": first, "change_s": change})
+    if not rows:
+        raise refusals[0]
+    return rows
+
+
+async def pairs_once(vehicles: int, engine: EngineName, log: Path) -> tuple[float, float]:
+    """Seconds to give each directed pair a loss of its own, and then another."""
+    directed = list(itertools.permutations(range(1, vehicles + 1), 2))
+    losses = [number / (len(directed) + 1) for number in range(1, len(directed) + 1)]
+    seconds = []
+    async with await Lab.open(range(1, vehicles + 1), engine=engine, log=log) as lab:
+        for some in (losses, losses[::-1]):
+            links = dict(zip(directed, map(LinkConditions, some), strict=True))
+            start = time.perf_counter()
+            await lab.apply(NetworkConditions(links=links))
+            seconds.append(time.perf_counter() - start)
+    first, change = seconds
+    return first, change
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("vehicles", nargs="*", type=int, default=[5, 20, 50, 100])
-    parser.add_argument("--rounds", type=int, default=3, help="the median of so many is shown")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("vehicles", nargs="*", type=int, metavar="N", help="vehicles (5 20 50 100; with --pairs 100)")
+    parser.add_argument("--rounds", type=int, default=3, help="median and spread are shown")
     parser.add_argument("--json", action="store_true")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--mininet", action="store_true", help="beside Mininet")
+    what.add_argument("--pairs", action="store_true", help="every directed pair with a loss of its own")
     options = parser.parse_args()
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        for count in options.vehicles:
-            rounds = [asyncio.run(once(count, Path(folder, "lab.log"))) for _ in range(options.rounds)]
-            up, down = (statistics.median(seconds) for seconds in list(zip(*rounds, strict=True))[:2])
-            rows.append({"vehicles": count, "engine": rounds[0][2], "up_s": round(up, 3), "down_s": round(down, 3)})
-    if options.json:
-        json.dump(rows, sys.stdout)
-        sys.stdout.write("\n")
-    else:
-        sys.stdout.write("vehicles  engine      up        down\n")
-        for row in rows:
-            sys.stdout.write(f"{row['vehicles']:8}  {row['engine']:10}  {row['up_s']:.3f} s   {row['down_s']:.3f} s\n")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            log = Path(folder, "lab.log")
+            if options.pairs:
+                counts = options.vehicles or [100]
+                rows = [row for count in counts for row in pairs(count, options.rounds, log)]
+            else:
+                if options.mininet:
+                    check_mininet()
+                counts = options.vehicles or [5, 20, 50, 100]
+                rows = [up_and_down(count, options.rounds, options.mininet, log) for count in counts]
+    except (LabError, _CannotError) as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(3)
+    show(rows, _FORMS, options.json)
 
 
 if __name__ == "__main__":

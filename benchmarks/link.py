@@ -1,0 +1,268 @@
+"""What a link of the lab costs without conditions: `python -m benchmarks.link [--rounds R] [--seconds S] [--json]`.
+
+Links of two vehicles each, side by side in one private network and measured in turn, round by round: a veth pair made
+with ip(8) and nothing else (`veth`), the lab's switch without an engine (`switch`), and the switch with each engine
+that works here while nothing is asked of it. Ratios are to the veth pair in the same round.
+
+UDP: datagrams of 512 bytes received in a second while the sender sends as it can, and the processor time of a datagram
+sent, carried and received. TCP: bytes received in a second on one connection. Round trip: a datagram of 64 bytes
+and its echo. Both ends are Python, each on a processor of its own if there are two; their own time is in every figure,
+of the veth pair too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.rounds import Spread, show
+from netem import addresses, namespaces
+from netem.engine import Engine
+from netem.errors import EngineError
+from netem.fabric import Fabric
+from netem.nft import NftablesEngine
+from netem.tc import NetemEngine
+
+_DATAGRAM = bytes(512)
+_PING = bytes(64)
+_CHUNK = bytes(256 << 10)
+_BURST = 64  # datagrams, which a receiver has room for
+_PORT = 14600
+_DEADLINE_S = 10.0
+_ROUND_TRIPS = 5000
+_WARM_UP = 200
+
+_fork = multiprocessing.get_context("fork")  # a socket stays in the network in which it was made, in a child too
+
+
+@dataclass(frozen=True)
+class Link:
+    """Vehicles 1 and 2, and the way into the network of each (`Fabric.inside`)."""
+
+    name: str
+    inside: Callable[[int], AbstractContextManager[None]]
+
+    def datagrams(self) -> tuple[socket.socket, socket.socket]:
+        """A UDP socket in each network, connected to the other."""
+        ends = []
+        for vehicle, peer in ((1, 2), (2, 1)):
+            with self.inside(vehicle):
+                end = socket.socket(type=socket.SOCK_DGRAM)
+            end.settimeout(_DEADLINE_S)
+            end.bind((addresses.address(vehicle), _PORT))
+            end.connect((addresses.address(peer), _PORT))
+            ends.append(end)
+        return ends[0], ends[1]
+
+    def stream(self) -> tuple[socket.socket, socket.socket]:
+        """Both ends of a TCP connection from 1 to 2."""
+        with self.inside(2):
+            listener = socket.create_server((addresses.address(2), _PORT))
+        with listener, self.inside(1):
+            client = socket.create_connection(listener.getsockname(), timeout=_DEADLINE_S)
+            server, _ = listener.accept()
+        server.settimeout(_DEADLINE_S)
+        return client, server
+
+
+def veth_pair() -> Link:
+    namespaces.unshare_network()
+    one = namespaces.open_network()
+    namespaces.unshare_network()
+    two = namespaces.open_network()
+    _ip(f"link add eth0 type veth peer name eth0 netns /proc/{os.getpid()}/fd/{one}", *_own(2))
+    namespaces.enter_network(one)
+    _ip(*_own(1))
+    ends = {1: one, 2: two}
+    return Link("veth", lambda vehicle: namespaces.inside(ends[vehicle], one))
+
+
+def _own(vehicle: int) -> list[str]:
+    network = f"{addresses.address(vehicle)}/{addresses.PREFIX_LENGTH}"
+    return [f"address add {network} dev eth0", "link set eth0 up", "link set lo up"]
+
+
+def _ip(*commands: str) -> None:
+    subprocess.run(["ip", "-batch", "-"], input="\n".join(commands), text=True, check=True)
+
+
+def switch(engine: type[Engine] | None) -> Link:
+    """As `netem.init` makes it; raises EngineError where the engine does not work."""
+    namespaces.unshare_network()
+    fabric = Fabric([1, 2])
+    if engine is not None:
+        engine(fabric)
+    return Link(engine.name if engine else "switch", fabric.inside)
+
+
+def links() -> list[Link]:
+    found = [veth_pair(), switch(None)]
+    for engine in (NetemEngine, NftablesEngine):
+        try:
+            found.append(switch(engine))
+        except EngineError as error:
+            sys.stderr.write(f"Left out: engine {engine.name}, {error}\n")
+    return found
+
+
+# What is measured
+
+
+def udp(link: Link, seconds: float) -> dict[str, float]:
+    sender, receiver = link.datagrams()
+    with sender, receiver, _beside(_count_datagrams, receiver) as counted:
+        end = time.perf_counter() + seconds
+        while time.perf_counter() < end:
+            for _ in range(_BURST):
+                sender.send(_DATAGRAM)
+        for _ in range(5):  # an empty one says that it is the last, if there is room for it
+            time.sleep(0.02)
+            sender.send(b"")
+        return {"UDP 1000 datagrams/s": counted() / 1000}
+
+
+def _count_datagrams(receiver: socket.socket) -> float:
+    count = 0
+    receiver.recv(len(_DATAGRAM))
+    start = last = time.perf_counter()
+    while receiver.recv(len(_DATAGRAM)):
+        count += 1
+        last = time.perf_counter()
+    return count / (last - start)
+
+
+def udp_cost(link: Link, seconds: float) -> dict[str, float]:
+    """Processor time of a datagram, sent, carried and received in one process: others on the machine matter little."""
+    sender, receiver = link.datagrams()
+    count = 0
+    with sender, receiver:
+        start = time.process_time()
+        end = time.perf_counter() + seconds
+        while time.perf_counter() < end:
+            for _ in range(_BURST):
+                sender.send(_DATAGRAM)
+            for _ in range(_BURST):
+                receiver.recv(len(_DATAGRAM))
+            count += _BURST
+        return {"UDP processor us": (time.process_time() - start) / count * 1e6}
+
+
+def tcp(link: Link, seconds: float) -> dict[str, float]:
+    sender, receiver = link.stream()
+    with sender, receiver, _beside(_count_bytes, receiver) as counted:
+        end = time.perf_counter() + seconds
+        while time.perf_counter() < end:
+            sender.sendall(_CHUNK)
+        sender.shutdown(socket.SHUT_WR)
+        return {"TCP Mbyte/s": counted() / 1e6}
+
+
+def _count_bytes(receiver: socket.socket) -> float:
+    buffer = bytearray(len(_CHUNK))
+    count = 0
+    start = time.perf_counter()
+    while received := receiver.recv_into(buffer):
+        count += received
+    return count / (time.perf_counter() - start)
+
+
+def round_trips(link: Link, _: float) -> dict[str, float]:
+    near, far = link.datagrams()
+    microseconds = []
+    with near, far, _beside(_echo, far):
+        for _ in range(_WARM_UP + _ROUND_TRIPS):
+            start = time.perf_counter_ns()
+            near.send(_PING)
+            near.recv(len(_PING))
+            microseconds.append((time.perf_counter_ns() - start) / 1000)
+    percentiles = statistics.quantiles(microseconds[_WARM_UP:], n=100)
+    return {"round trip median us": percentiles[49], "round trip 99 % us": percentiles[98]}
+
+
+def _echo(far: socket.socket) -> float:
+    while True:
+        far.send(far.recv(len(_PING)))
+
+
+@contextmanager
+def _beside(function: Callable[[socket.socket], float], end: socket.socket) -> Iterator[Callable[[], float]]:
+    """Run the function in a process of its own meanwhile; gives the way to wait for what it returns."""
+    ours, theirs = _fork.Pipe(duplex=False)
+
+    def run() -> None:
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        theirs.send(function(end))
+
+    def result() -> float:
+        if not ours.poll(_DEADLINE_S):
+            raise TimeoutError("The other end of the link has not come to its end")
+        return float(ours.recv())
+
+    process = _fork.Process(target=run)
+    process.start()
+    processors = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(processors)})
+    try:
+        yield result
+    finally:
+        os.sched_setaffinity(0, processors)
+        process.kill()
+        process.join()
+
+
+def measure(rounds: int, seconds: float) -> dict[str, dict[str, list[float]]]:
+    """Figures of each round by quantity and link."""
+    found: dict[str, dict[str, list[float]]] = {}
+    lines = links()
+    for _ in range(rounds):
+        for what in (udp, udp_cost, tcp, round_trips):
+            for link in lines:
+                for quantity, figure in what(link, seconds).items():
+                    found.setdefault(quantity, {}).setdefault(link.name, []).append(figure)
+    return found
+
+
+def rows(found: dict[str, dict[str, list[float]]]) -> list[dict[str, Any]]:
+    return [
+        {
+            "quantity": quantity,
+            "link": link,
+            "figure": Spread.of(figures),
+            "ratio": Spread.of_ratios(figures, by_link["veth"]),
+        }
+        for quantity, by_link in found.items()
+        for link, figures in by_link.items()
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=15, help="median and spread are shown")
+    parser.add_argument("--seconds", type=float, default=0.2, help="of each measurement of a rate")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)  # in the private network already
+    options = parser.parse_args()
+    if options.inside:
+        found = rows(measure(options.rounds, options.seconds))
+        show(found, {"figure": ",.1f", "ratio": ".2f"}, options.json)
+        return
+    possible, word = namespaces.probe()
+    if not possible:
+        sys.stderr.write(f"This machine does not let us make a private network ({word}). {namespaces.way_out(word)}\n")
+        sys.exit(3)
+    argv = [sys.executable, "-m", "benchmarks.link", "--inside", *sys.argv[1:]]
+    sys.exit(subprocess.run(namespaces.command(argv, user_namespace=os.geteuid() != 0), check=False).returncode)
+
+
+if __name__ == "__main__":
+    main()
