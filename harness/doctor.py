@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from netem import doctor as lab_doctor
+from netem import uml
+from netem.errors import UmlError
 from sitl.ardupilot import ArduPilot
 from sitl.vehicle import VehicleError
 
@@ -31,7 +33,15 @@ def examine() -> list[Finding]:
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
     )
     lab = [Finding(one.name, one.ok, one.needed, one.detail, one.way_out) for one in lab_doctor.examine()]
-    return [python, *lab, _ardupilot()]
+    return [python, *lab, _user_mode_linux(), _ardupilot()]
+
+
+def _user_mode_linux() -> Finding:
+    use = "--kernel uml: all of netem, in a process without privileges"
+    try:
+        return Finding("User Mode Linux", True, False, f"{uml.find()}, for {use}")
+    except UmlError as error:
+        return Finding("User Mode Linux", False, False, str(error), f"with it there is {use}")
 
 
 def _ardupilot() -> Finding:

@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 
 from harness.errors import HarnessError
 from harness.scenario import Scenario
-from harness.timeline import Change, final_reconcile, timeline_of
+from harness.timeline import RANGE, Change, final_reconcile, timeline_of
 
 MAX_FINAL_ROUNDS = 20
 """Bound on the rounds of a final reconcile; each lets every agent reconcile once."""
@@ -41,11 +41,17 @@ class Played:
         self.exit_status = error.exit_status
 
     def record(self, change: dict[str, Any]) -> None:
-        """Take down a change that was made."""
+        """Take down a change that was made; of those that flight makes, only who is connected to whom."""
+        if change["what"] == RANGE and self.network and _same_connections(change, self.network[-1]):
+            return
         if "fully_connected" in change:
             self.network.append(change)
         if change["what"] != "start":
             self.faults.append(change)
+
+
+def _same_connections(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return all(one[key] == other[key] for key in ("what", "detail", "fully_connected"))
 
 
 class Swarm(Protocol):

@@ -49,6 +49,8 @@ class Fault(_Model):
     detail: str
     fully_connected: bool | None = None
     agents: list[int] | None = None
+    disk: Literal["kept", "lost"] | None = None
+    """What a reboot left of it."""
 
 
 class FinalReconcile(_Model):
@@ -60,14 +62,17 @@ class FinalReconcile(_Model):
 
 
 class AgentRecord(_Model):
-    """`outcome` is exported, not exported, killed, crashed, hung, running or not started; counters are null if unknown.
+    """`outcome` is exported, not exported, killed, rebooting, crashed, hung, paused, running or not started.
 
-    Counters are those of all its lives, if it was restarted.
+    Counters are those of all its lives, if it had more than one, and null if unknown.
     """
 
     outcome: str
     detail: str | None = None
     restarts: int = 0
+    """How often it began anew with nothing."""
+    reboots: int = 0
+    """How often it came back with what was on its disk."""
     completed_before: list[str] = []
     """Hashes of the blocks that it completed in lives that left no export, since it was killed."""
     idle: bool | None = None
@@ -78,6 +83,58 @@ class AgentRecord(_Model):
     dropped: dict[str, int] | None = None
     send_failures: int | None = None
     trace_problem: str | None = None
+
+
+class BlockHolders(_Model):
+    """Who held a block right after vehicles were lost, and at the end; `agent_id` completed it."""
+
+    block: str
+    block_hash: str
+    agent_id: int
+    holders: list[int]
+    holders_at_end: list[int]
+
+
+class Loss(_Model):
+    """Vehicles were lost at `at_s`, and all that they held with them. Counts are null where traces are missing.
+
+    Of the blocks `completed` by then, by anybody, `survived` are those that some other vehicle held, `gone` those that
+    only the lost ones did, and `gone_at_end` those that nobody holds at the end, whatever took them.
+    """
+
+    at_s: float
+    what: str
+    vehicles: list[int]
+    completed: int | None = None
+    survived: int | None = None
+    gone: int | None = None
+    gone_at_end: int | None = None
+    blocks: list[BlockHolders] = []
+    """Those that the lost vehicles had completed, and those that are gone; the oldest first."""
+
+
+class LeastHeld(_Model):
+    """The smallest set of vehicles whose loss would lose a block: the holders of the block that the fewest hold."""
+
+    vehicles: int
+    """How many there are to hold it."""
+    holders: list[int]
+    block: str
+    block_hash: str
+    blocks: int
+    """How many blocks are on as few vehicles."""
+    of: int
+    """How many blocks there are."""
+
+
+class Survival(_Model):
+    """What became of the `completed` blocks where vehicles were lost; `gone` are on no vehicle at the end."""
+
+    losses: list[Loss] = []
+    completed: int
+    gone: int
+    at_end: LeastHeld | None = None
+    before_final_reconcile: LeastHeld | None = None
 
 
 class JudgedRecord(_Model):
@@ -112,6 +169,7 @@ class RunRecord(JudgedRecord):
     """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
     characteristics: dict[str, CharacteristicVerdict] = {}
     figures: dict[str, float | int | None] = {}
+    survival: Survival | None = None
     errors: list[str] = []
     """A sentence for each file that the checker could not use, or not wholly."""
 

@@ -18,17 +18,19 @@ from harness.backends.agent_process import agent_command
 from harness.backends.process import ProcessRun, refuse_what_needs_virtual_time, refuse_what_this_machine_cannot
 from harness.backends.simulation import refuse_what_needs_processes
 from harness.backends.vehicle_process import VehicleFailedError
+from harness.checker.survival import survival
 from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
+from harness.lateness import Lateness, lateness
 from harness.mission import Played
 from harness.progress import Progress
-from harness.record import Backend, RunRecord
+from harness.record import Backend, RunRecord, Survival
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
-from harness.scenario.vehicles import VehicleKind
 from harness.simulate import simulate_into
+from netem import uml
 from sitl.ardupilot import ArduPilot
 from sitl.embedded import Embedded
-from sitl.vehicle import NoBinaryError, UnusableBinaryError
+from sitl.vehicle import NoBinaryError, UnusableBinaryError, VehicleType
 from sitl.vehicle import VehicleKind as Kind
 
 PACKAGES = ("ucp-harness", "pymavlink", "pyroute2")
@@ -36,14 +38,19 @@ PACKAGES = ("ucp-harness", "pymavlink", "pyroute2")
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: where it is, how it ended, what was found, and the exit status of the command line."""
+    """A finished run: where it is, how it ended, what was found, and the exit status of the command line.
+
+    `lateness` is that of the agents' timers, of processes only, and if enough of them tell.
+    """
 
     directory: Path
     played: Played
     result: checker.Result
+    survival: Survival
     exit_status: int
     wall_s: float
     report: Path
+    lateness: Lateness | None
 
 
 def run(scenario: Scenario, seed: int, out: Path, progress: Progress, backend: Backend = "process") -> Run:
@@ -84,15 +91,17 @@ def run(scenario: Scenario, seed: int, out: Path, progress: Progress, backend: B
         counters=played.counters,
     )
     directory.write_record(record)
-    result = checker.check(checker.gather([directory.path]))
+    evidence = checker.gather([directory.path])
+    result, survived = checker.check(evidence), survival(evidence)
     wall_s = time.monotonic() - started
-    directory.write_record(_updated(record, **result.to_json(), wall_s=round(wall_s, 1)))
+    directory.write_record(_updated(record, **result.to_json(), survival=survived, wall_s=round(wall_s, 1)))
     try:
         page = report.write_report(directory.path)
     except RunDirectoryError as error:
         raise MachineError(f"{error}; run.json has the verdict") from None
     status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)
-    return Run(directory.path, played, result, status, wall_s, page)
+    late = lateness(evidence.traces.values()) if backend == "process" else None
+    return Run(directory.path, played, result, survived, status, wall_s, page, late)
 
 
 def _updated(record: RunRecord, **keys: Any) -> RunRecord:
@@ -110,12 +119,12 @@ def prepare(scenario: Scenario, seed: int, backend: Backend) -> Play:
         return lambda rundir, progress, interrupted: simulate_into(rundir, scenario, seed, progress, interrupted)
     refuse_what_needs_virtual_time(scenario)
     refuse_what_this_machine_cannot(scenario)
-    kind = choose_vehicles(scenario)
+    kinds = choose_vehicles(scenario)
     agent_command(scenario)
     # Another run is another mission: its blocks must not be taken for this one's.
     initial_data = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
     return lambda rundir, progress, interrupted: ProcessRun(
-        scenario, seed, kind, initial_data, rundir, progress, interrupted
+        scenario, seed, kinds, initial_data, rundir, progress, interrupted
     ).play()
 
 
@@ -127,22 +136,25 @@ async def _until_interrupted(play: Play, directory: RunDirectory, progress: Prog
     return await play(directory, progress, interrupted)
 
 
-def choose_vehicles(scenario: Scenario) -> Kind | None:
-    """ArduPilot if a binary is found, else the embedded vehicle, unless the scenario says. None: no vehicles.
+def choose_vehicles(scenario: Scenario) -> dict[VehicleType, Kind]:
+    """The kind of each type of vehicle in use; empty: no vehicles.
 
-    Raises VehicleFailedError for a binary that will not do, MachineError if ArduPilot is asked for and not here.
+    ArduPilot if the binaries of all types are found, else the embedded vehicle, unless the scenario says. Raises
+    VehicleFailedError for a binary that will not do, MachineError if ArduPilot is asked for and not here.
     """
-    asked: VehicleKind | None = scenario.vehicles.kind
-    if asked == "none":
-        return None
-    if asked == "embedded":
-        return Embedded()
+    vehicles = scenario.vehicles
+    if vehicles.kind == "none":
+        return {}
+    types = dict.fromkeys(vehicles.type_of(vehicle) for vehicle in scenario.roster)
+    embedded: dict[VehicleType, Kind] = {vehicle_type: Embedded(vehicle_type) for vehicle_type in types}
+    if vehicles.kind == "embedded":
+        return embedded
     try:
-        return ArduPilot.find(scenario.vehicles.binary, os.environ)
+        return {vehicle_type: ArduPilot.find(vehicles.binary, os.environ, vehicle_type) for vehicle_type in types}
     except NoBinaryError as error:
-        if asked == "ardupilot":
+        if vehicles.kind == "ardupilot":
             raise MachineError(str(error)) from None
-        return Embedded()
+        return embedded
     except UnusableBinaryError as error:
         raise VehicleFailedError(str(error)) from None
 
@@ -152,6 +164,6 @@ def versions() -> dict[str, str]:
     return {
         **{package: version(package) for package in PACKAGES},
         "python": platform.python_version(),
-        "kernel": platform.release(),
+        "kernel": f"{platform.release()} (User Mode Linux)" if uml.inside() else platform.release(),
         "platform": sys.platform,
     }

@@ -1,9 +1,11 @@
 """The run directory: all that a run leaves, and all that anything after the run needs.
 
 run.json            scenario as resolved, seed, versions, backend, engine, verdict
-agents/7.*          mission file, chain export, trace and log of agent 7
-vehicles/7/         the vehicle's own files, its output, telemetry.tlog
+agents/7.*          mission file, chain export, trace and log of agent 7; its store, if it keeps one
+agents/7-2/         those of its second life, if it was killed and began again; export and trace are above, too
+vehicles/7/         the vehicle's own files, its output, telemetry.tlog; of its second life in vehicles/7-2/
 network.jsonl       every change of conditions as the kernel applied it, and its counters at the end
+tracks.jsonl        where the vehicles were, in metres north, east and up from the middle of the field
 lab.log             what the lab itself had to say
 report.html  chains.svg
 """
@@ -15,11 +17,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from harness import traces
 from harness.checker.evidence import RUN_FILE
 from harness.errors import MachineError, RunDirectoryError
-from harness.exports import BEFORE_FINAL_RECONCILE, export_paths
+from harness.exports import BEFORE_FINAL_RECONCILE, SUFFIX, export_paths
 from harness.record import RunRecord
+from netem.radio import Place
 from ucp.files import write_json_atomically
+
+TRACKS_FILE = "tracks.jsonl"
 
 
 class RunDirectory:
@@ -32,15 +38,38 @@ class RunDirectory:
         self.lab_log = self.path / "lab.log"
         claim(path, self.agents, self.vehicles)
 
-    def vehicle(self, vehicle_id: int) -> Path:
-        path = self.vehicles / str(vehicle_id)
+    def vehicle(self, vehicle_id: int, life: int = 1) -> Path:
+        path = self.vehicles / (str(vehicle_id) if life == 1 else f"{vehicle_id}-{life}")
         path.mkdir(exist_ok=True)
         return path
 
-    def write_mission(self, agent_id: int, mission: Mapping[str, Any]) -> Path:
-        path = self.agents / f"{agent_id}.mission.json"
+    def agent(self, agent_id: int, life: int = 1) -> Path:
+        """The directory in which the agent works."""
+        path = self.agents if life == 1 else self.agents / f"{agent_id}-{life}"
+        path.mkdir(exist_ok=True)
+        return path
+
+    def write_mission(self, directory: Path, agent_id: int, mission: Mapping[str, Any]) -> Path:
+        path = directory / f"{agent_id}.mission.json"
         write_json_atomically(path, dict(mission))
         return path
+
+    def bring_export(self, agent_id: int, directory: Path) -> None:
+        """Copy the export of a later life, if there is one, to where the checker looks for it."""
+        export = directory / f"{agent_id}{SUFFIX}"
+        if directory != self.agents and export.exists():
+            shutil.copyfile(export, self.agents / export.name)
+
+    def bring_trace(self, agent_id: int, directory: Path) -> None:
+        """Append the trace of a later life to the agent's; half a last line, which it was killed over, goes."""
+        later = directory / f"{agent_id}{traces.SUFFIX}"
+        if not later.exists():
+            return
+        with (self.agents / later.name).open("a+b") as trace:
+            trace.seek(0)
+            trace.truncate(trace.read().rfind(b"\n") + 1)
+            with later.open("rb") as file:
+                shutil.copyfileobj(file, trace)
 
     def keep_exports_before_final_reconcile(self) -> None:
         """Copy the exports as they stand: how the mission left the chains, before anybody put them in order."""
@@ -50,7 +79,15 @@ class RunDirectory:
             shutil.copyfile(path, kept / path.name)
 
     def append_network(self, record: Mapping[str, Any]) -> None:
-        with (self.path / "network.jsonl").open("a", encoding="utf-8") as file:
+        self._append("network.jsonl", record)
+
+    def append_tracks(self, at_s: float, places: Mapping[int, Place]) -> None:
+        """`at_s` in mission seconds."""
+        tracks = {str(vehicle): place.to_json() for vehicle, place in places.items()}
+        self._append(TRACKS_FILE, {"at_s": round(at_s, 3), "places": tracks})
+
+    def _append(self, name: str, record: Mapping[str, Any]) -> None:
+        with (self.path / name).open("a", encoding="utf-8") as file:
             file.write(json.dumps(record, separators=(",", ":")) + "\n")
 
     def write_record(self, record: RunRecord) -> None:

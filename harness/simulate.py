@@ -5,7 +5,7 @@ Both are judged by the same checker. In memory the evidence comes straight from 
 
 import asyncio
 import dataclasses
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +22,7 @@ from harness.record import JudgedRecord
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.traces import Header, Trace
+from netem.radio import Place
 from ucp.export import export_chain
 from ucp.files import TraceFile, write_json_atomically
 from ucp.trace import HandlerRun, header_line
@@ -137,6 +138,9 @@ class InMemory:
     def changed(self, record: dict[str, Any]) -> None:
         """The run's record has it."""
 
+    def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
+        """Nobody asks where vehicles were."""
+
     def keep_chains(self, simulation: Simulation) -> None:
         self._kept = self._exports(simulation)
 
@@ -183,6 +187,9 @@ class OnDisk:
 
     def changed(self, record: dict[str, Any]) -> None:
         self._rundir.append_network(record)
+
+    def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
+        self._rundir.append_tracks(at_s, places)
 
     def keep_chains(self, simulation: Simulation) -> None:
         self.export(simulation)

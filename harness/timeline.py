@@ -4,15 +4,19 @@ A timeline is computed before the run from the scenario alone, so every backend 
 """
 
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from itertools import groupby, product
 from typing import Any
 
 from harness.scenario import Scenario
 from harness.scenario.network import NetworkModel
 from harness.scenario.schedule import UNTOUCHED, Layer
-from harness.scenario.timeline import FaultName, TimelineEntry
+from harness.scenario.timeline import Disk, FaultName, TimelineEntry
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
+
+RANGE = "range"
+"""What a change of the network is called that flight has made, not the scenario."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,10 @@ class NetworkChange:
     what: str
     detail: str
     conditions: NetworkConditions
+    clears_all: bool = False
+    """From here on distance does not matter either."""
+    losses: Mapping[str, float] = field(default_factory=dict)
+    """What the radio now loses between two vehicles ("1-2"), where that has changed."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         """The record of this change, made at `at_s`."""
@@ -31,24 +39,28 @@ class NetworkChange:
             "what": self.what,
             "detail": self.detail,
             "fully_connected": self.conditions.fully_connected,
+            **({"losses": dict(self.losses)} if self.losses else {}),
         }
 
 
 @dataclass(frozen=True)
 class AgentFault:
-    """At `at_s` mission seconds something happens to `agents`."""
+    """At `at_s` mission seconds something happens to `agents`. `disk` is what a reboot leaves of it."""
 
     at_s: float
     what: FaultName
     agents: tuple[int, ...]
+    disk: Disk | None = None
 
     @property
     def detail(self) -> str:
-        return f"agent{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
+        who = f"agent{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
+        return who if self.disk is None else f"{who}, disk {self.disk}"
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         """The record of this fault, made at `at_s`."""
-        return {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
+        record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
+        return record if self.disk is None else {**record, "disk": self.disk}
 
 
 Change = NetworkChange | AgentFault
@@ -57,7 +69,9 @@ Change = NetworkChange | AgentFault
 def timeline_of(scenario: Scenario) -> list[Change]:
     """All that the scenario changes, in order; the first is the network's first state, at 0 s."""
     faults: list[Change] = [
-        AgentFault(entry.at_s, *entry.fault) for entry in scenario.timeline_in_order() if entry.fault is not None
+        AgentFault(at_s, what, entry.fault[1], entry.disk)
+        for at_s, what, entry in scenario.faults_in_order()
+        if entry.fault is not None
     ]
     first, *states = _network_states(scenario)
     return [first, *sorted([*states, *faults], key=lambda change: change.at_s)]
@@ -128,7 +142,7 @@ def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[
 
 def final_reconcile(at_s: float) -> NetworkChange:
     """All conditions are cleared, so that everybody can hear everybody."""
-    return _change(at_s, "final reconcile", NetworkConditions())
+    return replace(_change(at_s, "final reconcile", NetworkConditions()), clears_all=True)
 
 
 def _change(at_s: float, what: str, conditions: NetworkConditions) -> NetworkChange:

@@ -1,4 +1,8 @@
-"""One agent under test as a process in its vehicle's namespace: started, asked, exported, stopped."""
+"""One agent under test as a process in its vehicle's namespace: started, asked, exported, stopped.
+
+An agent that is killed and begins again, or comes back from a brown-out, has another life: another process, with a
+directory of its own, so that nothing of an earlier life is overwritten, or found by an agent that should have nothing.
+"""
 
 import asyncio
 import base64
@@ -7,6 +11,8 @@ import os
 import shutil
 import signal
 import sys
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +23,7 @@ from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.seeds import agent_seed
+from harness.traces import SUFFIX, read_trace
 from netem.lab import Lab, LabProcess
 from sitl.vehicle import AGENT_PORT
 from ucp.mission import SCHEMA as MISSION_SCHEMA
@@ -45,46 +52,106 @@ class AgentFailedError(HarnessError):
 
     exit_status = VIOLATED
 
-    def __init__(self, agent_id: int, outcome: str, detail: str) -> None:
-        super().__init__(f"agent {agent_id} {detail}; its log is agents/{agent_id}.log")
+    def __init__(self, agent_id: int, outcome: str, detail: str, log: Path) -> None:
+        super().__init__(f"agent {agent_id} {detail}; its log is {log}")
         self.agent_id = agent_id
         self.outcome = outcome
 
 
+@dataclass
+class _Life:
+    """`store` is where it keeps what it holds, if the scenario asks for that; `status` is its last."""
+
+    directory: Path
+    store: Path
+    status: Status | None = None
+    killed: bool = False
+    """The data that it held is gone."""
+    reboot: bool = False
+    """It began with what was on disk."""
+
+
 class AgentProcess:
-    """`status` is the agent's last, None before the first; `outcome` is what became of it, for run.json."""
+    """`status` is the agent's last, None while it has none; `outcome` is what became of it, for run.json."""
 
     def __init__(self, agent_id: int, rundir: RunDirectory) -> None:
         self.agent_id = agent_id
-        self.status: Status | None = None
         self.outcome = "not started"
         self.detail: str | None = None
         self._rundir = rundir
-        self._control = AgentControl(rundir.agents / f"{agent_id}.control")
+        self._lives: list[_Life] = []
         self._process: LabProcess | None = None
+        self._being_asked = asyncio.Lock()
+        """Nobody stops or kills it while it is asked for its status."""
+        self._completed_before: list[str] = []
 
-    async def start(self, lab: Lab, scenario: Scenario, seed: int, initial_data: bytes, with_vehicle: bool) -> None:
-        """Start the process and wait until it answers. Raises AgentFailedError, AgentRefusedError."""
-        mission = _mission(self.agent_id, lab, scenario, seed, initial_data, with_vehicle)
-        path = self._rundir.write_mission(self.agent_id, mission)
-        output = self._rundir.agents / f"{self.agent_id}.log"
+    @property
+    def lives(self) -> int:
+        """How many it has had, this one included."""
+        return len(self._lives)
+
+    @property
+    def awake(self) -> bool:
+        """Whether it runs and answers."""
+        return self.outcome == "running"
+
+    @property
+    def status(self) -> Status | None:
+        return self._lives[-1].status if self.outcome in ("running", "paused") else None
+
+    # A life
+
+    async def start(
+        self,
+        lab: Lab,
+        scenario: Scenario,
+        seed: int,
+        initial_data: bytes,
+        with_vehicle: bool,
+        epoch_us: int | None = None,
+    ) -> None:
+        """Start the process and wait until it answers; with `epoch_us` it joins the mission that began then.
+
+        Raises AgentFailedError, AgentRefusedError.
+        """
+        life = self._begin_life()
+        mission = {
+            **_mission(self.agent_id, lab, scenario, with_vehicle),
+            "initial_data": base64.b64encode(initial_data).decode("ascii"),
+            "seed": agent_seed(seed, self.agent_id, len(self._lives)),
+            "epoch_us": epoch_us,
+            "store": os.path.relpath(life.store, life.directory) if _keeps_disk(self.agent_id, scenario) else None,
+        }
+        path = self._rundir.write_mission(life.directory, self.agent_id, mission)
+        output = self._log
+        self._control = AgentControl(self._control_path)
         self._process = await lab.spawn(
             self.agent_id,
             [*agent_command(scenario), path.name],
-            cwd=self._rundir.agents,
+            cwd=life.directory,
             env=dict(os.environ),
             stdout=output,
             stderr=output,
         )
+        await self._wait_until_it_answers(self._process)
         self.outcome = "running"
+
+    def _begin_life(self) -> _Life:
+        directory = self._rundir.agent(self.agent_id, len(self._lives) + 1)
+        kept = self.outcome == "rebooting"
+        store = self._lives[-1].store if kept else directory / f"{self.agent_id}.store"
+        self._lives.append(_Life(directory, store, reboot=kept))
+        return self._lives[-1]
+
+    async def _wait_until_it_answers(self, process: LabProcess) -> None:
         deadline = asyncio.get_running_loop().time() + START_LIMIT_S
         while True:
             try:
                 self._take(await self._control.ask("status", timeout_s=ANSWER_LIMIT_S))
                 return
             except AgentSilentError:
-                if self._process.returncode is not None:
-                    raise self._crashed(self._process.returncode) from None
+                if process.returncode is not None:
+                    raise self._crashed(process.returncode) from None
                 if asyncio.get_running_loop().time() > deadline:
                     raise self._failed("hung", f"did not answer within {START_LIMIT_S:g} s of its start") from None
                 await asyncio.sleep(ASK_AGAIN_S)
@@ -93,6 +160,36 @@ class AgentProcess:
         """Raises AgentFailedError when the process ends."""
         assert self._process is not None
         raise self._crashed(await self._process.wait())
+
+    async def kill(self, *, disk_kept: bool = False) -> None:
+        """SIGKILL, which no agent survives; what it held is gone but for its disk, if that is kept.
+
+        Stop watching it before. Raises AgentFailedError if it had failed by itself.
+        """
+        assert self._process is not None
+        async with self._being_asked:
+            if self.awake:
+                self._take(await self.ask("status"))  # its counters die with it
+            self._control.close()
+            self.outcome = "rebooting" if disk_kept else "killed"
+            self._lives[-1].killed = not disk_kept
+            await self._process.send_signal(signal.SIGKILL)
+            await self._process.wait()
+            self._control_path.unlink(missing_ok=True)
+
+    async def pause(self) -> None:
+        """SIGSTOP: it stands still, and what reaches it waits in its socket, as much as fits there."""
+        assert self._process is not None
+        async with self._being_asked:
+            await self._process.send_signal(signal.SIGSTOP)
+            self.outcome = "paused"
+
+    async def resume(self) -> None:
+        assert self._process is not None
+        await self._process.send_signal(signal.SIGCONT)
+        self.outcome = "running"
+
+    # What it is asked
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         """Raises AgentFailedError if the agent does not answer, AgentRefusedError if it cannot."""
@@ -105,18 +202,20 @@ class AgentProcess:
                 raise self._crashed(self._process.returncode) from None
             raise self._failed("hung", f"stopped answering: {error}") from None
 
-    async def poll(self) -> Status:
-        """Ask for the status. Raises AgentFailedError."""
-        return self._take(await self.ask("status"))
+    async def poll(self) -> Status | None:
+        """Ask for the status; None of an agent that is dead or paused. Raises AgentFailedError."""
+        async with self._being_asked:
+            return self._take(await self.ask("status")) if self.awake else None
 
-    def _take(self, status: dict[str, Any]) -> Status:
+    def _take(self, answer: dict[str, Any]) -> Status:
         try:
-            self.status = Status.model_validate(status)
+            status = Status.model_validate(answer)
         except ValidationError as error:
             wrong = ", ".join(dict.fromkeys(str(problem["loc"][0]) for problem in error.errors()))
             detail = f"does not follow the agent contract: in its status {wrong} is missing or wrong"
             raise self._failed("broken", detail) from None
-        return self.status
+        self._lives[-1].status = status
+        return status
 
     async def export(self) -> None:
         """Have the chain exported. Raises AgentFailedError, or MachineError if the agent could not write it."""
@@ -126,26 +225,68 @@ class AgentProcess:
         except AgentRefusedError as error:
             self.outcome, self.detail = "not exported", str(error)
             raise MachineError(f"{error}; what was written before is there") from None
+        self._rundir.bring_export(self.agent_id, self._lives[-1].directory)
 
     async def export_finally(self) -> None:
-        """The last export, of an agent that still runs. Raises as `export`."""
-        if self.outcome == "running":
+        """The last export, of an agent that is still alive. Raises as `export`."""
+        if self.outcome == "paused":
+            await self.resume()
+        if self.awake:
             await self.export()
             self.outcome = "exported"
 
+    # The end
+
     async def stop(self) -> None:
+        if self._process is None:
+            return
         self._control.close()
-        if self._process is not None and self._process.returncode is None:
+        if self._process.returncode is None:
             if self.outcome == "hung":
                 await self._process.send_signal(signal.SIGKILL)
                 await self._process.wait()
             else:
                 await self._process.terminate(STOP_GRACE_S)
 
+    def put_together(self) -> None:
+        """Put what all lives left where that of one life would be: for the checker. Raises OSError."""
+        for number, life in enumerate(self._lives, 1):
+            if life.killed:
+                trace = read_trace(life.directory / f"{self.agent_id}{SUFFIX}")
+                self._completed_before += trace.completed() if trace else []
+            if number > 1:
+                self._rundir.bring_trace(self.agent_id, life.directory)
+                self._rundir.bring_export(self.agent_id, life.directory)
+
     def to_json(self) -> dict[str, Any]:
-        told = {"idle", "bytes_sent", "dropped", "send_failures", "trace_problem"}
-        status = self.status.model_dump(include=told) if self.status else {}
-        return {"outcome": self.outcome, "detail": self.detail, **status}
+        lives = self._lives
+        record = {
+            "outcome": self.outcome,
+            "detail": self.detail,
+            "restarts": sum(not life.reboot for life in lives[1:]),
+            "reboots": sum(life.reboot for life in lives),
+            "completed_before": list(dict.fromkeys(self._completed_before)),
+        }
+        statuses = [life.status for life in lives if life.status is not None]
+        if not statuses:
+            return record
+        last_words_of = lives[-1].status if self.outcome not in ("killed", "rebooting") else None
+        failures = [status.send_failures for status in statuses if status.send_failures is not None]
+        return record | {
+            "idle": last_words_of.idle if last_words_of else None,
+            "bytes_sent": sum(status.bytes_sent for status in statuses),
+            "dropped": dict(sum((Counter(status.dropped) for status in statuses), Counter())),
+            "send_failures": sum(failures) if failures else None,
+            "trace_problem": next((status.trace_problem for status in statuses if status.trace_problem), None),
+        }
+
+    @property
+    def _control_path(self) -> Path:
+        return self._lives[-1].directory / f"{self.agent_id}.control"
+
+    @property
+    def _log(self) -> Path:
+        return self._lives[-1].directory / f"{self.agent_id}.log"
 
     def _crashed(self, returncode: int) -> AgentFailedError:
         how = signal.Signals(-returncode).name if returncode < 0 else f"status {returncode}"
@@ -153,29 +294,31 @@ class AgentProcess:
 
     def _failed(self, outcome: str, detail: str) -> AgentFailedError:
         self.outcome, self.detail = outcome, detail
-        return AgentFailedError(self.agent_id, outcome, detail)
+        return AgentFailedError(self.agent_id, outcome, detail, self._log.relative_to(self._rundir.path))
 
 
-def _mission(
-    agent_id: int, lab: Lab, scenario: Scenario, seed: int, initial_data: bytes, with_vehicle: bool
-) -> dict[str, Any]:
+def _keeps_disk(agent_id: int, scenario: Scenario) -> bool:
+    """Whether what is on its disk is ever asked for."""
+    return any(entry.disk == "kept" and agent_id in (entry.reboot or ()) for entry in scenario.timeline)
+
+
+def _mission(agent_id: int, lab: Lab, scenario: Scenario, with_vehicle: bool) -> dict[str, Any]:
+    """The part of its mission file that does not change from life to life."""
     events = scenario.events
     return {
         "schema": MISSION_SCHEMA,
         "agent_id": agent_id,
         "roster": list(scenario.roster),
-        "initial_data": base64.b64encode(initial_data).decode("ascii"),
         "network": {"address": lab.addresses[agent_id], "broadcast": lab.broadcast, "port": PORT},
         "events": {
             "source": events.source if with_vehicle else "random",
             "mean_s": events.mean_s,
             "position_interval_s": events.position_interval_s,
+            "log": list(events.log),
             "vehicle_host": "127.0.0.1",
             "vehicle_port": AGENT_PORT,
         },
         "settings": dataclasses.asdict(scenario.settings),
         "quirks": dataclasses.asdict(scenario.quirks),
-        "seed": agent_seed(seed, agent_id),
         "speedup": scenario.speedup,
-        "epoch_us": None,
     }

@@ -7,39 +7,42 @@ stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and s
 import asyncio
 import tempfile
 import time
-from collections.abc import Coroutine
+from collections import defaultdict
+from collections.abc import Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
 from harness import mission
+from harness.agents import Status
 from harness.backends.agent_process import AgentFailedError, AgentProcess
-from harness.backends.vehicle_process import VehicleProcess
+from harness.backends.vehicle_process import VehicleProcess, system_ids
 from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
 from harness.mission import Played
 from harness.progress import Progress, Snapshot
+from harness.reach import TRACK_S, Reach
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
-from harness.timeline import Change, NetworkChange, describe, timeline_of
+from harness.timeline import AgentFault, Change, NetworkChange, describe, timeline_of
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError, EngineError, LabUnavailable, NetemError
 from netem.lab import Lab
 from netem.tc import may_refuse
-from sitl.vehicle import Home, VehicleKind, home_in_field
+from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
 from ucp.clock import MICROSECONDS, MissionClock
 
 POLL_S = 0.25
 QUIET_POLL_S = 0.1
 START_DELAY_S = 0.05
+FOLLOW_S = 0.1
+"""Wall time between two looks at where the vehicles are, at least."""
 
 
 def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
     """Raises ScenarioError naming the keys that real processes cannot be given yet."""
-    faults = dict.fromkeys(entry.fault[0] for entry in scenario.timeline if entry.fault)
     keys = [
         *(["fates"] if scenario.fates else []),
         *(["clocks"] if scenario.clocks else []),
         *(["events.source: scripted"] if scenario.events.source == "scripted" else []),
-        *(f"timeline: {fault}" for fault in faults),
     ]
     if keys:
         named = ", ".join(f"`{key}`" for key in keys)
@@ -98,13 +101,13 @@ def refuse_what_this_machine_cannot(scenario: Scenario) -> None:
 
 
 class ProcessRun:
-    """One run; `play` it once. `kind` None: no vehicles. `interrupted` ends the mission early."""
+    """One run; `play` it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early."""
 
     def __init__(
         self,
         scenario: Scenario,
         seed: int,
-        kind: VehicleKind | None,
+        kinds: Mapping[VehicleType, VehicleKind],
         initial_data: bytes,
         rundir: RunDirectory,
         progress: Progress,
@@ -117,17 +120,24 @@ class ProcessRun:
         self.progress = progress
         self.interrupted = interrupted
         self.played = Played()
+        self._kinds = kinds
+        self._system_ids = system_ids(scenario.roster)
         self.agents = [AgentProcess(agent_id, rundir) for agent_id in scenario.roster]
-        self.vehicles = [
-            VehicleProcess(vehicle_id, index, kind, rundir)
-            for index, vehicle_id in enumerate(scenario.roster)
-            if kind is not None
-        ]
+        self.vehicles = [self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds]
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
+        self._reach = Reach(scenario)
+        self._changing_network = asyncio.Lock()
         self._group = asyncio.TaskGroup()
-        self._watchers: list[asyncio.Task[None]] = []
+        self._watchers: dict[str, list[asyncio.Task[None]]] = defaultdict(list)
+        """Of what -> the tasks that watch it, or fly it."""
+        self._starting: dict[int, asyncio.Task[None]] = {}
+        """Agents that begin again and do not answer yet."""
+
+    def _vehicle(self, vehicle_id: int, life: int = 1) -> VehicleProcess:
+        kind = self._kinds[self.scenario.vehicles.type_of(vehicle_id)]
+        return VehicleProcess(vehicle_id, self._system_ids[vehicle_id], kind, self.rundir, life)
 
     async def play(self) -> Played:
         """Raises MachineError if this machine cannot build the lab; all else that goes wrong is in the answer."""
@@ -157,14 +167,21 @@ class ProcessRun:
             async with asyncio.TaskGroup() as self._group:
                 self._watch(self._watch_for_interruption())
                 await story
-                for watcher in self._watchers:
-                    watcher.cancel()
+                for what in list(self._watchers):
+                    self._watch_no_more(what)
         except BaseExceptionGroup as errors:
             raise _first(errors) from None
 
-    def _watch(self, coroutine: Coroutine[Any, Any, None]) -> None:
-        """Run something beside the mission: what it raises ends the mission, and it ends with the mission."""
-        self._watchers.append(self._group.create_task(coroutine))
+    def _watch(self, coroutine: Coroutine[Any, Any, None], of: str = "mission") -> None:
+        """Run something beside the mission: what it raises ends the mission, and it ends with the mission.
+
+        Or before, by `_watch_no_more(of)`.
+        """
+        self._watchers[of].append(self._group.create_task(coroutine))
+
+    def _watch_no_more(self, of: str) -> None:
+        for watcher in self._watchers.pop(of, ()):
+            watcher.cancel()
 
     async def _watch_for_interruption(self) -> None:
         await self.interrupted.wait()
@@ -184,31 +201,44 @@ class ProcessRun:
         await self.apply(first)
         await self._start_clock()
         self._watch(self._poll_agents())
+        if self.vehicles:
+            self._watch(self._follow_flight())
         for vehicle in self.vehicles:
-            self._watch(vehicle.take_off(self.scenario.vehicles.takeoff_altitude_m))
+            self._fly(vehicle)
+
+    def _fly(self, vehicle: VehicleProcess) -> None:
+        flight = self.scenario.flight_of(vehicle.vehicle_id)
+        flown = (
+            vehicle.take_off(self.scenario.vehicles.takeoff_altitude_m)
+            if flight is None
+            else vehicle.fly(flight.planned(), flight.by)
+        )
+        self._watch(flown, of=f"flight {vehicle.vehicle_id}")
+
+    def _home(self, number: int) -> Home:
+        vehicles = self.scenario.vehicles
+        return home_in_field(number, Home(*vehicles.home), vehicles.spacing_m)
 
     async def _start_vehicles(self, lab: Lab) -> None:
         if not self.vehicles:
             return
         self._show("starting vehicles")
-        field_home = Home(*self.scenario.vehicles.home)
+        speedup = self.scenario.speedup
         await asyncio.gather(
-            *(
-                vehicle.start(lab, home_in_field(index, field_home), self.scenario.speedup)
-                for index, vehicle in enumerate(self.vehicles)
-            )
+            *(vehicle.start(lab, self._home(number), speedup) for number, vehicle in enumerate(self.vehicles))
         )
         for vehicle in self.vehicles:
-            self._watch(vehicle.watch())
+            self._watch(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
 
     async def _start_agents(self, lab: Lab) -> None:
         self._show("starting agents")
+        await asyncio.gather(*(self._start_agent(agent, lab) for agent in self.agents))
+
+    async def _start_agent(self, agent: AgentProcess, lab: Lab) -> None:
+        """Start it, into the mission if that is under way."""
         with_vehicle = bool(self.vehicles)
-        await asyncio.gather(
-            *(agent.start(lab, self.scenario, self.seed, self.initial_data, with_vehicle) for agent in self.agents)
-        )
-        for agent in self.agents:
-            self._watch(agent.watch())
+        await agent.start(lab, self.scenario, self.seed, self.initial_data, with_vehicle, self.clock.epoch_us)
+        self._watch(agent.watch(), of=f"agent {agent.agent_id}")
 
     async def _start_clock(self) -> None:
         epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
@@ -216,44 +246,123 @@ class ProcessRun:
         self.clock.start(epoch_us)
 
     async def apply(self, change: Change) -> None:
-        assert isinstance(change, NetworkChange), "others are refused"
-        applied = await self._lab.apply(change.conditions.at_speed(self.scenario.speedup))
+        if isinstance(change, NetworkChange):
+            await self._put_into_force(self._reach.ask(change), asked=change.conditions)
+            return
+        await asyncio.gather(*(self._fault(change, agent_id) for agent_id in change.agents))
+        record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
+        self.played.record(record)
+        self.rundir.append_network(record)
+
+    async def _fault(self, fault: AgentFault, agent_id: int) -> None:
+        """What the timeline does to an agent, and to its vehicle if it has one."""
+        if agent_id in self._starting:
+            await self._starting.pop(agent_id)
+        number = self.scenario.roster.index(agent_id)
+        agent = self.agents[number]
+        vehicle = self.vehicles[number] if self.vehicles else None
+        match fault.what:
+            case "pause":
+                await agent.pause()
+            case "resume":
+                await agent.resume()
+            case "reboot":
+                await self._kill(agent, disk_kept=fault.disk == "kept")
+            case "kill":
+                await asyncio.gather(self._kill(agent), *([self._shoot_down(vehicle)] if vehicle else []))
+            case "crash":
+                assert vehicle is not None, "without vehicles a crash is refused"
+                self._watch(vehicle.fall(), of=f"flight {agent_id}")
+                await self._kill(agent)
+            case "boot":
+                self._starting[agent_id] = self._group.create_task(self._start_agent(agent, self._lab))
+            case "restart":
+                self._starting[agent_id] = self._group.create_task(self._start_again(agent, number))
+
+    async def _kill(self, agent: AgentProcess, *, disk_kept: bool = False) -> None:
+        self._watch_no_more(f"agent {agent.agent_id}")
+        await agent.kill(disk_kept=disk_kept)
+
+    async def _shoot_down(self, vehicle: VehicleProcess) -> None:
+        self._watch_no_more(f"flight {vehicle.vehicle_id}")
+        self._watch_no_more(f"vehicle {vehicle.vehicle_id}")
+        await vehicle.kill()
+
+    async def _start_again(self, agent: AgentProcess, number: int) -> None:
+        """A new agent, on a new vehicle in the place of the one that was lost."""
+        if self._kinds:
+            await self._shoot_down(self.vehicles[number])  # a wreck still holds its ports
+            life = agent.lives + 1
+            vehicle = self._vehicle(agent.agent_id, life)
+            self.vehicles[number] = vehicle
+            await vehicle.start(self._lab, self._home(number), self.scenario.speedup)
+            self._watch(vehicle.watch(), of=f"vehicle {agent.agent_id}")
+            self._fly(vehicle)
+        await self._start_agent(agent, self._lab)
+
+    async def _put_into_force(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
+        """`asked` by the timeline, not by flight, of which it is on record what changed."""
+        async with self._changing_network:  # in the order in which they were asked for
+            applied = await self._lab.apply(change.conditions.at_speed(self.scenario.speedup))
         self.network = change.detail
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
         self.played.record(record)
-        self.rundir.append_network({**record, "asked": change.conditions.to_json(), "applied": applied.to_json()})
+        if asked is not None:
+            record |= {"asked": asked.to_json(), "applied": applied.to_json()}
+        self.rundir.append_network(record)
+
+    async def _follow_flight(self) -> None:
+        """Write down where the vehicles are, and have the network follow them."""
+        field, radio = Home(*self.scenario.vehicles.home), self.scenario.network.radio
+        every_s = max(FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
+        while True:
+            places = {vehicle.vehicle_id: vehicle.place(field) for vehicle in self.vehicles}
+            self.rundir.append_tracks(self.clock.now(), places)
+            if change := self._reach.move(self.clock.now(), places):
+                await self._put_into_force(change)
+            await asyncio.sleep(every_s)
 
     async def until(self, mission_s: float) -> None:
-        await asyncio.sleep(max(0.0, self.clock.wall_s(mission_s - self.clock.now())))
+        while (left_s := mission_s - self.clock.now()) > 0:  # a clock that is about to start stands at 0
+            await asyncio.sleep(self.clock.wall_s(left_s))
 
     async def stop_events(self) -> None:
-        await asyncio.gather(*(agent.ask("stop_events") for agent in self.agents))
+        await asyncio.gather(*self._starting.values())
+        await asyncio.gather(*(agent.ask("stop_events") for agent in self._awake()))
 
     async def until_idle(self, limit_s: float) -> bool:
         deadline_s = self.clock.now() + limit_s
         handled: list[int] | None = None
         while self.clock.now() < deadline_s:
-            statuses = await asyncio.gather(*(agent.poll() for agent in self.agents))
+            statuses = (await self._statuses()).values()
             before, handled = handled, [status.handled for status in statuses]
             if all(status.idle for status in statuses) and handled == before:
-                return True
+                return not any(agent.outcome == "paused" for agent in self.agents)
             await asyncio.sleep(QUIET_POLL_S)
         return False
 
     async def keep_chains(self) -> None:
-        await asyncio.gather(*(agent.export() for agent in self.agents))
+        await asyncio.gather(*(agent.export() for agent in self._awake()))
         self.rundir.keep_exports_before_final_reconcile()
 
     async def reconcile(self, agent_id: int) -> None:
         await next(agent for agent in self.agents if agent.agent_id == agent_id).ask("reconcile")
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        statuses = await asyncio.gather(*(agent.poll() for agent in self.agents))
-        return {agent.agent_id: status.top_chain_hash for agent, status in zip(self.agents, statuses, strict=True)}
+        return {agent_id: status.top_chain_hash for agent_id, status in (await self._statuses()).items()}
+
+    def _awake(self) -> list[AgentProcess]:
+        """The agents that are neither dead nor paused."""
+        return [agent for agent in self.agents if agent.awake]
+
+    async def _statuses(self) -> dict[int, Status]:
+        """The status of each agent that is neither dead nor paused."""
+        polled = await asyncio.gather(*(agent.poll() for agent in self.agents))
+        return {agent.agent_id: status for agent, status in zip(self.agents, polled, strict=True) if status}
 
     async def _poll_agents(self) -> None:
         while True:
-            await asyncio.gather(*(agent.poll() for agent in self.agents))
+            await self._statuses()
             self._show(self.stage)
             await asyncio.sleep(POLL_S)
 
@@ -277,6 +386,8 @@ class ProcessRun:
             self.played.counters = (await lab.read()).to_json()
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
             await asyncio.gather(*(agent.stop() for agent in self.agents), *(one.stop() for one in self.vehicles))
+            for agent in self.agents:
+                agent.put_together()
         except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed
             self._ended_early(MachineError(str(error)))
         except OSError as error:

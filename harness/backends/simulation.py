@@ -2,33 +2,35 @@
 
 Nothing here waits, and nothing depends on the machine: the same scenario and seed give the same run, to the last bit.
 Each agent's events, the lots of each sender, and each agent's quirks have random streams of their own, so that adding
-one fault leaves the others as they are. No vehicles fly; without vehicles, events are those of Algorithm 21.
+one fault leaves the others as they are. Vehicles are tracks, without telemetry, so events are those of Algorithm 21.
 """
 
 import dataclasses
 import gc
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from random import Random
 from typing import Any, Protocol
 
 from harness.backends.fate_script import FateScript, NameOf
-from harness.backends.virtual_air import Flight, Happening, Logged, VirtualAir
+from harness.backends.virtual_air import NEVER, Flight, Happening, Logged, VirtualAir
 from harness.errors import ScenarioError
 from harness.mission import Played
+from harness.reach import TRACK_S, Reach, tracks_of
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from harness.scenario.scenario import Clock
-from harness.scenario.timeline import FaultName
 from harness.seeds import agent_seed
-from harness.timeline import Change, NetworkChange, disconnected_until, timeline_of
+from harness.timeline import AgentFault, Change, NetworkChange, disconnected_until
 from netem.medium import Medium
+from netem.radio import Place
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
 from ucp.messages import datagram_bytes
+from ucp.store import Holdings
 from ucp.trace import HandlerRun
 
 ENGINE = "virtual time"
@@ -40,13 +42,10 @@ BREATH_S = 20.0
 
 def refuse_what_needs_processes(scenario: Scenario) -> None:
     """Raises ScenarioError naming the keys that virtual time cannot give."""
-    states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
-    needs = dict.fromkeys(need for state in states for need in state.needs())
     asked = {
         "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
         "vehicles.binary": scenario.vehicles.binary is not None,
         "agent_command": scenario.agent_command is not None,
-        **{f"network: {need}": need.split()[-1] in ("rate", "limit") for need in needs},  # a queue, which it has not
     }
     keys = [f"`{key}`" for key, needed in asked.items() if needed]
     if keys:
@@ -71,19 +70,24 @@ class Recorder(Protocol):
     def changed(self, record: dict[str, Any]) -> None:
         """A change of the network, or a fault of agents, was made."""
 
+    def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
+        """Here are the vehicles now, if any fly."""
+
     def keep_chains(self, simulation: "Simulation") -> None:
         """A final reconcile is about to put the chains in order."""
 
 
 @dataclass(slots=True)
 class Life:
-    """An agent from its start or restart on."""
+    """An agent from its start, restart or reboot on."""
 
     agent: Agent
     source: RandomEvents
     clock: Clock | None
     """None shows mission time."""
     born_at: float
+    found: Holdings | None = None
+    """What was on its disk, if it came back from a brown-out with it."""
     deadline: float | None = None
     """When its next timer ends, in mission seconds."""
     waiting: list[Happening] | None = None
@@ -126,6 +130,12 @@ class Simulation:
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
         self._lives: list[list[Life]] = [[] for _ in self.roster]
         self._alive: list[Life | None] = [None for _ in self.roster]
+        self._disks: dict[int, Holdings] = {}
+        """What is on the disk of the agents that reboot with it."""
+        self._reach = Reach(scenario)
+        self._tracks = tracks_of(scenario)
+        self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
+        self._moves_at = NEVER
         self._medium = Medium(self.roster, seed)
         self._block_names: dict[bytes, str] = {}
         self._script = fate_script(scenario.fates, self.roster, self._block_name)
@@ -141,30 +151,49 @@ class Simulation:
 
     async def begin(self, first: Change) -> None:
         await self.apply(first)
+        self._move()
         for number in range(len(self.roster)):
             self._start(number)
         for event in self.scenario.events.script:
             self._air.expect(event.at_s, self._number[event.agent], (ANY_LIFE, SCRIPTED_EVENT_ID, bytes(event.bytes)))
 
     async def until(self, mission_s: float) -> None:
-        if self._breathe is None:
+        if self._breathe is None and not self._tracks:
             self._run(mission_s)
             return
         while self._now < mission_s:
-            self._run(min(mission_s, self._now + BREATH_S))
-            await self._breathe(self)
+            self._run(min(mission_s, self._now + BREATH_S, self._moves_at))
+            if self._now == self._moves_at:
+                self._move()
+            if self._breathe is not None:
+                await self._breathe(self)
 
     async def apply(self, change: Change) -> None:
+        if isinstance(change, NetworkChange):
+            self._put_into_force(self._reach.ask(change), asked=change.conditions.to_json())
+            return
         record = change.to_json(round(self._now, 3))
         self.played.record(record)
-        if isinstance(change, NetworkChange):
-            self._medium.apply(change.conditions)
-            self.network = change.detail
-            record = {**record, "asked": change.conditions.to_json()}
-        else:
-            for agent_id in change.agents:
-                self._fault(change.what, self._number[agent_id])
+        for agent_id in change.agents:
+            self._fault(change, self._number[agent_id])
         self._recorder.changed(record)
+
+    def _put_into_force(self, change: NetworkChange, **more: Any) -> None:
+        self._medium.apply(change.conditions)
+        self.network = change.detail
+        record = change.to_json(round(self._now, 3))
+        self.played.record(record)
+        self._recorder.changed({**record, **more})
+
+    def _move(self) -> None:
+        """The vehicles are somewhere else by now."""
+        if not self._tracks:
+            return
+        places = {vehicle: Place(*track.in_field(self._now)) for vehicle, track in self._tracks.items()}
+        self._recorder.moved(self._now, places)
+        if change := self._reach.move(self._now, places):
+            self._put_into_force(change)
+        self._moves_at = self._now + self._move_every_s
 
     async def stop_events(self) -> None:
         self._generating = False
@@ -185,7 +214,7 @@ class Simulation:
     async def reconcile(self, agent_id: int) -> None:
         number = self._number[agent_id]
         life = self._alive[number]
-        if life is not None:
+        if life is not None and life.waiting is None:
             self._hear(number, life)
             life.agent.begin_reconcile(self._local(life))
             self._after(number, life)
@@ -216,10 +245,15 @@ class Simulation:
     def _agent_to_json(self, number: int) -> dict[str, Any]:
         lives = self._lives[number]
         life = self._alive[number]
+        completed = dict.fromkeys(block.hex() for one in lives for block in one.agent.completed)
+        for block in life.agent.completed if life else ():
+            del completed[block.hex()]
+        reboots = sum(one.found is not None for one in lives)
         return {
-            "outcome": "killed" if life is None else "exported",
-            "restarts": len(lives) - 1,
-            "completed_before": [block.hex() for one in lives if one is not life for block in one.agent.completed],
+            "outcome": "exported" if life else "rebooting" if number in self._disks else "killed",
+            "restarts": len(lives) - 1 - reboots,
+            "reboots": reboots,
+            "completed_before": list(completed),
             "idle": life.agent.idle if life else None,
             "bytes_sent": sum(life.bytes_sent for life in lives),
             "messages_sent": sum(life.agent.sent.total() for life in lives),
@@ -231,7 +265,7 @@ class Simulation:
         """`<agent>.<ordinal>` of a block that an agent has completed."""
         if block_hash not in self._block_names:
             for agent_id, lives in zip(self.roster, self._lives, strict=True):
-                completed = [block for life in lives for block in life.agent.completed]
+                completed = dict.fromkeys(block for life in lives for block in life.agent.completed)
                 self._block_names.update((block, f"{agent_id}.{count}") for count, block in enumerate(completed, 1))
         return self._block_names.get(block_hash)
 
@@ -315,8 +349,9 @@ class Simulation:
     def _say(self, number: int, life: Life) -> None:
         """Send what the agent has to say."""
         for sequence, message in life.agent.messages_to_send():
-            life.bytes_sent += datagram_bytes(message)
-            self._air.broadcast(self._now, number, sequence, message)
+            data_bytes = datagram_bytes(message)
+            life.bytes_sent += data_bytes
+            self._air.broadcast(self._now, number, sequence, message, data_bytes)
 
     def _take_down(self, agent: Agent, mission_s: float) -> None:
         runs = agent.trace()
@@ -326,7 +361,7 @@ class Simulation:
 
     # An agent's life
 
-    def _start(self, number: int) -> None:
+    def _start(self, number: int, found: Holdings | None = None) -> None:
         agent_id = self.roster[number]
         scenario = self.scenario
         seed = agent_seed(self.seed, agent_id, len(self._lives[number]) + 1)
@@ -340,11 +375,14 @@ class Simulation:
         )
         agent.quirks = dataclasses.replace(scenario.quirks)
         source = RandomEvents(Random(seed), scenario.events.mean_s)
-        life = Life(agent, source, scenario.clocks.get(agent_id), self._now)
+        life = Life(agent, source, scenario.clocks.get(agent_id), self._now, found)
         self._lives[number].append(life)
         self._alive[number] = life
         self._air.born_at[number] = self._now
         self._recorder.begin(life)
+        if found is not None:
+            agent.boot(found, self._local(life))
+            self._after(number, life)
         self._expect_event(number, life)
 
     def _expect_event(self, number: int, life: Life) -> None:
@@ -353,16 +391,18 @@ class Simulation:
             this_life = len(self._lives[number])
             self._air.expect(max(self._now, life.born_at + due), number, (this_life, event_id, data))
 
-    def _fault(self, what: FaultName, number: int) -> None:
+    def _fault(self, fault: AgentFault, number: int) -> None:
         life = self._alive[number]
-        match what:
-            case "kill":
+        match fault.what:
+            case "kill" | "crash" | "reboot":
                 if life is not None:
                     self._hear(number, life)
+                    if fault.disk == "kept":
+                        self._disks[number] = Holdings.of(life.agent)
                 self._alive[number] = None
                 self._air.is_gone(number)
-            case "restart":
-                self._start(number)
+            case "restart" | "boot":
+                self._start(number, self._disks.pop(number, None))
             case "pause" if life is not None:
                 self._hear(number, life)
                 life.waiting = []

@@ -127,10 +127,10 @@ class VirtualAir:
         self._rank += 1
         heappush(self._coming, (at, self._rank, number, what))
 
-    def broadcast(self, now: float, number: int, sequence: int, message: Message) -> None:
-        """The agent with this number sends `message`."""
+    def broadcast(self, now: float, number: int, sequence: int, message: Message, data_bytes: int) -> None:
+        """The agent with this number sends `message`, in a datagram with so many bytes of data."""
         self._rank += 1
-        lots = self._medium.draw(number)
+        lots = self._medium.draw(number, now, data_bytes)
         kind = type(message)
         flight = Flight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots)
         if kind in ASKED and not self._deliver_all:

@@ -1,6 +1,7 @@
 """The checker: decides from exports, and more from traces, whether the six characteristics hold (Section 4.3).
 
-One file per characteristic, each a function from `Evidence` to `Characteristic`; `verdict.py` gathers them.
+One file per characteristic, each a function from `Evidence` to `Characteristic`; `verdict.py` gathers them. Beside
+them, `survival.py` says what the loss of vehicles took and could take.
 """
 
 from harness.checker.evidence import Evidence, gather

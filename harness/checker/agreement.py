@@ -48,10 +48,11 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
     last_change = {agent_id: trace.chain_changed_at() for agent_id, trace in evidence.traces.items()}
     for agent_id in differing & set(evidence.traces):
         others = max((t for other, t in last_change.items() if other != agent_id), default=0.0)
-        began = False
-        for run in evidence.traces[agent_id].runs:
-            if run.handler == "reconcile_begin" and run.branch == "begun":
-                began = run.t >= max(since, others)
-            elif began and run.handler == "reconcile_finalize" and not run.state.reconciling:
-                had.add(agent_id)
+        for life in evidence.traces[agent_id].lives():
+            began = False
+            for _, run in life:
+                if run.handler == "reconcile_begin" and run.branch == "begun":
+                    began = run.t >= max(since, others)
+                elif began and run.handler == "reconcile_finalize" and not run.state.reconciling:
+                    had.add(agent_id)
     return had

@@ -90,6 +90,9 @@ def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, set[tuple[int
         case {"operator": _}:
             if run.handler != "reconcile_begin":
                 return "was triggered by the operator, who can only begin a reconcile"
+        case {"boot": _}:
+            if run.handler != "reconcile_finalize" or len(ran) > 1:
+                return "was triggered by a boot, which only ends a reconcile, and before anything else"
         case _:
             return "has no trigger"
     return None

@@ -9,19 +9,24 @@ from typing import Any
 
 from harness.explore.tape import Logged, Lost
 from harness.scenario import Scenario
+from harness.scenario.timeline import FAULTS
 
 Document = dict[str, Any]
 
-UNPLAYED = ("about", "speedup", "vehicles")
+UNPLAYED = ("about", "speedup")
 """Keys that change nothing in virtual time."""
+FLIGHT = ("vehicles", "flight", "network.radio")
+"""Keys that say which messages are lost to distance, and nothing else in virtual time."""
 NEVER_IN_BURSTS = {"p": 0.0, "r": 1.0}
 """Loss in bursts that never come: nothing is lost, and lots are drawn as with bursts that do."""
-FAULTS = ("kill", "restart", "pause", "resume")
 
 
 def document_of(scenario: Scenario) -> Document:
     document = scenario.model_dump(mode="json", exclude_defaults=True)
-    return {key: value for key, value in document.items() if key not in UNPLAYED} | {"agents": list(scenario.roster)}
+    document = {key: value for key, value in document.items() if key not in UNPLAYED}
+    if scenario.network.radio is None:
+        document = _without_flight(document)
+    return {**document, "agents": list(scenario.roster)}
 
 
 def with_key(document: Document, key: str, value: Any) -> Document:
@@ -44,6 +49,7 @@ def at(document: Document, key: str) -> Any:
 def scripted(document: Document, logged: list[Logged], drops: list[Document]) -> Document:
     """With these events and no others, and nothing lost but by these drops."""
     script = [event_of(event) for event in logged]
+    document = _without_flight(document)
     network = _without_loss(document.get("network", {}))
     entries = [{**entry, **_silent(entry)} for entry in document.get("timeline", [])]
     document = with_key(with_key(document, "network", network), "timeline", [one for one in entries if len(one) > 1])
@@ -79,6 +85,12 @@ def fate_by_time(lost: Lost, slack_s: float) -> Document:
     return {"message": lost.message, "sender": lost.sender, "receiver": lost.receiver, **window, "drop": True}
 
 
+def _without_flight(document: Document) -> Document:
+    for key in FLIGHT:
+        document = with_key(document, key, None)
+    return document
+
+
 def _without_loss(network: Document) -> Document:
     silent = {**network, **_silent(network)}
     if "receivers" in network:
@@ -111,7 +123,9 @@ def with_agents(document: Document, kept: Collection[int]) -> Document:
     document = with_key(document, "fates", [one for one in document.get("fates", []) if _named_in(one) <= {*kept}])
     document = with_key(document, "timeline", [*filter(None, (_entry(one, kept) for one in timeline(document)))])
     document = with_key(document, "schedule", [_schedule(one, kept) for one in document.get("schedule", [])])
-    for key in ("clocks", "network.receivers"):
+    flights = [_of(flight, ("vehicles",), kept) for flight in document.get("flight", [])]
+    document = with_key(document, "flight", [flight for flight in flights if flight["vehicles"]])
+    for key in ("clocks", "network.receivers", "vehicles.types"):
         named = at(document, key) or {}
         document = with_key(document, key, {name: value for name, value in named.items() if int(name) in kept})
     links = [_of(link, ("from", "to"), kept) for link in at(document, "network.links") or []]

@@ -1,7 +1,8 @@
 """What happened in a run by chance, taken down: the events that agents logged, and the messages that were lost.
 
 A scenario that scripts them plays the very same run again: a sender's lots for latency are drawn for every broadcast,
-and in their own stream, whatever becomes of it.
+and in their own stream, whatever becomes of it. Not so where messages also come twice: netem draws for the second copy
+too, and a fate loses all copies of a message or none. What does not replay is not offered (`explore.shrink`).
 """
 
 from collections import Counter

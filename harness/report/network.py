@@ -69,7 +69,7 @@ def faults(result: dict[str, Any]) -> list[tuple[str, str, str]]:
         rest = {
             key: value
             for key, value in known.items()
-            if key not in ("at_s", "what", "detail", "agents") and value is not None
+            if key not in ("at_s", "what", "detail", "agents", "disk") and value is not None
         }
         details = [words.value(known["detail"])] if known.get("detail") else []
         details += [f"{words.label(key)}: {words.value(value)}" for key, value in rest.items()]

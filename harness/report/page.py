@@ -16,10 +16,11 @@ from markupsafe import Markup
 
 from harness.errors import RunDirectoryError
 from harness.exports import BEFORE_FINAL_RECONCILE, Export, Exports, export_paths, read_exports
-from harness.report import network, swarm, verdicts, words
+from harness.report import map_section, network, survival, swarm, verdicts, words
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.colours import Ink
+from harness.report.map_svg import STYLE as MAP_STYLE
 from harness.report.result import mapping, number, read_result
 from ucp.files import write_atomically
 
@@ -63,7 +64,7 @@ def _page(result: dict[str, Any], exports: Exports, ink: Mapping[int, Ink], run_
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(value=words.value)
-    style = TREE_STYLE + _PAGE_STYLE
+    style = TREE_STYLE + MAP_STYLE + _PAGE_STYLE
     judged, outcome = verdicts.verdicts(result), _outcome(result)
     return environment.get_template("page.html.j2").render(
         style=Markup(style),  # noqa: S704 - ours, and escaped it would not be what the digest is of
@@ -80,11 +81,13 @@ def _page(result: dict[str, Any], exports: Exports, ink: Mapping[int, Ink], run_
             (FIGURES.get(key, words.label(key)), words.value(figure))
             for key, figure in mapping(result, "figures").items()
         ],
+        survival=survival.section(result, ink),
         pictures=_pictures(exports, ink, run_dir),
         blocks=swarm.block_rows(exports.by_agent, ink),
         strip=network.strip(result),
         network=network.start(result),
         faults=network.faults(result),
+        flight=map_section.section(run_dir, ink),
         agents=swarm.agents_table(result, exports.by_agent, ink),
         versions=mapping(result, "versions"),
         evidence_shown=EVIDENCE_SHOWN,

@@ -59,7 +59,7 @@ def agents_table(result: dict[str, Any], exports: Mapping[int, Export], ink: Map
         cells |= {words.label(key): value for key, value in agent.items() if key not in ("detail", "dropped")}
         gone = listing(agent, "completed_before")
         cells["completed before"] = len(gone) or None
-        cells["restarts"] = agent.get("restarts") or None
+        cells |= {key: agent.get(key) or None for key in ("restarts", "reboots")}
         if dropped := mapping(agent, "dropped"):
             cells["dropped"] = ", ".join(f"{words.value(count)} {reason}" for reason, count in dropped.items())
         if export := exports.get(agent_id):

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
 from harness.scenario.model import MAX_AGENTS, Model, Probability, VehicleId, VehicleKey
+from harness.scenario.radio import RadioModel
 from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
 from netem.errors import ConditionsError
 from netem.link import MAX_DELAY_S, MAX_LIMIT
@@ -131,6 +132,8 @@ class NetworkModel(Model):
     """How many messages from one sender to one receiver may wait for delay or rate; what exceeds it is lost."""
     receivers: dict[VehicleKey, Receiver] = {}
     links: Annotated[list[Link], Field(max_length=10_000)] = []
+    radio: RadioModel | None = None
+    """What is lost over the distance between two vehicles, besides; None: distance does not matter."""
 
     @model_validator(mode="after")
     def _means_something(self) -> "NetworkModel":

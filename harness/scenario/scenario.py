@@ -9,12 +9,14 @@ from pydantic import Field, field_validator, model_validator
 
 from harness.scenario.events import Events
 from harness.scenario.fates import Fate
+from harness.scenario.flight import Flight
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
 from harness.scenario.schedule import NEEDED, Schedule
-from harness.scenario.timeline import FAULT_LEADS_TO, FAULT_NEEDS, TimelineEntry
+from harness.scenario.timeline import FAULT_LEADS_TO, FAULT_NEEDS, FaultName, TimelineEntry
 from harness.scenario.vehicles import Vehicles
 from netem.errors import ConditionsError
+from sitl.plan import PlanError
 from ucp.block import MAX_AGENT_ID
 from ucp.settings import Quirks, Settings
 
@@ -45,6 +47,7 @@ class Scenario(Model):
     schedule: Annotated[list[Schedule], Field(max_length=100)] = []
     events: Events = Events()
     vehicles: Vehicles = Vehicles()
+    flight: Annotated[list[Flight], Field(max_length=MAX_AGENTS)] = []
     agent_command: Annotated[list[str], Field(min_length=1, max_length=100)] | None = None
     """Any program that follows ucp/CONTRACT.md, with its arguments; the mission file's name is added."""
     settings: Settings = Settings()
@@ -59,8 +62,17 @@ class Scenario(Model):
         """The agents' IDs, ascending."""
         return tuple(range(1, self.agents + 1)) if isinstance(self.agents, int) else tuple(sorted(self.agents))
 
+    def flight_of(self, vehicle: int) -> Flight | None:
+        """The flight that names this vehicle, if one does."""
+        return next((flight for flight in self.flight if vehicle in flight.vehicles), None)
+
     def timeline_in_order(self) -> list[TimelineEntry]:
         return sorted(self.timeline, key=lambda entry: entry.at_s)
+
+    def faults_in_order(self) -> list[tuple[float, FaultName, TimelineEntry]]:
+        """(mission seconds, what, entry) of all that happens to agents; of one instant what was begun first."""
+        faults = [(at_s, what, entry) for entry in self.timeline_in_order() for at_s, what in entry.course()]
+        return sorted(faults, key=lambda fault: fault[0])
 
     @field_validator("agents", mode="before")
     @classmethod
@@ -111,6 +123,9 @@ class Scenario(Model):
         yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named())
         yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
         yield from (("clocks", vehicle) for vehicle in self.clocks)
+        yield from (("vehicles.types", vehicle) for vehicle in self.vehicles.types)
+        for index, flight in enumerate(self.flight):
+            yield from ((f"flight.{index}.vehicles", vehicle) for vehicle in flight.vehicles)
         for index, fate in enumerate(self.fates):
             yield from ((f"fates.{index}.sender", vehicle) for vehicle in (fate.sender,) if vehicle)
             yield from ((f"fates.{index}.receiver", vehicle) for vehicle in (fate.receiver,) if vehicle)
@@ -119,6 +134,28 @@ class Scenario(Model):
             if entry.fault is not None:
                 what, agents = entry.fault
                 yield from ((f"timeline.{index}.{what}", agent) for agent in agents)
+
+    @model_validator(mode="after")
+    def _plans_can_be_flown(self) -> "Scenario":
+        for key, asked in (("flight", self.flight), ("network.radio", self.network.radio)):
+            if asked and self.vehicles.kind == "none":
+                raise ValueError(f"`{key}` needs vehicles, and `vehicles.kind` is none: leave one of them out")
+        types = {self.vehicles.type_of(vehicle) for vehicle in self.roster}
+        if self.vehicles.binary is not None and len(types) > 1:
+            raise ValueError(
+                f"`vehicles.binary` is one program, and there are {' and '.join(sorted(types))}: "
+                f"name the directory of their binaries in ARDUPILOT_SITL instead"
+            )
+        twice = Counter(vehicle for flight in self.flight for vehicle in flight.vehicles).most_common(1)
+        if twice and twice[0][1] > 1:
+            raise ValueError(f"`flight` names vehicle {twice[0][0]} twice: a vehicle flies one plan")
+        for index, flight in enumerate(self.flight):
+            for vehicle in flight.vehicles:
+                try:
+                    flight.planned().check(self.vehicles.type_of(vehicle))
+                except PlanError as error:
+                    raise ValueError(f"flight.{index}.plan, for vehicle {vehicle}: {error}") from None
+        return self
 
     @model_validator(mode="after")
     def _schedule_can_be_played(self) -> "Scenario":
@@ -152,16 +189,29 @@ class Scenario(Model):
                 self.network.conditions(partition).validate(self.roster)
             except ConditionsError as error:
                 raise ValueError(f"{where}: {error}") from None
+        return self
+
+    @model_validator(mode="after")
+    def _faults_can_be_played(self) -> "Scenario":
         state = dict.fromkeys(self.roster, "running")
-        for entry in self.timeline_in_order():
-            if entry.fault is not None:
-                what, agents = entry.fault
-                needed, then = FAULT_NEEDS[what], FAULT_LEADS_TO[what]
-                for agent in agents:
-                    if state[agent] not in needed:
-                        where = f"timeline.{self.timeline.index(entry)}.{what}"
-                        raise ValueError(f"{where}: agent {agent} is {state[agent]} then, not {' or '.join(needed)}")
-                    state[agent] = then
+        for at_s, what, entry in self.faults_in_order():
+            assert entry.fault is not None, "it is one"
+            key, agents = entry.fault
+            where = f"timeline.{self.timeline.index(entry)}.{key}"
+            if at_s > self.duration_s:
+                end = f"the mission's end at {self.duration_s:g} s"
+                raise ValueError(f"{where}: its agents would be back at {at_s:g} s, after {end}")
+            if what == "crash" and self.vehicles.kind == "none":
+                raise ValueError(
+                    f"{where} needs vehicles that can fall: `vehicles.kind` is none, where `kill` does the same"
+                )
+            for agent in agents:
+                if state[agent] not in FAULT_NEEDS[what]:
+                    needed = " or ".join(FAULT_NEEDS[what])
+                    raise ValueError(f"{where}: agent {agent} is {state[agent]} then, not {needed}")
+                state[agent] = FAULT_LEADS_TO[what]
+        if set(state.values()) == {"killed"}:
+            raise ValueError("the timeline leaves nobody: at the end all agents are killed; spare or restart one")
         return self
 
 

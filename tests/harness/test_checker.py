@@ -209,6 +209,7 @@ def test_blocks_of_an_agent_that_left_nothing_are_not_taken_for_genuine(perfect:
         ({"timer": "voting"}, "another handler's"),
         ({"local": "reconcile_finalize"}, "had not run"),
         ({}, "no trigger"),
+        ({"boot": 3}, "was triggered by a boot, which only ends a reconcile"),
     ],
 )
 def test_a_handler_without_a_trigger_of_its_own_violates_1(run_dir: Path, trigger: dict, detail: str) -> None:

@@ -100,7 +100,7 @@ def test_doctor_says_what_this_machine_can_do_as_text_and_json() -> None:
 def test_a_scenario_runs_in_virtual_time_and_says_that_no_vehicles_fly(tmp_path: Path) -> None:
     done = harness("run", PERFECT, "--backend", "sim", "--seed", "1", "--out", tmp_path / "run")
     assert done.returncode == 0
-    assert "No vehicles fly in virtual time" in done.stdout
+    assert "Virtual time has no telemetry" in done.stdout
     assert (tmp_path / "run" / "report.html").exists()
 
 

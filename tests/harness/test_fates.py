@@ -78,6 +78,15 @@ def test_a_fate_picks_messages_by_type_sender_receiver_and_count() -> None:
     assert sorted(sender for t, sender in heard if t > 20) == [2, 3]
 
 
+def test_a_block_is_called_the_same_whether_or_not_its_agent_rebooted_before() -> None:
+    script = [*BLOCK_OF_1, *({"at_s": at_s, "agent": 1} for at_s in (30, 31, 32))]
+    reboot = [{"at_s": 20, "reboot": [1], "down_s": 5, "disk": "kept"}]
+    missed = [{"message": "Commit Block", "block": "1.2", "receiver": 2, "drop": True}]
+    simulated = played(missed, script, timeline=reboot)
+    assert not simulated.played.unmatched_fates
+    assert [len(export.chain) for export in simulated.evidence.exports.values()] == [2, 1, 2]
+
+
 def test_a_fate_picks_messages_by_block_and_by_when_they_are_sent() -> None:
     script = [*BLOCK_OF_1, *({"at_s": at_s, "agent": 1} for at_s in (21, 22, 23))]
     by_block = arrivals(played([{"block": "1.2", "sender": 1, "drop": True}], script), 2, "Block Add Request")

@@ -1,4 +1,4 @@
-"""What a scenario can do to agents: kill, restart, pause, resume, and clocks that are wrong."""
+"""What a scenario can do to agents: kill, crash, restart, pause, resume, reboot, and clocks that are wrong."""
 
 from itertools import pairwise
 from random import Random
@@ -7,15 +7,28 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from harness.checker import Evidence
+from harness.checker.agreement import had_a_chance
+from harness.record import JudgedRecord
+from harness.scenario import Scenario
 from harness.seeds import agent_seed
 from harness.simulate import Simulated, simulate
+from harness.traces import Header, Trace
 from tests.harness.virtual import scenario
 from ucp.events import RandomEvents
+from ucp.store import Holdings
+from ucp.trace import HandlerRun, State
+
+
+def faulty(timeline: list[dict[str, Any]], **keys: Any) -> Scenario:
+    return scenario(timeline=timeline, **{"duration_s": 600, "events": {"source": "random", "mean_s": 10}, **keys})
 
 
 def played(timeline: list[dict[str, Any]], **keys: Any) -> Simulated:
-    keys = {"duration_s": 600, "events": {"source": "random", "mean_s": 10}, **keys}
-    return simulate(scenario(timeline=timeline, **keys), 4, tracing=True)
+    return simulate(faulty(timeline, **keys), 4, tracing=True)
+
+
+REBOOT = {"at_s": 10, "reboot": [1], "down_s": 20, "disk": "kept"}
 
 
 def verdicts(simulated: Simulated) -> set[str]:
@@ -71,6 +84,68 @@ def test_a_restarted_agent_logs_its_own_events_only() -> None:
     assert [run.t for run in simulated.evidence.traces[2].runs if run.t > 300 and "event" in run.trigger] == expected
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_reboot_with_its_disk_loses_no_block(seed: int) -> None:
+    reboots = [
+        {"at_s": 203.0, "reboot": [2, 3], "down_s": 20, "disk": "kept"},
+        {"at_s": 411.0, "reboot": [2], "down_s": 1, "disk": "kept"},
+    ]
+    simulated = simulate(faulty(reboots, network={"loss": 0.3}, final_reconcile=True), seed, tracing=True)
+    assert verdicts(simulated) == {"holds"}
+    assert simulated.result.characteristics["5"].reason.endswith("blocks are in every chain")
+    agent = simulated.played.agents["2"]
+    assert (agent["outcome"], agent["restarts"], agent["reboots"], agent["completed_before"]) == ("exported", 0, 2, [])
+    trace = simulated.evidence.traces[2]
+    first, second, third = ([run for _, run in life] for life in trace.lives())
+    assert max(run.t for run in first) <= 203 < 223 <= min(run.t for run in second)
+    assert (second[0].t, second[0].trigger) == (223, {"boot": first[-1].state.chain})
+    assert (third[0].t, third[0].handler) == (412, "reconcile_finalize")
+    completed = simulated.evidence.exports[2].completed
+    assert completed == list(dict.fromkeys(trace.completed()))
+    assert [fault["what"] for fault in simulated.played.faults[:4]] == ["reboot", "boot", "reboot", "boot"]
+
+
+def test_a_reboot_whose_disk_is_lost_is_a_kill_and_a_restart() -> None:
+    rebooted = played([{"at_s": 300, "reboot": [2], "down_s": 30, "disk": "lost"}], final_reconcile=True)
+    killed = played([{"at_s": 300, "kill": [2]}, {"at_s": 330, "restart": [2]}], final_reconcile=True)
+    assert rebooted.played.agents == killed.played.agents
+    assert rebooted.evidence.exports == killed.evidence.exports
+    assert rebooted.evidence.traces == killed.evidence.traces
+    assert verdicts(rebooted) == {"holds"}
+
+
+def test_a_crash_is_a_kill_in_virtual_time() -> None:
+    crashed, killed = played([{"at_s": 300, "crash": [2]}]), played([{"at_s": 300, "kill": [2]}])
+    assert crashed.evidence.exports == killed.evidence.exports
+    assert crashed.played.agents == killed.played.agents
+
+
+def test_losing_a_block_over_a_brown_out_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that is kept excuses nothing."""
+    alone = [{"at_s": 0, "partition": [[2], [1, 3, 4, 5]]}, {"at_s": 400, "heal": True}]
+    reboot = {"at_s": 300, "reboot": [2], "down_s": 30, "disk": "kept"}
+    assert verdicts(played([*alone, reboot], final_reconcile=True)) == {"holds"}
+    monkeypatch.setattr("harness.backends.simulation.Holdings.of", lambda agent: Holdings())
+    assert played([*alone, reboot], final_reconcile=True).result.characteristics["5"].verdict == "violated"
+
+
+def test_a_reconcile_that_a_brown_out_ended_gives_no_chance_to_agree() -> None:
+    """What ends it after the boot is no answer of the others."""
+    began = {"handler": "reconcile_begin", "algorithm": 7, "branch": "begun", "reconciling": True}
+    ended = {"handler": "reconcile_finalize", "algorithm": 20, "branch": "done", "reconciling": False}
+    runs = [run_of(10.0, **began), run_of(20.0, **ended)]
+    connected = [{"at_s": 0.0, "what": "start", "detail": "", "fully_connected": True}]
+    record = JudgedRecord.model_validate({"roster": [1], "network": connected})
+    header = Header(agent_id=1, roster=[1], settings={}, clock={})
+    one_life, two_lives = Trace(header, runs), Trace(header, runs, starts=[1])
+    assert had_a_chance(Evidence({}, {1: one_life}, record), {1}) == {1}
+    assert had_a_chance(Evidence({}, {1: two_lives}, record), {1}) == set()
+
+
+def run_of(t: float, *, handler: str, algorithm: int, branch: str, reconciling: bool) -> HandlerRun:
+    return HandlerRun(t, handler, algorithm, {}, branch, [], [], State(0, 0, 0, reconciling, not reconciling, ""))
+
+
 def test_without_traces_a_restarted_agents_blocks_are_known_all_the_same() -> None:
     one = scenario(
         duration_s=600,
@@ -97,8 +172,11 @@ def test_a_vote_may_last_longer_while_its_agent_is_paused() -> None:
 
 
 def test_an_agent_that_stays_paused_leaves_the_run_unsettled() -> None:
-    simulated = played([{"at_s": 500, "pause": [3]}])
+    simulated = played([{"at_s": 500, "pause": [1]}], final_reconcile=True)
     assert not simulated.played.settled
+    assert simulated.played.final_reconcile is not None
+    assert not simulated.played.final_reconcile["complete"]
+    assert max(run.t for run in simulated.evidence.traces[1].runs) <= 500
 
 
 @pytest.mark.parametrize(("offset_s", "drift"), [(-1000, 0.0), (1000, 0.0), (0, 0.01), (-50, -0.2)])
@@ -134,8 +212,27 @@ def test_agents_agree_whatever_their_clocks_show(offset_s: float, drift: float) 
         ([{"at_s": 2, "kill": [9]}], "timeline.0.kill names vehicle 9, which does not exist"),
         ([{"at_s": 2, "kill": []}], "at least 1 item"),
         ([{"at_s": 2, "kill": [1], "heal": True}], "needs exactly one of"),
+        ([{"at_s": 2, "crash": [9]}], "timeline.0.crash names vehicle 9, which does not exist"),
+        ([{"at_s": 1, "kill": [1]}, REBOOT], "timeline.1.reboot: agent 1 is killed then, not running or paused"),
+        ([REBOOT, {"at_s": 25, "kill": [1]}], "timeline.1.kill: agent 1 is rebooting then, not running or paused"),
+        ([{**REBOOT, "down_s": 1191}], "its agents would be back at 1201 s, after the mission's end at 1200 s"),
+        ([{"at_s": 10, "reboot": [1], "disk": "kept"}], "a reboot needs `down_s`"),
+        ([{"at_s": 10, "reboot": [1], "down_s": 20}], "a reboot needs .* `disk: kept` or `disk: lost`"),
+        ([{"at_s": 10, "kill": [1], "disk": "lost"}], "`down_s` and `disk` belong to `reboot`"),
+        ([{"at_s": 10, "kill": [1, 2, 3]}, {"at_s": 20, "crash": [4, 5]}], "the timeline leaves nobody"),
     ],
 )
 def test_faults_that_cannot_be_played_are_refused(timeline: list[dict[str, Any]], sentence: str) -> None:
     with pytest.raises(ValidationError, match=sentence):
         scenario(timeline=timeline)
+
+
+def test_what_follows_in_the_instant_of_a_boot_finds_the_agent_running() -> None:
+    scenario(timeline=[{"at_s": 30, "kill": [1]}, REBOOT])
+
+
+def test_without_vehicles_nothing_can_crash() -> None:
+    crash = [{"at_s": 10, "crash": [1]}]
+    with pytest.raises(ValidationError, match=r"timeline\.0\.crash needs vehicles that can fall"):
+        scenario(timeline=crash, vehicles={"kind": "none"})
+    scenario(timeline=crash)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from harness.errors import RunDirectoryError
-from harness.rundir import claim
+from harness.rundir import RunDirectory, claim
 
 
 def test_a_directory_that_holds_anything_is_left_alone(tmp_path: Path) -> None:
@@ -16,3 +16,16 @@ def test_a_directory_that_holds_anything_is_left_alone(tmp_path: Path) -> None:
         claim(tmp_path / "kept")
     claim(tmp_path / "new" / "one", tmp_path / "new" / "one" / "inner")
     assert (tmp_path / "new" / "one" / "inner").is_dir()
+
+
+def test_the_trace_of_a_later_life_follows_the_whole_lines_of_the_earlier(tmp_path: Path) -> None:
+    rundir = RunDirectory(tmp_path / "run")
+    first, second = rundir.agent(7), rundir.agent(7, life=2)
+    assert (first.name, second.name) == ("agents", "7-2")
+    (first / "7.trace.jsonl").write_text("one\ntw")
+    (second / "7.trace.jsonl").write_text("three\n")
+    rundir.bring_trace(7, second)
+    assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"
+    assert (second / "7.trace.jsonl").read_text() == "three\n"
+    rundir.bring_trace(7, rundir.agent(7, life=3))  # it was killed before it said anything
+    assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"

@@ -4,16 +4,21 @@ from typing import Any
 
 import pytest
 
-from harness.explore.document import document_of
+from harness.explore.document import document_of, with_agents
 from harness.explore.smaller import replays, scenario_of
 from harness.explore.tape import record
 from harness.simulate import simulate
 from tests.harness.virtual import scenario
 
+APART = [
+    {"vehicles": [1, 2], "plan": [{"take_off": 20}, {"go_to": [300, 0]}]},
+    {"vehicles": [3, 4], "plan": [{"take_off": 20}, {"go_to": [-300, 0]}, {"go_to": [0, 0]}]},
+]
 LOSS: list[dict[str, Any]] = [
     {"network": {"loss": 0.3}},
     {"network": {"loss": {"p": 0.1, "r": 0.3}}},
-    {"network": {"loss": 0.2, "delay": {"mean_s": 1, "jitter_s": 0.9}, "duplicate": 0.3, "reorder": 0.2}},
+    {"network": {"loss": 0.2, "delay": {"mean_s": 1, "jitter_s": 0.9, "distribution": "normal"}}},
+    {"network": {"delay": {"mean_s": 1, "jitter_s": 0.9}, "duplicate": 0.3, "reorder": 0.2}},
     {"network": {"receivers": {3: {"loss": 0.9}}, "links": [{"from": 1, "to": 2, "loss": 0.5, "both": True}]}},
     {"timeline": [{"at_s": 100, "loss": 0.5}, {"at_s": 200, "partition": [[1, 2]]}, {"at_s": 400, "heal": True}]},
     {"network": {"loss": 0.2}, "timeline": [{"at_s": 100, "pause": [1]}, {"at_s": 300, "resume": [1]}]},
@@ -21,6 +26,7 @@ LOSS: list[dict[str, Any]] = [
     {"network": {"loss": 0.2}, "quirks": {"ignore_commit": 0.3}},
     {"network": {"loss": 0.2}, "clocks": {2: {"offset_s": 500, "drift": 0.01}}},
     {"network": {"loss": 0.2}, "fates": [{"message": "Commit Block", "sender": 1, "delay_s": 3.0}]},
+    {"network": {"radio": {"log_distance": {}}}, "vehicles": {"types": {2: "copter"}}, "flight": APART},
 ]
 
 
@@ -37,6 +43,14 @@ def test_what_is_scripted_from_a_run_is_that_run(keys: dict[str, Any]) -> None:
         same = again.evidence.traces[agent_id].runs
         assert [(run.t, run.handler, run.branch) for run in same] == steps
     assert not again.played.unmatched_fates
+
+
+def test_agents_that_are_left_out_fly_no_more() -> None:
+    asked = scenario(agents=4, network={"radio": {"hard_range": {}}}, vehicles={"types": {2: "copter"}}, flight=APART)
+    fewer = scenario_of(with_agents(document_of(asked), [1, 3]))
+    assert [flight.vehicles for flight in fewer.flight] == [[1], [3]]
+    assert fewer.vehicles.types == {}
+    assert scenario_of(with_agents(document_of(asked), [1])).flight_of(3) is None
 
 
 def test_a_recording_names_what_was_lost() -> None:

@@ -107,6 +107,30 @@ def result_of(agent_ids: Sequence[int]) -> dict[str, Any]:
             "bytes": 301442,
             "longest_vote_s": 12.5,
         },
+        "survival": {
+            "losses": [
+                {
+                    "at_s": 300.0,
+                    "what": "crash",
+                    "vehicles": [3],
+                    "completed": 12,
+                    "survived": 11,
+                    "gone": 1,
+                    "gone_at_end": 2,
+                    "blocks": [
+                        {
+                            "block": "3.1",
+                            "block_hash": "ab" * 32,
+                            "agent_id": 3,
+                            "holders": [],
+                            "holders_at_end": [1, 2],
+                        }
+                    ],
+                }
+            ],
+            "completed": 41,
+            "gone": 2,
+        },
         "vehicles": {
             str(agent_id): {"kind": "embedded", "mode": "GUIDED", "armed": True, "real_time_factor": 1.0}
             for agent_id in agent_ids

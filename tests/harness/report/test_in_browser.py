@@ -7,7 +7,9 @@ from typing import Literal
 import pytest
 
 from harness.report import write_report
+from harness.scenario import Scenario
 from tests.harness.report.browser import Browser, chromium_or_skip, open_browser
+from tests.harness.report.flights import split_and_rejoin, write_flight
 from tests.harness.report.runs import write_run
 
 DISCONNECTED = {agent: [f"{agent}.{n}" for n in range(1, 41)] for agent in (1, 2, 3, 4, 65535)}
@@ -22,6 +24,12 @@ LABELS_THAT_DO_NOT_FIT = """
     const box = g.querySelector('rect').getBBox(), text = t.getBBox();
     return text.x < box.x + 2 || text.x + text.width > box.x + box.width - 2;
   }).map(t => t.textContent))
+"""
+TAGS_THAT_DO_NOT_FIT = """
+[...document.querySelectorAll('.map rect[rx] + text')].filter(t => {
+  const box = t.previousElementSibling.getBBox(), text = t.getBBox();
+  return text.x < box.x || text.x + text.width > box.x + box.width;
+}).map(t => t.textContent)
 """
 
 
@@ -74,6 +82,32 @@ def test_a_tree_wider_than_the_screen_scrolls_inside_its_frame_by_keyboard(brows
     )
     assert frame <= 360
     assert tree >= frame
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run_dir = write_run(tmp_path_factory.mktemp("run") / "run", {agent: ["1.1"] for agent in range(1, 6)})
+    network = {"radio": {"hard_range": {"range_m": 250}}}
+    timeline = [{"at_s": 500, "kill": [5]}]
+    scenario = Scenario.model_validate({"name": "x", "agents": 5, "network": network, "timeline": timeline})
+    write_flight(run_dir, scenario, {agent: split_and_rejoin(agent) for agent in range(1, 6)}, 600)
+    return write_report(run_dir)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1280])
+def test_the_map_fits_the_screen_in_its_colours_and_the_console_is_silent(
+    browser: Browser, flown: Path, width: int, scheme: Literal["light", "dark"]
+) -> None:
+    browser.show(flown, width=width, scheme=scheme)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    colour = browser.evaluate("getComputedStyle(document.querySelector('.way.part0')).stroke")
+    assert colour == {"light": "rgb(0, 114, 178)", "dark": "rgb(86, 180, 233)"}[scheme]
+    dashes = "new Set([...document.querySelectorAll('.way')].map(w => getComputedStyle(w).strokeDasharray)).size"
+    assert browser.evaluate(dashes) == 2, "parts also differ by their dashes"
+    assert browser.evaluate("document.querySelectorAll('.moments .map').length") == 5
+    assert browser.evaluate(TAGS_THAT_DO_NOT_FIT) == []
+    assert browser.complaints == []
 
 
 @pytest.mark.parametrize(("required", "outcome"), [("", pytest.skip.Exception), ("lab,browser", pytest.fail.Exception)])

@@ -56,6 +56,7 @@ def test_the_page_says_how_the_run_went_in_its_order(tmp_path: Path) -> None:
         "15 % loss",
         "Characteristics",
         "Figures",
+        "Survival",
         "Chains",
         "Network and faults",
         "Vehicles and agents",
@@ -75,6 +76,20 @@ def test_the_page_says_how_the_run_went_in_its_order(tmp_path: Path) -> None:
         "ucp-harness 0.1.0",
     ):
         assert said in page.text
+
+
+def test_the_page_says_what_the_losses_of_vehicles_took(tmp_path: Path) -> None:
+    page = report(tmp_path / "run")
+    for said in (
+        "at 300 s vehicle 3 was lost (crash), and with it 1 of 12 completed blocks",
+        "at the end 2 of 41 completed blocks are gone",
+        "5 min 3 crash 12 11 1 2",
+        "5 min: who held which blocks",
+        "3.1 nobody 1, 2",
+    ):
+        assert said in page.text
+    for survival in (None, 7, {"losses": "none"}):
+        assert "Survival" not in report(tmp_path / f"without {survival}", {"survival": survival}).text
 
 
 def test_a_violation_leads_and_its_evidence_is_complete(tmp_path: Path) -> None:
@@ -228,7 +243,7 @@ def test_whatever_the_result_holds_there_is_a_report(
 
 def test_template_and_styles_are_in_the_package() -> None:
     shipped = {entry.name for entry in resources.files("harness.report").iterdir()}
-    assert {"page.html.j2", "page.css", "chain_tree.css"} <= shipped
+    assert {"page.html.j2", "page.css", "chain_tree.css", "map.css"} <= shipped
 
 
 def test_what_the_mission_left_is_drawn_beside_what_the_final_reconcile_made_of_it(tmp_path: Path) -> None:

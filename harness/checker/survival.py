@@ -1,0 +1,180 @@
+"""Does the data survive the loss of vehicles? The question with which the thesis begins (Chapter 1, Section 3.3).
+
+A block survives where anybody holds it, in the chain, waiting to be committed, or on the reconcile stack: whoever comes
+home with it brings it home. What was where when vehicles were lost, the traces tell; what is where at the end, the
+exports do.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+
+from harness.checker.characteristic import agents
+from harness.checker.evidence import Evidence
+from harness.exports import Export
+from harness.record import BlockHolders, Fault, LeastHeld, Loss, Survival
+from harness.traces import Held, Trace
+
+LOSSES = ("kill", "crash")
+LOSSES_TOLD = 5
+
+
+def survival(evidence: Evidence) -> Survival:
+    """What became of the completed blocks with each loss of vehicles, and what the next loss could take."""
+    at_end = _holders(evidence.exports)
+    lost = [fault for fault in (evidence.record.faults if evidence.record else ()) if _is_loss(fault)]
+    return Survival(
+        losses=_losses(evidence, lost, at_end),
+        completed=len(evidence.completed_blocks()),
+        gone=len(evidence.completed_blocks().keys() - at_end.keys()),
+        at_end=_least_held(evidence, evidence.exports),
+        before_final_reconcile=_least_held(evidence, evidence.before_final_reconcile),
+    )
+
+
+def _is_loss(fault: Fault) -> bool:
+    return fault.what in LOSSES or (fault.what == "reboot" and fault.disk == "lost")
+
+
+def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
+    """Block hash -> who holds the block, wherever."""
+    holders: dict[str, list[int]] = {}
+    for agent_id, export in sorted(exports.items()):
+        for block_hash in dict.fromkeys(block.block_hash for block in export.blocks()):
+            holders.setdefault(block_hash, []).append(agent_id)
+    return holders
+
+
+def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld | None:
+    """The block that the fewest vehicles hold, the oldest of several; None if there is no block."""
+    holders = _holders(exports)
+    if not holders:
+        return None
+    fewest = min(map(len, holders.values()))
+    blocks = {block.block_hash: block for export in exports.values() for block in export.blocks()}
+    few = [blocks[block_hash] for block_hash, held_by in holders.items() if len(held_by) == fewest]
+    oldest = min(few, key=lambda block: (block.timestamp_us, block.block_hash))
+    return LeastHeld(
+        vehicles=len(exports),
+        holders=holders[oldest.block_hash],
+        block=evidence.name(oldest.block_hash),
+        block_hash=oldest.block_hash,
+        blocks=len(few),
+        of=len(holders),
+    )
+
+
+def _losses(evidence: Evidence, lost: list[Fault], at_end: Mapping[str, list[int]]) -> list[Loss]:
+    untold = [trace for trace in evidence.traces.values() if trace.problem]
+    if untold or set(evidence.roster or ()) - set(evidence.traces):
+        return [Loss(at_s=fault.at_s, what=fault.what, vehicles=fault.agents or []) for fault in lost]
+    instants = [fault.at_s for fault in lost]
+    held = {
+        agent_id: _held_at(trace, instants, [fault.at_s for fault in lost if agent_id in (fault.agents or ())])
+        for agent_id, trace in sorted(evidence.traces.items())
+    }
+    completed = {
+        block_hash: (run.t, agent_id)
+        for agent_id, trace in evidence.traces.items()
+        for run in reversed(trace.runs)
+        for operation, block_hash in run.changes
+        if operation == "complete"
+    }
+    found = []
+    for number, fault in enumerate(lost):
+        vehicles = fault.agents or []
+        by_then = {block: agent_id for block, (at_s, agent_id) in completed.items() if at_s <= fault.at_s}
+        left = {agent_id: then[number] for agent_id, then in held.items() if agent_id not in vehicles}
+        survived = by_then.keys() & set().union(*left.values())
+        gone = (by_then.keys() & set().union(*(held[agent_id][number] for agent_id in vehicles))) - survived
+        told = [block for block, agent_id in by_then.items() if block in gone or agent_id in vehicles]
+        found.append(
+            Loss(
+                at_s=fault.at_s,
+                what=fault.what,
+                vehicles=vehicles,
+                completed=len(by_then),
+                survived=len(survived),
+                gone=len(gone),
+                gone_at_end=len(by_then.keys() - at_end.keys()),
+                blocks=[
+                    BlockHolders(
+                        block=evidence.name(block),
+                        block_hash=block,
+                        agent_id=by_then[block],
+                        holders=[agent_id for agent_id, then in left.items() if block in then],
+                        holders_at_end=at_end.get(block, []),
+                    )
+                    for block in sorted(told, key=lambda block: completed[block])
+                ],
+            )
+        )
+    return found
+
+
+def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) -> list[set[str]]:
+    """The blocks that an agent held at each of the instants, the moment before it was lost itself."""
+    waiting, found = deque(instants), []
+    held, at_s = Held(), -math.inf
+
+    def take_down() -> None:
+        instant = waiting.popleft()
+        gone = any(at_s <= loss < instant for loss in lost_at)
+        found.append(set() if gone else {block for block, copies in held.copies.items() if copies})
+
+    for life in trace.lives():
+        new = Held()
+        for _, run in life:
+            while waiting and waiting[0] < run.t:
+                take_down()
+            held, at_s = new, run.t
+            held.replay(run)
+    while waiting:
+        take_down()
+    return found
+
+
+def in_words(survived: Survival) -> list[str]:
+    """A sentence for each of the first losses, one for the end, and one for what the next loss could take."""
+    sentences = [_loss_in_words(loss) for loss in survived.losses[:LOSSES_TOLD]]
+    if len(survived.losses) > LOSSES_TOLD:
+        sentences.append(f"{len(survived.losses) - LOSSES_TOLD} more losses of vehicles are in run.json")
+    if survived.losses:
+        sentences.append(f"at the end {_of(survived.gone, survived.completed)} {_is(survived.gone)} gone")
+    if survived.before_final_reconcile is not None:
+        sentences.append(f"before the final reconcile {_least_held_in_words(survived.before_final_reconcile)}")
+    if survived.at_end is not None:
+        sentences.append(_least_held_in_words(survived.at_end))
+    return sentences
+
+
+def _loss_in_words(loss: Loss) -> str:
+    one = len(loss.vehicles) == 1
+    sentence = f"at {loss.at_s:.0f} s {_vehicles(loss.vehicles)} {'was' if one else 'were'} lost ({loss.what})"
+    if loss.completed is None or loss.gone is None:
+        return f"{sentence}; without all traces nobody knows what was where"
+    return f"{sentence}, and with {'it' if one else 'them'} {_of(loss.gone, loss.completed)}"
+
+
+def _least_held_in_words(least: LeastHeld) -> str:
+    if len(least.holders) == least.vehicles:
+        what = "the block is" if least.of == 1 else f"all {least.of} blocks are"
+        return f"{what} on all {least.vehicles} vehicles"
+    also = f", and {least.blocks} of {least.of} blocks have no more copies" if least.blocks > 1 else ""
+    losing = f"losing {_vehicles(least.holders)} would lose block {least.block}{also}"
+    bearable = len(least.holders) - 1
+    if not bearable:
+        return losing
+    return f"losing any {'one vehicle' if bearable == 1 else f'{bearable} vehicles'} loses no block; {losing}"
+
+
+def _vehicles(vehicles: list[int]) -> str:
+    return agents(vehicles).replace("agent", "vehicle")
+
+
+def _of(blocks: int, completed: int) -> str:
+    return f"{blocks or 'none'} of {completed} completed blocks"
+
+
+def _is(count: int) -> str:
+    return "are" if count > 1 else "is"

@@ -1,0 +1,87 @@
+"""`ucp-harness chain`: what the chains say, for people, programs and maps."""
+
+import contextlib
+import io
+import json
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from harness import logbook
+from harness.commands.terminal import complain
+from harness.errors import WRONG_REQUEST, ExportError, MachineError, RunDirectoryError
+from harness.logbook.geojson import geojson
+from harness.logbook.kml import kml
+from harness.logbook.positions import Track, tracks
+from harness.logbook.text import document, lines
+
+
+def chain_command(
+    paths: Annotated[list[Path], typer.Argument(help="A run directory, or chain exports from anywhere.")],
+    agent: Annotated[int | None, typer.Option(help="Only what this agent's export holds.")] = None,
+    decode: Annotated[bool, typer.Option("--decode", help="Each event in words.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="The chains as JSON on standard output.")] = False,
+    geojson_file: Annotated[
+        Path | None, typer.Option("--geojson", help="Instead, write the vehicles' positions there; must be new.")
+    ] = None,
+    kml_file: Annotated[Path | None, typer.Option("--kml", help="The same for Google Earth; must be new.")] = None,
+) -> None:
+    """Print each agent's chain, block by block; or put what the vehicles logged on a map."""
+    whole = logbook.read(paths)
+    shown = whole if agent is None else whole.only(agent)
+    if geojson_file is not None or kml_file is not None:
+        _write_maps(tracks(shown), shown.telemetry, geojson_file, kml_file)
+    elif as_json:
+        _print([json.dumps(document(shown, decode), indent=1)])
+    else:
+        _print(lines(shown, decode))
+    for sentence in (*shown.absent.values(), *shown.errors):
+        complain(sentence)
+    if shown.errors or not shown.exports:
+        raise typer.Exit(WRONG_REQUEST)
+
+
+def _write_maps(made: list[Track], telemetry: bool, geojson_file: Path | None, kml_file: Path | None) -> None:
+    if not made:
+        why = "no vehicle logged one" if telemetry else "the events are not those of vehicles"
+        raise ExportError(f"there is no position in these chains ({why}), so there is no map")
+    if geojson_file is not None:
+        _write_new(geojson_file, json.dumps(geojson(made), ensure_ascii=False) + "\n")
+    if kml_file is not None:
+        _write_new(kml_file, kml(made))
+    written = " and ".join(str(path) for path in (geojson_file, kml_file) if path is not None)
+    positions = sum(len(track.fixes) for track in made)
+    _print([f"{positions} positions of {len(made)} vehicles: {written}"])
+
+
+def _write_new(path: Path, text: str) -> None:
+    """Raises RunDirectoryError if the file is there already or cannot be made, MachineError if the disk refuses."""
+    try:
+        file = path.open("x", encoding="utf-8")
+    except FileExistsError:
+        raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten") from None
+    except OSError as error:
+        raise RunDirectoryError(f"{path} cannot be made: {error.strerror}; choose another file") from None
+    try:
+        with file:
+            file.write(text)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            path.unlink()
+        raise MachineError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def _print(texts: Iterable[str]) -> None:
+    """Plain lines. A reader that has seen enough (`| head`) ends them, and nothing else."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal that lacks a vehicle's characters
+    try:
+        for text in texts:
+            sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere

@@ -1,0 +1,32 @@
+"""`ucp-harness check`: judge a run again, or exports from anywhere."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from harness import checker
+from harness.checker.survival import survival
+from harness.commands.terminal import complain, print_json, show_result, show_survival
+from harness.errors import VIOLATED, WRONG_REQUEST
+
+
+def check_command(
+    paths: Annotated[list[Path], typer.Argument(help="A run directory, or chain exports from anywhere.")],
+    as_json: Annotated[bool, typer.Option("--json", help="The verdict as JSON on standard output.")] = False,
+) -> None:
+    """Decide the six characteristics from exported chains, and from traces beside them."""
+    evidence = checker.gather(paths)
+    result, survived = checker.check(evidence), survival(evidence)
+    if as_json:
+        print_json({**result.to_json(), "survival": survived.model_dump()})
+    else:
+        show_result(Console(), result)
+        show_survival(Console(), survived)
+    for error in result.errors:
+        complain(error)
+    if result.violated:
+        raise typer.Exit(VIOLATED)
+    if result.errors or not evidence.exports:
+        raise typer.Exit(WRONG_REQUEST)

@@ -1,0 +1,50 @@
+"""`ucp-harness doctor`: what this machine can do, and what its network really does."""
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from harness import measured
+from harness.commands.terminal import print_json
+from harness.doctor import examine
+from harness.errors import CANNOT_HERE, VIOLATED
+from harness.kernel import Kernel, run_inside
+
+
+def doctor_command(
+    as_json: Annotated[bool, typer.Option("--json", help="The findings as JSON on standard output.")] = False,
+    measure: Annotated[
+        bool, typer.Option("--measure", help="Also what the network really does to packets; up to a minute.")
+    ] = False,
+    kernel: Annotated[Kernel, typer.Option(help="Of which kernel: this machine's, or User Mode Linux.")] = Kernel.host,
+) -> None:
+    """Say what this machine can do, and what would let it do more; with --measure, whether it does as asked."""
+    if kernel is Kernel.uml:
+        asked = {"--json": as_json, "--measure": measure}
+        raise typer.Exit(run_inside(["doctor", *(option for option, wanted in asked.items() if wanted)]))
+    findings = examine()
+    able = all(finding.ok for finding in findings if finding.needed)
+    if not as_json:
+        table = Table.grid(padding=(0, 2))
+        for finding in findings:
+            mark = Text("✔", style="green") if finding.ok else Text("✘", style="red" if finding.needed else "yellow")
+            table.add_row(mark, finding.name, Text(finding.detail))
+            if not finding.ok and finding.way_out:
+                table.add_row("", "", Text(f"→ {finding.way_out}", style="dim"))
+        Console().print(table)
+    engines = []
+    if measure and able:
+        with measured.saying(Console(stderr=True)) as say:
+            engines = measured.measure_engines(findings, say)
+    found = [finding.to_json() for finding in findings]
+    if as_json:
+        print_json({"findings": found, "measured": [one.to_json() for one in engines]} if measure else found)
+    elif engines:
+        Console().print(measured.render(engines))
+    if not able:
+        raise typer.Exit(CANNOT_HERE)
+    if not all(one.ok for one in engines):
+        raise typer.Exit(VIOLATED)

@@ -1,0 +1,108 @@
+"""`ucp-harness run`: play a scenario and judge it."""
+
+import secrets
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+
+from harness import progress
+from harness.commands.terminal import complain, show_result, show_survival
+from harness.errors import HarnessError, ScenarioError
+from harness.kernel import Kernel, run_inside
+from harness.run import Run, run
+from harness.rundir import default_path
+from harness.scenario import Scenario, load_scenario
+from harness.scenario.load import explain
+
+
+class Vehicles(StrEnum):
+    ardupilot = "ardupilot"
+    embedded = "embedded"
+    none = "none"
+
+
+class Backend(StrEnum):
+    process = "process"
+    sim = "sim"
+
+
+def run_command(
+    scenario: Annotated[Path, typer.Argument(help="Scenario file (YAML).")],
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of all that we draw; drawn itself if not given.")
+    ] = None,
+    speedup: Annotated[float | None, typer.Option(help="Mission seconds per second of wall time.")] = None,
+    vehicles: Annotated[Vehicles | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
+    backend: Annotated[
+        Backend, typer.Option(help="Real processes in a private network, or virtual time.")
+    ] = Backend.process,
+    out: Annotated[Path | None, typer.Option(help="Run directory; must be new or empty.")] = None,
+    kernel: Annotated[
+        Kernel, typer.Option(help="This machine's kernel, or User Mode Linux: it has netem, and needs no rights.")
+    ] = Kernel.host,
+) -> None:
+    """Play a scenario, check the six characteristics, write a report."""
+    console = Console()
+    request = _with_options(load_scenario(scenario), speedup, vehicles)
+    directory = (out or default_path(request.name)).absolute()
+    chosen_seed = secrets.randbelow(2**32) if seed is None else seed
+    if kernel is Kernel.uml:
+        if backend is Backend.sim:
+            raise HarnessError("--kernel uml is for real processes: virtual time, --backend sim, needs no kernel")
+        options = {"--seed": chosen_seed, "--out": directory, "--speedup": speedup, "--vehicles": vehicles}
+        given = [f"{option}={value}" for option, value in options.items() if value is not None]
+        console.print("Booting User Mode Linux.", style="dim")
+        raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
+    console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
+    if backend is Backend.sim and request.events.source == "mavlink":
+        console.print("Virtual time has no telemetry: events are random (Algorithm 21).", style="dim")
+    shown = progress.for_console(console)
+    try:
+        finished = run(request, chosen_seed, directory, shown, backend.value)
+    finally:
+        shown.close()
+    show_result(console, finished.result)
+    show_survival(console, finished.survival)
+    _show_end(console, finished)
+    raise typer.Exit(finished.exit_status)
+
+
+def _with_options(scenario: Scenario, speedup: float | None, vehicles: Vehicles | None) -> Scenario:
+    """The scenario as resolved: the command line's word comes before the file's."""
+    document: dict[str, Any] = scenario.model_dump()
+    if speedup is not None:
+        if not 0 < speedup <= 1000:
+            raise typer.BadParameter(f"{speedup:g} is not a speedup: it is more than 0 and at most 1000")
+        document["speedup"] = speedup
+    if vehicles is not None:
+        document["vehicles"]["kind"] = vehicles.value
+    try:
+        return Scenario.model_validate(document)
+    except ValidationError as error:
+        raise ScenarioError(explain(error, Scenario)) from None
+
+
+def _show_end(console: Console, finished: Run) -> None:
+    if finished.played.outcome != "completed":
+        complain(f"{finished.played.outcome_detail}; what there was has been exported and checked")
+    for error in finished.result.errors:
+        complain(error)
+    for sentence in finished.played.unmatched_fates:
+        complain(f"{sentence}, so this run does not show what it was meant to")
+    slow = [
+        f"{vehicle} ({record['real_time_factor']:.2f})"
+        for vehicle, record in finished.played.vehicles.items()
+        if (record.get("real_time_factor") or 1.0) < 0.95
+    ]
+    if slow:
+        complain(f"vehicles {', '.join(slow)} did not keep up with the clock: choose a smaller --speedup")
+    late = finished.lateness
+    if late is not None and not late.tolerable:
+        told = f"one in twenty of the agents' vote timers fired {late.late_s:.1f} or more mission seconds late"
+        complain(f"this machine was too slow: {told} (set to {late.asked_s:g} s): choose a smaller --speedup")
+    wall = f"{finished.wall_s:.0f}" if finished.wall_s >= 10 else f"{finished.wall_s:.1f}"
+    console.print(f"{wall} s; report: {finished.report}", highlight=False, soft_wrap=True)

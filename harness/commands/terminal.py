@@ -1,0 +1,63 @@
+"""What several commands print, and how: results for people, JSON for programs, complaints on standard error."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import typer
+from rich.console import Console, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from harness import checker
+from harness.checker.survival import in_words
+from harness.matrix.record import MatrixRecord
+from harness.record import Survival
+from harness.scale.record import ScaleRecord
+
+STYLES = {"holds": "green", "violated": "bold red", "not applicable": "yellow"}
+MARKS = {"holds": "✔", "violated": "✘", "not applicable": "-"}
+EVIDENCE_SHOWN = 5
+
+
+def show_result(console: Console, result: checker.Result) -> None:
+    table = Table.grid(padding=(0, 2))
+    for number, one in result.characteristics.items():
+        verdict = Text(f"{MARKS[one.verdict]} {one.verdict}", style=STYLES[one.verdict])
+        table.add_row(number, one.name, verdict, Text(one.reason))
+        for finding in one.evidence[:EVIDENCE_SHOWN]:
+            table.add_row("", "", "", Text(f"agent {finding.agent_id}: {finding.detail}", style="red"))
+        if len(one.evidence) > EVIDENCE_SHOWN:
+            table.add_row("", "", "", Text(f"and {len(one.evidence) - EVIDENCE_SHOWN} more in run.json or --json"))
+    console.print(table)
+    known = {name: value for name, value in result.figures.items() if value is not None}
+    words = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in known.items())
+    console.print(words, highlight=False, style="dim")
+
+
+def show_survival(console: Console, survived: Survival) -> None:
+    for sentence in in_words(survived):
+        console.print(sentence, highlight=False, soft_wrap=True)
+
+
+def end_sweep(record: MatrixRecord | ScaleRecord, table: RenderableType | None, picture: Path) -> NoReturn:
+    """Show what came out, as JSON if there is no table, and exit."""
+    if table is None:
+        print_json(record.to_json())
+    else:
+        console = Console()
+        console.print(table)
+        console.print(f"{record.wall_s:.0f} s; {picture}", highlight=False, soft_wrap=True)
+    if record.outcome == "interrupted":
+        ended = f"the {record.runs} of {record.runs_asked} runs that had ended are in {picture.parent}"
+        complain(f"interrupted; {ended}")
+    raise typer.Exit(record.exit_status)
+
+
+def print_json(document: Any) -> None:
+    sys.stdout.write(json.dumps(document, indent=1) + "\n")
+
+
+def complain(sentence: str) -> None:
+    Console(stderr=True).print(Text(f"ucp-harness: {sentence}", style="red"), soft_wrap=True)

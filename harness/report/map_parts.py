@@ -1,0 +1,173 @@
+"""The parts that the network falls into, each with a letter, and the stretches of a track that were flown in them.
+
+A part is two or more vehicles that reach each other and not everybody; whoever reaches nobody is alone. A part keeps
+its letter from one state to the next as long as most of it does.
+"""
+
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count
+from operator import attrgetter
+
+from harness.connectivity import Connectivity, State
+from harness.report.chain_tree import ranges
+from harness.tracks import Fix, Tracks, between
+
+MAX_STRETCHES = 4000
+"""Of all vehicles together; nobody could tell more of them apart."""
+MAX_NAMED = 6
+"""Parts that are told one by one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Division:
+    """From `at_s` on the living vehicles were in these parts, by number from 0, the rest alone.
+
+    While everybody reaches everybody, all are `together`, and there is no part.
+    """
+
+    at_s: float
+    what: str
+    parts: dict[int, frozenset[int]]
+    alone: frozenset[int]
+    together: frozenset[int]
+
+    @property
+    def living(self) -> frozenset[int]:
+        return self.together | self.alone | frozenset().union(*self.parts.values())
+
+    def place_of(self, vehicle: int) -> tuple[int | None, frozenset[int]]:
+        """Its part, and whom it reaches."""
+        return self.part_of(vehicle), self.fellows(vehicle)
+
+    def part_of(self, vehicle: int) -> int | None:
+        """The number of its part; None if it is in none."""
+        return next((number for number, members in self.parts.items() if vehicle in members), None)
+
+    def fellows(self, vehicle: int) -> frozenset[int]:
+        """Those that it reaches, and itself."""
+        part = self.part_of(vehicle)
+        if part is not None:
+            return self.parts[part]
+        return self.together if vehicle in self.together else frozenset({vehicle})
+
+    def changed_since(self, before: "Division") -> int:
+        """How many vehicles were lost or back, or reached others than before of those that lived before and after."""
+        both = self.living & before.living
+        moved = sum(self.fellows(vehicle) & both != before.fellows(vehicle) & both for vehicle in both)
+        return moved + len(self.living ^ before.living)
+
+    def in_words(self) -> str:
+        """Such as "all 5 connected", or "A 1-3; B 4, 5; alone 6"."""
+        if self.together:
+            return f"all {len(self.together)} connected" if len(self.together) > 1 else "1 vehicle"
+        said = [f"{letter(number)} {listed(members)}" for number, members in self.parts.items()]
+        if len(said) > MAX_NAMED:
+            largest = max(self.parts.values(), key=len)
+            said = [f"{len(said)} parts, the largest of {len(largest)}"]
+        if self.alone:
+            few = len(ranges(sorted(self.alone))) <= MAX_NAMED
+            said.append(f"alone {listed(self.alone)}" if few else f"{len(self.alone)} alone")
+        return "; ".join(said) or "nobody left"
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A vehicle's way while its place in the network did not change; `division` is the one in which it began."""
+
+    vehicle: int
+    fixes: list[Fix]
+    division: Division | None
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """From take-off, or from where it was first seen, until the run ended or the vehicle was lost."""
+
+    vehicle: int
+    stretches: list[Stretch]
+    lost: bool
+
+    @property
+    def start(self) -> Fix:
+        return self.stretches[0].fixes[0]
+
+    @property
+    def end(self) -> Fix:
+        return self.stretches[-1].fixes[-1]
+
+
+def letter(number: int) -> str:
+    """A, B, ... Z, A2, B2, ..."""
+    return chr(ord("A") + number % 26) + (str(number // 26 + 1) if number >= 26 else "")
+
+
+def listed(vehicles: frozenset[int]) -> str:
+    return ", ".join(ranges(sorted(vehicles)))
+
+
+def divisions(states: Sequence[State]) -> list[Division]:
+    found: list[Division] = []
+    before: dict[int, frozenset[int]] = {}
+    for state in states:
+        if len(state.components) == 1:
+            found.append(Division(state.at_s, state.what, {}, frozenset(), state.components[0]))
+            continue
+        parts = [group for group in state.components if len(group) > 1]
+        alone = frozenset().union(*(group for group in state.components if len(group) == 1))
+        numbered = _numbered(parts, before)
+        before = numbered or before
+        found.append(Division(state.at_s, state.what, numbered, alone, frozenset()))
+    return found
+
+
+def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]) -> dict[int, frozenset[int]]:
+    """The parts by number: that of the former part most of which is in it, or else the first that is free."""
+    numbers: dict[int, frozenset[int]] = {}
+    for part in parts:
+        shared = {number: len(part & members) for number, members in before.items() if number not in numbers}
+        best = max(shared, key=lambda number: shared[number], default=None)
+        if best is None or 2 * shared[best] <= len(before[best]):
+            best = None
+        numbers[best if best is not None else -1 - len(numbers)] = part
+    free = (number for number in count() if number not in numbers)
+    return dict(sorted((number if number >= 0 else next(free), part) for number, part in numbers.items()))
+
+
+def longest(found: Sequence[Division], end_s: float, most: int) -> list[Division]:
+    """The first, and those of the others that lasted longest; each then lasts until the next that is left."""
+    if len(found) <= most:
+        return list(found)
+    ends = [*(division.at_s for division in found[1:]), end_s]
+    by_length = sorted(range(1, len(found)), key=lambda at: found[at].at_s - ends[at])
+    return [found[at] for at in sorted([0, *by_length[: most - 1]])]
+
+
+def lives(
+    vehicle: int, tracks: Tracks, network: Connectivity, found: Sequence[Division], end_s: float
+) -> Iterator[Life]:
+    """The ways of a vehicle, and of those that took its place after it was lost."""
+    wreck: Fix | None = None
+    for begin_s, until_s, lost in network.lives(vehicle, end_s):
+        flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
+        while wreck and flown and flown[0][1:] == wreck[1:]:  # the new vehicle is not there yet
+            del flown[0]
+        if flown:
+            end = tracks.at(vehicle, until_s)
+            yield Life(vehicle, list(_stretches(vehicle, [*flown, end], found)), lost)
+            wreck = end
+
+
+def _stretches(vehicle: int, way: list[Fix], found: Sequence[Division]) -> Iterator[Stretch]:
+    now = next((division for division in reversed(found) if division.at_s <= way[0].at_s), None)
+    begin = 0
+    for division in found:
+        unchanged = now is not None and now.place_of(vehicle) == division.place_of(vehicle)
+        if unchanged or not way[0].at_s < division.at_s < way[-1].at_s:
+            continue
+        end = bisect_left(way, division.at_s, begin, key=attrgetter("at_s"))
+        turn = between(way[end - 1], way[end], division.at_s)
+        yield Stretch(vehicle, [*way[begin:end], turn], now)
+        way[end - 1], begin, now = turn, end - 1, division
+    yield Stretch(vehicle, way[begin:], now)

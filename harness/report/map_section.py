@@ -1,0 +1,150 @@
+"""Where the vehicles flew, and who could reach whom: a map of the tracks, and the swarm at telling moments."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from markupsafe import Markup
+
+from harness.connectivity import NETWORK_FILE, Connectivity, read_connectivity
+from harness.report import map_svg, words
+from harness.report.colours import Ink
+from harness.report.map_geometry import Extent, extent
+from harness.report.map_parts import MAX_STRETCHES, Division, Life, divisions, letter, lives, longest
+from harness.rundir import TRACKS_FILE
+from harness.timeline import RANGE
+from harness.tracks import Tracks, read_tracks
+
+MOVES_M = 1.0
+"""A vehicle that stays within so many metres stands."""
+MOMENTS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """The swarm at one moment: `at` and, if something happened, `what`; and how the network then was."""
+
+    at: str
+    what: str
+    network: str
+    picture: Markup
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """`tracks` is None if there is nothing to draw, and `notes` then say why."""
+
+    tracks: Markup | None
+    legend: list[tuple[Markup, str]]
+    """How something is drawn, and what it is."""
+    moments: list[Moment]
+    notes: list[str]
+
+
+def section(run_dir: Path, ink: Mapping[int, Ink]) -> Section | None:
+    """None if no vehicle of the run is known to have moved, and nothing was wrong with what was read."""
+    tracks = read_tracks(run_dir / TRACKS_FILE, ink)
+    if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
+        return Section(None, [], [], tracks.problems) if tracks.problems else None
+    network = read_connectivity(run_dir / NETWORK_FILE, ink)
+    return _drawn(tracks, network, ink)
+
+
+def _moved(tracks: Tracks, vehicle: int) -> bool:
+    fixes = tracks.by_vehicle[vehicle]
+    return any(
+        max(metres) - min(metres) > MOVES_M
+        for metres in ([fix.north_m for fix in fixes], [fix.east_m for fix in fixes])
+    )
+
+
+def _drawn(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink]) -> Section:
+    end_s = max(fixes[-1].at_s for fixes in tracks.by_vehicle.values())
+    known = [division for division in divisions(network.states) if division.at_s <= end_s]
+    kept = longest(known, end_s, max(MAX_STRETCHES // len(tracks.by_vehicle), 2))
+    flown = [life for vehicle in tracks.by_vehicle for life in lives(vehicle, tracks, network, kept, end_s)]
+    land = extent([fix for fixes in tracks.by_vehicle.values() for fix in fixes])
+    reboots = [(tracks.at(vehicle, at_s), vehicle) for at_s, vehicle in network.reboots if at_s <= end_s]
+    moments = [
+        _moment(at_s, division, tracks, network, flown, land, ink) for at_s, division in _telling(known, tracks, end_s)
+    ]
+    notes = [*tracks.problems, *network.problems]
+    if not known:
+        notes.append("network.jsonl: who could reach whom is not on record")
+    elif len(kept) < len(known):
+        notes.append(f"network.jsonl: of {len(known) - 1} changes the map has the {len(kept) - 1} that lasted longest")
+    return Section(
+        map_svg.draw_tracks(flown, reboots, land, ink, _description(tracks, land, moments)),
+        _legend(flown, rebooted=bool(reboots)),
+        moments,
+        notes,
+    )
+
+
+def _telling(known: Sequence[Division], tracks: Tracks, end_s: float) -> list[tuple[float, Division | None]]:
+    """Begin, end, and the changes between that did most to most vehicles for longest, with what was then in force."""
+    begin_s = min(fixes[0].at_s for fixes in tracks.by_vehicle.values())
+    ends = [*(division.at_s for division in known[1:]), end_s]
+    weights = {}
+    for before, division, until_s in zip(known, known[1:], ends[1:], strict=False):
+        if division.at_s > begin_s:
+            weights[division.at_s] = division.changed_since(before) * (until_s - division.at_s)
+    told = sorted(weights, key=lambda at_s: -weights[at_s])[: MOMENTS - 2]
+    moments = sorted({begin_s, *told, end_s})
+    return [(at_s, next((one for one in reversed(known) if one.at_s <= at_s), None)) for at_s in moments]
+
+
+def _moment(
+    at_s: float,
+    division: Division | None,
+    tracks: Tracks,
+    network: Connectivity,
+    flown: Sequence[Life],
+    land: Extent,
+    ink: Mapping[int, Ink],
+) -> Moment:
+    living = set(ink) if division is None else division.living
+    seen = {vehicle: tracks.at(vehicle, at_s) for vehicle in sorted(living) if vehicle in tracks.by_vehicle}
+    links = network.links(at_s) if division else []
+    lost = [life.end for life in flown if life.lost and life.end.at_s <= at_s and life.vehicle not in living]
+    what = division.what if division and division.at_s == at_s and division.what not in (RANGE, "start") else ""
+    said = "the network is not on record" if division is None else division.in_words()
+    at = words.duration(round(at_s, 1))
+    picture = map_svg.draw_moment(
+        seen,
+        lost,
+        [(one, other) for one, other in links if one in seen and other in seen],
+        division,
+        land,
+        ink,
+        f"The swarm at {at}: {said}",
+    )
+    return Moment(at, what, said, picture)
+
+
+def _legend(flown: Sequence[Life], *, rebooted: bool) -> list[tuple[Markup, str]]:
+    """What is on the map of the tracks, and no more."""
+    parts: dict[str, set[int]] = {}
+    for life in flown:
+        for one in life.stretches:
+            part = one.division.part_of(life.vehicle) if one.division else None
+            parts.setdefault(map_svg.look(one.division, life.vehicle), set()).update(() if part is None else (part,))
+    means = {"whole": "connected to all", "unknown": "network not on record", "alone": "alone, cut off from all"}
+    entries = [
+        (which, means.get(which) or f"part {', '.join(map(letter, sorted(parts[which])))}")
+        for which in map_svg.LOOKS
+        if which in parts
+    ]
+    entries += [("start", "start"), ("end", "end")]
+    entries += [("lost", "lost")] if any(life.lost for life in flown) else []
+    entries += [("reboot", "agent reboots")] if rebooted else []
+    return [(map_svg.sample(which), meaning) for which, meaning in entries]
+
+
+def _description(tracks: Tracks, land: Extent, moments: Sequence[Moment]) -> str:
+    """What the map shows, in words."""
+    count = len(tracks.by_vehicle)
+    said = "; ".join(f"at {one.at}{f', {one.what}' if one.what else ''}: {one.network}" for one in moments)
+    vehicles = f"{count} vehicles" if count > 1 else "1 vehicle"
+    area = f"{land.width_m:.0f} m from west to east, {land.height_m:.0f} m from south to north"
+    return f"{vehicles}; {area}; {said}."

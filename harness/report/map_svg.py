@@ -1,0 +1,248 @@
+"""The map as SVG: the tracks, coloured by the part of the network that the vehicle was in, and the swarm at one moment.
+
+Colour is never all: parts have letters and dashes, vehicles their IDs, and everything has a tooltip. `map.css` has the
+colours, so the pictures stand inside a page that includes STYLE.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from markupsafe import Markup
+
+from harness.report import words
+from harness.report.colours import Ink
+from harness.report.map_geometry import Extent, Point, Projection, thinned
+from harness.report.map_parts import Division, Life, Stretch, letter, listed
+from harness.report.map_tags import tags
+from harness.report.svg import FONT, n
+from harness.tracks import Fix
+
+STYLE = (Path(__file__).parent / "map.css").read_text(encoding="utf-8")
+
+PART_LOOKS = 4
+"""Parts that look different; further ones look the same again, and have other letters."""
+LOOKS = ("unknown", "whole", *(f"part{number}" for number in range(PART_LOOKS)), "alone")
+MAX_POINTS = 20_000
+MAX_LINKS = 1500
+"""Drawn at one moment; of more only the shortest."""
+MOST_TAGGED_AT_A_MOMENT = 15
+"""Vehicles that have their IDs written beside them in a small map."""
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 14, 62
+_ROOM_WIDTH, _ROOM_HEIGHT = 900, 600
+_MOMENT_WIDTH, _MOMENT_HEIGHT = 300, 240
+
+
+def look(division: Division | None, vehicle: int) -> str:
+    """The class of what is drawn of a vehicle at that time."""
+    if division is None:
+        return "unknown"
+    if vehicle in division.together:
+        return "whole"
+    part = division.part_of(vehicle)
+    return "alone" if part is None else f"part{part % PART_LOOKS}"
+
+
+def draw_tracks(
+    lives: Sequence[Life],
+    reboots: Sequence[tuple[Fix, int]],
+    land: Extent,
+    ink: Mapping[int, Ink],
+    description: str,
+) -> Markup:
+    """`reboots` say where and whose agent went down; `description` says in words what the picture shows."""
+    to_px = Projection(land, _LEFT, _TOP, _ROOM_WIDTH, _ROOM_HEIGHT)
+    return Markup(
+        '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
+        ' aria-labelledby="tracks-title tracks-desc" font-family="{font}" font-size="12">'
+        '<title id="tracks-title">Map of the tracks</title><desc id="tracks-desc">{desc}</desc>\n'
+        "{frame}\n{ways}\n{marks}</svg>\n"
+    ).format(
+        w=n(_LEFT + to_px.width + _RIGHT),
+        h=n(_TOP + to_px.height + _BOTTOM),
+        font=FONT,
+        desc=description,
+        frame=_frame(to_px),
+        ways=_ways([stretch for life in lives for stretch in life.stretches], to_px),
+        marks=_marks(lives, reboots, to_px, ink),
+    )
+
+
+def draw_moment(
+    swarm: Mapping[int, Fix],
+    lost: Sequence[Fix],
+    links: Sequence[tuple[int, int]],
+    division: Division | None,
+    land: Extent,
+    ink: Mapping[int, Ink],
+    description: str,
+) -> Markup:
+    """The living vehicles of the `swarm`, and where others were `lost`."""
+    to_px = Projection(land, 1, 1, _MOMENT_WIDTH, _MOMENT_HEIGHT)
+    at = {vehicle: to_px(fix) for vehicle, fix in swarm.items()}
+    dots = (_dot(vehicle, place, division, ink[vehicle]) for vehicle, place in at.items())
+    tagged = list(at.items()) if len(at) <= MOST_TAGGED_AT_A_MOMENT else []
+    return Markup(
+        '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
+        ' preserveAspectRatio="xMinYMin" aria-label="{desc}" font-family="{font}" font-size="12">'
+        '<rect class="frame" x="1" y="1" width="{fw}" height="{fh}"/>{links}{crosses}{dots}{tags}</svg>'
+    ).format(
+        w=n(to_px.width + 2),
+        h=n(to_px.height + 2),
+        fw=n(to_px.width),
+        fh=n(to_px.height),
+        desc=description,
+        font=FONT,
+        links=_links(at, links, division),
+        crosses=Markup("").join(_cross(to_px(fix), "a vehicle was lost here") for fix in lost),
+        dots=Markup("").join(dots),
+        tags=tags(tagged, [to_px(fix) for fix in lost], to_px, ink),
+    )
+
+
+def _links(at: Mapping[int, Point], links: Sequence[tuple[int, int]], division: Division | None) -> Markup:
+    drawn: dict[str, list[str]] = {}
+    shortest = sorted(links, key=lambda pair: math.dist(at[pair[0]], at[pair[1]]))
+    for one, other in shortest[:MAX_LINKS]:
+        (x1, y1), (x2, y2) = at[one], at[other]
+        drawn.setdefault(look(division, one), []).append(f"M{n(x1)} {n(y1)}L{n(x2)} {n(y2)}")
+    return Markup("").join(
+        Markup('<path class="link {}" d="{}"/>').format(which, "".join(lines)) for which, lines in drawn.items()
+    )
+
+
+def _dot(vehicle: int, place: Point, division: Division | None, ink: Ink) -> Markup:
+    return Markup('<circle class="dot {}" cx="{}" cy="{}" r="4.5" fill="{}"><title>{}</title></circle>').format(
+        look(division, vehicle),
+        n(place[0]),
+        n(place[1]),
+        ink.fill,
+        f"vehicle {vehicle}: {_whereabouts(division, vehicle)}",
+    )
+
+
+def sample(which: str) -> Markup:
+    """For a legend: one of LOOKS, or start, end, lost, reboot."""
+    place = (17.0, 8.0)
+    match which:
+        case "start":
+            shape = _start(place, "start", "currentColor", "currentColor")
+        case "end":
+            shape = _end(place, "end", "currentColor", "currentColor")
+        case "lost":
+            shape = _cross(place, "lost")
+        case "reboot":
+            shape = _diamond(place, "reboot")
+        case _:
+            shape = Markup('<path class="way {}" d="M1 8h32"/>').format(which)
+    return Markup('<svg width="34" height="16" aria-hidden="true">{}</svg>').format(shape)
+
+
+def _frame(to_px: Projection) -> Markup:
+    """A rule and a tick for each round metre, the scale bar, and where north is."""
+    left, top = to_px.left, to_px.top
+    right, bottom = left + to_px.width, top + to_px.height
+    north, east = to_px.ticks_m()
+    rules = [f"M{n(left)} {n(to_px.y(metres))}H{n(right)}" for metres in north]
+    rules += [f"M{n(to_px.x(metres))} {n(top)}V{n(bottom)}" for metres in east]
+    texts = [_text(left - 7, to_px.y(metres) + 4, "end", words.value(round(metres, 6))) for metres in north]
+    texts += [_text(to_px.x(metres), bottom + 17, "middle", words.value(round(metres, 6))) for metres in east]
+    bar_m = to_px.scale_bar_m()
+    bar_px, y = bar_m * to_px.px_per_m, bottom + 44
+    return Markup(
+        '<path class="rule" d="{}"/><rect class="frame" x="{}" y="{}" width="{}" height="{}"/>{}{}{}'
+        '<path class="bar" d="M{} {}v5h{}v-5"><title>scale bar</title></path>{}'
+        '<path class="arrow" d="M{} {}v-16m-4 6l4-6 4 6"/>{}'
+    ).format(
+        "".join(rules),
+        n(left),
+        n(top),
+        n(to_px.width),
+        n(to_px.height),
+        Markup("").join(texts),
+        _text(left, bottom + 36, "start", "metres east"),
+        Markup(
+            '<text class="quiet" text-anchor="end" transform="translate(14 {}) rotate(-90)">metres north</text>'
+        ).format(n(top)),
+        n(right - bar_px),
+        n(y),
+        n(bar_px),
+        _text(right - bar_px - 8, y + 5, "end", f"{words.value(round(bar_m, 6))}\u00a0m"),
+        n(right - bar_px - 92),
+        n(y + 6),
+        _text(right - bar_px - 82, y + 5, "start", "N"),
+    )
+
+
+def _ways(stretches: Sequence[Stretch], to_px: Projection) -> Markup:
+    """Quiet ones first, so that parts are seen over them."""
+    lines = thinned([[to_px(fix) for fix in one.fixes] for one in stretches], MAX_POINTS)
+    looks = [look(one.division, one.vehicle) for one in stretches]
+    drawn = sorted(zip(looks, stretches, lines, strict=True), key=lambda way: LOOKS.index(way[0]))
+    return Markup("\n").join(
+        Markup('<path class="way {}" d="M{}"><title>{}</title></path>').format(
+            which, "L".join(f"{n(x)} {n(y)}" for x, y in line), _told(one)
+        )
+        for which, one, line in drawn
+    )
+
+
+def _told(stretch: Stretch) -> str:
+    begin, end = (words.duration(stretch.fixes[at].at_s) for at in (0, -1))
+    return f"vehicle {stretch.vehicle}, {begin} to {end}: {_whereabouts(stretch.division, stretch.vehicle)}"
+
+
+def _whereabouts(division: Division | None, vehicle: int) -> str:
+    if division is None:
+        return "network not on record"
+    part, fellows = division.place_of(vehicle)
+    others = listed(fellows - {vehicle})
+    if not others:
+        return "alone"
+    return f"connected to all, {others}" if part is None else f"part {letter(part)}, with {others}"
+
+
+def _marks(
+    lives: Sequence[Life], reboots: Iterable[tuple[Fix, int]], to_px: Projection, ink: Mapping[int, Ink]
+) -> Markup:
+    """Starts, reboots and ends, and the vehicles' IDs beside their ends."""
+    parts = []
+    for life in lives:
+        colours, start, end = ink[life.vehicle], life.start, life.end
+        begins = f"vehicle {life.vehicle} starts at {words.duration(start.at_s)}"
+        ends = f"vehicle {life.vehicle} {'is lost' if life.lost else 'ends'} at {words.duration(end.at_s)}"
+        parts.append(_start(to_px(start), begins, colours.fill, colours.stroke))
+        parts.append(_cross(to_px(end), ends) if life.lost else _end(to_px(end), ends, colours.fill, colours.stroke))
+    parts += [
+        _diamond(to_px(fix), f"agent {vehicle} reboots at {words.duration(fix.at_s)}") for fix, vehicle in reboots
+    ]
+    return Markup("").join(parts) + tags([(life.vehicle, to_px(life.end)) for life in lives], [], to_px, ink)
+
+
+def _start(place: Point, tip: str, fill: str, stroke: str) -> Markup:
+    return Markup('<rect x="{}" y="{}" width="7" height="7" fill="{}" stroke="{}"><title>{}</title></rect>').format(
+        n(place[0] - 3.5), n(place[1] - 3.5), fill, stroke, tip
+    )
+
+
+def _end(place: Point, tip: str, fill: str, stroke: str) -> Markup:
+    return Markup('<circle cx="{}" cy="{}" r="4.5" fill="{}" stroke="{}"><title>{}</title></circle>').format(
+        n(place[0]), n(place[1]), fill, stroke, tip
+    )
+
+
+def _cross(place: Point, tip: str) -> Markup:
+    return Markup('<path class="lost" d="M{} {}l10 10m0-10l-10 10"><title>{}</title></path>').format(
+        n(place[0] - 5), n(place[1] - 5), tip
+    )
+
+
+def _diamond(place: Point, tip: str) -> Markup:
+    return Markup('<path class="reboot" d="M{} {}l5 5-5 5-5-5z"><title>{}</title></path>').format(
+        n(place[0]), n(place[1] - 5), tip
+    )
+
+
+def _text(x: float, y: float, anchor: str, text: str) -> Markup:
+    return Markup('<text class="quiet" x="{}" y="{}" text-anchor="{}">{}</text>').format(n(x), n(y), anchor, text)

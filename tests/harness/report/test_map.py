@@ -1,0 +1,254 @@
+"""The map: which vehicle flew where, in which part of the network, and what is said of it."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+from harness.connectivity import State
+from harness.report import map_section, write_report
+from harness.report.colours import Ink, inks
+from harness.report.map_parts import divisions, letter, longest
+from harness.report.map_section import Section
+from harness.rundir import TRACKS_FILE
+from harness.scenario import Scenario
+from tests.harness.report.flights import Way, split_and_rejoin, still, write_flight, write_lines
+from tests.harness.report.runs import write_run
+from tests.harness.report.test_page import Reader
+
+FIVE = range(1, 6)
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def scenario(range_m: float = 250.0, **more: Any) -> Scenario:
+    network = {"radio": {"hard_range": {"range_m": range_m}}}
+    return Scenario.model_validate({"name": "split", "duration_s": 1200, "network": network, **more})
+
+
+def drawn(run_dir: Path, seconds: int = 600, ways: dict[int, Way] | None = None, **more: Any) -> Section:
+    ways = ways or {vehicle: split_and_rejoin(vehicle) for vehicle in FIVE}
+    write_flight(run_dir, scenario(agents=len(ways), **more), ways, seconds)
+    section = map_section.section(run_dir, inks(ways))
+    assert section is not None
+    return section
+
+
+def paths(section: Section) -> list[tuple[str, str, list[tuple[float, float]]]]:
+    """Class, tooltip and points of all ways on the map."""
+    found = []
+    for path in ElementTree.fromstring(str(section.tracks)).iter(f"{SVG}path"):  # noqa: S314 - ours
+        if path.get("class", "").startswith("way "):
+            points = [tuple(map(float, pair.split())) for pair in re.split("[ML]", path.get("d", "")) if pair]
+            found.append((path.get("class", "").removeprefix("way "), path.findtext(f"{SVG}title") or "", points))
+    return found  # type: ignore[return-value]
+
+
+def said(section: Section) -> list[str]:
+    return [" ".join(filter(None, (one.at, one.what, one.network))).replace("\u00a0", " ") for one in section.moments]
+
+
+def state(at_s: float, *components: set[int]) -> State:
+    return State(at_s, "range", tuple(frozenset(component) for component in components))
+
+
+def test_a_split_and_a_rejoin_are_on_the_map_in_their_parts(tmp_path: Path) -> None:
+    section = drawn(tmp_path)
+    assert [which for _, which in section.legend] == ["connected to all", "part A", "part B", "start", "end"]
+    ways = paths(section)
+    assert sum(which == "part0" for which, _, _ in ways) == 3
+    assert sum(which == "part1" for which, _, _ in ways) == 2
+    (second,) = [tip for which, tip, _ in ways if which == "part0" and tip.startswith("vehicle 2")]
+    assert second.endswith("part A, with 1, 3")
+    assert all("connected to all" in tip for which, tip, _ in ways if which == "whole")
+
+
+def test_the_moments_are_begin_changes_and_end_with_the_live_links(tmp_path: Path) -> None:
+    section = drawn(tmp_path)
+    (begin, apart, together, end) = said(section)
+    assert begin == "0 s all 5 connected"
+    assert apart.endswith("min A 1\u20133; B 4, 5")
+    assert together.endswith("min all 5 connected")
+    assert end == "10 min all 5 connected"
+    links = [re.findall('class="link ([a-z0-9]+)"', one.picture) for one in section.moments]
+    assert links == [["whole"], ["part0", "part1"], ["whole"], ["whole"]]
+
+
+def test_a_known_track_gives_the_known_path(tmp_path: Path) -> None:
+    """A square of 200 m, flown north, east, south, west: on the map up, right, down, left."""
+
+    def square(at_s: float) -> tuple[float, float]:
+        side, along = int(at_s // 50) % 4, at_s % 50 * 4
+        return [(along, 0.0), (200.0, along), (200 - along, 200.0), (0.0, 200 - along)][side]
+
+    section = drawn(tmp_path, 200, {1: square, 2: still(100, 100)}, range_m=1000)
+    (points,) = [points for _, tip, points in paths(section) if tip.startswith("vehicle 1")]
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3), back = points
+    assert (x0, y0) == back
+    assert (x0, y1, x2, y3) == (x1, y2, x3, y0)
+    assert y1 < y0
+    assert x2 > x1
+    side = y0 - y1
+    assert x2 - x1 == pytest.approx(side, abs=0.11)
+    bar = re.search(r'class="bar" d="M[\d.]+ [\d.]+v5h([\d.]+)v-5"', str(section.tracks))
+    metres = re.search(r">(\d+)\u00a0m</text>", str(section.tracks))
+    assert bar
+    assert metres
+    assert float(bar[1]) / int(metres[1]) == pytest.approx(side / 200, rel=0.01)
+
+
+def test_a_vehicle_that_leaves_all_is_alone_from_where_it_left(tmp_path: Path) -> None:
+    ways = {1: still(0, 0), 2: still(10, 0), 3: lambda at_s: (0.0, 2 * at_s)}
+    section = drawn(tmp_path, 200, ways)
+    ((_, tip, points),) = [way for way in paths(section) if way[0] == "alone"]
+    assert tip.replace("\u00a0", " ") == "vehicle 3, 2.1 min to 3.33 min: alone"
+    ((_, _, before),) = [way for way in paths(section) if way[0] == "whole" and way[1].startswith("vehicle 3")]
+    assert before[-1] == points[0]
+    assert (points[0][0] - before[0][0]) / (points[-1][0] - before[0][0]) == pytest.approx(126 / 200, abs=0.01)
+    assert said(section)[1] == "2.1 min A 1, 2; alone 3"
+
+
+def test_a_track_changes_its_colour_between_two_looks_where_the_vehicle_then_was(tmp_path: Path) -> None:
+    timeline = [{"at_s": 50.25, "partition": [[1]]}, {"at_s": 50.75, "heal": True}]
+    ways: dict[int, Way] = {1: lambda at_s: (at_s, 0.0), 2: lambda at_s: (0.0, at_s)}
+    flown = paths(drawn(tmp_path, 100, ways, timeline=timeline))
+    (alone,) = [points for which, tip, points in flown if which == "alone" and tip.startswith("vehicle 1")]
+    before, after = [points for which, tip, points in flown if which == "whole" and tip.startswith("vehicle 1")]
+    assert (alone[0], alone[-1]) == (before[-1], after[0])
+    up = before[0][1] - after[-1][1]
+    assert (before[0][1] - alone[0][1]) / up == pytest.approx(0.5025, abs=0.001)
+    assert (before[0][1] - alone[-1][1]) / up == pytest.approx(0.5075, abs=0.001)
+
+
+def test_a_lost_vehicle_ends_in_a_cross_and_its_successor_begins_at_home(tmp_path: Path) -> None:
+    timeline = [
+        {"at_s": 50, "kill": [2]},
+        {"at_s": 100, "restart": [2]},
+        {"at_s": 120, "reboot": [1], "down_s": 10, "disk": "kept"},
+    ]
+
+    def killed(at_s: float) -> tuple[float, float]:
+        return (min(at_s, 50.0), 0.0) if at_s <= 101 else (0.0, at_s - 102)
+
+    ways: dict[int, Way] = {1: still(0, 5), 2: killed}
+    section = drawn(tmp_path, 150, ways, timeline=timeline)
+    tips = [tip.replace("\u00a0", " ") for tip in re.findall("<title>([^<]*)</title>", str(section.tracks))]
+    assert "vehicle 2 is lost at 50 s" in tips
+    assert "vehicle 2 starts at 102 s" in tips
+    assert "agent 1 reboots at 2 min" in tips
+    assert str(section.tracks).count('class="lost"') == 1
+    assert {"lost", "agent reboots"} <= {meaning for _, meaning in section.legend}
+    assert said(section)[1:3] == ["50 s kill 1 vehicle", "100 s restart all 2 connected"]
+    assert ['class="lost"' in one.picture for one in section.moments] == [False, True, False, False]
+
+
+def test_parts_keep_their_letters_while_most_of_them_stay() -> None:
+    found = divisions(
+        [
+            state(0, {1, 2, 3, 4, 5, 6, 7}),
+            state(10, {1, 2, 3, 4}, {5, 6, 7}),
+            state(20, {5, 6, 7, 4}, {1, 2, 3}),
+            state(30, {1, 2, 3, 4, 5, 6, 7}),
+            state(35, *({vehicle} for vehicle in range(1, 8))),
+            state(40, {4, 5, 6, 7}, {2, 3}, {1}),
+            state(50, {1, 6}, {2, 3}, {4, 5}, {7}),
+            state(60),
+        ]
+    )
+    assert [division.in_words() for division in found] == [
+        "all 7 connected",
+        "A 1\u20134; B 5\u20137",
+        "A 1\u20133; B 4\u20137",
+        "all 7 connected",
+        "alone 1\u20137",
+        "A 2, 3; B 4\u20137; alone 1",
+        "A 2, 3; B 1, 6; C 4, 5; alone 7",
+        "nobody left",
+    ]
+    assert [letter(number) for number in (0, 25, 26, 53)] == ["A", "Z", "A2", "B3"]
+
+
+def test_of_too_many_changes_those_that_lasted_longest_are_kept() -> None:
+    found = divisions([state(at_s, {1, 2}, {3 + at}) for at, at_s in enumerate((0, 1, 10, 12, 30))])
+    assert [one.at_s for one in longest(found, 40, 3)] == [0, 12, 30]
+    assert longest(found, 40, 5) == found
+
+
+def test_at_most_six_moments_are_shown_the_longest_among_them(tmp_path: Path) -> None:
+    timeline = [
+        entry
+        for at_s, until_s in ((100, 110), (200, 290), (300, 310), (400, 405), (500, 590))
+        for entry in ({"at_s": at_s, "partition": [[1, 2]]}, {"at_s": until_s, "heal": True})
+    ]
+    section = drawn(tmp_path, 600, {1: still(0, 0), 2: still(9, 9), 3: split_and_rejoin(1)}, timeline=timeline)
+    assert len(section.moments) == 6
+    assert {"3.33 min partition A 1, 2; alone 3", "8.33 min partition A 1, 2; alone 3"} <= set(said(section))
+    assert not [one for one in said(section) if one.startswith("6.67 min")]
+
+
+def test_the_description_says_in_words_what_happened(tmp_path: Path) -> None:
+    tracks = str(drawn(tmp_path).tracks)
+    described = re.search('<desc id="tracks-desc">([^<]*)</desc>', tracks)
+    assert described
+    assert described[1].startswith("5 vehicles; ")
+    assert "at 0\u00a0s: all 5 connected; at " in described[1]
+    assert "A 1\u20133; B 4, 5" in described[1]
+
+
+def test_twenty_minutes_of_five_stay_small_and_fifty_within_bounds(tmp_path: Path) -> None:
+    five = drawn(tmp_path, 1200)
+    assert len(str(five.tracks)) + sum(len(one.picture) for one in five.moments) < 60_000
+
+    def way(vehicle: int) -> Way:
+        return lambda at_s: (
+            at_s * math.cos(vehicle) / 3 + 60 * math.sin(at_s / 7),
+            at_s * math.sin(vehicle) / 3 + 60 * math.cos(at_s / (5 + vehicle % 3)),
+        )
+
+    fifty = drawn(tmp_path, 120, {vehicle: way(vehicle) for vehicle in range(1, 51)}, range_m=80)
+    assert sum(len(points) for _, _, points in paths(fifty)) <= 20_000
+    assert len(str(fifty.tracks)) + sum(len(one.picture) for one in fifty.moments) < 2_000_000
+
+
+@pytest.fixture
+def ink() -> dict[int, Ink]:
+    return inks(FIVE)
+
+
+def test_where_nobody_moves_or_nobody_looked_there_is_no_map(tmp_path: Path, ink: dict[int, Ink]) -> None:
+    assert map_section.section(tmp_path, ink) is None
+    write_flight(tmp_path, scenario(agents=5), {vehicle: still(vehicle, 0) for vehicle in FIVE}, 5)
+    assert map_section.section(tmp_path, ink) is None
+
+
+def test_tracks_without_a_record_of_the_network_are_drawn_and_it_is_said(tmp_path: Path, ink: dict[int, Ink]) -> None:
+    write_lines(tmp_path / TRACKS_FILE, [{"at_s": at, "places": {"3": [at * 9, 0, 0]}} for at in range(3)])
+    section = map_section.section(tmp_path, ink)
+    assert section is not None
+    assert [which for which, _, _ in paths(section)] == ["unknown"]
+    assert section.notes == ["network.jsonl: who could reach whom is not on record"]
+    assert "link" not in section.moments[0].picture
+
+
+def test_damaged_tracks_leave_a_sentence_on_the_page(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", {1: "1.1", 2: "1.1"})
+    (run_dir / TRACKS_FILE).write_text('{\n{"at_s": 1, "places": {"<script>": [0, 0, 0]}}\n')
+    page = Reader(write_report(run_dir).read_text(encoding="utf-8"))
+    assert "tracks.jsonl: 2 lines are left out, damaged or of no meaning." in page.text
+    assert "map" not in {attributes.get("class") for tag, attributes in page.elements if tag == "svg"}
+
+
+def test_texts_from_the_record_stay_text(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", {1: "1.1", 2: "1.1"})
+    write_flight(run_dir, scenario(agents=2), {1: still(0, 0), 2: split_and_rejoin(2)}, 20)
+    record = run_dir / "network.jsonl"
+    asked = {"at_s": 10.0, "what": "<script>alert(1)</script>", "asked": {"partition": [[1]]}}
+    write_lines(tmp_path / "more", [asked])
+    record.write_text(record.read_text() + (tmp_path / "more").read_text())
+    page = write_report(run_dir).read_text(encoding="utf-8")
+    assert "<script" not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    identifiers = re.findall(r' id="([^"]+)"', page)
+    assert len(identifiers) == len(set(identifiers))

@@ -1,0 +1,157 @@
+"""`--kernel uml`: the command line in User Mode Linux, as a user sees it from outside."""
+
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from netem import uml
+from netem.errors import UmlError
+from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences, write_scenario
+from tests.machine import require_uml
+
+QUICK = {"agents": 2, "duration_s": 20, "speedup": 20, "events": {"source": "random", "mean_s": 2}}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """An empty directory, where User Mode Linux is installed."""
+    require_uml()
+    return tmp_path
+
+
+def test_a_run_leaves_verdict_report_and_status_as_on_the_host(folder: Path) -> None:
+    scenario = write_scenario(folder, **QUICK, network={"delay": 0.1})
+    done = harness("run", scenario, "--kernel", "uml", "--vehicles", "none", "--seed", "7", "--out", folder / "run")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("holds") == 6
+    record = json.loads((folder / "run" / "run.json").read_text())
+    assert (record["outcome"], record["engine"], record["seed"]) == ("completed", "netem", 7)
+    assert "User Mode Linux" in record["versions"]["kernel"]
+    left = {path.name for path in folder.glob("run/**/*")}
+    assert {"report.html", "network.jsonl", "1.chain.json", "2.trace.jsonl"} <= left
+    assert all(path.stat().st_uid == os.geteuid() for path in folder.glob("run/**/*"))
+    assert harness("check", folder / "run").returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_is_exported_and_judged(folder: Path, number: signal.Signals) -> None:
+    with _Started(folder) as started:
+        started.wait_for_mission()
+        started.process.send_signal(number)
+        rest, errors = started.process.communicate(timeout=DEADLINE_S)
+    assert started.process.returncode == 130
+    assert "interrupted at mission second" in errors
+    assert "holds" in rest
+    assert {path.name for path in folder.glob("run/agents/*.chain.json")} == {"1.chain.json", "2.chain.json"}
+    assert (folder / "run" / "report.html").exists()
+    started.wait_until_nothing_is_left()
+
+
+def test_a_killed_harness_leaves_nothing_behind(folder: Path) -> None:
+    with _Started(folder) as started:
+        started.wait_for_mission()
+        assert started.left()
+        started.process.kill()
+        started.process.wait()
+        started.wait_until_nothing_is_left()
+
+
+def test_the_exit_status_and_both_outputs_come_out_whole(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    lines = 20000
+    assert _run(f"seq {lines}; echo complaint >&2; exit 7") == 7
+    out, err = capfd.readouterr()
+    assert out == "".join(f"{number}\n" for number in range(1, lines + 1))
+    assert err == "complaint\n"
+
+
+def test_a_kernel_that_panics_is_an_error_not_a_status(folder: Path) -> None:
+    with pytest.raises(UmlError, match="panic"):
+        _run("echo c >/proc/sysrq-trigger; sleep 60")
+
+
+def test_a_kernel_that_falls_silent_is_an_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uml, "SILENCE_LIMIT_S", 3.0)
+    monkeypatch.setattr(uml, "BEAT_S", 60)
+    with pytest.raises(UmlError, match="nothing came from it for 3 s"):
+        _run("sleep 60")
+
+
+def test_a_kernel_that_does_not_boot_is_an_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uml, "MEMORY", "nonsense")
+    with pytest.raises(UmlError, match="it did not boot"):
+        _run("true")
+
+
+def test_without_user_mode_linux_the_way_out_is_named(tmp_path: Path) -> None:
+    asked = ("run", write_scenario(tmp_path), "--kernel", "uml", "--out", tmp_path / "run")
+    done = harness(*asked, env={**os.environ, "PATH": str(tmp_path)})
+    assert done.returncode == 3
+    (said,) = sentences(done.stderr)
+    assert "apt install user-mode-linux" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_virtual_time_has_no_kernel(tmp_path: Path) -> None:
+    asked = ("run", write_scenario(tmp_path), "--kernel", "uml", "--backend", "sim", "--out", tmp_path / "run")
+    done = harness(*asked)
+    assert done.returncode == 2
+    assert "--backend sim" in sentences(done.stderr)[0]
+    assert not (tmp_path / "run").exists()
+
+
+def _run(script: str) -> int:
+    return uml.run(["sh", "-c", script], cwd=Path("/"), env={"PATH": uml.SYSTEM_PATH})
+
+
+class _Started:
+    """A long run in User Mode Linux; `temporary` is where it keeps what should be gone in the end."""
+
+    def __init__(self, folder: Path) -> None:
+        scenario = write_scenario(folder, **{**QUICK, "duration_s": 100_000})
+        self.temporary = folder / "tmp"
+        self.temporary.mkdir()
+        self.process = subprocess.Popen(
+            [*COMMAND, "run", str(scenario), "--kernel", "uml", "--vehicles", "none", "--out", str(folder / "run")],
+            env={**os.environ, "TMPDIR": str(self.temporary)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def wait_for_mission(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if "mission;" in line:
+                return
+        pytest.fail(f"it ended before the mission: {self.process.communicate()}")
+
+    def left(self) -> list[str]:
+        """The processes of its User Mode Linux: their command lines name its directory."""
+        found = []
+        for entry in Path("/proc").iterdir():
+            try:
+                command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            except OSError:
+                continue
+            if f"uml_dir={self.temporary}" in command:
+                found.append(command)
+        return found
+
+    def wait_until_nothing_is_left(self) -> None:
+        deadline = time.monotonic() + DEADLINE_S
+        while left := [*self.left(), *self.temporary.iterdir()]:
+            assert time.monotonic() < deadline, f"still there: {left}"
+            time.sleep(0.05)
+
+    def __enter__(self) -> "_Started":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.process.kill()
+        self.process.communicate()

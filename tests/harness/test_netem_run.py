@@ -1,0 +1,45 @@
+"""A whole run of agents over real netem, judged: on this machine if its kernel has netem, else in User Mode Linux."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from harness.progress import Silent
+from harness.run import run
+from harness.scenario import Scenario
+from tests.machine import require
+
+pytestmark = pytest.mark.lab
+
+LOSS = {"p": 0.02, "r": 0.38}  # 5 % in bursts of 2.6 messages
+DELAY = {"mean_s": 0.1, "jitter_s": 0.02, "distribution": "normal"}
+
+
+def test_agents_agree_over_delays_and_bursts_of_loss(tmp_path: Path) -> None:
+    require("netem")
+    scenario = Scenario.model_validate(
+        {
+            "name": "netem",
+            "agents": 3,
+            "duration_s": 60,
+            "speedup": 20,
+            "vehicles": {"kind": "none"},
+            "events": {"source": "random", "mean_s": 5},
+            "network": {"loss": LOSS, "delay": DELAY},
+            "final_reconcile": True,
+        }
+    )
+    finished = run(scenario, 1, tmp_path / "run", Silent())
+    assert finished.played.outcome == "completed", finished.played.outcome_detail
+    assert finished.played.engine == "netem"
+    assert finished.exit_status == 0
+    verdicts = {number: one.verdict for number, one in finished.result.characteristics.items()}
+    assert [verdicts[number] for number in ("2", "3", "4")] == ["holds"] * 3
+    assert (finished.result.figures["blocks"] or 0) > 0
+    start, *_, end = map(json.loads, (tmp_path / "run" / "network.jsonl").read_text().splitlines())
+    for receiver in start["applied"]["receivers"].values():
+        assert receiver["loss"] == LOSS | {"loss_good": 0.0, "loss_bad": 1.0}
+        # Delays are of mission seconds: on the wire they are as much shorter as the clock is faster.
+        assert receiver["delay"] == {"mean_s": 0.005, "jitter_s": 0.001, "distribution": "normal"}
+    assert all(receiver["passed"] > 0 for receiver in end["counters"]["receivers"].values())

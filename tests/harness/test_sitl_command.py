@@ -1,0 +1,132 @@
+"""`ucp-harness sitl` as a user runs it, against a firmware server on loopback."""
+
+import json
+import platform
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
+from tests.sitl.firmware_server import BINARY, RELEASE, FirmwareServer, serving
+
+pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="installs binaries for x86_64")
+
+
+@pytest.fixture
+def server() -> Iterator[FirmwareServer]:
+    with serving() as state:
+        yield state
+
+
+@pytest.fixture
+def environ(server: FirmwareServer, tmp_path: Path) -> dict[str, str]:
+    """An environment with a cache of its own and nothing but this server."""
+    cache = str(tmp_path / "cache")
+    return {"XDG_CACHE_HOME": cache, "PATH": "/usr/bin:/bin", "UCP_SITL_URL": server.url, "no_proxy": "127.0.0.1"}
+
+
+def test_install_path_list_and_install_again(environ: dict[str, str], tmp_path: Path) -> None:
+    directory = tmp_path / "cache" / "ucp-harness" / "sitl" / "copter" / "4.6.3"
+    done = harness("sitl", "install", env=environ)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"copter 4.6.3 is installed: {directory}\n"
+    again = harness("sitl", "install", "--version", "4.6.3", env=environ)
+    assert (again.returncode, again.stdout) == (0, f"copter 4.6.3 is installed already: {directory}\n")
+    path = harness("sitl", "path", env=environ)
+    assert (path.returncode, path.stdout) == (0, f"{directory}\n")
+    (offer,) = json.loads(harness("sitl", "list", "--json", env=environ).stdout)
+    assert offer.pop("fetched_at").endswith("Z")
+    assert offer.pop("size_bytes") > len(BINARY)
+    assert offer == {
+        "vehicle": "copter",
+        "source": "cache",
+        "path": str(directory),
+        "version": "4.6.3",
+        "current": True,
+        "problem": None,
+    }
+
+
+def test_list_has_what_the_environment_offers_and_what_is_damaged(environ: dict[str, str], tmp_path: Path) -> None:
+    harness("sitl", "install", env=environ)
+    installed = tmp_path / "cache" / "ucp-harness" / "sitl" / "copter" / "4.6.3"
+    (installed / "arducopter").write_bytes(b"x")
+    named, on_path = tmp_path / "named", tmp_path / "on path"
+    for directory, mode in ((named, 0o644), (on_path, 0o755)):
+        directory.mkdir()
+        (directory / "arducopter").write_bytes(BINARY)
+        (directory / "arducopter").chmod(mode)
+    environ |= {"ARDUPILOT_SITL": str(named), "PATH": f"{on_path}:{environ['PATH']}"}
+    offers = json.loads(harness("sitl", "list", "--json", env=environ).stdout)
+    assert [(offer["source"], offer["path"], offer["problem"]) for offer in offers] == [
+        ("ARDUPILOT_SITL", f"{named}/arducopter", "arducopter is not executable"),
+        ("PATH", f"{on_path}/arducopter", None),
+        ("cache", str(installed), "arducopter is not the file that was fetched (SHA-256)"),
+    ]
+    shown = harness("sitl", "list", env=environ).stdout
+    assert shown.count("arducopter is not") == 2
+    assert "4.6.3" in shown
+
+
+def test_a_damaged_binary_has_no_path(environ: dict[str, str], tmp_path: Path) -> None:
+    harness("sitl", "install", env=environ)
+    (tmp_path / "cache" / "ucp-harness" / "sitl" / "copter" / "4.6.3" / "copter.parm").unlink()
+    done = harness("sitl", "path", env=environ)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "is damaged, copter.parm cannot be read" in sentences(done.stderr)[0]
+
+
+def test_nothing_installed_is_status_3_with_the_command_that_installs(environ: dict[str, str]) -> None:
+    done = harness("sitl", "path", "--vehicle", "plane", env=environ)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert sentences(done.stderr) == ["no plane is installed: run `ucp-harness sitl install --vehicle plane`"]
+    assert "run `ucp-harness sitl install" in harness("sitl", "list", env=environ).stdout
+    assert json.loads(harness("sitl", "list", "--json", env=environ).stdout) == []
+
+
+@pytest.mark.parametrize("options", [("--version", "9.9.9"), ("--vehicle", "boat"), ("--url", "ftp://x")])
+def test_a_wrong_request_is_status_2(options: tuple[str, str], environ: dict[str, str]) -> None:
+    done = harness("sitl", "install", *options, env=environ)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+
+
+def test_no_server_is_status_3_in_one_sentence(environ: dict[str, str]) -> None:
+    environ["UCP_SITL_URL"] = "http://127.0.0.1:1"  # tcpmux, which nobody runs
+    done = harness("sitl", "install", env=environ)
+    assert done.returncode == 3
+    (said,) = sentences(done.stderr)
+    assert said.startswith("127.0.0.1:1 cannot be reached (Connection refused): if there is a mirror")
+
+
+def test_a_cache_that_cannot_be_written_is_status_3(environ: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "cache").write_text("a file")
+    done = harness("sitl", "install", env=environ)
+    assert done.returncode == 3
+    (said,) = sentences(done.stderr)
+    assert "set XDG_CACHE_HOME" in said
+
+
+def test_ctrl_c_is_status_130_and_what_came_is_kept(
+    server: FirmwareServer, environ: dict[str, str], tmp_path: Path
+) -> None:
+    server.change(f"{RELEASE}arducopter", silent_after=len(BINARY) // 2)
+    with subprocess.Popen(
+        [*COMMAND, "sitl", "install"], env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + DEADLINE_S
+        while not (kept := [part for part in tmp_path.glob("**/*.part/*.part") if part.stat().st_size]):
+            assert time.monotonic() < deadline and process.poll() is None, "nothing came"
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 130
+    assert sentences(stderr) == ["interrupted; the same command goes on where it stopped"]
+    assert 0 < kept[0].stat().st_size <= len(BINARY) // 2
+    server.change(f"{RELEASE}arducopter", silent_after=None)
+    assert harness("sitl", "install", env=environ).returncode == 0
+    assert server.ranges_of("arducopter")[1] is not None
