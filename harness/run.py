@@ -15,7 +15,8 @@ from typing import Any
 
 from harness import checker, report
 from harness.backends.agent_process import agent_command
-from harness.backends.process import ProcessRun, refuse_what_needs_virtual_time, refuse_what_this_machine_cannot
+from harness.backends.process import ProcessRun
+from harness.backends.rehearsal import refuse_what_needs_virtual_time, refuse_what_this_machine_cannot
 from harness.backends.simulation import refuse_what_needs_processes
 from harness.backends.vehicle_process import VehicleFailedError
 from harness.checker.survival import survival

@@ -5,28 +5,26 @@ stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and s
 """
 
 import asyncio
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Coroutine, Mapping
-from pathlib import Path
 from typing import Any
 
 from harness import mission
 from harness.agents import Status
 from harness.backends.agent_process import AgentFailedError, AgentProcess
+from harness.backends.rehearsal import network_needs
 from harness.backends.vehicle_process import VehicleProcess, system_ids
-from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
+from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.mission import Played
 from harness.progress import Progress, Snapshot
 from harness.reach import TRACK_S, Reach
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
-from harness.timeline import AgentFault, Change, NetworkChange, describe, timeline_of
+from harness.timeline import AgentFault, Change, NetworkChange, describe
 from netem.conditions import NetworkConditions
-from netem.errors import ConditionsError, EngineError, LabUnavailable, NetemError
+from netem.errors import LabUnavailable, NetemError
 from netem.lab import Lab
-from netem.tc import may_refuse
 from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
 from ucp.clock import MICROSECONDS, MissionClock
 
@@ -35,69 +33,6 @@ QUIET_POLL_S = 0.1
 START_DELAY_S = 0.05
 FOLLOW_S = 0.1
 """Wall time between two looks at where the vehicles are, at least."""
-
-
-def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
-    """Raises ScenarioError naming the keys that real processes cannot be given yet."""
-    keys = [
-        *(["fates"] if scenario.fates else []),
-        *(["clocks"] if scenario.clocks else []),
-        *(["events.source: scripted"] if scenario.events.source == "scripted" else []),
-    ]
-    if keys:
-        named = ", ".join(f"`{key}`" for key in keys)
-        raise ScenarioError(f"{named} need{'s' if len(keys) == 1 else ''} virtual time: use --backend sim")
-
-
-def network_needs(scenario: Scenario) -> list[str]:
-    """What the scenario asks of the network beyond loss and partition, each once.
-
-    Raises ScenarioError for conditions that mean nothing on a clock that runs at the scenario's speedup.
-    """
-    return list(dict.fromkeys(need for state in _networks(scenario) for need in state.needs()))
-
-
-def _networks(scenario: Scenario) -> list[NetworkConditions]:
-    """Every state of the network, each once, without partitions, on a clock that runs at the scenario's speedup."""
-    states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
-    found: list[NetworkConditions] = []
-    for state in states:
-        try:
-            network = state.at_speed(scenario.speedup).healed()
-        except ConditionsError as error:
-            raise ScenarioError(f"`network` at `speedup` {scenario.speedup:g}: {error}") from None
-        if network not in found:
-            found.append(network)
-    return found
-
-
-def refuse_what_this_machine_cannot(scenario: Scenario) -> None:
-    """Raises MachineError, with the way out, if no engine here does what the network asks.
-
-    Tried in a lab of its own, for a fraction of a second, and only if it asks for more than loss and partitions; what
-    some kernels refuse although they have netem is rehearsed there.
-    """
-    needs = network_needs(scenario)
-    rehearsed = [network for network in _networks(scenario) if may_refuse(network)]
-    if not needs:
-        return
-
-    async def attempt(folder: str) -> None:
-        async with await Lab.open(scenario.roster, needs=needs, log=Path(folder, "lab.log")) as lab:
-            for network in rehearsed:
-                await lab.apply(network)
-
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            asyncio.run(attempt(folder))
-        except LabUnavailable as error:
-            raise MachineError(str(error)) from None
-        except EngineError as error:
-            raise MachineError(
-                f"this kernel cannot do what the network asks; play it in virtual time (--backend sim): {error}"
-            ) from None
-        except NetemError as error:
-            raise MachineError(f"the lab could not be built: {error}") from None
 
 
 class ProcessRun:

@@ -8,13 +8,15 @@ from __future__ import annotations
 import asyncio
 import statistics
 from collections import Counter
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 from typing import Any, get_args
 
 import pytest
 
-from harness.backends.process import refuse_what_this_machine_cannot
+from harness.backends.rehearsal import refuse_what_this_machine_cannot
 from harness.errors import MachineError
 from harness.scenario import Scenario
 from netem.conditions import NetworkConditions
@@ -268,6 +270,22 @@ def test_what_some_kernels_with_netem_refuse_is_found_before_anything_starts(net
     refuse_what_this_machine_cannot(scenario(2.0))
     with pytest.raises(MachineError, match=r"this kernel cannot do .*--backend sim.*delay\.jitter_s asked.* 1 to 2"):
         refuse_what_this_machine_cannot(scenario(5.0))
+
+
+def test_flight_makes_links_differ_which_is_rehearsed_too(netem: str, tmp_path: Path) -> None:
+    twice = LinkConditions(duplicate=0.5)
+    refused: list[EngineError] = []
+
+    async def story(air: Air) -> None:
+        try:
+            await air.lab.apply(NetworkConditions(twice, links={(1, 2): replace(twice, loss=0.5)}))
+        except EngineError as error:
+            refused.append(error)
+
+    in_lab([1, 2, 3], netem, tmp_path, story)
+    flying = {"name": "Twice", "agents": 3, "speedup": 1, "network": {"duplicate": 0.5, "radio": {"hard_range": {}}}}
+    with pytest.raises(MachineError, match="duplicat") if refused else nullcontext():
+        refuse_what_this_machine_cannot(Scenario.model_validate(flying))
 
 
 def test_what_an_engine_cannot_do_is_refused_before_anything_starts_with_the_way_out(tmp_path: Path) -> None:
