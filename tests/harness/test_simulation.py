@@ -144,6 +144,13 @@ def test_what_is_not_delivered_would_have_changed_nothing(
     assert left_behind(simulate(one, seed)) == left_behind(needed)
 
 
+def test_nor_where_flight_makes_the_network() -> None:
+    one = load_scenario(SCENARIOS / "split_rejoin.yaml")
+    needed, all_ = simulate(one, 1, tracing=True), simulate(one, 1, tracing=True, deliver_all=True)
+    assert left_behind(needed) == left_behind(all_)
+    assert effective_runs(needed) == effective_runs(all_)
+
+
 def digest(simulated: Simulated) -> str:
     """Of exports, traces and figures."""
     document = left_behind(simulated)
@@ -168,6 +175,8 @@ BURSTS = {
         ("loss_15.yaml", 2, "a8cce796a772945e"),
         ("missed_commit.yaml", 1, "492a6c65e1d37673"),
         ("partition_heal.yaml", 1, "988c978a053cea73"),
+        ("split_rejoin.yaml", 1, "314fd04da1a47bb4"),
+        ("attrition.yaml", 1, "2dcf131485a492fe"),
         ("bursts", 1, "c096a7b164a7bf65"),
     ],
 )
