@@ -12,9 +12,11 @@ import typer
 from harness.commands import sitl
 from harness.commands.chain import chain_command
 from harness.commands.check import check_command
+from harness.commands.diff import diff_command
 from harness.commands.doctor import doctor_command
 from harness.commands.explore import explore_command
 from harness.commands.matrix import matrix_command
+from harness.commands.report import report_command
 from harness.commands.run import run_command
 from harness.commands.scale import scale_command
 from harness.commands.terminal import complain
@@ -28,6 +30,8 @@ app = typer.Typer(
 )
 app.command("run")(run_command)
 app.command("check")(check_command)
+app.command("report")(report_command)
+app.command("diff")(diff_command)
 app.command("chain")(chain_command)
 app.command("matrix")(matrix_command)
 app.command("explore")(explore_command)

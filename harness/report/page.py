@@ -154,7 +154,7 @@ def _outcome(result: dict[str, Any]) -> tuple[str, str] | None:
     if outcome == "completed":
         return None
     detail = result.get("outcome_detail")
-    if outcome is None:
+    if outcome in (None, "running"):
         return "This run has not recorded its end", words.value(detail or "It is still going on, or it was killed.")
     return f"This run did not complete: {words.value(outcome)}", words.value(detail or "")
 

@@ -1,0 +1,97 @@
+"""`ucp-harness diff`: where two runs part."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import shorten
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from harness.commands.terminal import complain, print_json
+from harness.difference import AgentDifference, Difference, Parting, Step, compare
+
+DIFFERENT = 1
+VALUE_CHARACTERS = 60
+
+
+def diff_command(
+    run_a: Annotated[Path, typer.Argument(help="A run directory.")],
+    run_b: Annotated[Path, typer.Argument(help="Another, of the same agents.")],
+    as_json: Annotated[bool, typer.Option("--json", help="The differences as JSON on standard output.")] = False,
+) -> None:
+    """Say where two runs part: exit status 0 if they do not, 1 if they do."""
+    found = compare(run_a, run_b)
+    if as_json:
+        print_json({"a": str(run_a), "b": str(run_b), **found.to_json()})
+    else:
+        console = Console()
+        for line in _lines(found):
+            console.print(Text(line), soft_wrap=True)
+    for sentence in found.errors:
+        complain(sentence)
+    if found.verdict == "differ":
+        raise typer.Exit(DIFFERENT)
+
+
+def _lines(found: Difference) -> Iterator[str]:
+    """All that there is to say, A being the first run and B the second."""
+    for one in found.keys:
+        yield f"{one.key}: {_value(one.a)} in A, {_value(one.b)} in B"
+    runs = f"{found.handler_runs} handler runs of {len(found.agents)} agents, and their chains"
+    match found.verdict:
+        case "identical":
+            yield f"identical to the last byte: {runs}"
+        case "same but for times":
+            yield f"the same: {runs}; only times, and the hashes that cover them, differ"
+        case _:
+            yield from _differences(found)
+
+
+def _differences(found: Difference) -> Iterator[str]:
+    first = found.first
+    if first is not None:
+        parting = found.agents[first].run
+        assert parting is not None, "it is what makes it the first"
+        yield f"the runs part first at {parting.at_s:.3f} s, with agent {first}"
+    for agent_id, one in found.agents.items():
+        yield f"agent {agent_id}: {'the same' if one == AgentDifference(None, None) else ''}".rstrip()
+        if one.run is not None:
+            yield f"  parts at handler run {one.run.number}"
+            yield from (f"    {where}  {words}" for where, words in zip("AB", _both(one.run), strict=True))
+        if one.chain is not None:
+            a, b = (block or "not there" for block in (one.chain.a, one.chain.b))
+            yield f"  block {one.chain.place} of its chain is {a} in A, {b} in B"
+
+
+def _both(parting: Parting) -> tuple[str, str]:
+    """What the agent does in either run; changes and messages only if they differ."""
+    a, b = parting.a, parting.b
+    changes = a is None or b is None or a.changes != b.changes
+    sent = a is None or b is None or a.sent != b.sent
+    return _step(a, changes, sent), _step(b, changes, sent)
+
+
+def _step(step: Step | None, changes: bool, sent: bool) -> str:
+    if step is None:
+        return "nothing more"
+    life = f"life {step.life}, " if step.life > 1 else ""
+    words = f"{step.t:.3f} s (line {step.line}): {life}{step.handler}, {step.branch}; {_trigger(step.trigger)}"
+    if changes and step.changes:
+        words += f"; {', '.join(' '.join(change) for change in step.changes)}"
+    if sent and step.sent:
+        words += f"; sends {', '.join(' '.join(filter(None, one)) for one in step.sent)}"
+    return words
+
+
+def _trigger(trigger: dict[str, int | str]) -> str:
+    """What made the handler run, such as: Commit Block, number 17 of agent 4."""
+    if "message" in trigger:
+        return f"{trigger['message']}, number {trigger.get('seq')} of agent {trigger.get('from')}"
+    return ", ".join(f"{kind} {what}" for kind, what in trigger.items())
+
+
+def _value(value: Any) -> str:
+    return shorten(json.dumps(value, ensure_ascii=False), VALUE_CHARACTERS, placeholder=" …")

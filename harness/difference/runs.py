@@ -1,0 +1,161 @@
+"""Comparing two run directories."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from harness import traces
+from harness.checker.evidence import RUN_FILE
+from harness.difference.keys import KeyDifference, differing_keys
+from harness.difference.steps import Step, completed_blocks, name, read_lines
+from harness.errors import RunDirectoryError
+from harness.exports import export_paths, read_exports
+from harness.report.result import agent_ids, listing, mapping, read_result
+
+
+@dataclass(frozen=True)
+class Parting:
+    """Where the traces of an agent part: at the handler run of this number; None where a trace has ended before."""
+
+    number: int
+    a: Step | None
+    b: Step | None
+
+    @property
+    def at_s(self) -> float:
+        """The earlier of both, in mission seconds."""
+        return min(step.t for step in (self.a, self.b) if step is not None)
+
+
+@dataclass(frozen=True)
+class ChainParting:
+    """Where the exported chains of an agent part: the names of the block in this place, which counts from 1.
+
+    None where a chain has ended before; that of an agent without an export has no block.
+    """
+
+    place: int
+    a: str | None
+    b: str | None
+
+
+@dataclass(frozen=True)
+class AgentDifference:
+    run: Parting | None
+    chain: ChainParting | None
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What tells two runs apart.
+
+    keys: of the scenario, and `seed`.
+    agents: every agent of the roster; both None for one that does the same in both.
+    handler_runs: how many were the same, of all agents, each counted up to where it parts.
+    exact: the traces are the same to the last byte of each handler run.
+    errors: a sentence for each export that could not be used.
+    """
+
+    keys: list[KeyDifference]
+    agents: dict[int, AgentDifference]
+    handler_runs: int
+    exact: bool
+    errors: list[str]
+
+    @property
+    def first(self) -> int | None:
+        """The agent that parts first in mission time, the lowest ID of several; None if no trace parts."""
+        at_s = {agent_id: one.run.at_s for agent_id, one in self.agents.items() if one.run is not None}
+        return min(at_s, key=lambda agent_id: (at_s[agent_id], agent_id), default=None)
+
+    @property
+    def verdict(self) -> str:
+        """`identical`, `same but for times`, or `differ`; keys that differ make no difference by themselves."""
+        if any(one.run or one.chain for one in self.agents.values()):
+            return "differ"
+        return "identical" if self.exact else "same but for times"
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "verdict": self.verdict,
+            "keys": [asdict(one) for one in self.keys],
+            "first": self.first,
+            "handler_runs": self.handler_runs,
+            "agents": {str(agent_id): asdict(one) for agent_id, one in self.agents.items()},
+            "errors": self.errors,
+        }
+
+
+def compare(a: Path, b: Path) -> Difference:
+    """Raises RunDirectoryError if the two cannot be compared: no run directory, no trace, another roster or backend."""
+    one, other = _Run(a), _Run(b)
+    _refuse_what_cannot_be_compared(one, other)
+    agents: dict[int, AgentDifference] = {}
+    handler_runs, exact = 0, True
+    for agent_id in one.roster:
+        same, to_the_byte, parting = _compare_traces(one, other, agent_id)
+        handler_runs, exact = handler_runs + same, exact and to_the_byte
+        agents[agent_id] = AgentDifference(parting, _compare_chains(one.chain(agent_id), other.chain(agent_id)))
+    keys = [*differing_keys(one.asked(), other.asked())]
+    return Difference(keys, agents, handler_runs, exact, one.exports.errors + other.exports.errors)
+
+
+class _Run:
+    """One run directory."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.result = read_result(path / RUN_FILE)
+        self.roster: Sequence[int] = agent_ids(listing(self.result, "roster"))
+        self.exports = read_exports(export_paths(path))
+        self.names: Mapping[str, str] = {
+            block: known
+            for agent_id in self.roster
+            for block, known in completed_blocks(self.trace(agent_id), agent_id).items()
+        }
+
+    def trace(self, agent_id: int) -> Path:
+        return self.path / "agents" / f"{agent_id}{traces.SUFFIX}"
+
+    def chain(self, agent_id: int) -> list[str]:
+        export = self.exports.by_agent.get(agent_id)
+        return [name(block, self.names) for block in export.chain_of_block_hashes] if export else []
+
+    def asked(self) -> dict[str, Any]:
+        return {"seed": self.result.get("seed"), **mapping(self.result, "scenario")}
+
+
+def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
+    for run in (a, b):
+        if not run.roster:
+            raise RunDirectoryError(f"{run.path / RUN_FILE}: it names no agents: play the run again")
+    if a.roster != b.roster:
+        rosters = (" ".join(map(str, run.roster)) for run in (a, b))
+        raise RunDirectoryError("the runs have agents {} and {}: compare runs of the same agents".format(*rosters))
+    if a.result.get("backend") != b.result.get("backend"):
+        raise RunDirectoryError(
+            "one run was in virtual time, whose traces leave out messages that change nothing, and one was not: "
+            "compare runs of the same backend"
+        )
+
+
+def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, Parting | None]:
+    """How many handler runs are the same, whether to the last byte, and where the traces part."""
+    same, exact = 0, True
+    for one, other in zip_longest(read_lines(a.trace(agent_id)), read_lines(b.trace(agent_id))):
+        if one is None or other is None or (one.life, one.text) != (other.life, other.text):
+            exact = False
+            step, other_step = one and Step.of(one, a.names), other and Step.of(other, b.names)
+            if step != other_step:
+                return same, exact, Parting(same + 1, step, other_step)
+        same += 1
+    return same, exact, None
+
+
+def _compare_chains(a: list[str], b: list[str]) -> ChainParting | None:
+    for place, (one, other) in enumerate(zip_longest(a, b), 1):
+        if one != other:
+            return ChainParting(place, one, other)
+    return None

@@ -1,0 +1,251 @@
+"""The library: every scenario, played in virtual time, shows what its first lines say that it shows."""
+
+from collections import Counter
+from collections.abc import Callable
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+import yaml
+
+from harness.checker.survival import survival
+from harness.checker.uniform_chain import common_prefix
+from harness.scenario import load_scenario
+from harness.simulate import Simulated, simulate
+from harness.timeline import RANGE
+from ucp.trace import State
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+MATRIX = SCENARIOS / "thesis_matrix.yaml"
+SEEDS = (1, 2, 3)
+FEW = 5
+"""Blocks; the most that the last votes of 20 minutes leave open."""
+
+
+@cache
+def played(name: str, seed: int) -> Simulated:
+    return simulate(load_scenario(SCENARIOS / f"{name}.yaml"), seed, tracing=True)
+
+
+def chains(run: Simulated) -> dict[int, list[str]]:
+    """Each agent's chain by names of blocks, as the mission left it."""
+    exports = run.evidence.before_final_reconcile or run.evidence.exports
+    return {agent: [run.evidence.name(it) for it in one.chain_of_block_hashes] for agent, one in exports.items()}
+
+
+def mutual(run: Simulated) -> int:
+    return common_prefix(list(chains(run).values()))
+
+
+def tail(run: Simulated) -> int:
+    """How far the longest chain goes beyond the mutual chain."""
+    return max(map(len, chains(run).values())) - mutual(run)
+
+
+def distinct(run: Simulated) -> int:
+    return len(set(map(tuple, chains(run).values())))
+
+
+def copies(run: Simulated) -> Counter[str]:
+    """In how many chains each block was, as the mission left them."""
+    return Counter(block for chain in chains(run).values() for block in chain)
+
+
+def reconciles(run: Simulated, *agents: int) -> int:
+    """How often agents, or these, began one in the mission."""
+    final = run.played.final_reconcile
+    return sum(
+        step.branch == "begun" and (final is None or round(step.t, 3) < final["at_s"])
+        for agent, trace in run.evidence.traces.items()
+        for step in trace.runs
+        if step.handler == "reconcile_begin" and (not agents or agent in agents)
+    )
+
+
+def state(run: Simulated, agent: int, at_s: float) -> State:
+    """What the agent held just before that mission second."""
+    return [step.state for step in run.evidence.traces[agent].runs if step.t < at_s][-1]
+
+
+def longest_stack(run: Simulated) -> int:
+    """The most blocks that an agent had taken off its chain at once."""
+    return max(step.state.stack for trace in run.evidence.traces.values() for step in trace.runs)
+
+
+def perfect(run: Simulated, seed: int) -> None:
+    assert reconciles(run) == 0
+    assert distinct(run) == 1
+
+
+def missed_commit(run: Simulated, seed: int) -> None:
+    assert reconciles(run) > 0
+    assert tail(run) <= FEW
+
+
+def loss_10(run: Simulated, seed: int) -> None:
+    assert 0 < reconciles(run) < reconciles(played("loss_15", seed))
+    assert tail(run) <= FEW
+
+
+def loss_15(run: Simulated, seed: int) -> None:
+    assert reconciles(run) > 0
+    assert tail(run) <= FEW
+
+
+def loss_25(run: Simulated, seed: int) -> None:
+    assert distinct(run) > 1
+    assert mutual(run) > len(run.evidence.completed_blocks()) / 2
+    assert reconciles(run) > reconciles(played("loss_15", seed))
+
+
+def loss_30(run: Simulated, seed: int) -> None:
+    assert distinct(run) > 1
+    assert any(common_prefix(list(pair)) > mutual(run) for pair in combinations(chains(run).values(), 2))
+
+
+def loss_50(run: Simulated, seed: int) -> None:
+    assert mutual(run) < len(run.evidence.completed_blocks()) / 5
+    assert distinct(run) == 5
+    assert reconciles(run) > len(run.evidence.completed_blocks())
+
+
+def loss_75(run: Simulated, seed: int) -> None:
+    assert mutual(run) == 0
+    assert list(copies(run).values()).count(1) > 0.8 * len(copies(run))
+    assert any(max(copies(played("loss_75", seed)).values()) > 1 for seed in SEEDS)
+
+
+def loss_100(run: Simulated, seed: int) -> None:
+    assert reconciles(run) == 0
+    for agent, chain in chains(run).items():
+        assert chain == [f"{agent}.{ordinal}" for ordinal in range(1, len(chain) + 1)]
+    assert sum(map(len, chains(run).values())) == len(run.evidence.completed_blocks())
+
+
+def partition_heal(run: Simulated, seed: int) -> None:
+    one, other = state(run, 1, 600), state(run, 3, 600)
+    assert min(one.chain, other.chain) > 0
+    assert one.top != other.top
+    assert reconciles(run) > 0
+    assert distinct(run) == 1
+
+
+def rolling_partitions(run: Simulated, seed: int) -> None:
+    apart = {200: "12 345", 400: "23 145", 600: "34 125", 800: "45 123", 1000: "15 234"}
+    agreed = 0
+    for end_s, groups in apart.items():
+        two, three = ({state(run, int(agent), end_s).top for agent in group} for group in groups.split())
+        assert not two & three
+        agreed += (len(two) == 1) + (len(three) == 1)
+    assert agreed > len(apart)
+    assert reconciles(run) > FEW
+    assert distinct(run) == 1
+
+
+def late_joiner(run: Simulated, seed: int) -> None:
+    assert run.played.agents["5"]["restarts"] == 1
+    before = state(run, 1, 600).chain
+    assert before > 0
+    assert reconciles(run, 5) > 0
+    assert len(chains(run)[5]) > before
+    assert distinct(run) == 1
+
+
+def asymmetric_links(run: Simulated, seed: int) -> None:
+    unheard, *others = chains(run).values()
+    assert all(chain == others[0] for chain in others)
+    assert unheard[-1].startswith("1.")
+    assert unheard[-1] not in others[0]
+
+
+def flapping(run: Simulated, seed: int) -> None:
+    assert reconciles(run) > 0
+    assert distinct(run) == 1
+
+
+def attrition(run: Simulated, seed: int) -> None:
+    losses = survival(run.evidence).losses
+    assert [(loss.at_s, loss.what, loss.vehicles) for loss in losses] == [
+        (300, "kill", [2]),
+        (500, "crash", [4]),
+        (750, "reboot", [6]),
+    ]
+    lives = {agent: (one["outcome"], one["restarts"], one["reboots"]) for agent, one in run.played.agents.items()}
+    assert (lives["2"], lives["3"], lives["4"]) == (("exported", 1, 0), ("exported", 0, 1), ("killed", 0, 0))
+    assert survival(run.evidence).gone < FEW
+
+
+def forced_tie(run: Simulated, seed: int) -> None:
+    assert [step.branch for step in run.evidence.traces[1].runs if step.branch.startswith("tie")]
+
+
+def large_divergence(run: Simulated, seed: int) -> None:
+    assert longest_stack(run) >= 50
+    assert distinct(run) == 1
+
+
+def split_rejoin(run: Simulated, seed: int) -> None:
+    assert any(change["what"] == RANGE for change in run.played.network)
+    assert longest_stack(run) > 1
+    assert tail(run) <= FEW
+
+
+def lost_last_commit(run: Simulated, seed: int) -> None:
+    without, *others = chains(run)[2], *(chains(run)[agent] for agent in (1, 3, 4, 5))
+    assert all(chain == [*without, "4.2"] for chain in others)
+    assert reconciles(run) == 0
+
+
+CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
+    claim.__name__: claim
+    for claim in (
+        perfect,
+        missed_commit,
+        loss_10,
+        loss_15,
+        loss_25,
+        loss_30,
+        loss_50,
+        loss_75,
+        loss_100,
+        partition_heal,
+        rolling_partitions,
+        late_joiner,
+        asymmetric_links,
+        flapping,
+        attrition,
+        forced_tie,
+        large_divergence,
+        split_rejoin,
+        lost_last_commit,
+    )
+}
+
+
+def test_every_scenario_of_the_library_claims_something() -> None:
+    assert {path.stem for path in SCENARIOS.glob("*.yaml")} - {MATRIX.stem} == set(CLAIMS)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", CLAIMS)
+def test_a_scenario_shows_what_it_says(name: str, seed: int) -> None:
+    run = played(name, seed)
+    assert run.played.settled
+    assert not run.result.violated
+    assert not run.played.unmatched_fates
+    CLAIMS[name](run, seed)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", [name for name in CLAIMS if load_scenario(SCENARIOS / f"{name}.yaml").final_reconcile])
+def test_a_final_reconcile_makes_one_chain_of_all_that_is_left(name: str, seed: int) -> None:
+    run = played(name, seed)
+    assert run.result.figures["distinct_chains"] == 1
+    assert run.result.figures["mutual_chain"] == len(run.evidence.completed_blocks()) - survival(run.evidence).gone
+    assert {one.verdict for one in run.result.characteristics.values()} == {"holds"}
+
+
+def test_there_is_a_scenario_for_every_rate_of_the_thesis() -> None:
+    lossy = {path.stem: load_scenario(path).network.loss for path in SCENARIOS.glob("loss_*.yaml")}
+    assert lossy == {f"loss_{rate * 100:.0f}": rate for rate in yaml.safe_load(MATRIX.read_text())["loss"] if rate}
