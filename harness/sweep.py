@@ -1,4 +1,4 @@
-"""Many tasks on all cores of this machine: outcomes in the tasks' order, a progress bar, nothing left behind.
+"""Many tasks on all cores of this machine: an outcome for each, a progress bar, nothing left behind.
 
     with sweep(tasks, work, jobs, what="runs") as outcomes:
         for task, outcome in outcomes:
@@ -56,28 +56,29 @@ def cores() -> int:
 
 @contextlib.contextmanager
 def sweep(
-    tasks: Iterable[T], work: Callable[[T], R], jobs: int, *, what: str | None = None
+    tasks: Iterable[T], work: Callable[[T], R], jobs: int, *, what: str | None = None, in_order: bool = True
 ) -> Iterator[Iterator[tuple[T, R | Failed]]]:
     """Each task with its outcome, in the order of `tasks` however many `jobs` there are; 1 forks nothing.
 
-    An outcome is handed over when all before it are. A HarnessError that `work` raises because the request is wrong, or
-    cannot be met on this machine, is raised here: it would be the same for every task. Ctrl-C and SIGTERM raise
-    KeyboardInterrupt; leaving the block, however, ends all processes at once.
+    An outcome is handed over when all before it are, or if not `in_order`, as soon as it is there. A HarnessError that
+    `work` raises because the request is wrong, or cannot be met on this machine, is raised here: it would be the same
+    for every task. Ctrl-C and SIGTERM raise KeyboardInterrupt; leaving the block, however, ends all processes at once.
     `what` names the tasks on a progress bar on standard error; None shows nothing.
     """
     total = len(tasks) if isinstance(tasks, Sized) else None
-    with _terminated_is_interrupted(), _shown(what, total) as count:
+    with terminated_is_interrupted(), shown(what, total) as count:
         if jobs == 1:
-            yield ((task, _raised(count(_outcome(work, task)))) for task in tasks)
+            yield ((task, raised(count(outcome_of(work, task)))) for task in tasks)
             return
-        pool = _Pool(work, jobs, count)
+        pool = _Pool(work, jobs, count, in_order)
         try:
             yield pool.outcomes(tasks)
         finally:
             pool.stop()
 
 
-def _outcome(work: Callable[[T], R], task: T) -> R | Failed | HarnessError:
+def outcome_of(work: Callable[[T], R], task: T) -> R | Failed | HarnessError:
+    """What comes of one task. A HarnessError is for `raised` to raise where the tasks are handed out."""
     try:
         return work(task)
     except HarnessError as error:
@@ -88,7 +89,7 @@ def _outcome(work: Callable[[T], R], task: T) -> R | Failed | HarnessError:
         return Failed(f"{type(error).__name__}{said} ({Path(place.filename).name} line {place.lineno})")
 
 
-def _raised(outcome: R | HarnessError) -> R:
+def raised(outcome: R | HarnessError) -> R:
     if isinstance(outcome, HarnessError):
         raise outcome
     return outcome
@@ -115,18 +116,18 @@ class _Worker(Generic[T, R]):
 
 def _serve(work: Callable[[T], R], connection: Connection, parent: int) -> None:
     CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of a terminal's processes; our parent decides
+    os.setpgid(0, 0)  # Ctrl-C reaches the process group that a terminal runs; our parent, which is in it, decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     while os.getppid() == parent:
-        connection.send(_outcome(work, connection.recv()))
+        connection.send(outcome_of(work, connection.recv()))
 
 
 class _Pool(Generic[T, R]):
     """One task at a time to each worker: its death then concerns that task only, and another takes its place."""
 
-    def __init__(self, work: Callable[[T], R], jobs: int, count: Callable[[Any], Any]) -> None:
-        self._work, self._jobs, self._count = work, jobs, count
+    def __init__(self, work: Callable[[T], R], jobs: int, count: Callable[[Any], Any], in_order: bool) -> None:
+        self._work, self._jobs, self._count, self._in_order = work, jobs, count, in_order
         self._idle: list[_Worker[T, R]] = []
         self._busy: dict[Connection, tuple[int, _Worker[T, R]]] = {}
 
@@ -143,9 +144,10 @@ class _Pool(Generic[T, R]):
                 return
             for connection in wait(list(self._busy), timeout=WAKE_EVERY_S):
                 number, outcome = self._end(connection)  # type: ignore[arg-type]  # it waits for other things too
-                ended[number] = _raised(self._count(outcome))
-            while due in ended:
-                yield begun.pop(due), ended.pop(due)
+                ended[number] = raised(self._count(outcome))
+            while ended and (due in ended or not self._in_order):
+                number = due if self._in_order else next(iter(ended))
+                yield begun.pop(number), ended.pop(number)
                 due += 1
 
     def stop(self) -> None:
@@ -194,7 +196,8 @@ def _signals_held() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _terminated_is_interrupted() -> Iterator[None]:
+def terminated_is_interrupted() -> Iterator[None]:
+    """SIGTERM, too, raises KeyboardInterrupt."""
     if threading.current_thread() is not threading.main_thread():  # only there can handlers be set
         yield
         return
@@ -206,7 +209,7 @@ def _terminated_is_interrupted() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _shown(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]]:
+def shown(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]]:
     """A function that counts what passes through it: on a bar, or where there is no terminal, in a line now and then.
 
     No thread draws, because a process must not be forked beside one.
@@ -217,7 +220,7 @@ def _shown(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=console, auto_refresh=False, transient=True, disable=not console.is_terminal)
-    shown = bar.add_task(what, total=total)
+    line = bar.add_task(what, total=total)
     every_s, last, done = REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S, time.monotonic(), 0
 
     def count(outcome: Any) -> Any:
@@ -225,7 +228,7 @@ def _shown(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]
         done += 1
         if time.monotonic() - last >= every_s:
             last = time.monotonic()
-            bar.update(shown, completed=done, refresh=True)
+            bar.update(line, completed=done, refresh=True)
             if not console.is_terminal:
                 of = f" of {total}" if total is not None else ""
                 console.print(f"{done}{of} {what}", highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`ucp-harness matrix`: a scenario over loss rates and seeds."""
+"""`ucp-harness matrix`: a scenario over loss rates, numbers of agents, backends and seeds."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -7,29 +7,49 @@ from typing import Annotated
 import typer
 
 from harness import matrix
-from harness.commands.terminal import end_sweep
-from harness.matrix import outputs, table
-from harness.rundir import claim, default_path
+from harness.commands.terminal import complain, end_sweep
+from harness.matrix import outputs, results, table
+from harness.matrix.baseline import load_baseline
+from harness.matrix.run import compared, on_cluster, on_cores
+from harness.rundir import default_path
 from harness.sweep import cores
 
 
 class Backend(StrEnum):
+    process = "process"
     sim = "sim"
 
 
 def matrix_command(
     file: Annotated[Path, typer.Argument(metavar="MATRIX", help="Matrix file (YAML).")],
-    backend: Annotated[Backend, typer.Option(help="What plays the runs.")] = Backend.sim,
-    out: Annotated[Path | None, typer.Option(help="Directory of the results; must be new or empty.")] = None,
+    backend: Annotated[Backend | None, typer.Option(help="What plays the runs, instead of the file's word.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Directory of the results: new or empty, or of this matrix, which then goes on.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="matrix.json on standard output, no table.")] = False,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
     ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="TCP://HOST:PORT", help="Dask scheduler, whose workers play the runs.")
+    ] = None,
+    against: Annotated[
+        Path | None, typer.Option(metavar="BASELINE", help="An earlier matrix.json: exit 1 if a figure is worse.")
+    ] = None,
 ) -> None:
     """Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated."""
-    request = matrix.load_matrix(file)
+    request = matrix.load_matrix(file, backend.value if backend else None)
+    baseline = load_baseline(against, request) if against else None
     directory = (out or default_path(request.name)).absolute()
-    claim(directory)
-    finished = matrix.run_matrix(request, jobs or cores(), shown=True)
+    if scheduler is None:
+        spread = on_cores(request, jobs or cores(), shown=True)
+    else:
+        spread = on_cluster(request, scheduler, shown=True)
+    with results.opened(directory, request) as ended:
+        finished = matrix.run_matrix(request, ended, spread)
+    if baseline is not None:
+        finished = compared(finished, baseline, str(against))
     outputs.write(finished, directory)
+    if finished.record.outcome == "interrupted":
+        complain(f"the same command with --out {directory} goes on from here")
     end_sweep(finished.record, None if as_json else table.render(finished.record), directory / "matrix.svg")

@@ -1,10 +1,13 @@
-"""The matrix: one scenario over loss rates and many seeds, in the simulation, on all cores.
+"""The matrix: one scenario over loss rates, numbers of agents, backends and many seeds, on all cores or a Dask cluster.
 
-model.py     what is asked: the matrix file        estimate.py  a mean or a share with its 95 % interval
-metrics.py   what is measured of each run          cell.py      all runs at one loss rate, summed up
-run.py       the runs themselves                   record.py    matrix.json
-outputs.py   the files     table.py  the terminal  picture.py   matrix.svg
-thesis.py    THESIS.md: the figures beside what Section 4.3 observed
+model.py       what is asked: the matrix file       estimate.py   a mean or a share with its 95 % interval
+metrics.py     what is measured of each run         cell.py       all runs at one point, summed up
+play.py        one run                              results.py    results.jsonl, from which a matrix goes on
+run.py         all of them                          cluster.py    spread over a Dask cluster
+record.py      matrix.json                          baseline.py, comparison.py   beside an earlier night
+outputs.py     the files                            summary.py  junit.py  picture.py  table.py   four of them
+thesis.py      THESIS.md: the figures beside what Section 4.3 observed
+NIGHTLY.md     a matrix every night, on a build server
 """
 
 from harness.matrix.model import Matrix, load_matrix

@@ -1,35 +1,51 @@
-"""Runs, and all runs at one loss rate summed up."""
+"""Runs, and all runs at one point of the matrix summed up."""
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from harness.checker.characteristic import Verdict
 from harness.checker.verdict import CHECKS
 from harness.matrix.estimate import Estimate
-from harness.matrix.metrics import METRICS, Figures
+from harness.matrix.metrics import METRICS
+from harness.matrix.model import Point, Task
+from harness.record import Backend
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """What one run leaves here: figures, and a verdict for each characteristic; or why it has none (`failed`)."""
+class Placed(BaseModel):
+    """What belongs to one point of the matrix."""
+
+    model_config = ConfigDict(frozen=True)
 
     loss: float
+    agents: int
+    backend: Backend
+
+    @property
+    def point(self) -> Point:
+        return Point(self.loss, self.agents, self.backend)
+
+
+class Run(Placed):
+    """What one run leaves here: figures, and a verdict for each characteristic; or why it has none (`failed`)."""
+
     seed: int
-    figures: Figures = field(default_factory=dict)
-    verdicts: dict[str, Verdict] = field(default_factory=dict)
+    figures: dict[str, float | int | None] = {}
+    verdicts: dict[str, Verdict] = {}
     failed: str | None = None
 
+    @property
+    def task(self) -> Task:
+        return Task(self.point, self.seed)
 
-class Cell(BaseModel):
-    """`runs` at one `loss`, of which `failed` have no figures; an estimate per metric; how often each verdict fell.
+
+class Cell(Placed):
+    """`runs` at one point, of which `failed` have no figures; an estimate per metric; how often each verdict fell.
 
     `violated` has the seeds of the runs that violated a characteristic, to play them again.
     """
 
-    loss: float
     runs: int
     failed: int
     estimates: dict[str, Estimate]
@@ -37,11 +53,11 @@ class Cell(BaseModel):
     violated: dict[str, list[int]]
 
 
-def sum_up(loss: float, runs: Sequence[Run]) -> Cell:
+def sum_up(point: Point, runs: Sequence[Run]) -> Cell:
     judged = [run for run in runs if run.failed is None]
     violated = {number: [run.seed for run in judged if run.verdicts[number] == "violated"] for number in CHECKS}
     return Cell(
-        loss=loss,
+        **point._asdict(),
         runs=len(runs),
         failed=len(runs) - len(judged),
         estimates={metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS},

@@ -11,12 +11,16 @@ Figures = Mapping[str, float | int | None]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """`of` is None for a run that does not tell. `unit`: a share of the runs, a share in each run, or a number."""
+    """`of` is None for a run that does not tell. `unit`: a share of the runs, a share in each run, or a number.
+
+    `worse`: which direction is, None if neither.
+    """
 
     name: str
     label: str
     of: Callable[[Figures], float | None]
     unit: Literal["share of runs", "share", "number"] = "number"
+    worse: Literal["lower", "higher"] | None = None
 
     def estimate(self, runs: Iterable[Figures]) -> Estimate:
         values = [value for figures in runs if (value := self.of(figures)) is not None]
@@ -40,11 +44,12 @@ def _mutual_share(figures: Figures) -> float | None:
 
 
 METRICS = (
-    Metric("uniform", "one chain", uniform, "share of runs"),
-    Metric("mutual_share", "mutual chain", _mutual_share, "share"),
-    Metric("distinct_chains", "distinct chains", figure("distinct_chains")),
-    Metric("reconciles", "reconciles", figure("reconciles")),
-    Metric("copies_mean", "copies mean", figure("copies_mean")),
-    Metric("copies_min", "copies fewest", figure("copies_min")),
-    Metric("messages_per_block", "messages per block", figure("messages_per_block")),
+    Metric("uniform", "one chain", uniform, "share of runs", worse="lower"),
+    Metric("mutual_share", "mutual chain", _mutual_share, "share", worse="lower"),
+    Metric("distinct_chains", "distinct chains", figure("distinct_chains"), worse="higher"),
+    Metric("reconciles", "reconciles", figure("reconciles"), worse="higher"),
+    Metric("copies_mean", "copies mean", figure("copies_mean"), worse="lower"),
+    Metric("copies_min", "copies fewest", figure("copies_min"), worse="lower"),
+    Metric("messages_per_block", "messages per block", figure("messages_per_block"), worse="higher"),
 )
+BY_NAME = {metric.name: metric for metric in METRICS}

@@ -1,25 +1,42 @@
-"""The matrix file: which scenario, at which loss rates, with which seeds."""
+"""The matrix file: which scenario, at which loss rates, with how many agents, by which backends, with which seeds."""
 
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from harness.errors import ScenarioError
+from harness.record import Backend
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
-from harness.scenario.model import BOUNDED, Model, Probability
+from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Probability
 
 MAX_SEEDS = 10_000
 MAX_SEED = 2**32 - 1
 
 
-class Matrix(Model):
-    """A scenario, played at each rate of `loss` with each of `seeds`.
+class Point(NamedTuple):
+    """Where a cell stands in the matrix."""
 
-    `loss` takes the place of the scenario's `network.loss`, which therefore has to stay unset: two words for one thing
-    could differ. Whatever else the scenario says of the network (receivers that differ, its timeline) holds in every
-    cell. Every cell has the same seeds, so the same blocks are built at the same times in all of them: cells differ by
-    their loss, not by their luck (common random numbers).
+    loss: float
+    agents: int
+    backend: Backend
+
+
+class Task(NamedTuple):
+    """One run that is asked for."""
+
+    point: Point
+    seed: int
+
+
+class Matrix(Model):
+    """A scenario, played by each `backend` with each number of `agents` at each rate of `loss` with each of `seeds`.
+
+    `loss` takes the place of the scenario's `network.loss`, and `agents`, if given, of its `agents`, which therefore
+    have to stay unset: two words for one thing could differ. Whatever else the scenario says of the network (receivers
+    that differ, its timeline) holds in every cell. Every cell has the same seeds, so the same blocks are built at the
+    same times at every loss: cells differ by their loss, not by their luck (common random numbers).
     """
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
@@ -29,21 +46,67 @@ class Matrix(Model):
     loss: Annotated[list[Probability], Field(min_length=1, max_length=100)]
     seeds: int | list[int] = 200
     """How many, counted from 1, or which."""
+    agents: (
+        Annotated[list[Annotated[int, Field(ge=1, le=MAX_AGENTS, strict=True)]], Field(min_length=1, max_length=100)]
+        | None
+    ) = None
+    """One number or several; the scenario's if not given."""
+    backend: Annotated[list[Backend], Field(min_length=1, default_factory=lambda: ["sim"])]
+    """One or several."""
+    keep: Literal["violated", "all"] = "violated"
+    """Of which runs as processes the directories are kept: those that violated a characteristic or failed, or all."""
 
     @property
     def seed_list(self) -> list[int]:
         return list(range(1, self.seeds + 1)) if isinstance(self.seeds, int) else self.seeds
 
-    def scenario_at(self, loss: float) -> Scenario:
-        network = self.scenario.network.model_copy(update={"loss": loss})
-        return self.scenario.model_copy(update={"network": network})
+    @property
+    def points(self) -> list[Point]:
+        agents = self.agents or [len(self.scenario.roster)]
+        return [Point(loss, number, backend) for backend, number, loss in product(self.backend, agents, self.loss)]
+
+    @property
+    def tasks(self) -> list[Task]:
+        return [Task(point, seed) for point in self.points for seed in self.seed_list]
+
+    def scenario_at(self, point: Point) -> Scenario:
+        network = self.scenario.network.model_copy(update={"loss": point.loss})
+        agents = point.agents if self.agents else self.scenario.agents
+        return self.scenario.model_copy(update={"network": network, "agents": agents})
 
     @model_validator(mode="before")
     @classmethod
-    def _scenario_has_a_name(cls, document: Any) -> Any:
-        if isinstance(document, dict) and isinstance(document.get("scenario"), dict) and "name" in document:
-            return {**document, "scenario": {"name": document["name"], **document["scenario"]}}
-        return document
+    def _scenario_takes_from_the_matrix(cls, document: Any) -> Any:
+        """Its name, and the first number of agents, so that what it says of single agents has a meaning."""
+        if not isinstance(document, dict):
+            return document
+        scenario, agents = document.get("scenario"), document.get("agents")
+        if isinstance(scenario, Scenario):
+            scenario = scenario.model_dump(exclude_unset=True)
+        if not isinstance(scenario, dict):
+            return document
+        if "name" in document:
+            scenario = {"name": document["name"], **scenario}
+        if agents:
+            first = agents[0] if isinstance(agents, list) else agents
+            if scenario.get("agents", first) != first:
+                said = BOUNDED.repr(scenario["agents"])
+                raise ValueError(
+                    f"`scenario` sets agents to {said}, which the matrix's `agents` is for: remove it there"
+                )
+            scenario = {**scenario, "agents": first}
+        return {**document, "scenario": scenario}
+
+    @model_validator(mode="after")
+    def _scenario_fits_every_number_of_agents(self) -> "Matrix":
+        for agents in self.agents or ():
+            try:
+                Scenario.model_validate({**self.scenario.model_dump(), "agents": agents})
+            except ValidationError as error:
+                raise ValueError(
+                    f"`agents` has {agents}, for which `scenario` is wrong: {explain(error, Scenario)}"
+                ) from None
+        return self
 
     @field_validator("scenario")
     @classmethod
@@ -54,10 +117,15 @@ class Matrix(Model):
             )
         return scenario
 
-    @field_validator("loss")
+    @field_validator("agents", "backend", mode="before")
     @classmethod
-    def _each_rate_once(cls, loss: list[float]) -> list[float]:
-        return _each_once(loss)
+    def _one_or_several(cls, value: Any) -> Any:
+        return value if value is None or isinstance(value, list) else [value]
+
+    @field_validator("loss", "agents", "backend")
+    @classmethod
+    def _each_once(cls, values: list[Any] | None) -> list[Any] | None:
+        return values and _each_once(values)
 
     @field_validator("seeds", mode="before")
     @classmethod
@@ -72,9 +140,14 @@ class Matrix(Model):
         return _each_once(seeds)
 
 
-def load_matrix(path: Path) -> Matrix:
-    """Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed."""
+def load_matrix(path: Path, backend: Backend | None = None) -> Matrix:
+    """`backend` comes before the file's word.
+
+    Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed.
+    """
     document = read_yaml(path, "matrix")
+    if backend is not None:
+        document["backend"] = backend
     if isinstance(document.get("scenario"), str):
         document["scenario"] = load_scenario(path.parent / document["scenario"])
     try:

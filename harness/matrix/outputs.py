@@ -2,8 +2,13 @@
 
 matrix.json   all of it, schema `ucp-matrix/1`
 matrix.csv    one row a cell
-runs.csv      one row a run: loss, seed, figures, verdicts
+runs.csv      one row a run: loss, agents, backend, seed, figures, verdicts
 matrix.svg    the picture
+summary.md    table and findings in Markdown
+junit.xml     a test case a cell
+
+results.jsonl, from which all of it is made, is written while runs end (results.py); runs/ has the run directories that
+were kept of runs as processes.
 """
 
 import csv
@@ -15,9 +20,11 @@ from typing import Any
 from harness.checker.verdict import CHECKS
 from harness.errors import MachineError
 from harness.matrix.cell import Cell, Run
+from harness.matrix.junit import to_junit
 from harness.matrix.metrics import METRICS
 from harness.matrix.picture import draw
 from harness.matrix.run import Finished
+from harness.matrix.summary import to_markdown
 from ucp.files import write_atomically, write_json_atomically
 
 
@@ -29,12 +36,14 @@ def write(finished: Finished, directory: Path) -> None:
         write_atomically(directory / "matrix.csv", to_csv(_cell_row(cell) for cell in record.cells))
         write_atomically(directory / "runs.csv", to_csv(_run_rows(finished.runs)))
         write_atomically(directory / "matrix.svg", draw(record))
+        write_atomically(directory / "summary.md", to_markdown(record))
+        write_atomically(directory / "junit.xml", to_junit(record))
     except OSError as error:
         raise MachineError(f"{error.filename or directory} cannot be written: {error.strerror}") from None
 
 
 def _cell_row(cell: Cell) -> dict[str, Any]:
-    row: dict[str, Any] = {"loss": cell.loss, "runs": cell.runs, "failed": cell.failed}
+    row: dict[str, Any] = {**cell.point._asdict(), "runs": cell.runs, "failed": cell.failed}
     for metric in METRICS:
         estimate = cell.estimates[metric.name]
         row |= {metric.name: estimate.mean, f"{metric.name}_low": estimate.low, f"{metric.name}_high": estimate.high}
@@ -42,10 +51,10 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
 
 
 def _run_rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
-    figures = list(dict.fromkeys(name for run in runs for name in run.figures))
+    figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
     for run in runs:
         yield {
-            "loss": run.loss,
+            **run.point._asdict(),
             "seed": run.seed,
             **{name: run.figures.get(name) for name in figures},
             **{f"characteristic_{number}": run.verdicts.get(number) for number in CHECKS},

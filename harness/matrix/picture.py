@@ -1,7 +1,8 @@
 """matrix.svg: how the swarm fares as the loss grows, six small panels side by side over the same axis.
 
-Lines are means, bands their 95 % intervals, a dot each loss that was measured. Two lines in a panel also differ by
-their dashes and are named where they are.
+With several numbers of agents or backends, six panels for each of them, one below the other. Lines are means, bands
+their 95 % intervals, a dot each loss that was measured. Two lines in a panel also differ by their dashes and are named
+where they are.
 """
 
 import math
@@ -11,16 +12,14 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from harness.matrix.cell import Cell
-from harness.matrix.metrics import METRICS, Metric
+from harness.matrix.metrics import BY_NAME
 from harness.matrix.record import MatrixRecord
-from harness.matrix.table import say
+from harness.matrix.table import say, series, series_name
 from harness.report import svg, words
 from harness.report.svg import Area, Axis, n
 
 COLUMNS = 3
-HEAD, PANEL_HEIGHT, FOOT = 74, 218, 26
-
-_BY_NAME = {metric.name: metric for metric in METRICS}
+HEAD, SERIES_HEAD, PANEL_HEIGHT, FOOT = 74, 26, 218, 26
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +31,7 @@ class Panel:
 
     @property
     def shares(self) -> bool:
-        return _BY_NAME[self.lines[0][0]].unit != "number"
+        return BY_NAME[self.lines[0][0]].unit != "number"
 
 
 PANELS = (
@@ -47,35 +46,55 @@ PANELS = (
 
 def draw(record: MatrixRecord) -> str:
     """A file of its own."""
-    cells = sorted(record.cells, key=lambda cell: cell.loss)
-    areas = svg.grid(len(PANELS), COLUMNS, HEAD, PANEL_HEIGHT)
-    return svg.document(
-        HEAD + math.ceil(len(PANELS) / COLUMNS) * PANEL_HEIGHT + FOOT,
-        record.matrix.name,
-        _about(record),
-        description(cells),
-        [_panel(panel, cells, area) for panel, area in zip(PANELS, areas, strict=True)],
-        _legend(record),
+    top: float = HEAD
+    parts = []
+    for cells in _series(record):
+        if name := _name(record, cells):
+            parts.append(_heading(name, top))
+            top += SERIES_HEAD
+        areas = svg.grid(len(PANELS), COLUMNS, top, PANEL_HEIGHT)
+        parts += [_panel(panel, cells, area) for panel, area in zip(PANELS, areas, strict=True)]
+        top += math.ceil(len(PANELS) / COLUMNS) * PANEL_HEIGHT
+    return svg.document(top + FOOT, record.matrix.name, _about(record), description(record), parts, _legend(record))
+
+
+def _heading(name: str, top: float) -> Markup:
+    return Markup('<text x="{}" y="{}" font-size="15" font-weight="600" fill="{}">{}</text>\n').format(
+        n(svg.MARGIN + 4), n(top + 12), svg.INK, name
     )
 
 
-def description(cells: Sequence[Cell]) -> str:
+def _series(record: MatrixRecord) -> list[list[Cell]]:
+    """By ascending loss; one series without cells if no run has ended."""
+    return [sorted(cells, key=lambda cell: cell.loss) for cells in series(record)] or [[]]
+
+
+def _name(record: MatrixRecord, cells: Sequence[Cell]) -> str:
+    """What tells a series from others; nothing if there are none."""
+    return ", ".join(series_name(record.matrix, cells[0].point)) if cells else ""
+
+
+def description(record: MatrixRecord) -> str:
     """What the picture shows, in words."""
-    if not cells:
+    if not record.cells:
         return "No run has ended."
     parts = []
-    for panel in PANELS:
-        for name, line in panel.lines:
-            values = (f"{_say(name, cell)} at {words.percent(cell.loss)}" for cell in cells)
-            parts.append(f"{panel.title}{f' ({line})' if line else ''}: {', '.join(values)}.")
+    for cells in _series(record):
+        if series_is := _name(record, cells):
+            parts.append(f"{series_is}:")
+        for panel in PANELS:
+            for name, line in panel.lines:
+                values = (f"{_say(name, cell)} at {words.percent(cell.loss)}" for cell in cells)
+                parts.append(f"{panel.title}{f' ({line})' if line else ''}: {', '.join(values)}.")
     return " ".join(parts)
 
 
 def _about(record: MatrixRecord) -> str:
-    scenario = record.matrix.scenario
+    agents = sorted({point.agents for point in record.matrix.points})
+    simulated = "simulated " if record.backend == "sim" else ""
     parts = [
-        f"{len(scenario.roster)} agents, {words.duration(scenario.duration_s)}",
-        f"{words.value(record.runs)} simulated runs",
+        f"{', '.join(map(str, agents))} agents, {words.duration(record.matrix.scenario.duration_s)}",
+        f"{words.value(record.runs)} {simulated}runs",
     ]
     if record.outcome == "interrupted":
         parts.append(f"interrupted: {words.value(record.runs_asked)} were asked for")
@@ -147,5 +166,4 @@ def _value_axis(panel: Panel, cells: Sequence[Cell], area: Area) -> Axis:
 
 
 def _say(name: str, cell: Cell) -> str:
-    metric: Metric = _BY_NAME[name]
-    return say(metric, cell.estimates[name])
+    return say(BY_NAME[name], cell.estimates[name])

@@ -5,34 +5,39 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.errors import INTERRUPTED, VIOLATED
-from harness.matrix.cell import Cell
+from harness.matrix.cell import Cell, Placed
+from harness.matrix.comparison import Comparison
 from harness.matrix.model import Matrix
 
 SCHEMA = "ucp-matrix/1"
 
 
-class FailedRun(BaseModel):
+class FailedRun(Placed):
     """A run without a result, and why."""
 
-    loss: float
     seed: int
     reason: str
 
 
 class MatrixRecord(BaseModel):
-    """One matrix. `matrix` is the file as resolved; a cell for each loss of which a run has ended."""
+    """One matrix. `matrix` is the file as resolved; a cell for each point of which a run has ended.
+
+    `started_at` is when it was begun; `wall_s` is of the last command, if it was interrupted and went on. `against` is
+    what changed since the night that it was compared with.
+    """
 
     model_config = ConfigDict(populate_by_name=True)
 
     schema_: Literal["ucp-matrix/1"] = Field(default="ucp-matrix/1", alias="schema")
     matrix: Matrix
-    backend: Literal["sim"]
+    backend: Literal["sim", "process", "several"]
     versions: dict[str, str]
     started_at: str
     wall_s: float
     outcome: Literal["completed", "interrupted"]
     cells: list[Cell]
     failed: list[FailedRun] = []
+    against: Comparison | None = None
 
     @property
     def runs(self) -> int:
@@ -40,14 +45,15 @@ class MatrixRecord(BaseModel):
 
     @property
     def runs_asked(self) -> int:
-        return len(self.matrix.loss) * len(self.matrix.seed_list)
+        return len(self.matrix.points) * len(self.matrix.seed_list)
 
     @property
     def exit_status(self) -> int:
         """As documented for the command line; a run that failed counts like an agent that did."""
         if self.outcome == "interrupted":
             return INTERRUPTED
-        return VIOLATED if self.failed or any(cell.violated for cell in self.cells) else 0
+        regressed = self.against is not None and self.against.regressions
+        return VIOLATED if self.failed or regressed or any(cell.violated for cell in self.cells) else 0
 
     def to_json(self) -> dict[str, Any]:
         return self.model_dump(mode="json", by_alias=True)

@@ -1,71 +1,92 @@
-"""The matrix's runs: each loss with each seed, spread over the cores, and summed up."""
+"""The matrix's runs: each point with each seed, spread over cores or a cluster, and summed up."""
 
 import time
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from functools import partial
 
-from harness.checker import Result
+from harness.errors import InterruptedRunError, ScenarioError
 from harness.matrix.cell import Run, sum_up
-from harness.matrix.model import Matrix
+from harness.matrix.cluster import cluster
+from harness.matrix.comparison import Comparison, compare
+from harness.matrix.model import Matrix, Point, Task
+from harness.matrix.play import Judge, Player, simulated
 from harness.matrix.record import FailedRun, MatrixRecord
+from harness.matrix.results import Results
 from harness.run import versions
-from harness.scenario import Scenario
-from harness.sweep import Failed, sweep
+from harness.sweep import Failed, cores, sweep
 
-Judge = Callable[[Scenario, int], Result]
-"""Plays a scenario with a seed, and judges it."""
+Outcomes = Iterator[tuple[Task, Run | Failed]]
+Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
+"""Hands out tasks, and brings their outcomes as they end."""
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A matrix that is over, also if it was interrupted: the runs that ended, by loss and then seed as in the file."""
+    """A matrix that is over, also if it was interrupted: the runs that ended, by point and then seed as in the file."""
 
     record: MatrixRecord
     runs: list[Run]
 
 
-def run_matrix(matrix: Matrix, jobs: int, judge: Judge | None = None, *, shown: bool = False) -> Finished:
-    """Play and sum up. Ctrl-C ends it early, with all that had ended. Raises HarnessError if it cannot be played.
+def on_cores(matrix: Matrix, jobs: int, *, shown: bool = False) -> Spread:
+    """So many runs at the same time; with processes among them, no more than there are cores."""
+    if "process" in matrix.backend:
+        jobs = min(jobs, cores())
+    return partial(sweep, jobs=jobs, what="runs" if shown else None, in_order=False)
 
-    `judge` is the simulation unless given.
+
+def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
+    """On the workers of the Dask scheduler at `address`. Raises ScenarioError for processes."""
+    if "process" in matrix.backend:
+        raise ScenarioError(
+            "--scheduler is for virtual time: runs as processes leave their directories here, so play them without it, "
+            "or with --backend sim"
+        )
+    return partial(cluster, address=address, what="runs" if shown else None)
+
+
+def run_matrix(matrix: Matrix, results: Results, spread: Spread, judge: Judge = simulated) -> Finished:
+    """Play what `results` has not, add it there, and sum up all. Ctrl-C ends it early, with all that had ended.
+
+    Raises HarnessError if it cannot be played. `judge` plays what virtual time is asked for.
     """
-    judge = judge or _simulated
-    scenarios = {loss: matrix.scenario_at(loss) for loss in matrix.loss}
-    started, started_at = time.monotonic(), datetime.now(UTC)
-
-    def play(task: tuple[float, int]) -> Run:
-        """In another process, of whose evidence only this comes back."""
-        loss, seed = task
-        result = judge(scenarios[loss], seed)
-        verdicts = {number: one.verdict for number, one in result.characteristics.items()}
-        return Run(loss, seed, result.figures, verdicts)
-
-    runs: list[Run] = []
+    started = time.monotonic()
+    play = Player(matrix, results.directory / "runs", judge)
+    tasks = [task for task in matrix.tasks if task not in results.runs]
+    play.refuse(dict.fromkeys(task.point for task in tasks))
     interrupted = False
-    tasks = [(loss, seed) for loss in matrix.loss for seed in matrix.seed_list]
     try:
-        with sweep(tasks, play, jobs, what="runs" if shown else None) as outcomes:
-            for (loss, seed), run in outcomes:
-                runs.append(Run(loss, seed, failed=run.reason) if isinstance(run, Failed) else run)
-    except KeyboardInterrupt:
+        with spread(tasks, play) as outcomes:
+            for task, run in outcomes:
+                results.add(_failed(task, run.reason) if isinstance(run, Failed) else run)
+    except (KeyboardInterrupt, InterruptedRunError):
         interrupted = True
-    by_loss = {loss: [run for run in runs if run.loss == loss] for loss in matrix.loss}
+    runs = [results.runs[task] for task in matrix.tasks if task in results.runs]
+    by_point: dict[Point, list[Run]] = defaultdict(list)
+    for run in runs:
+        by_point[run.point].append(run)
     record = MatrixRecord(
         matrix=matrix,
-        backend="sim",
+        backend=matrix.backend[0] if len(matrix.backend) == 1 else "several",
         versions=versions(),
-        started_at=started_at.isoformat(timespec="seconds").replace("+00:00", "Z"),
+        started_at=results.started_at,
         wall_s=round(time.monotonic() - started, 1),
         outcome="interrupted" if interrupted else "completed",
-        cells=[sum_up(loss, its_runs) for loss, its_runs in by_loss.items() if its_runs],
-        failed=[FailedRun(loss=run.loss, seed=run.seed, reason=run.failed) for run in runs if run.failed is not None],
+        cells=[sum_up(point, its_runs) for point, its_runs in by_point.items()],
+        failed=[FailedRun(**run.point._asdict(), seed=run.seed, reason=run.failed) for run in runs if run.failed],
     )
     return Finished(record, runs)
 
 
-def _simulated(scenario: Scenario, seed: int) -> Result:
-    """Without traces, which cost more than the run: characteristic 1 is then not judged, 2 and 3 only at the end."""
-    from harness.simulate import simulate
+def compared(finished: Finished, baseline: MatrixRecord, path: str) -> Finished:
+    """With what changed since the matrix of `baseline`, which is from `path`."""
+    changes = list(compare(baseline.cells, finished.record.cells))
+    comparison = Comparison(baseline=path, started_at=baseline.started_at, changes=changes)
+    return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
 
-    return simulate(scenario, seed).result
+
+def _failed(task: Task, reason: str) -> Run:
+    return Run(**task.point._asdict(), seed=task.seed, failed=reason)

@@ -1,6 +1,6 @@
-"""The matrix on the terminal: for each loss the means, and below them their 95 % intervals; then what went wrong."""
+"""The matrix on the terminal: for each cell the means, and below them their 95 % intervals; then what went wrong."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -8,27 +8,71 @@ from rich.text import Text
 
 from harness.checker.verdict import CHECKS
 from harness.matrix.cell import Cell
+from harness.matrix.comparison import Change
 from harness.matrix.estimate import Estimate
-from harness.matrix.metrics import METRICS, Metric
+from harness.matrix.metrics import BY_NAME, METRICS, Metric
+from harness.matrix.model import Matrix, Point
 from harness.matrix.record import MatrixRecord
 from harness.report import words
 
 NAMED = 5
-"""More runs than these are counted, not named; matrix.json names them all."""
+"""More runs of a cell than these are counted, not named; matrix.json names them all."""
 
 
 def render(record: MatrixRecord) -> RenderableType:
+    parts: list[RenderableType] = []
+    for cells in series(record):
+        if name := ", ".join(series_name(record.matrix, cells[0].point)):
+            parts.append(Text(name, style="bold"))
+        parts.append(_table(record, cells))
+    notes = (Text(note, style="red") for note in troubles_of_all(record))
+    better = (Text(note, style="green") for note in improvements(record))
+    return Group(*parts, Text(explanation(record) + unjudged(record), style="dim"), *notes, *better)
+
+
+def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
     table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim")
     for header in ("loss", "runs", *(metric.label for metric in METRICS), "vio-\nlated"):
         table.add_column(header.replace(" ", "\n", 1), justify="right", vertical="bottom", no_wrap=True)
-    for cell in record.cells:
+    for cell in cells:
         estimates = [(metric, cell.estimates[metric.name]) for metric in METRICS]
         means = (Text(say_mean(metric, estimate)) for metric, estimate in estimates)
         table.add_row(words.percent(cell.loss), str(cell.runs), *means, _violated(cell))
         if len(record.matrix.seed_list) > 1:
             table.add_row("", "", *(Text(say_interval(*one), style="dim") for one in estimates))
-    notes = (Text(note, style="red") for note in (*_violations(record), *_failures(record)))
-    return Group(table, Text(explanation(record) + unjudged(record), style="dim"), *notes)
+    return table
+
+
+def series(record: MatrixRecord) -> list[list[Cell]]:
+    """The cells of each backend and number of agents, which differ by their loss alone."""
+    groups: dict[tuple[object, ...], list[Cell]] = {}
+    for cell in record.cells:
+        groups.setdefault((cell.backend, cell.agents), []).append(cell)
+    return list(groups.values())
+
+
+def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
+    """What tells the cells apart: the loss, and the axes that have several values. Each with its words for a point."""
+    named: dict[str, Callable[[Point], str]] = {"loss": lambda point: words.percent(point.loss)}
+    if len(matrix.agents or ()) > 1:
+        named["agents"] = lambda point: str(point.agents)
+    if len(matrix.backend) > 1:
+        named["backend"] = lambda point: point.backend
+    return named
+
+
+def name_of(matrix: Matrix, point: Point) -> str:
+    """A cell's name: 15 % loss; 15 % loss, 10 agents, process."""
+    return ", ".join([f"{words.percent(point.loss)} loss", *series_name(matrix, point)])
+
+
+def series_name(matrix: Matrix, point: Point) -> list[str]:
+    """What else than its loss tells a cell apart."""
+    named = axes(matrix)
+    return [
+        *([f"{point.agents} agents"] if "agents" in named else []),
+        *([point.backend] if "backend" in named else []),
+    ]
 
 
 def say(metric: Metric, estimate: Estimate) -> str:
@@ -72,28 +116,50 @@ def unjudged(record: MatrixRecord) -> str:
     return f" Not applicable in any run: characteristic{'s' if len(never) > 1 else ''} {', '.join(never)}."
 
 
+def violated(cell: Cell) -> int:
+    """Runs that violated a characteristic."""
+    return len({seed for seeds in cell.violated.values() for seed in seeds})
+
+
+def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
+    """A sentence for each thing that is wrong in a cell."""
+    for number, seeds in cell.violated.items():
+        which = ", ".join(map(str, seeds[:NAMED])) + (", \u2026" if len(seeds) > NAMED else "")
+        plural = "s" if len(seeds) > 1 else ""
+        yield f"characteristic {number} violated in {len(seeds)} of {cell.runs} runs, seed{plural} {which}"
+    failed = [run for run in record.failed if run.point == cell.point]
+    for run in failed[:NAMED]:
+        yield f"seed {run.seed} failed: {run.reason}"
+    if len(failed) > NAMED:
+        yield f"{len(failed) - NAMED} more runs failed"
+    for change in record.against.regressions if record.against else ():
+        if change.point == cell.point:
+            yield _say_change(change)
+
+
+def troubles_of_all(record: MatrixRecord) -> Iterable[str]:
+    for cell in record.cells:
+        for sentence in troubles(record, cell):
+            yield f"{name_of(record.matrix, cell.point)}: {sentence}"
+
+
+def improvements(record: MatrixRecord) -> Iterable[str]:
+    for change in record.against.changes if record.against else ():
+        if not change.worse:
+            yield f"{name_of(record.matrix, change.point)}: {_say_change(change)}"
+
+
+def _say_change(change: Change) -> str:
+    metric = BY_NAME[change.metric]
+    became = "worse" if change.worse else "better"
+    return f"{metric.label} {became}: {say(metric, change.now)}, was {say(metric, change.before)}"
+
+
 def _violated(cell: Cell) -> Text:
-    runs = len({seed for seeds in cell.violated.values() for seed in seeds})
+    runs = violated(cell)
     if cell.failed:
         return Text(f"{runs} + {cell.failed}", style="bold red")
     return Text(str(runs), style="bold red" if runs else "green")
-
-
-def _violations(record: MatrixRecord) -> Iterable[str]:
-    for cell in record.cells:
-        for number, seeds in cell.violated.items():
-            which = ", ".join(map(str, seeds[:NAMED])) + (", \u2026" if len(seeds) > NAMED else "")
-            yield (
-                f"{words.percent(cell.loss)} loss: characteristic {number} violated in {len(seeds)} of "
-                f"{cell.runs} runs, seed{'s' if len(seeds) > 1 else ''} {which}"
-            )
-
-
-def _failures(record: MatrixRecord) -> Iterable[str]:
-    for run in record.failed[:NAMED]:
-        yield f"{words.percent(run.loss)} loss: seed {run.seed} failed: {run.reason}"
-    if len(record.failed) > NAMED:
-        yield f"and {len(record.failed) - NAMED} more runs failed"
 
 
 def _number(number: float) -> str:

@@ -1,15 +1,33 @@
 """A judge that needs no simulation: figures that follow from loss and seed."""
 
+import tempfile
+from pathlib import Path
+from typing import Any
+
 from harness.checker import Result
 from harness.checker.characteristic import Characteristic, Verdict
-from harness.matrix import Matrix
+from harness.matrix import Finished, Matrix, run_matrix
+from harness.matrix.play import Judge
+from harness.matrix.results import opened
+from harness.matrix.run import on_cores
 from harness.scenario import Scenario
 
 CHARACTERISTICS = ("1", "2", "3", "4", "5", "6")
 
 
-def matrix(*, name: str = "test", loss: tuple[float, ...] = (0.0, 0.5), seeds: int | list[int] = 4) -> Matrix:
-    return Matrix(name=name, scenario=Scenario(name=name, agents=5), loss=list(loss), seeds=seeds)
+def matrix(
+    *, name: str = "test", loss: tuple[float, ...] = (0.0, 0.5), seeds: int | list[int] = 4, **keys: Any
+) -> Matrix:
+    return Matrix.model_validate(
+        {"name": name, "scenario": {"agents": 5} if "agents" not in keys else {}, "loss": list(loss), "seeds": seeds}
+        | keys
+    )
+
+
+def played(asked: Matrix, jobs: int, judge: Judge, directory: Path | None = None) -> Finished:
+    """Into `directory`, or one that nobody looks into."""
+    with tempfile.TemporaryDirectory() as folder, opened(directory or Path(folder), asked) as results:
+        return run_matrix(asked, results, on_cores(asked, jobs), judge)
 
 
 def judge(scenario: Scenario, seed: int) -> Result:

@@ -29,7 +29,8 @@ def test_a_matrix_ends_in_a_table_and_files(tmp_path: Path) -> None:
     assert "Not applicable in any run: characteristic 1." in " ".join(done.stdout.split())
     assert str(tmp_path / "out" / "matrix.svg") in done.stdout
     files = {path.name for path in (tmp_path / "out").iterdir()}
-    assert files == {"matrix.json", "matrix.csv", "runs.csv", "matrix.svg"}
+    figures = {"results.jsonl", "matrix.json", "matrix.csv", "runs.csv"}
+    assert files == {*figures, "matrix.svg", "summary.md", "junit.xml"}
 
 
 def test_it_finds_one_chain_without_loss_and_none_in_common_without_contact(tmp_path: Path) -> None:
@@ -61,6 +62,86 @@ def test_a_wrong_request_is_one_sentence_and_status_2(tmp_path: Path, keys: dict
     assert sentence in said
 
 
+def test_an_interrupted_matrix_goes_on_and_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
+    asked = written(tmp_path, seeds=80)
+    command = [*COMMAND, "matrix", str(asked), "--jobs", "2", "--out", str(tmp_path / "out")]
+    results = tmp_path / "out" / "results.jsonl"
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not results.exists() or results.read_bytes().count(b"\n") < 10:
+            assert process.poll() is None, process.communicate()
+        process.kill()
+        process.communicate()
+    ended = results.read_bytes()
+    ended = ended[: ended.rfind(b"\n") + 1]
+    assert ended.count(b"\n") < 161
+    done = harness("matrix", asked, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert results.read_bytes().startswith(ended)
+    assert results.read_bytes().count(b"\n") == 161
+    harness("matrix", asked, "--out", tmp_path / "whole")
+    for name in ("matrix.csv", "runs.csv", "matrix.svg"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_against_an_earlier_night(tmp_path: Path) -> None:
+    asked = written(tmp_path)
+    harness("matrix", asked, "--out", tmp_path / "before")
+    baseline = tmp_path / "before" / "matrix.json"
+    same = harness("matrix", asked, "--against", baseline, "--out", tmp_path / "same")
+    assert (same.returncode, sentences(same.stderr)) == (0, [])
+    record = json.loads(baseline.read_text())
+    record["cells"][1]["estimates"]["copies_mean"] = {"n": 3, "mean": 2.0, "low": 1.9, "high": 2.1}
+    baseline.write_text(json.dumps(record))
+    worse = harness("matrix", asked, "--against", baseline, "--out", tmp_path / "worse")
+    assert worse.returncode == 1
+    assert "100 % loss: copies mean worse: 1 (±0), was 2 (±0.1)" in worse.stdout.replace("\u00a0", " ")
+    other = harness("matrix", written(tmp_path, loss=[0.5]), "--against", baseline, "--out", tmp_path / "other")
+    assert other.returncode == 2
+    assert "is of another matrix: `loss` differs" in sentences(other.stderr)[0]
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.lab
+@pytest.mark.parametrize("keep", ["violated", "all"])
+def test_processes_fly_a_matrix_and_leave_what_the_file_asks_for(tmp_path: Path, keep: str) -> None:
+    scenario = {"agents": 2, "duration_s": 60, "speedup": 60, "vehicles": {"kind": "none"}}
+    asked = written(tmp_path, scenario=scenario, loss=[0.0], seeds=2, backend="process", keep=keep)
+    done = harness("matrix", asked, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stdout + done.stderr
+    (cell,) = MatrixRecord.model_validate_json((tmp_path / "out" / "matrix.json").read_text()).cells
+    assert (cell.backend, cell.runs, cell.failed) == ("process", 2, 0)
+    assert cell.verdicts["3"] == {"holds": 2}
+    kept = sorted(path.parent.name for path in tmp_path.glob("out/runs/*/run.json"))
+    assert kept == (["loss-0.0-agents-2-seed-1", "loss-0.0-agents-2-seed-2"] if keep == "all" else [])
+
+
+@pytest.mark.lab
+def test_a_run_whose_agent_crashes_is_a_result_and_is_kept(tmp_path: Path) -> None:
+    agent = tmp_path / "agent"
+    agent.write_text("#!/bin/sh\nexit 7\n")
+    agent.chmod(0o755)
+    scenario = {"agents": 2, "duration_s": 60, "vehicles": {"kind": "none"}, "agent_command": [str(agent)]}
+    asked = written(tmp_path, scenario=scenario, loss=[0.0, 0.5], seeds=1, backend="process")
+    done = harness("matrix", asked, "--out", tmp_path / "out")
+    assert done.returncode == 1, done.stderr
+    failed = MatrixRecord.model_validate_json((tmp_path / "out" / "matrix.json").read_text()).failed
+    assert [run.loss for run in failed] == [0.0, 0.5]
+    for run in failed:
+        kept = tmp_path / "out" / "runs" / f"loss-{run.loss}-agents-2-seed-1"
+        assert run.reason.endswith(f"; see {kept}")
+        assert (kept / "run.json").exists()
+
+
+def test_what_a_backend_cannot_play_is_refused_before_anything_is_played(tmp_path: Path) -> None:
+    scenario = {"agents": 2, "clocks": {"1": {"drift": 0.1}}}
+    done = harness(
+        "matrix", written(tmp_path, scenario=scenario, backend=["sim", "process"]), "--out", tmp_path / "out"
+    )
+    assert done.returncode == 2
+    assert sentences(done.stderr) == ["`clocks` needs virtual time: use --backend sim"]
+    assert (tmp_path / "out" / "results.jsonl").read_text().count("\n") == 1
+
+
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     done = harness("matrix", written(tmp_path), "--out", tmp_path)
     assert done.returncode == 2
@@ -83,7 +164,8 @@ def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(tmp_path: Path) -> 
     assert process.returncode == 130
     assert json.loads(said)["outcome"] == "interrupted"
     assert json.loads((out / "matrix.json").read_text()) == json.loads(said)
-    (sentence,) = sentences(complaint)
+    way_on, sentence = sentences(complaint)
+    assert way_on == f"the same command with --out {out} goes on from here"
     assert sentence.startswith("interrupted; the ")
     assert sentence.endswith(f" of 20000 runs that had ended are in {out}")
     assert not processes(tmp_path)

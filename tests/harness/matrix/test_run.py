@@ -12,12 +12,12 @@ from rich.console import Console
 
 from harness.checker import Result
 from harness.errors import MachineError
-from harness.matrix import MatrixRecord, outputs, run_matrix, table
+from harness.matrix import MatrixRecord, outputs, table
 from harness.matrix.picture import PANELS, draw
 from harness.matrix.thesis import BEGIN, END, OBSERVED, PAGE, put_between_markers
 from harness.matrix.thesis import table as thesis_table
 from harness.scenario import Scenario
-from tests.harness.matrix.stub import judge, matrix
+from tests.harness.matrix.stub import judge, matrix, played
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -30,7 +30,7 @@ def shown(record: MatrixRecord, width: int = 80) -> str:
 
 
 def test_each_cell_sums_up_its_runs() -> None:
-    record = run_matrix(matrix(), 2, judge).record
+    record = played(matrix(), 2, judge).record
     perfect, lossy = record.cells
     assert (perfect.loss, perfect.runs, perfect.failed, perfect.violated) == (0.0, 4, 0, {})
     assert perfect.estimates["uniform"].mean == 1.0
@@ -43,7 +43,7 @@ def test_each_cell_sums_up_its_runs() -> None:
 
 
 def test_the_result_does_not_depend_on_the_number_of_jobs() -> None:
-    one, two = (run_matrix(matrix(seeds=[5, 3, 9]), jobs, judge) for jobs in (1, 2))
+    one, two = (played(matrix(seeds=[5, 3, 9]), jobs, judge) for jobs in (1, 2))
     assert one.runs == two.runs
     assert [(run.loss, run.seed) for run in one.runs] == [(0.0, 5), (0.0, 3), (0.0, 9), (0.5, 5), (0.5, 3), (0.5, 9)]
     assert one.record.cells == two.record.cells
@@ -56,7 +56,7 @@ def test_a_run_that_fails_is_told_and_the_others_count() -> None:
             raise KeyError("block")
         return judge(scenario, seed)
 
-    record = run_matrix(matrix(loss=(0.0,)), 2, breaks).record
+    record = played(matrix(loss=(0.0,)), 2, breaks).record
     (cell,) = record.cells
     assert (cell.runs, cell.failed, cell.estimates["reconciles"].n) == (4, 1, 3)
     (failed,) = record.failed
@@ -70,7 +70,7 @@ def test_a_scenario_that_cannot_be_played_is_one_error() -> None:
         raise MachineError("not in the simulation")
 
     with pytest.raises(MachineError, match="not in the simulation"):
-        run_matrix(matrix(), 2, refuses)
+        played(matrix(), 2, refuses)
 
 
 def test_an_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_an_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
             raise KeyboardInterrupt
         return judge(scenario, seed)
 
-    finished = run_matrix(matrix(), 1, interrupted)
+    finished = played(matrix(), 1, interrupted)
     assert finished.record.outcome == "interrupted"
     assert finished.record.exit_status == 130
     assert [cell.runs for cell in finished.record.cells] == [4, 1]
@@ -94,7 +94,7 @@ def test_an_interrupt_before_the_first_run_ended_leaves_files_all_the_same(tmp_p
     def interrupted(scenario: Scenario, seed: int) -> Result:
         raise KeyboardInterrupt
 
-    finished = run_matrix(matrix(), 1, interrupted)
+    finished = played(matrix(), 1, interrupted)
     outputs.write(finished, tmp_path)
     ElementTree.parse(tmp_path / "matrix.svg")  # noqa: S314 - ours
     assert MatrixRecord.model_validate_json((tmp_path / "matrix.json").read_text()).cells == []
@@ -102,7 +102,7 @@ def test_an_interrupt_before_the_first_run_ended_leaves_files_all_the_same(tmp_p
 
 
 def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> None:
-    finished = run_matrix(matrix(), 1, judge)
+    finished = played(matrix(), 1, judge)
     outputs.write(finished, tmp_path)
     document = json.loads((tmp_path / "matrix.json").read_text())
     assert document["schema"] == "ucp-matrix/1"
@@ -121,7 +121,7 @@ def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> N
 
 
 def test_the_table_fits_eighty_columns_and_names_what_was_violated() -> None:
-    lines = shown(run_matrix(matrix(), 1, judge).record)
+    lines = shown(played(matrix(), 1, judge).record)
     assert "\u2026" not in lines
     assert "100 %" in lines
     assert "50 % loss: characteristic 3 violated in 1 of 4 runs, seed 2" in lines
@@ -129,7 +129,7 @@ def test_the_table_fits_eighty_columns_and_names_what_was_violated() -> None:
 
 
 def test_a_single_run_has_no_interval_and_it_is_said() -> None:
-    record = run_matrix(matrix(seeds=1), 1, judge).record
+    record = played(matrix(seeds=1), 1, judge).record
     assert record.cells[0].estimates["reconciles"].low is None
     assert "\u00b1" not in shown(record)
     assert "One run a cell, so there are no intervals." in shown(record)
@@ -139,7 +139,7 @@ def test_a_single_run_has_no_interval_and_it_is_said() -> None:
 
 
 def test_the_picture_has_a_panel_for_each_figure_and_a_dot_for_each_mean() -> None:
-    drawing = ElementTree.fromstring(draw(run_matrix(matrix(), 1, judge).record))  # noqa: S314 - ours
+    drawing = ElementTree.fromstring(draw(played(matrix(), 1, judge).record))  # noqa: S314 - ours
     texts = {element.text for element in drawing.iter(f"{SVG}text")}
     assert {panel.title for panel in PANELS} <= texts
     lines = sum(len(panel.lines) for panel in PANELS)
@@ -149,7 +149,7 @@ def test_the_picture_has_a_panel_for_each_figure_and_a_dot_for_each_mean() -> No
 
 
 def test_the_picture_escapes_names_and_refers_to_nothing() -> None:
-    drawing = draw(run_matrix(matrix(name='<script>"&'), 1, judge).record)
+    drawing = draw(played(matrix(name='<script>"&'), 1, judge).record)
     assert "<script" not in drawing
     ElementTree.fromstring(drawing)  # noqa: S314 - ours
     assert set(re.findall(r"https?://[^\"']*", drawing)) == {"http://www.w3.org/2000/svg"}
@@ -157,13 +157,13 @@ def test_the_picture_escapes_names_and_refers_to_nothing() -> None:
 
 @pytest.mark.parametrize("loss", [(0.0,), (1.0,), (0.3,), (0.01, 0.011)])
 def test_any_range_of_losses_can_be_drawn(loss: tuple[float, ...]) -> None:
-    drawing = ElementTree.fromstring(draw(run_matrix(matrix(loss=loss), 1, judge).record))  # noqa: S314 - ours
+    drawing = ElementTree.fromstring(draw(played(matrix(loss=loss), 1, judge).record))  # noqa: S314 - ours
     places = [float(dot.attrib["cx"]) for dot in drawing.iter(f"{SVG}circle")]
     assert all(0 < place < 900 for place in places)
 
 
 def test_the_thesis_page_has_a_place_for_the_table_and_every_rate() -> None:
-    record = run_matrix(matrix(loss=tuple(OBSERVED)), 1, judge).record
+    record = played(matrix(loss=tuple(OBSERVED)), 1, judge).record
     page = put_between_markers(PAGE.read_text(), thesis_table(record))
     rows = page.split(BEGIN)[1].split(END)[0].splitlines()
     assert len(rows) == 2 + len(OBSERVED)

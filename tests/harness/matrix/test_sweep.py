@@ -50,6 +50,11 @@ def test_outcomes_come_in_the_order_of_the_tasks(jobs: int) -> None:
         assert list(outcomes) == [(number, number * number) for number in range(40)]
 
 
+def test_outcomes_may_come_as_they_are_there() -> None:
+    with sweep([0.5, 0.0, 0.01], time.sleep, 2, in_order=False) as outcomes:
+        assert [task for task, _ in outcomes] == [0.0, 0.01, 0.5]
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_task_that_fails_says_why_and_the_others_go_on(jobs: int) -> None:
     def work(number: int) -> float:
@@ -110,6 +115,18 @@ def test_an_interrupt_ends_all_processes_at_once(number: signal.Signals) -> None
         said, _ = process.communicate(timeout=DEADLINE_S)
     assert said == "interrupted\n"
     assert not any(alive(pid) for pid in pids)
+
+
+def test_ctrl_c_in_a_terminal_is_for_the_one_that_started_them() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        assert process.stdout is not None
+        pids = [int(process.stdout.readline()) for _ in range(2)]
+        assert process.pid not in {os.getpgid(pid) for pid in pids}, "a terminal signals a whole process group"
+        os.killpg(process.pid, signal.SIGINT)
+        said, _ = process.communicate(timeout=DEADLINE_S)
+    assert said == "interrupted\n"
 
 
 def test_the_processes_die_with_the_one_that_started_them() -> None:

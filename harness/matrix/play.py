@@ -1,0 +1,71 @@
+"""One run of a matrix: in the simulation, or as processes in a run directory of its own."""
+
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.checker import Result
+from harness.errors import VIOLATED, HarnessError, InterruptedRunError
+from harness.matrix.cell import Run
+from harness.matrix.model import Matrix, Point, Task
+from harness.progress import Silent
+from harness.run import prepare, run
+from harness.scenario import Scenario
+
+Judge = Callable[[Scenario, int], Result]
+"""Plays a scenario with a seed, and judges it."""
+
+
+class RunFailedError(HarnessError):
+    """A run did not come to its end, or an agent crashed or hung in it."""
+
+    exit_status = VIOLATED
+
+
+def simulated(scenario: Scenario, seed: int) -> Result:
+    """Without traces, which cost more than the run: characteristic 1 is then not judged, 2 and 3 only at the end."""
+    from harness.simulate import simulate
+
+    return simulate(scenario, seed).result
+
+
+@dataclass(frozen=True)
+class Player:
+    """Plays any run of `matrix`; processes leave their run directories in `directory`. `judge` is for virtual time."""
+
+    matrix: Matrix
+    directory: Path
+    judge: Judge = simulated
+
+    def __call__(self, task: Task) -> Run:
+        scenario = self.matrix.scenario_at(task.point)
+        simulated = task.point.backend == "sim"
+        result = self.judge(scenario, task.seed) if simulated else self._as_processes(scenario, task)
+        verdicts = {number: one.verdict for number, one in result.characteristics.items()}
+        return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts)
+
+    def refuse(self, points: Iterable[Point]) -> None:
+        """Raises HarnessError if a backend, or this machine, cannot play these: before hours of others have gone by."""
+        for point in points:
+            prepare(self.matrix.scenario_at(point), 0, point.backend)
+
+    def _as_processes(self, scenario: Scenario, task: Task) -> Result:
+        """Raises RunFailedError, which names the run directory."""
+        directory = self.directory / directory_name(task)
+        shutil.rmtree(directory, ignore_errors=True)  # of a run that was broken off
+        try:
+            finished = run(scenario, task.seed, directory, Silent(), "process")
+        except HarnessError as error:  # what every run would meet has been refused
+            raise RunFailedError(f"{error}; see {directory}") from None
+        if finished.played.outcome == "interrupted":
+            raise InterruptedRunError(f"the run in {directory} was interrupted")
+        if finished.played.outcome == "failed":
+            raise RunFailedError(f"{finished.played.outcome_detail}; see {directory}")
+        if not finished.result.violated and self.matrix.keep == "violated":
+            shutil.rmtree(directory)
+        return finished.result
+
+
+def directory_name(task: Task) -> str:
+    return f"loss-{task.point.loss}-agents-{task.point.agents}-seed-{task.seed}"

@@ -1,0 +1,76 @@
+"""summary.md: the matrix in Markdown, for a job's summary on GitHub or a message to the team."""
+
+from collections.abc import Iterator
+
+from harness.matrix.cell import Cell
+from harness.matrix.metrics import METRICS
+from harness.matrix.record import MatrixRecord
+from harness.matrix.table import (
+    axes,
+    explanation,
+    improvements,
+    say_interval,
+    say_mean,
+    troubles_of_all,
+    unjudged,
+    violated,
+)
+from harness.report import words
+
+
+def to_markdown(record: MatrixRecord) -> str:
+    lines = [f"## {_escaped(record.matrix.name)}", "", f"**{_verdict(record)}**", "", *_table(record), ""]
+    lines += [explanation(record) + unjudged(record), ""]
+    if found := [*troubles_of_all(record), *improvements(record)]:
+        lines += [*(f"- {_escaped(sentence)}" for sentence in found), ""]
+    versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
+    lines += [f"<sub>Begun {words.started(record.started_at)}; {versions}</sub>"]
+    return "\n".join(lines) + "\n"
+
+
+def _verdict(record: MatrixRecord) -> str:
+    """What a reader in a hurry wants to know."""
+    runs = sum(cell.runs for cell in record.cells)
+    said = [f"{words.value(runs)} runs"]
+    if record.outcome == "interrupted":
+        said[0] += f" of {words.value(record.runs_asked)}, interrupted"
+    bad = sum(map(violated, record.cells))
+    said.append(f"{bad} violated a characteristic" if bad else "none violated a characteristic")
+    if record.failed:
+        said.append(f"{len(record.failed)} failed")
+    if record.against:
+        worse = len(record.against.regressions)
+        which = f"{worse or 'no'} figure{'s' if worse > 1 else ''} worse"
+        said.append(f"{which} than on {words.started(record.against.started_at)}")
+    return "; ".join(said)
+
+
+def _table(record: MatrixRecord) -> Iterator[str]:
+    named = axes(record.matrix)
+    headers = [*named, "runs", *(metric.label for metric in METRICS), "violated", "failed"]
+    yield _row(headers)
+    yield _row(["--:"] * len(headers))
+    for cell in record.cells:
+        yield _row([*(say(cell.point) for say in named.values()), str(cell.runs), *_figures(cell), *_bad(cell)])
+
+
+def _figures(cell: Cell) -> Iterator[str]:
+    for metric in METRICS:
+        estimate = cell.estimates[metric.name]
+        interval = say_interval(metric, estimate)
+        yield say_mean(metric, estimate) + (f"<br><sub>{interval}</sub>" if interval else "")
+
+
+def _bad(cell: Cell) -> Iterator[str]:
+    for number in (violated(cell), cell.failed):
+        yield f"**{number}**" if number else "0"
+
+
+def _row(fields: list[str]) -> str:
+    return f"| {' | '.join(fields)} |"
+
+
+def _escaped(text: str) -> str:
+    """As words on one line, whatever they hold."""
+    line = " ".join(text.splitlines())
+    return "".join(f"\\{character}" if character in "\\`*_{}[]<>#|~&" else character for character in line)
