@@ -6,7 +6,7 @@ is told in `problem`, and what came before it still counts.
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
 from pathlib import Path
@@ -106,8 +106,11 @@ class Held:
                     self.not_in_chain.add(block)
 
 
-def read_trace(path: Path) -> Trace | None:
-    """The trace in `path`; None if there is none, or it does not even begin as one."""
+def read_trace(path: Path, unread: Callable[[str], bool] = lambda line: False) -> Trace | None:
+    """The trace in `path`; None if there is none, or it does not even begin as one.
+
+    Handler runs whose lines are to stay `unread` are left out unseen, and lines are then not counted by `lives`.
+    """
     trace: Trace | None = None
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
@@ -118,6 +121,8 @@ def read_trace(path: Path) -> Trace | None:
                     if trace is not None and len(line) == MAX_LINE_CHARACTERS:
                         trace.problem = f"line {number} is too long"
                     break
+                if trace is not None and unread(line):
+                    continue
                 try:
                     document = json.loads(line)
                     if isinstance(document, dict) and "schema" in document:

@@ -1,6 +1,7 @@
 """The page: gathers what a run directory holds, draws the pictures, and writes `report.html` and `chains.svg`.
 
-The page loads nothing and runs no script; its Content-Security-Policy allows its own style sheet and nothing else.
+The page loads nothing; its Content-Security-Policy allows its own style sheet and the script of its timeline, which
+it can do without, and nothing else.
 Whatever comes from agents and scenarios is text to the template, which escapes all of it.
 """
 
@@ -16,7 +17,8 @@ from markupsafe import Markup
 
 from harness.errors import RunDirectoryError
 from harness.exports import BEFORE_FINAL_RECONCILE, Export, Exports, export_paths, read_exports
-from harness.report import map_section, network, survival, swarm, verdicts, words
+from harness.naming import name_blocks
+from harness.report import map_section, network, survival, swarm, timeline, verdicts, words
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.colours import Ink
@@ -64,11 +66,13 @@ def _page(result: dict[str, Any], exports: Exports, ink: Mapping[int, Ink], run_
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(value=words.value)
-    style = TREE_STYLE + MAP_STYLE + _PAGE_STYLE
+    style = TREE_STYLE + MAP_STYLE + timeline.STYLE + _PAGE_STYLE
     judged, outcome = verdicts.verdicts(result), _outcome(result)
     return environment.get_template("page.html.j2").render(
         style=Markup(style),  # noqa: S704 - ours, and escaped it would not be what the digest is of
-        style_digest=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii"),
+        style_digest=_digest(style),
+        script=Markup(timeline.SCRIPT),  # noqa: S704 - ours as well
+        script_digest=_digest(timeline.SCRIPT),
         title=words.value(mapping(result, "scenario").get("name") or "unnamed scenario"),
         about=mapping(result, "scenario").get("about"),
         summary=_summary(result, exports),
@@ -84,6 +88,7 @@ def _page(result: dict[str, Any], exports: Exports, ink: Mapping[int, Ink], run_
         survival=survival.section(result, ink),
         pictures=_pictures(exports, ink, run_dir),
         blocks=swarm.block_rows(exports.by_agent, ink),
+        timeline=timeline.section(result, run_dir, ink, name_blocks(exports.by_agent)),
         strip=network.strip(result),
         network=network.start(result),
         faults=network.faults(result),
@@ -93,6 +98,11 @@ def _page(result: dict[str, Any], exports: Exports, ink: Mapping[int, Ink], run_
         evidence_shown=EVIDENCE_SHOWN,
         long_text=LONG_TEXT,
     )
+
+
+def _digest(text: str) -> str:
+    """As a Content-Security-Policy names what it allows."""
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
 
 
 def _pictures(exports: Exports, ink: Mapping[int, Ink], run_dir: Path) -> list[dict[str, Any]]:

@@ -70,9 +70,14 @@ class Browser:
         return result["result"].get("value")
 
     def press(self, key: str, text: str = "") -> None:
-        code = {" ": 32, "Tab": 9}[key]
+        code = {" ": 32, "Tab": 9, "Home": 36, "ArrowLeft": 37, "ArrowRight": 39, "+": 187, "-": 189}[key]
         self._call("Input.dispatchKeyEvent", type="keyDown", key=key, text=text, windowsVirtualKeyCode=code)
         self._call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """With the mouse, from one place in the window to another."""
+        for event, (x, y), buttons in (("mousePressed", start, 1), ("mouseMoved", end, 1), ("mouseReleased", end, 0)):
+            self._call("Input.dispatchMouseEvent", type=event, x=x, y=y, button="left", buttons=buttons, clickCount=1)
 
     def screenshot(self, path: Path) -> None:
         """The whole page, also what is below the fold."""

@@ -1,0 +1,188 @@
+"""The timeline: what each agent did along mission time, and under it how far the data had spread.
+
+The page is whole without its script: the pictures then show the whole run, and the tables what is in them.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from markupsafe import Markup
+from pydantic import ValidationError
+
+from harness.connectivity import NETWORK_FILE, read_connectivity
+from harness.course import LATEST_S, Course, Message, Reconcile, Vote, course, ends_at, possible, read_traces
+from harness.record import Fault
+from harness.report import timeline_charts, timeline_lanes, words
+from harness.report.colours import Ink
+from harness.report.map_parts import divisions
+from harness.report.result import listing, number
+from harness.report.timeline_lanes import OUTCOMES
+from harness.report.timeline_plot import Shade, axis, seconds
+from harness.spread import spread
+
+_HERE = Path(__file__).parent
+STYLE = (_HERE / "timeline.css").read_text(encoding="utf-8")
+SCRIPT = (_HERE / "timeline.js").read_text(encoding="utf-8")
+
+MAX_ARROWS = 20_000
+MAX_ROWS = 500
+MAX_SHADES = 300
+MAX_FAULTS = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """`left_out` says how many rows there were no room for."""
+
+    rows: list[list[str]]
+    left_out: int
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """`messages` is what the script draws arrows from, as JSON: null if they are left out."""
+
+    end_s: float
+    agents: list[tuple[int, Ink]]
+    lane_height: int
+    lanes: Markup
+    legend: list[tuple[Markup, str]]
+    charts: list[timeline_charts.Chart]
+    axis: Markup
+    messages: str
+    votes: Table
+    reconciles: Table
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """`drawn` is None if there is nothing to draw; `notes` say why, or what was left out."""
+
+    drawn: Drawn | None
+    notes: list[str]
+
+
+def section(result: dict[str, Any], run_dir: Path, ink: Mapping[int, Ink], names: Mapping[str, str]) -> Section | None:
+    """`names` are those of blocks by hash. None if there is no trace, and nothing was wrong with what was read."""
+    traces, whole, notes = read_traces(run_dir / "agents", ink)
+    if not traces:
+        return Section(None, notes) if notes else None
+    faults = _faults(result)
+    duration_s = number(result, "scenario", "duration_s") or 0.0
+    known = [fault.at_s for fault in faults]
+    end_s = max(ends_at(traces), *known, duration_s if 0 < duration_s <= LATEST_S else 1.0, 1.0)
+    told = course(traces, faults, end_s, whole=whole)
+    shades, shades_left_out = _shades(run_dir, ink, end_s)
+    if shades_left_out:
+        notes.append(f"{shades_left_out} shorter stretches of a parted network are not shaded")
+    if len(faults) > MAX_FAULTS:
+        notes.append(f"of {len(faults)} faults and changes of the network the first {MAX_FAULTS} are drawn")
+        faults = faults[:MAX_FAULTS]
+    agents = [(agent, ink[agent]) for agent in sorted(traces)]
+    messages, without = _messages(told.messages, [agent for agent, _ in agents], names)
+    picture = timeline_lanes.draw(
+        told, faults, shades, [agent for agent, _ in agents], names, end_s, _in_words(told, len(agents), end_s)
+    )
+    drawn = Drawn(
+        end_s,
+        agents,
+        picture.lane_height,
+        picture.drawing,
+        picture.legend,
+        timeline_charts.draw(spread(traces, faults), faults, shades, end_s),
+        axis(end_s),
+        messages,
+        _table(told.votes, lambda vote: _vote_row(vote, names)),
+        _table(told.reconciles, _reconcile_row),
+    )
+    return Section(drawn, [*notes, *without, *picture.notes])
+
+
+def _faults(result: dict[str, Any]) -> list[Fault]:
+    found = []
+    for fault in listing(result, "faults"):
+        try:
+            found.append(Fault.model_validate(fault))
+        except ValidationError:
+            continue
+    return possible(found)
+
+
+def _shades(run_dir: Path, ink: Mapping[int, Ink], end_s: float) -> tuple[list[Shade], int]:
+    """When the network was parted, and how many shorter times there were no room for."""
+    known = divisions(read_connectivity(run_dir / NETWORK_FILE, ink).states)
+    ends = [*(division.at_s for division in known[1:]), end_s]
+    found = [
+        Shade(division.at_s, min(until_s, end_s), division.in_words())
+        for division, until_s in zip(known, ends, strict=False)
+        if not division.together and division.living and division.at_s < min(until_s, end_s)
+    ]
+    kept = sorted(found, key=lambda shade: shade.start_s - shade.end_s)[:MAX_SHADES]
+    return sorted(kept, key=lambda shade: shade.start_s), len(found) - len(kept)
+
+
+def _messages(
+    messages: Sequence[Message] | None, agents: Sequence[int], names: Mapping[str, str]
+) -> tuple[str, list[str]]:
+    """Names of messages, agents, and of each message: when, from which lane, name, block, and [lane, when] handled."""
+    if messages is None:
+        return "null", ["Messages are left out: the traces are too large to draw them from"]
+    heard = [message for message in messages if message.receipts]
+    arrows = sum(len(message.receipts) for message in heard)
+    if arrows > MAX_ARROWS:
+        return "null", [f"Messages are left out: {arrows} would be too many for a page"]
+    lanes = {agent: lane for lane, agent in enumerate(agents)}
+    kinds = {name: place for place, name in enumerate(dict.fromkeys(message.name for message in heard))}
+    sent = [
+        [
+            round(message.at_s, 3),
+            lanes[message.sender],
+            kinds[message.name],
+            timeline_lanes.named(message.block, names) if message.block else "",
+            [[lanes[agent], round(at_s, 3)] for agent, at_s in message.receipts],
+        ]
+        for message in heard
+    ]
+    document = {"kinds": [name[:40] for name in kinds], "agents": list(agents), "sent": sent}
+    return json.dumps(document, separators=(",", ":")), []
+
+
+Span = TypeVar("Span", Vote, Reconcile)
+
+
+def _table(found: Sequence[Span], row: Callable[[Span], list[str]]) -> Table:
+    first = sorted(found, key=lambda one: (one.start_s, one.agent))[:MAX_ROWS]
+    return Table([row(one) for one in first], len(found) - len(first))
+
+
+def _vote_row(vote: Vote, names: Mapping[str, str]) -> list[str]:
+    return [
+        seconds(vote.start_s),
+        str(vote.agent),
+        timeline_lanes.named(vote.block, names),
+        OUTCOMES.get(vote.outcome, vote.outcome[:40]),
+        seconds(vote.end_s - vote.start_s),
+    ]
+
+
+def _reconcile_row(reconcile: Reconcile) -> list[str]:
+    return [
+        seconds(reconcile.start_s),
+        str(reconcile.agent),
+        reconcile.reason,
+        timeline_lanes.phases_in_words(reconcile) + ("" if reconcile.done else ", cut short"),
+        seconds(reconcile.end_s - reconcile.start_s),
+    ]
+
+
+def _in_words(told: Course, agents: int, end_s: float) -> str:
+    """What the lanes show, for who does not see them."""
+    approved = sum(vote.outcome == "approved" for vote in told.votes)
+    return (
+        f"Timeline of {agents} agents over {words.duration(round(end_s, 1))}: {len(told.votes)} votes, {approved} of"
+        f" them approved, {len(told.commits)} commits, {len(told.reconciles)} reconciles, {len(told.ties)} ties."
+        " The tables below list votes and reconciles."
+    )

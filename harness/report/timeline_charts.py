@@ -1,0 +1,111 @@
+"""Small charts under the lanes: the chains and the copies of blocks along the same time axis."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from harness.record import Fault
+from harness.report import words
+from harness.report.svg import n
+from harness.report.timeline_plot import Shade, plot, seconds, shaded, short
+from harness.spread import Spread
+
+HEIGHT = 72
+MAX_MOMENTS = 600
+
+_TOP, _BOTTOM = 14, 4  # room above the highest value and below 0
+
+Figure = Callable[[Spread], float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """`lines` say how each line is drawn, and what it is."""
+
+    name: str
+    lines: list[tuple[Markup, str]]
+    drawing: Markup
+
+
+_CHARTS: tuple[tuple[str, tuple[tuple[str, Figure], ...]], ...] = (
+    ("blocks in chain", (("longest", lambda one: one.longest_chain), ("mutual", lambda one: one.mutual_chain))),
+    ("distinct chains", (("chains", lambda one: one.distinct_chains),)),
+    ("copies in chains", (("mean", lambda one: one.copies_mean), ("fewest", lambda one: one.copies_min))),
+)
+_LOOKS = ("broken", "whole")
+"""Of two lines; one by itself is whole."""
+
+
+def draw(spreads: Sequence[Spread], faults: Sequence[Fault], shades: Sequence[Shade], end_s: float) -> list[Chart]:
+    """A chart for each group of figures; `spreads` are how things stood from when on, in order, one at least."""
+    moments = thinned(spreads, end_s)
+    behind = shaded(shades, faults, HEIGHT)
+    return [_chart(name, figures, moments, behind, end_s) for name, figures in _CHARTS]
+
+
+def thinned(spreads: Sequence[Spread], end_s: float) -> Sequence[Spread]:
+    """Where there are many: of those that nobody could tell apart in the whole picture, the worst and the last."""
+    if len(spreads) <= MAX_MOMENTS:
+        return spreads
+    kept: dict[int, tuple[Spread, Spread]] = {}
+    for one in spreads:
+        place = int(one.at_s / end_s * MAX_MOMENTS / 2)
+        worst = min(kept[place][0], one, key=lambda moment: moment.mutual_chain) if place in kept else one
+        kept[place] = worst, one
+    return [one for pair in kept.values() for one in dict.fromkeys(pair)]
+
+
+def _chart(
+    name: str, figures: Sequence[tuple[str, Figure]], moments: Sequence[Spread], behind: Markup, end_s: float
+) -> Chart:
+    highest = max((value for _, figure in figures for one in moments if (value := figure(one)) is not None), default=0)
+    looks = _LOOKS[-len(figures) :]
+    per_px = max(highest, 1) / (HEIGHT - _TOP - _BOTTOM)
+    lines = [
+        Markup('<path class="line {}" d="{}"/>').format(look, _steps(moments, figure, per_px, end_s))
+        for look, (_, figure) in zip(looks, figures, strict=True)
+    ]
+    until = [*(one.at_s for one in moments[1:]), end_s]
+    tips = [
+        Markup('<rect class="tip" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
+            short(one.at_s), short(until_s - one.at_s), HEIGHT, _tip(one, figures, name)
+        )
+        for one, until_s in zip(moments, until, strict=True)
+        if until_s > one.at_s
+    ]
+    base = Markup('<path class="base" d="M0 {}H{}"/>').format(n(HEIGHT - _BOTTOM), short(end_s))
+    scale = Markup('<text class="scale" x="4" y="11">{}</text>').format(words.value(highest))
+    said = ", ".join(f"{what} {words.value(figure(moments[-1]))}" for what, figure in figures)
+    description = f"{name} along mission time, at most {words.value(highest)}; at the end {said}"
+    return Chart(
+        name,
+        [
+            (
+                Markup(
+                    '<svg width="34" height="16" aria-hidden="true"><path class="line {}" d="M1 8h32"/></svg>'
+                ).format(look),
+                what,
+            )
+            for look, (what, _) in zip(looks, figures, strict=True)
+        ],
+        plot([behind, base, *lines, *tips], [scale], HEIGHT, end_s, description),
+    )
+
+
+def _steps(moments: Sequence[Spread], figure: Figure, per_px: float, end_s: float) -> str:
+    """A line that goes up or down where the value does, and begins where there is one."""
+    path = ""
+    last: float | None = None
+    for one in moments:
+        value = figure(one)
+        if value is not None and value != last:
+            y = n(HEIGHT - _BOTTOM - value / per_px)
+            path += f"H{short(one.at_s)}V{y}" if path else f"M{short(one.at_s)} {y}"
+            last = value
+    return f"{path}H{short(end_s)}" if path else ""
+
+
+def _tip(one: Spread, figures: Sequence[tuple[str, Figure]], name: str) -> str:
+    said = ", ".join(f"{what} {words.value(figure(one))}" for what, figure in figures)
+    return f"from {seconds(one.at_s)}: {name}: {said}"

@@ -1,0 +1,211 @@
+"""The timeline on the page: it says what happened, stays small, and makes no markup of what it is given."""
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness import course as told
+from harness.course import Commit, Course, Phase, Reconcile, Tie, Vote
+from harness.progress import Silent
+from harness.report import timeline, timeline_charts, timeline_lanes, write_report
+from harness.run import run
+from harness.spread import Spread
+from tests.harness.report.runs import write_run
+from tests.harness.report.test_page import HOSTILE, Reader
+from tests.harness.virtual import scenario
+
+AGENTS = range(1, 6)
+TROUBLED: dict[str, Any] = {
+    "agents": 5,
+    "duration_s": 1200,
+    "network": {"loss": 0.15},
+    "timeline": [
+        {"at_s": 300, "partition": [[1, 2], [3, 4, 5]]},
+        {"at_s": 400, "pause": [5]},
+        {"at_s": 450, "resume": [5]},
+        {"at_s": 600, "heal": True},
+        {"at_s": 700, "kill": [2]},
+        {"at_s": 800, "restart": [2]},
+        {"at_s": 900, "reboot": [3], "down_s": 30, "disk": "kept"},
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("runs") / "run"
+    return run(scenario(**TROUBLED), 7, directory, Silent(), backend="sim").directory
+
+
+def html_of(run_dir: Path) -> str:
+    return write_report(run_dir).read_text(encoding="utf-8")
+
+
+def run_with(tmp_path: Path, *lines: Mapping[str, Any], result: Mapping[str, Any] | None = None) -> Path:
+    """A run of agents 1 and 2 with these lines in the trace of agent 1."""
+    run_dir = write_run(tmp_path / "run", {1: "1.1", 2: "1.1"}, result)
+    header = {"schema": "ucp-trace/1", "agent_id": 1, "roster": [1, 2], "settings": {}, "clock": {}}
+    written = "".join(json.dumps(line) + "\n" for line in (header, *lines))
+    (run_dir / "agents" / "1.trace.jsonl").write_text(written)
+    return run_dir
+
+
+def a_line(at_s: float, handler: str, branch: str, **keys: Any) -> dict[str, Any]:
+    state = {"chain": 0, "deque": 0, "stack": 0, "reconciling": False, "idle": True, "top": ""}
+    line = {"t": at_s, "handler": handler, "algorithm": 1, "trigger": {"event": 1}, "branch": branch}
+    return {**line, "changes": [], "sent": [], "state": state, **keys}
+
+
+def test_every_kind_of_thing_is_drawn_with_a_title_and_explained(troubled: Path) -> None:
+    html = html_of(troubled)
+    for said in (
+        "300\u00a0s to 600\u00a0s: A 3\u20135; B 1, 2",
+        "300\u00a0s: partition, loss 15 %, partition 1 2 | 3 4 5",
+        "700\u00a0s: kill, agent 2",
+        "900\u00a0s: reboot, agent 3, disk kept",
+        "agent 5 is paused, 400\u00a0s to 450\u00a0s",
+    ):
+        assert f"<title>{said}</title>" in html
+    for pattern in (
+        r"agent 5: vote on 5\.1, [\d.]+\u00a0s to [\d.]+\u00a0s: approved",
+        r"agent \d commits 5\.1 \(heard\), [\d.]+\u00a0s",
+        r"agent \d: reconcile \(vote not approved\), phase 1, ",
+        r"agent \d: reconcile \(chain diverged\), phase 2, ",
+        r"from [\d.]+\u00a0s: blocks in chain: longest \d+, mutual \d+",
+    ):
+        assert re.search(f"<title>{pattern}", html), pattern
+    text = Reader(html).text
+    for meaning in ("vote approved", "reconcile, phase 3", "lost", "paused", "reboots", "network parted"):
+        assert meaning in text
+
+
+def test_the_tables_have_every_vote_and_reconcile(troubled: Path) -> None:
+    page, result = Reader(html_of(troubled)), json.loads((troubled / "run.json").read_text())
+    assert f"The {result['figures']['reconciles']} reconciles as a table" in page.text
+    assert re.search(
+        r"The \d+ votes as a table proposed at agent block outcome took 90\.\d+ s 5 5\.1 approved 10 s", page.text
+    )
+
+
+def test_all_pictures_have_words_and_all_identifiers_are_single(troubled: Path) -> None:
+    html = html_of(troubled)
+    plots = [attributes for _, attributes in Reader(html).elements if attributes.get("class") == "plot"]
+    assert len(plots) == 4
+    assert all(plot["role"] == "img" and plot["aria-label"] for plot in plots)
+    assert "at the end longest" in str(plots[1]["aria-label"])
+    identifiers = re.findall(r' id="([^"]+)"', html)
+    assert len(identifiers) == len(set(identifiers))
+
+
+def test_the_policy_allows_the_one_script_by_its_digest(troubled: Path) -> None:
+    html = html_of(troubled)
+    (script,) = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = next(str(a["content"]) for tag, a in Reader(html).elements if tag == "meta" and "http-equiv" in a)
+    assert f"script-src 'sha256-{digest}';" in policy
+    assert "unsafe" not in policy
+    assert not [key for _, attributes in Reader(html).elements for key in attributes if key.startswith("on")]
+
+
+def test_a_run_without_traces_has_neither_timeline_nor_script(tmp_path: Path) -> None:
+    html = html_of(write_run(tmp_path / "run", {1: "1.1"}))
+    assert "Timeline" not in html
+    assert "<script" not in html
+    assert "script-src" not in html
+
+
+def test_twenty_minutes_of_five_agents_stay_small_even_if_everything_is_heard(troubled: Path) -> None:
+    assert len(html_of(troubled).encode()) < 1_000_000
+
+
+def test_a_long_restless_run_is_thinned_and_says_so() -> None:
+    phases = [Phase("phase 1", 0.0, 1.0, 1)] * 3
+    spans = [(agent, float(at_s)) for agent in range(1, 51) for at_s in range(200)]
+    votes = [Vote(agent, "aa", at_s, at_s + 1, "approved") for agent, at_s in spans]
+    reconciles = [Reconcile(agent, at_s, at_s + 1, "why", phases, done=True) for agent, at_s in spans]
+    commits = [Commit(agent, at_s + part / 4, "aa", "heard") for agent, at_s in spans for part in range(4)]
+    ties = [Tie(agent, at_s, "tie: block") for agent, at_s in spans]
+    restless = Course(votes, reconciles, commits, ties, None)
+    picture = timeline_lanes.draw(restless, [], [], range(1, 51), {}, 200.0, "")
+    assert picture.notes == [
+        "Of 10000 votes the 6000 longest are drawn",
+        "Of 10000 reconciles the 6000 longest are drawn",
+        "Reconciles are drawn as one bar each: there are too many phases",
+    ]
+    assert [meaning for _, meaning in picture.legend] == ["vote approved", "commit", "reconcile", "tie"]
+    voters = {agent for agent in range(1, 51) if f"agent {agent}: vote" in picture.drawing}
+    assert voters == set(range(1, 51)), "no agent is left out for another"
+    assert len(picture.drawing) < 4_000_000
+    groups = timeline_lanes.gathered(commits, 200.0)
+    assert len(groups) <= timeline_lanes.MAX_COMMITS
+    assert sum(map(len, groups)) == len(commits), "no commit is lost, only drawn together"
+    assert all(len({commit.agent for commit in group}) == 1 for group in groups)
+
+
+def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> None:
+    spreads = [Spread(float(at_s), 9 - 9 * (at_s == 777), 9, 1, 1, 1.0) for at_s in range(5000)]
+    kept = timeline_charts.thinned(spreads, 5000.0)
+    assert len(kept) <= timeline_charts.MAX_MOMENTS
+    assert spreads[777] in kept
+    assert kept[-1] == spreads[-1]
+    assert [one.at_s for one in kept] == sorted(one.at_s for one in kept)
+
+
+@pytest.mark.parametrize(
+    ("module", "limit", "said"),
+    [(told, "MESSAGES_UP_TO_BYTES", "traces are too large"), (timeline, "MAX_ARROWS", "too many for a page")],
+)
+def test_messages_above_a_limit_are_left_out_and_that_is_said(
+    troubled: Path, monkeypatch: pytest.MonkeyPatch, module: Any, limit: str, said: str
+) -> None:
+    assert 'data-messages="{&#34;kinds' in html_of(troubled)
+    monkeypatch.setattr(module, limit, 10)
+    html = html_of(troubled)
+    assert 'data-messages="null"' in html
+    assert "Messages are left out" in html
+    assert said in html
+
+
+def test_hostile_traces_make_no_markup_and_no_large_page(tmp_path: Path) -> None:
+    hostile = HOSTILE * 500
+    lines = [
+        a_line(1.0, "process_next_deque_block", "proposed", sent=[{"message": hostile, "seq": 0, "block": hostile}]),
+        a_line(2.0, "vote_timer_expiration", hostile, changes=[["chain+", hostile], ["complete", hostile]]),
+        a_line(3.0, "reconcile_begin", "begun", trigger={hostile: hostile}),
+        a_line(4.0, "reconcile_phase_1", hostile, trigger={"message": hostile, "from": 1, "seq": 0}),
+        a_line(5.0, "reconcile_phase_2_timer_expiration", "tie:" + hostile),
+        a_line(1e300, hostile, hostile),
+    ]
+    faults = [
+        {"at_s": 2.0, "what": hostile, "detail": hostile, "agents": [1, 99]},
+        {"at_s": 1e300, "what": "kill", "detail": "", "agents": [1]},
+        {"at_s": "never"},
+    ]
+    html = html_of(run_with(tmp_path, *lines, result={"faults": faults}))
+    page = Reader(html)
+    assert sum(tag == "script" for tag, _ in page.elements) == 1
+    assert "img" not in {tag for tag, _ in page.elements}
+    assert not [attributes for _, attributes in page.elements if "onerror" in attributes]
+    drawn = html[html.index('id="timeline"') : html.index('id="network"')]
+    assert len(drawn) < 60_000
+    assert "handler runs without a possible time are left out" in page.text
+
+
+def test_a_file_that_is_no_trace_is_said_where_there_is_nothing_to_draw(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", {1: "1.1"})
+    (run_dir / "agents" / "1.trace.jsonl").write_text("no trace\n")
+    html = html_of(run_dir)
+    assert "1.trace.jsonl: not a trace; it is left out." in Reader(html).text
+    assert "<script" not in html
+
+
+def test_template_style_and_script_are_in_the_package() -> None:
+    shipped = {entry.name for entry in resources.files("harness.report").iterdir()}
+    assert {"timeline.html.j2", "timeline.css", "timeline.js"} <= shipped
