@@ -3,6 +3,7 @@
 Play the timeline, stop the events, let the agents settle, and reconcile finally if the scenario asks for it.
 """
 
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -86,6 +87,16 @@ class Swarm(Protocol):
     async def top_chain_hashes(self) -> dict[int, str]:
         """Of every living agent."""
 
+    async def completed(self) -> dict[int, int]:
+        """How many blocks of its own each agent has completed that is neither dead nor paused."""
+
+    async def take_stock(self) -> Played:
+        """What has been played by now, with exports and traces up to now, for whoever judges a run that goes on."""
+
+
+Story = Callable[[Swarm, Scenario], Awaitable[None]]
+"""What a swarm is led through, from its beginning to its end."""
+
 
 async def play(swarm: Swarm, scenario: Scenario) -> None:
     """Play the mission with `swarm`; `swarm.played` tells how it went."""
@@ -96,14 +107,19 @@ async def play(swarm: Swarm, scenario: Scenario) -> None:
         await swarm.until(change.at_s)
         await swarm.apply(change)
     await swarm.until(scenario.duration_s)
+    await settle(swarm, scenario)
+
+
+async def settle(swarm: Swarm, scenario: Scenario) -> None:
+    """The end of a mission: no more events; the agents finish, and reconcile finally if the scenario asks for it."""
     swarm.enter("settling")
     await swarm.stop_events()
     swarm.played.settled = await swarm.until_idle(scenario.settle.limit_s)
     if scenario.final_reconcile:
-        await _final_reconcile(swarm, scenario.settle.limit_s)
+        await reconcile_finally(swarm, scenario.settle.limit_s)
 
 
-async def _final_reconcile(swarm: Swarm, limit_s: float) -> None:
+async def reconcile_finally(swarm: Swarm, limit_s: float) -> None:
     """Clear all conditions and let one agent after another reconcile, until a round changes no chain."""
     await swarm.keep_chains()
     swarm.enter("final reconcile")

@@ -6,14 +6,14 @@ import platform
 import signal
 import sys
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from harness import checker, report
+from harness import checker, mission, report
 from harness.backends.agent_process import agent_command
 from harness.backends.process import ProcessRun
 from harness.backends.rehearsal import refuse_what_needs_virtual_time, refuse_what_this_machine_cannot
@@ -22,7 +22,7 @@ from harness.backends.vehicle_process import VehicleFailedError
 from harness.checker.survival import survival
 from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
 from harness.lateness import Lateness, lateness
-from harness.mission import Played
+from harness.mission import Played, Story
 from harness.progress import Progress
 from harness.record import Backend, RunRecord, Survival
 from harness.rundir import RunDirectory
@@ -60,64 +60,92 @@ def run(scenario: Scenario, seed: int, out: Path, progress: Progress, backend: B
     Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
     """
     play = prepare(scenario, seed, backend)
-    directory = RunDirectory(out)
-    started = time.monotonic()
-    record = RunRecord(
-        scenario=scenario,
-        roster=list(scenario.roster),
-        seed=seed,
-        backend=backend,
-        versions=versions(),
-        started_at=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-    )
-    directory.write_record(record)
+    recording = Recording(scenario, seed, out, backend)
     try:
-        played = asyncio.run(_until_interrupted(play, directory, progress))
+        played = asyncio.run(_until_interrupted(play, recording.directory, progress))
     except HarnessError as error:
-        directory.write_record(_updated(record, outcome="failed", outcome_detail=str(error)))
+        recording.fail(error)
         raise
-    record = _updated(
-        record,
-        engine=played.engine,
-        outcome=played.outcome,
-        outcome_detail=played.outcome_detail,
-        mission_s=played.mission_s,
-        settled=played.settled,
-        final_reconcile=played.final_reconcile,
-        network=played.network,
-        faults=played.faults,
-        agents=played.agents,
-        vehicles=played.vehicles,
-        unmatched_fates=played.unmatched_fates,
-        counters=played.counters,
-    )
-    directory.write_record(record)
-    evidence = checker.gather([directory.path])
-    result, survived = checker.check(evidence), survival(evidence)
-    wall_s = time.monotonic() - started
-    directory.write_record(_updated(record, **result.to_json(), survival=survived, wall_s=round(wall_s, 1)))
-    try:
-        page = report.write_report(directory.path)
-    except RunDirectoryError as error:
-        raise MachineError(f"{error}; run.json has the verdict") from None
-    status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)
-    late = lateness(evidence.traces.values()) if backend == "process" else None
-    return Run(directory.path, played, result, survived, status, wall_s, page, late)
+    return recording.end(played)
+
+
+class Recording:
+    """The directory of a run and its record, from its start to the verdict.
+
+    Raises RunDirectoryError if `out` is neither new nor empty, MachineError if the disk refuses the record.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, out: Path, backend: Backend) -> None:
+        self.directory = RunDirectory(out)
+        self._started = time.monotonic()
+        self._record = RunRecord(
+            scenario=scenario,
+            roster=list(scenario.roster),
+            seed=seed,
+            backend=backend,
+            versions=versions(),
+            started_at=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        )
+        self.directory.write_record(self._record)
+
+    def fail(self, error: HarnessError) -> None:
+        """The run could not begin."""
+        self._update(outcome="failed", outcome_detail=str(error))
+
+    def tell(self, scenario: Scenario) -> None:
+        """This is what the run plays: the scenario that it began with, and what it was told since."""
+        self._update(scenario=scenario)
+
+    def take_down(self, played: Played) -> None:
+        """What has been played by now."""
+        self._update(
+            engine=played.engine,
+            mission_s=played.mission_s,
+            settled=played.settled,
+            final_reconcile=played.final_reconcile,
+            network=played.network,
+            faults=played.faults,
+            agents=played.agents,
+            vehicles=played.vehicles,
+            unmatched_fates=played.unmatched_fates,
+            counters=played.counters,
+        )
+
+    def end(self, played: Played) -> Run:
+        """Judge what was played, and write record and report. Raises MachineError if the disk refuses them."""
+        self._record = _updated(self._record, outcome=played.outcome, outcome_detail=played.outcome_detail)
+        self.take_down(played)
+        evidence = checker.gather([self.directory.path])
+        result, survived = checker.check(evidence), survival(evidence)
+        wall_s = time.monotonic() - self._started
+        self._update(**result.to_json(), survival=survived, wall_s=round(wall_s, 1))
+        try:
+            page = report.write_report(self.directory.path)
+        except RunDirectoryError as error:
+            raise MachineError(f"{error}; run.json has the verdict") from None
+        status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)
+        late = lateness(evidence.traces.values()) if self._record.backend == "process" else None
+        return Run(self.directory.path, played, result, survived, status, wall_s, page, late)
+
+    def _update(self, **keys: Any) -> None:
+        self._record = _updated(self._record, **keys)
+        self.directory.write_record(self._record)
 
 
 def _updated(record: RunRecord, **keys: Any) -> RunRecord:
     return RunRecord.model_validate({**record.to_json(), **keys})
 
 
-Play = Callable[[RunDirectory, Progress, asyncio.Event], Awaitable[Played]]
+Play = Callable[[RunDirectory, Progress, asyncio.Event], Coroutine[Any, Any, Played]]
 """Plays one mission into a run directory, until it is over or the event is set."""
 
 
-def prepare(scenario: Scenario, seed: int, backend: Backend) -> Play:
-    """What plays `scenario`. Raises HarnessError if this backend, or this machine, cannot."""
+def prepare(scenario: Scenario, seed: int, backend: Backend, story: Story | None = None) -> Play:
+    """What plays `scenario`, or `story` with its swarm. Raises HarnessError if backend or machine cannot."""
+    told = story or mission.play
     if backend == "sim":
         refuse_what_needs_processes(scenario)
-        return lambda rundir, progress, interrupted: simulate_into(rundir, scenario, seed, progress, interrupted)
+        return lambda rundir, progress, interrupted: simulate_into(rundir, scenario, seed, progress, interrupted, told)
     refuse_what_needs_virtual_time(scenario)
     refuse_what_this_machine_cannot(scenario)
     kinds = choose_vehicles(scenario)
@@ -125,16 +153,22 @@ def prepare(scenario: Scenario, seed: int, backend: Backend) -> Play:
     # Another run is another mission: its blocks must not be taken for this one's.
     initial_data = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
     return lambda rundir, progress, interrupted: ProcessRun(
-        scenario, seed, kinds, initial_data, rundir, progress, interrupted
-    ).play()
+        scenario, seed, kinds, initial_data, rundir, progress, interrupted, keeps_disks=story is not None
+    ).play(told)
 
 
 async def _until_interrupted(play: Play, directory: RunDirectory, progress: Progress) -> Played:
     interrupted = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
         loop.add_signal_handler(number, interrupted.set)
-    return await play(directory, progress, interrupted)
+    try:
+        return await play(directory, progress, interrupted)
+    finally:
+        for number, handler in before.items():
+            loop.remove_signal_handler(number)
+            signal.signal(number, handler)
 
 
 def choose_vehicles(scenario: Scenario) -> dict[VehicleType, Kind]:

@@ -60,16 +60,23 @@ class RunDirectory:
         if directory != self.agents and export.exists():
             shutil.copyfile(export, self.agents / export.name)
 
-    def bring_trace(self, agent_id: int, directory: Path) -> None:
-        """Append the trace of a later life to the agent's; half a last line, which it was killed over, goes."""
+    def bring_trace(self, agent_id: int, directory: Path, brought: int = 0) -> int:
+        """Append what is new in the trace of a later life, after `brought` bytes, to the agent's; how many bytes it is.
+
+        Half a last line, which the agent was killed over or still writes, is left out.
+        """
         later = directory / f"{agent_id}{traces.SUFFIX}"
         if not later.exists():
-            return
+            return 0
+        with later.open("rb") as file:
+            file.seek(brought)
+            new = file.read()
+        new = new[: new.rfind(b"\n") + 1]
         with (self.agents / later.name).open("a+b") as trace:
             trace.seek(0)
             trace.truncate(trace.read().rfind(b"\n") + 1)
-            with later.open("rb") as file:
-                shutil.copyfileobj(file, trace)
+            trace.write(new)
+        return len(new)
 
     def keep_exports_before_final_reconcile(self) -> None:
         """Copy the exports as they stand: how the mission left the chains, before anybody put them in order."""

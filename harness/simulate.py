@@ -16,7 +16,7 @@ from harness.backends.simulation import Life, Simulation, refuse_what_needs_proc
 from harness.checker import Evidence
 from harness.errors import InterruptedRunError, MachineError
 from harness.exports import Export, ExportMaker
-from harness.mission import Played
+from harness.mission import Played, Story
 from harness.progress import Progress, Snapshot
 from harness.record import JudgedRecord
 from harness.rundir import RunDirectory
@@ -57,9 +57,9 @@ def simulate_in_memory(memory: "InMemory", scenario: Scenario, seed: int, **opti
 
 
 async def simulate_into(
-    rundir: RunDirectory, scenario: Scenario, seed: int, progress: Progress, interrupted: asyncio.Event
+    rundir: RunDirectory, scenario: Scenario, seed: int, progress: Progress, interrupted: asyncio.Event, story: Story
 ) -> Played:
-    """Play `scenario` in virtual time into a run directory, as agents as processes would."""
+    """Play `story` in virtual time into a run directory, as agents as processes would."""
 
     async def breathe(simulation: Simulation) -> None:
         progress.show(_snapshot(simulation))
@@ -70,7 +70,7 @@ async def simulate_into(
     with closing(OnDisk(rundir)) as files:
         simulation = Simulation(scenario, seed, files, breathe=breathe)
         try:
-            await mission.play(simulation, scenario)
+            await story(simulation, scenario)
         except InterruptedRunError as error:
             simulation.played.end_early("interrupted", error)
         except OSError as error:
@@ -143,6 +143,9 @@ class InMemory:
 
     def keep_chains(self, simulation: Simulation) -> None:
         self._kept = self._exports(simulation)
+
+    def export(self, simulation: Simulation) -> None:
+        """The evidence is made of the agents themselves."""
 
     def evidence(self, simulation: Simulation) -> Evidence:
         record = JudgedRecord.model_validate(

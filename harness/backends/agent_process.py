@@ -69,6 +69,10 @@ class _Life:
     """The data that it held is gone."""
     reboot: bool = False
     """It began with what was on disk."""
+    counted: bool = False
+    """What it completed is known, though it was killed."""
+    trace_brought: int = 0
+    """Bytes of its trace that are where the checker looks for them."""
 
 
 class AgentProcess:
@@ -108,10 +112,12 @@ class AgentProcess:
         seed: int,
         initial_data: bytes,
         with_vehicle: bool,
+        keeps_disk: bool,
         epoch_us: int | None = None,
     ) -> None:
         """Start the process and wait until it answers; with `epoch_us` it joins the mission that began then.
 
+        With `keeps_disk` it stores what it holds, to be rebooted with it.
         Raises AgentFailedError, AgentRefusedError.
         """
         life = self._begin_life()
@@ -120,7 +126,7 @@ class AgentProcess:
             "initial_data": base64.b64encode(initial_data).decode("ascii"),
             "seed": agent_seed(seed, self.agent_id, len(self._lives)),
             "epoch_us": epoch_us,
-            "store": os.path.relpath(life.store, life.directory) if _keeps_disk(self.agent_id, scenario) else None,
+            "store": os.path.relpath(life.store, life.directory) if keeps_disk else None,
         }
         path = self._rundir.write_mission(life.directory, self.agent_id, mission)
         output = self._log
@@ -249,13 +255,17 @@ class AgentProcess:
                 await self._process.terminate(STOP_GRACE_S)
 
     def put_together(self) -> None:
-        """Put what all lives left where that of one life would be: for the checker. Raises OSError."""
+        """Put what all lives have left where that of one life would be: for the checker. Raises OSError.
+
+        May be done again and again: what is there is not put there twice.
+        """
         for number, life in enumerate(self._lives, 1):
-            if life.killed:
+            if life.killed and not life.counted:
                 trace = read_trace(life.directory / f"{self.agent_id}{SUFFIX}")
                 self._completed_before += trace.completed() if trace else []
+                life.counted = True
             if number > 1:
-                self._rundir.bring_trace(self.agent_id, life.directory)
+                life.trace_brought += self._rundir.bring_trace(self.agent_id, life.directory, life.trace_brought)
                 self._rundir.bring_export(self.agent_id, life.directory)
 
     def to_json(self) -> dict[str, Any]:
@@ -297,8 +307,8 @@ class AgentProcess:
         return AgentFailedError(self.agent_id, outcome, detail, self._log.relative_to(self._rundir.path))
 
 
-def _keeps_disk(agent_id: int, scenario: Scenario) -> bool:
-    """Whether what is on its disk is ever asked for."""
+def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:
+    """Whether the scenario ever asks for what is on the agent's disk."""
     return any(entry.disk == "kept" and agent_id in (entry.reboot or ()) for entry in scenario.timeline)
 
 

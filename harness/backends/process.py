@@ -7,16 +7,16 @@ stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and s
 import asyncio
 import time
 from collections import defaultdict
-from collections.abc import Coroutine, Mapping
+from collections.abc import Awaitable, Coroutine, Mapping
+from dataclasses import replace
 from typing import Any
 
-from harness import mission
 from harness.agents import Status
-from harness.backends.agent_process import AgentFailedError, AgentProcess
+from harness.backends.agent_process import AgentFailedError, AgentProcess, reboots_with_disk
 from harness.backends.rehearsal import network_needs
 from harness.backends.vehicle_process import VehicleProcess, system_ids
 from harness.errors import HarnessError, InterruptedRunError, MachineError
-from harness.mission import Played
+from harness.mission import Played, Story
 from harness.progress import Progress, Snapshot
 from harness.reach import TRACK_S, Reach
 from harness.rundir import RunDirectory
@@ -36,7 +36,10 @@ FOLLOW_S = 0.1
 
 
 class ProcessRun:
-    """One run; `play` it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early."""
+    """One run; `play` it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early.
+
+    With `keeps_disks` every agent has a disk that it can be rebooted with, else those that the scenario reboots so.
+    """
 
     def __init__(
         self,
@@ -47,6 +50,8 @@ class ProcessRun:
         rundir: RunDirectory,
         progress: Progress,
         interrupted: asyncio.Event,
+        *,
+        keeps_disks: bool = False,
     ) -> None:
         self.scenario = scenario
         self.seed = seed
@@ -56,6 +61,7 @@ class ProcessRun:
         self.interrupted = interrupted
         self.played = Played()
         self._kinds = kinds
+        self._keeps_disks = keeps_disks
         self._system_ids = system_ids(scenario.roster)
         self.agents = [AgentProcess(agent_id, rundir) for agent_id in scenario.roster]
         self.vehicles = [self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds]
@@ -74,7 +80,7 @@ class ProcessRun:
         kind = self._kinds[self.scenario.vehicles.type_of(vehicle_id)]
         return VehicleProcess(vehicle_id, self._system_ids[vehicle_id], kind, self.rundir, life)
 
-    async def play(self) -> Played:
+    async def play(self, story: Story) -> Played:
         """Raises MachineError if this machine cannot build the lab; all else that goes wrong is in the answer."""
         try:
             lab = await Lab.open(self.scenario.roster, needs=network_needs(self.scenario), log=self.rundir.lab_log)
@@ -86,7 +92,7 @@ class ProcessRun:
             self._lab = lab
             self.played.engine = lab.engine
             try:
-                await self._guarded(mission.play(self, self.scenario))
+                await self._guarded(story(self, self.scenario))
             except HarnessError as error:
                 self._ended_early(error)
             except NetemError as error:
@@ -96,7 +102,7 @@ class ProcessRun:
             await self._wind_up(lab)
         return self.played
 
-    async def _guarded(self, story: Coroutine[Any, Any, None]) -> None:
+    async def _guarded(self, story: Awaitable[None]) -> None:
         """Run the mission; the first failure of anything, or the user's interruption, ends it and is raised."""
         try:
             async with asyncio.TaskGroup() as self._group:
@@ -172,7 +178,9 @@ class ProcessRun:
     async def _start_agent(self, agent: AgentProcess, lab: Lab) -> None:
         """Start it, into the mission if that is under way."""
         with_vehicle = bool(self.vehicles)
-        await agent.start(lab, self.scenario, self.seed, self.initial_data, with_vehicle, self.clock.epoch_us)
+        keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
+        epoch_us = self.clock.epoch_us
+        await agent.start(lab, self.scenario, self.seed, self.initial_data, with_vehicle, keeps_disk, epoch_us)
         self._watch(agent.watch(), of=f"agent {agent.agent_id}")
 
     async def _start_clock(self) -> None:
@@ -285,6 +293,16 @@ class ProcessRun:
 
     async def top_chain_hashes(self) -> dict[int, str]:
         return {agent_id: status.top_chain_hash for agent_id, status in (await self._statuses()).items()}
+
+    async def completed(self) -> dict[int, int]:
+        return {agent_id: status.completed for agent_id, status in (await self._statuses()).items()}
+
+    async def take_stock(self) -> Played:
+        await asyncio.gather(*(agent.export() for agent in self._awake()))
+        for agent in self.agents:
+            agent.put_together()
+        agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+        return replace(self.played, mission_s=round(self.clock.now(), 1), agents=agents)
 
     def _awake(self) -> list[AgentProcess]:
         """The agents that are neither dead nor paused."""

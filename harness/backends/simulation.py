@@ -76,6 +76,9 @@ class Recorder(Protocol):
     def keep_chains(self, simulation: "Simulation") -> None:
         """A final reconcile is about to put the chains in order."""
 
+    def export(self, simulation: "Simulation") -> None:
+        """Somebody wants to see the chains as they are now. Raises OSError."""
+
 
 @dataclass(slots=True)
 class Life:
@@ -222,16 +225,30 @@ class Simulation:
     async def top_chain_hashes(self) -> dict[int, str]:
         return {life.agent.agent_id: life.agent.chain.top_chain_hash.hex() for life in self.living()}
 
+    async def completed(self) -> dict[int, int]:
+        return {life.agent.agent_id: len(life.agent.completed) for life in self.living() if life.waiting is None}
+
+    async def take_stock(self) -> Played:
+        played = self._played_by_now()
+        self._recorder.export(self)
+        return played
+
     def end(self) -> None:
         """Take down what there is at the end."""
+        self.played = self._played_by_now()
+
+    def _played_by_now(self) -> Played:
         for number, life in enumerate(self._alive):
             if life is not None:
                 self._hear(number, life)
-        self.played.mission_s = round(self._now, 3)
-        if self._script.last_s is not None:
-            self.played.network = disconnected_until(self._script.last_s, self.played.network)
-        self.played.unmatched_fates = self._air.unmatched_fates()
-        self.played.agents = {str(agent_id): self._agent_to_json(number) for agent_id, number in self._number.items()}
+        last_s, network = self._script.last_s, self.played.network
+        return dataclasses.replace(
+            self.played,
+            mission_s=round(self._now, 3),
+            network=network if last_s is None else disconnected_until(last_s, network),
+            unmatched_fates=self._air.unmatched_fates(),
+            agents={str(agent_id): self._agent_to_json(number) for agent_id, number in self._number.items()},
+        )
 
     # What is there
 

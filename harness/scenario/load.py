@@ -18,9 +18,17 @@ def load_scenario(path: Path) -> Scenario:
     """Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed."""
     document = read_yaml(path, "scenario")
     try:
+        return parse(document)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+
+
+def parse(document: dict[str, Any]) -> Scenario:
+    """Raises ScenarioError: one sentence that names the key, the value and what is allowed."""
+    try:
         return Scenario.model_validate(document)
     except ValidationError as error:
-        raise ScenarioError(f"{path}: {explain(error, Scenario)}") from None
+        raise ScenarioError(explain(error, Scenario)) from None
 
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:

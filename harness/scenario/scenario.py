@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator, model_validator
 
 from harness.scenario.events import Events
+from harness.scenario.expect import Expect
 from harness.scenario.fates import Fate
 from harness.scenario.flight import Flight
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds, VehicleKey
@@ -56,6 +57,8 @@ class Scenario(Model):
     fates: Annotated[list[Fate], Field(max_length=100_000)] = []
     settle: Settle = Settle()
     final_reconcile: bool = False
+    expect: Expect | None = None
+    """For pytest, which collects the file as tests if it has this."""
 
     @property
     def roster(self) -> tuple[int, ...]:

@@ -29,3 +29,15 @@ def test_the_trace_of_a_later_life_follows_the_whole_lines_of_the_earlier(tmp_pa
     assert (second / "7.trace.jsonl").read_text() == "three\n"
     rundir.bring_trace(7, rundir.agent(7, life=3))  # it was killed before it said anything
     assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"
+
+
+def test_the_trace_of_a_life_that_goes_on_is_brought_piece_by_piece(tmp_path: Path) -> None:
+    rundir = RunDirectory(tmp_path / "run")
+    first, second = rundir.agent(7), rundir.agent(7, life=2)
+    (first / "7.trace.jsonl").write_text("one\n")
+    (second / "7.trace.jsonl").write_text("two\nthr")
+    brought = rundir.bring_trace(7, second)
+    (second / "7.trace.jsonl").write_text("two\nthree\n")
+    brought += rundir.bring_trace(7, second, brought)
+    assert (first / "7.trace.jsonl").read_text() == "one\ntwo\nthree\n"
+    assert rundir.bring_trace(7, second, brought) == 0

@@ -1,0 +1,86 @@
+"""UCP in pytest: the fixtures `swarm` and `scenario`, and scenarios with an `expect:` section as tests by themselves.
+
+pytest loads this module wherever the harness is installed, so it imports nothing of the harness before a test asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from harness.pytest_plugin.findings import Findings
+    from harness.pytest_plugin.swarm_in_test import Swarm
+    from harness.pytest_plugin.trial import Trial
+
+TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
+"""The run that a test is about."""
+
+MARKERS = (
+    "swarm(agents=5, backend='sim', seed=1, ...): what the fixture `swarm` is; any key of a scenario",
+    "scenario(file, backend='sim', seed=1): the scenario that the fixture `scenario` plays; from the test's directory",
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("ucp", "UCP harness")
+    group.addoption(
+        "--ucp-backend", choices=("sim", "process"), help="Play on this backend, whatever tests and scenarios say."
+    )
+    group.addoption("--ucp-seed", type=int, metavar="N", help="Play with this seed, whatever tests and scenarios say.")
+    group.addoption("--ucp-speedup", type=float, metavar="X", help="Mission seconds per second, of processes.")
+    group.addoption(
+        "--ucp-keep",
+        type=Path,
+        metavar="DIR",
+        help="Keep all run directories, in DIR; else those of failed tests, among pytest's temporary directories.",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    for marker in MARKERS:
+        config.addinivalue_line("markers", marker)
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    if file_path.suffix not in (".yaml", ".yml"):
+        return None
+    from harness.pytest_plugin.yaml_files import is_asked_for, is_ours
+
+    if not is_asked_for(file_path, parent.config) or not is_ours(file_path):
+        return None
+    from harness.pytest_plugin.items import ScenarioFile
+
+    return ScenarioFile.from_parent(parent, path=file_path)
+
+
+@pytest.fixture
+def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
+    """Agents to tell what happens, sentence by sentence: five of them, without loss, unless a marker says otherwise."""
+    from harness.pytest_plugin.fixtures import swarm_for
+
+    yield from swarm_for(request.node)
+
+
+@pytest.fixture
+def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
+    """What was found when the scenario of the marker `scenario` was played."""
+    from harness.pytest_plugin.fixtures import scenario_for
+
+    yield from scenario_for(request.node)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
+    """A run is judged as the last part of its test, not in the teardown: a violation is a failure of the test."""
+    try:
+        yield
+    except Exception:
+        if trial := item.stash.get(TRIAL, None):
+            item.add_report_section("call", "ucp", trial.end_of_failed_test())
+        raise
+    if trial := item.stash.get(TRIAL, None):
+        trial.end_of_test()

@@ -1,0 +1,83 @@
+"""What was found about a run, as a test asks for it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.checker import Result
+from harness.checker.characteristic import Characteristic, Finding, Verdict
+from harness.errors import ScenarioError
+from harness.exports import export_paths, read_exports
+from harness.naming import name_blocks
+
+EVIDENCE_SHOWN = 5
+
+
+@dataclass(frozen=True, repr=False)
+class Judgement:
+    """The verdict on one characteristic; shown by a failing assert, it says why."""
+
+    number: int
+    name: str
+    verdict: Verdict
+    reason: str
+    evidence: list[Finding]
+
+    @classmethod
+    def of(cls, number: int, found: Characteristic) -> "Judgement":
+        return cls(number, found.name, found.verdict, found.reason, found.evidence)
+
+    @property
+    def holds(self) -> bool:
+        return self.verdict == "holds"
+
+    def __repr__(self) -> str:
+        return f"<characteristic {self.number}, {self.name}: {self.verdict}: {self.reason}>"
+
+    def lines(self) -> list[str]:
+        """The verdict in a line, and its evidence."""
+        lines = [f"characteristic {self.number}, {self.name}: {self.verdict}: {self.reason}"]
+        lines += [f"    agent {finding.agent_id}: {finding.detail}" for finding in self.evidence[:EVIDENCE_SHOWN]]
+        if len(self.evidence) > EVIDENCE_SHOWN:
+            lines.append(f"    and {len(self.evidence) - EVIDENCE_SHOWN} more in the report")
+        return lines
+
+
+@dataclass(frozen=True, repr=False)
+class Findings:
+    """Of the run in `directory`, at its end or by now."""
+
+    directory: Path
+    result: Result
+
+    def __repr__(self) -> str:
+        return f"<run in {self.directory}>"
+
+    def characteristic(self, number: int) -> Judgement:
+        """Raises ScenarioError for a number that is not 1 to 6."""
+        __tracebackhide__ = True
+        found = self.result.characteristics.get(str(number))
+        if found is None:
+            raise ScenarioError(f"there is no characteristic {number!r}: they are 1 to 6")
+        return Judgement.of(number, found)
+
+    @property
+    def figures(self) -> dict[str, float | int | None]:
+        """As in run.json: `mutual_chain`, `distinct_chains`, `reconciles`, ..."""
+        return self.result.figures
+
+    def chain(self, agent: int) -> list[str]:
+        """The names of the blocks in the agent's chain, such as "4.11", the oldest first.
+
+        Raises ScenarioError if the agent has left no chain.
+        """
+        __tracebackhide__ = True
+        exports = read_exports(export_paths(self.directory)).by_agent
+        if agent not in exports:
+            raise ScenarioError(f"there is no chain of agent {agent!r}: there are those of {sorted(exports)}")
+        names = name_blocks(exports)
+        return [names[block_hash] for block_hash in exports[agent].chain_of_block_hashes]
+
+    @property
+    def report(self) -> Path:
+        """Where the report is once the test has ended, if it failed or `--ucp-keep` was given."""
+        return self.directory / "report.html"

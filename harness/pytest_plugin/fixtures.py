@@ -1,0 +1,84 @@
+"""What the fixtures `swarm` and `scenario` do, imported when a test asks for one of them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from harness.errors import ScenarioError
+from harness.progress import Silent
+from harness.pytest_plugin import TRIAL
+from harness.pytest_plugin.directories import discard, new_directory
+from harness.pytest_plugin.findings import Findings
+from harness.pytest_plugin.options import Options
+from harness.pytest_plugin.swarm_in_test import Swarm
+from harness.pytest_plugin.trial import Trial, one_sentence
+from harness.record import Backend
+from harness.run import Run, run
+from harness.scenario import Scenario, load_scenario
+from harness.scenario.load import parse
+
+DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
+
+
+def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
+    """The swarm of a test. `Trial` ends and judges it, or it ends here if the test does not come to its end."""
+    with one_sentence():
+        options = Options.of(node.config)
+        keys = {**DEFAULTS, "name": node.name[:200], "vehicles": {"kind": "none"}}
+        for marker in reversed(list(node.iter_markers("swarm"))):  # the nearest has the last word
+            keys |= marker.kwargs
+        backend, seed = _backend_and_seed(keys.pop("backend"), keys.pop("seed"), options)
+        scenario = options.at_speedup(parse(keys))
+        directory = new_directory(node, options)
+        swarm = Swarm(scenario, seed, backend, directory)
+    trial = node.stash[TRIAL] = Trial(scenario.expect, swarm.finish)
+    try:
+        yield swarm
+    finally:
+        swarm.close()
+    if trial.passed:
+        discard(directory, options)
+
+
+def scenario_for(node: pytest.Item) -> Iterator[Findings]:
+    """The findings of the scenario that the marker names, once it has been played."""
+    with one_sentence():
+        options = Options.of(node.config)
+        path, said = _marked(node)
+        backend, seed = _backend_and_seed(said["backend"], said["seed"], options)
+        scenario = options.at_speedup(load_scenario(path))
+        directory = new_directory(node, options)
+        finished = play(scenario, seed, backend, directory)
+    trial = node.stash[TRIAL] = Trial(scenario.expect, lambda _: finished)
+    yield Findings(directory, finished.result)
+    if trial.passed:
+        discard(directory, options)
+
+
+def play(scenario: Scenario, seed: int, backend: Backend, directory: Path) -> Run:
+    """Play and judge a scenario. Raises HarnessError, and KeyboardInterrupt if the run was interrupted."""
+    finished = run(scenario, seed, directory, Silent(), backend)
+    if finished.played.outcome == "interrupted":
+        raise KeyboardInterrupt(f"{finished.played.outcome_detail}; report: {finished.report}")
+    return finished
+
+
+def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
+    marker = node.get_closest_marker("scenario")
+    if marker is None or len(marker.args) != 1 or not marker.kwargs.keys() <= DEFAULTS.keys():
+        raise ScenarioError(
+            "the fixture `scenario` needs a marker that says which, and may say where and from what seed: "
+            '@pytest.mark.scenario("loss_15.yaml", backend="sim", seed=3)'
+        )
+    return node.path.parent / marker.args[0], {**DEFAULTS, **marker.kwargs}
+
+
+def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[Backend, int]:
+    """What a marker says of them, unless the command line says something else. Raises ScenarioError."""
+    if backend not in get_args(Backend):
+        raise ScenarioError(f"`backend` is {backend!r}: it should be {' or '.join(map(repr, get_args(Backend)))}")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ScenarioError(f"`seed` is {seed!r}: it should be a number, 0 or more")
+    return options.backend or backend, seed if options.seed is None else options.seed

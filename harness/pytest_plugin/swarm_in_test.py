@@ -1,0 +1,240 @@
+"""The swarm of a test, which tells what happens to it: any backend, mission seconds, one sentence after another."""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from harness import checker, mission
+from harness.errors import HarnessError, ScenarioError
+from harness.mission import Played
+from harness.progress import Silent
+from harness.pytest_plugin.findings import Findings, Judgement
+from harness.pytest_plugin.told import Sentence, Told
+from harness.record import Backend
+from harness.run import Play, Recording, Run, prepare
+from harness.scenario import Scenario
+
+
+class RunEndedError(Exception):
+    """The run has ended before the test: an agent or a vehicle failed, or the machine."""
+
+
+class Swarm:
+    """Agents on any backend, told what happens. Times are mission seconds, agents are named by their IDs.
+
+    Between two sentences virtual time stands still; real processes go on, and what is due then comes with the next.
+    What a test asks between two sentences is answered as of one moment. A sentence that cannot be is a ScenarioError,
+    and leaves everything as it is. Raises HarnessError if it cannot begin.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, backend: Backend, out: Path) -> None:
+        self._told = Told(scenario)
+        play = prepare(scenario, seed, backend, self._told.story)
+        self._recording = Recording(scenario, seed, out, backend)
+        self._judged = False
+        self._seen: Findings | None = None
+        self._interrupted = asyncio.Event()
+        self._runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
+        self._loop = self._runner.get_loop()
+        self._thread = ThreadPoolExecutor(1, "ucp-swarm")
+        self._playing: Future[Any] = self._thread.submit(self._play, play)
+        try:
+            wait((self._told.begun, self._playing), return_when=FIRST_COMPLETED)
+            if self._playing.done():
+                self._playing.result()
+        except BaseException:
+            self.close()
+            raise
+
+    def __repr__(self) -> str:
+        return f"<swarm, run in {self.directory}>"
+
+    def _play(self, play: Play) -> Played:
+        with self._runner:
+            try:
+                return self._runner.run(play(self._recording.directory, Silent(), self._interrupted))
+            except HarnessError as error:
+                self._recording.fail(error)
+                raise
+
+    # The network
+
+    def partition(self, *groups: list[int]) -> None:
+        """Cut the groups from each other; agents that none of them names form one more together."""
+        __tracebackhide__ = True
+        self._change(partition=[list(group) for group in groups])
+
+    def heal(self) -> None:
+        """Undo the partition."""
+        __tracebackhide__ = True
+        self._change(heal=True)
+
+    def loss(self, probability: float) -> None:
+        """From now on every receiver loses each message with this probability."""
+        __tracebackhide__ = True
+        self._change(loss=probability)
+
+    # The agents
+
+    def kill(self, *agents: int) -> None:
+        """They are gone with their vehicles, and all that they held with them (Section 3.3)."""
+        __tracebackhide__ = True
+        self._change(kill=list(agents))
+
+    def restart(self, *agents: int) -> None:
+        """Killed agents begin anew, with nothing but the inception block."""
+        __tracebackhide__ = True
+        self._change(restart=list(agents))
+
+    def pause(self, *agents: int) -> None:
+        """They stand still, and what reaches them waits."""
+        __tracebackhide__ = True
+        self._change(pause=list(agents))
+
+    def resume(self, *agents: int) -> None:
+        __tracebackhide__ = True
+        self._change(resume=list(agents))
+
+    def reboot(self, *agents: int, down_s: float = 30.0, disk: str = "kept") -> None:
+        """Their computers brown out; they are back after `down_s` with their `disk` "kept", or "lost"."""
+        __tracebackhide__ = True
+        self._change(reboot=list(agents), down_s=down_s, disk=disk)
+
+    def reconcile(self, agent: int) -> None:
+        """The agent begins a reconcile."""
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.reconcile(swarm, agent))
+
+    # Time
+
+    @property
+    def now_s(self) -> float:
+        """Mission seconds since the start."""
+        __tracebackhide__ = True
+        return float(self._hear(_now))
+
+    def run_for(self, seconds: float) -> None:
+        """Let the mission go on for so long."""
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.until(swarm, swarm.now() + seconds))
+
+    def run_until(self, mission_s: float) -> None:
+        """Let the mission go on until then."""
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.until(swarm, mission_s))
+
+    def wait_idle(self, limit_s: float = 1800.0) -> None:
+        """Let the mission go on until what was told last has sunk in.
+
+        That is, until each agent that runs has put a block of its own to the vote since, and all are idle. Raises
+        AssertionError if that takes longer than `limit_s`.
+        """
+        __tracebackhide__ = True
+        played = self._act(lambda swarm: self._told.until_idle(swarm, limit_s))
+        if played is None:
+            raise AssertionError(f"within {limit_s:g} mission seconds not every agent has voted and become idle")
+        self._seen = self._judge_by_now(played)
+
+    def final_reconcile(self) -> None:
+        """The end of the mission: no more events, no more conditions, and one agent after another reconciles."""
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.end(swarm, reconcile_finally=True))
+
+    # What there is by now
+
+    def characteristic(self, number: int) -> Judgement:
+        """The verdict as things stand: `holds`, `verdict`, `reason` and `evidence`."""
+        __tracebackhide__ = True
+        return self._findings().characteristic(number)
+
+    @property
+    def figures(self) -> dict[str, float | int | None]:
+        """As in run.json: `mutual_chain`, `distinct_chains`, `reconciles`, ..."""
+        __tracebackhide__ = True
+        return self._findings().figures
+
+    def chain(self, agent: int) -> list[str]:
+        """The names of the blocks in the agent's chain, such as "4.11", the oldest first."""
+        __tracebackhide__ = True
+        return self._findings().chain(agent)
+
+    @property
+    def directory(self) -> Path:
+        """That of the run."""
+        return self._recording.directory.path
+
+    @property
+    def report(self) -> Path:
+        """Where the report is once the test has ended, if it failed or `--ucp-keep` was given."""
+        return self.directory / "report.html"
+
+    def _findings(self) -> Findings:
+        """As of the first look since the last sentence, or of the moment for which `wait_idle` has waited."""
+        __tracebackhide__ = True
+        if self._seen is None:
+            self._seen = self._judge_by_now(self._hear(_take_stock))
+        return self._seen
+
+    def _judge_by_now(self, played: Played) -> Findings:
+        self._recording.take_down(played)
+        return Findings(self.directory, checker.check(checker.gather([self.directory])))
+
+    # Between the test and the run
+
+    def _change(self, **entry: Any) -> None:
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.change(swarm, **entry))
+
+    def _act(self, sentence: Sentence) -> Any:
+        __tracebackhide__ = True
+        self._seen = None
+        return self._hear(sentence)
+
+    def _hear(self, sentence: Sentence) -> Any:
+        __tracebackhide__ = True
+        answer: Future[Any] = Future()
+        self._in_loop(self._told.hear, sentence, answer)
+        wait((answer, self._playing), return_when=FIRST_COMPLETED)
+        if not answer.done():
+            raise RunEndedError(self._playing.result().outcome_detail or "the run has ended")
+        if mistake := answer.exception():
+            raise ScenarioError(str(mistake)) from None
+        return answer.result()
+
+    def _in_loop(self, callback: Callable[..., None], *arguments: Any) -> None:
+        with suppress(RuntimeError):  # the loop has ended, and the run with it
+            self._loop.call_soon_threadsafe(callback, *arguments)
+
+    def finish(self, settle: bool) -> Run:
+        """End the run, once the agents have settled if `settle`, and judge it. Raises MachineError."""
+        if settle:
+            with suppress(RunEndedError):  # the record says why
+                self._hear(lambda swarm: self._told.end(swarm, reconcile_finally=False))
+        self._in_loop(self._told.stop)
+        return self._judge()
+
+    def close(self) -> None:
+        """End the run at once, if nothing has ended it before, and judge what there is."""
+        self._in_loop(self._interrupted.set)
+        self._in_loop(self._told.stop)
+        self._thread.shutdown()
+        if not self._judged:
+            with suppress(HarnessError):  # it could not even begin, or the disk is full
+                self._judge()
+
+    def _judge(self) -> Run:
+        played = self._playing.result()
+        self._judged = True
+        self._recording.tell(self._told.scenario)
+        return self._recording.end(played)
+
+
+async def _take_stock(swarm: mission.Swarm) -> Played:
+    return await swarm.take_stock()
+
+
+async def _now(swarm: mission.Swarm) -> float:
+    return swarm.now()

@@ -1,0 +1,128 @@
+"""A mission that is told while it is played: a timeline that grows, sentence by sentence.
+
+The sentences come from another thread than that of the mission's loop, so that real processes are watched, and vehicles
+flown, while a test thinks or somebody looks at it in a debugger. Each sentence that changes something becomes an entry
+of the scenario's timeline: it is checked as an entry is, and what was told can be played again.
+"""
+
+import asyncio
+import math
+import re
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
+from typing import Any
+
+from harness import mission
+from harness.errors import ScenarioError
+from harness.mission import Played
+from harness.scenario import Scenario
+from harness.scenario.load import parse
+from harness.timeline import timeline_of
+
+INSTANT_S = 0.001
+"""Of two sentences in one instant the second comes a millisecond later."""
+LOOK_EVERY_S = 5.0
+"""Mission seconds between two looks at who has voted."""
+
+Sentence = Callable[[mission.Swarm], Awaitable[Any]]
+
+
+class Told:
+    """Play its `story`, wait until it has `begun`, then let it `hear` what happens, in the thread that plays it."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        """With everything in its timeline that was told by now."""
+        self.begun: Future[Any] = Future()
+        self._sentences: asyncio.Queue[tuple[Sentence, Future[Any]] | None] = asyncio.Queue()
+        self._played_s = 0.0
+        """Until when the timeline has been played."""
+        self._completed: dict[int, int] = {}
+        """How many blocks each agent had completed when something was last told."""
+
+    async def story(self, swarm: mission.Swarm, scenario: Scenario) -> None:
+        first, *_ = timeline_of(scenario)
+        await swarm.begin(first)
+        swarm.enter("mission")
+        self.begun.set_result(None)
+        while told := await self._sentences.get():
+            sentence, answer = told
+            try:
+                said = await sentence(swarm)
+            except ScenarioError as mistake:  # of whoever tells, who may go on
+                answer.set_exception(mistake)
+            else:
+                answer.set_result(said)
+
+    def hear(self, sentence: Sentence, answer: Future[Any]) -> None:
+        """Take the next sentence. What it says, or a mistake in it, is set in `answer`, unless the run ends first."""
+        self._sentences.put_nowait((sentence, answer))
+
+    def stop(self) -> None:
+        """There are no more sentences."""
+        self._sentences.put_nowait(None)
+
+    # Sentences
+
+    async def change(self, swarm: mission.Swarm, **entry: Any) -> None:
+        """Make this entry of a timeline happen now. Raises ScenarioError if it cannot."""
+        now = max(swarm.now(), self._played_s + INSTANT_S)
+        at_s = math.ceil(now * 1000) / 1000
+        last_s = at_s + entry.get("down_s", 0.0)
+        document = self.scenario.model_dump()
+        document["timeline"].append({"at_s": at_s, **entry})
+        document["duration_s"] = max(self.scenario.duration_s, last_s)
+        try:
+            self.scenario = parse(document)
+        except ScenarioError as error:
+            raise ScenarioError(re.sub(r"timeline\.\d+(\.|: )", "", str(error))) from None
+        await self.until(swarm, at_s)
+        self._completed = await swarm.completed()
+
+    async def until(self, swarm: mission.Swarm, mission_s: float) -> None:
+        """Go on until then, with what the timeline has in between."""
+        for change in [change for change in timeline_of(self.scenario) if self._played_s < change.at_s <= mission_s]:
+            await swarm.until(change.at_s)
+            await swarm.apply(change)
+            self._played_s = change.at_s
+        await swarm.until(mission_s)
+
+    async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> Played | None:
+        """Go on until everybody has voted since something was last told, and all are idle; None if that takes longer.
+
+        What has been played by then is taken while nobody stirs: real processes go on. A vote is what makes an agent
+        notice that its chain is another than the others' (Section 3.2).
+        """
+        end_s = swarm.now() + limit_s
+        while any(blocks <= self._completed.get(agent, 0) for agent, blocks in (await swarm.completed()).items()):
+            if swarm.now() >= end_s:
+                return None
+            await self.until(swarm, min(end_s, swarm.now() + LOOK_EVERY_S))
+        while await swarm.until_idle(end_s - swarm.now()):
+            chains = await swarm.top_chain_hashes()
+            played = await swarm.take_stock()
+            busy = any(agent.get("idle") is False for agent in played.agents.values())
+            if not busy and await swarm.top_chain_hashes() == chains:
+                return played
+        return None
+
+    async def reconcile(self, swarm: mission.Swarm, agent: int) -> None:
+        awake = await swarm.completed()
+        if agent not in awake:
+            raise ScenarioError(f"agent {agent!r} cannot reconcile: those that run are {', '.join(map(str, awake))}")
+        await swarm.reconcile(agent)
+
+    async def end(self, swarm: mission.Swarm, *, reconcile_finally: bool) -> None:
+        """The end of the mission, if it has not been. Raises ScenarioError if a second final reconcile is asked for."""
+        if swarm.played.final_reconcile is not None:
+            if reconcile_finally:
+                raise ScenarioError("the final reconcile has been: a mission has one, at its end")
+            return
+        if not self.scenario.schedule:  # which lasts as long as the mission was meant to
+            last_s = max(change.at_s for change in timeline_of(self.scenario))
+            self._set(duration_s=max(swarm.now(), last_s, INSTANT_S))
+        self._set(final_reconcile=reconcile_finally or self.scenario.final_reconcile)
+        await mission.settle(swarm, self.scenario)
+
+    def _set(self, **keys: Any) -> None:
+        self.scenario = self.scenario.model_copy(update=keys)

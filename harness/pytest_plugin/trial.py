@@ -1,0 +1,62 @@
+"""A run that a test is about, and whether it is what its scenario expects."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from harness.errors import HarnessError, MachineError
+from harness.pytest_plugin.findings import Judgement
+from harness.run import Run
+from harness.scenario.expect import Expect
+
+
+class Trial:
+    """`finish` ends the run, once the agents have settled if its argument says so, and judges it."""
+
+    def __init__(self, expect: Expect | None, finish: Callable[[bool], Run]) -> None:
+        self._expect = expect or Expect()
+        self._finish = finish
+        self.passed = False
+
+    def end_of_test(self) -> None:
+        """Raises pytest's Failed if the run is not what is expected of it."""
+        try:
+            finished = self._finish(True)
+        except HarnessError as error:
+            raise pytest.fail.Exception(str(error), pytrace=False) from None
+        if lines := self._unexpected(finished):
+            pytest.fail("\n".join([*lines, f"report: {finished.report}"]), pytrace=False)
+        self.passed = True
+
+    def end_of_failed_test(self) -> str:
+        """What there is to say beside the test's own failure."""
+        try:
+            finished = self._finish(False)
+        except HarnessError as error:
+            return str(error)
+        return "\n".join([*self._unexpected(finished), f"report: {finished.report}"])
+
+    def _unexpected(self, finished: Run) -> list[str]:
+        played = finished.played
+        lines = [played.outcome_detail] if played.outcome_detail else []
+        if played.outcome == "completed":
+            lines += [f"{fate}, so this run does not show what it was meant to" for fate in played.unmatched_fates]
+        for name, found in finished.result.characteristics.items():
+            number = int(name)
+            if not self._expect.as_expected(number, found.verdict):
+                expected = self._expect.characteristics.get(number)
+                lines += Judgement.of(number, found).lines()
+                lines += [f"    expected: {expected}"] if expected else []
+        return lines + list(self._expect.out_of_range(finished.result.figures))
+
+
+@contextmanager
+def one_sentence() -> Iterator[None]:
+    """Skip what this machine cannot do, and fail for what else is wrong, with the sentence that says it."""
+    try:
+        yield
+    except MachineError as error:
+        raise pytest.skip.Exception(str(error)) from None
+    except HarnessError as error:
+        raise pytest.fail.Exception(str(error), pytrace=False) from None

@@ -1,0 +1,129 @@
+"""What a scenario expects of its runs: which verdicts and figures, on which backends, with which seeds.
+
+expect:
+  characteristics: {1: holds, 5: holds, 6: not applicable}
+  figures: {mutual_chain: {min: 40}, distinct_chains: 1, reconciles: {max: 20}}
+  backends: [sim, process]
+  seeds: [1, 2, 3]
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BeforeValidator, Field, field_validator, model_validator
+
+from harness.scenario.model import BOUNDED, Model
+
+Verdict = Literal["holds", "violated", "not applicable"]
+
+FigureName = Literal[
+    "agents",
+    "blocks",
+    "mutual_chain",
+    "longest_chain",
+    "distinct_chains",
+    "copies_min",
+    "copies_mean",
+    "uniform_at_s",
+    "reconciles",
+    "messages",
+    "bytes",
+    "messages_per_block",
+    "mutual_chain_before_final_reconcile",
+    "distinct_chains_before_final_reconcile",
+]
+"""As in `harness.checker.figures`."""
+
+NUMBERS = {str(number): number for number in range(1, 7)}
+"""The characteristics; JSON has strings for keys."""
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _known_number(key: Any) -> int:
+    number = NUMBERS.get(str(key))
+    if number is None or isinstance(key, float):
+        raise ValueError(f"there is no characteristic {BOUNDED.repr(key)}: they are 1 to 6")
+    return number
+
+
+class Range(Model):
+    """From `min` to `max`, both included; at least one of them."""
+
+    min: Number | None = None
+    max: Number | None = None
+
+    @model_validator(mode="after")
+    def _means_something(self) -> "Range":
+        if self.min is None and self.max is None:
+            raise ValueError("needs `min` or `max`")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min:g} is more than max {self.max:g}")
+        return self
+
+    def __contains__(self, figure: float) -> bool:
+        return (self.min is None or figure >= self.min) and (self.max is None or figure <= self.max)
+
+    def describe(self) -> str:
+        """In words: "at least 40"."""
+        if self.min == self.max:
+            return f"{self.min:g}"
+        words = [f"at least {self.min:g}"] if self.min is not None else []
+        return " and ".join([*words, *([f"at most {self.max:g}"] if self.max is not None else [])])
+
+
+def _exactly(value: Any) -> Any:
+    """A number is short for the range from it to itself."""
+    if isinstance(value, Mapping | Range):
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError("should be a number, or {min: number, max: number}")
+    return {"min": value, "max": value}
+
+
+class Expect(Model):
+    """A characteristic that is not named may be anything but violated.
+
+    Every seed is played on every backend.
+    """
+
+    characteristics: dict[int, Verdict] = {}
+    figures: dict[FigureName, Annotated[Range, BeforeValidator(_exactly)]] = {}
+    backends: Annotated[list[Literal["process", "sim"]], Field(min_length=1)] = ["sim"]
+    seeds: Annotated[list[Annotated[int, Field(ge=0, strict=True)]], Field(min_length=1, max_length=10_000)] = [1]
+
+    @field_validator("characteristics", mode="before")
+    @classmethod
+    def _numbered(cls, verdicts: Any) -> Any:
+        if not isinstance(verdicts, Mapping):
+            return verdicts
+        return {_known_number(key): verdict for key, verdict in verdicts.items()}
+
+    @field_validator("figures", mode="before")
+    @classmethod
+    def _known_figures(cls, figures: Any) -> Any:
+        for name in figures if isinstance(figures, Mapping) else ():
+            if name not in get_args(FigureName):
+                raise ValueError(
+                    f"there is no figure {BOUNDED.repr(name)}: there are {', '.join(get_args(FigureName))}"
+                )
+        return figures
+
+    @field_validator("backends", "seeds")
+    @classmethod
+    def _each_once(cls, values: list[Any]) -> list[Any]:
+        if len(set(values)) < len(values):
+            raise ValueError("names one twice: each is a test of its own")
+        return values
+
+    def as_expected(self, number: int, verdict: Verdict) -> bool:
+        expected = self.characteristics.get(number)
+        return verdict != "violated" if expected is None else verdict == expected
+
+    def out_of_range(self, figures: Mapping[str, float | None]) -> Iterator[str]:
+        """A sentence for each figure that is not what it should be."""
+        for name, wanted in self.figures.items():
+            figure = figures.get(name)
+            if figure is None or figure not in wanted:
+                found = "not known" if figure is None else f"{figure:g}"
+                yield f"{name.replace('_', ' ')} is {found}, and should be {wanted.describe()}"

@@ -1,0 +1,51 @@
+"""Running a project's tests inside a test, and what they say."""
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+# Imported before pytester takes its picture of what is imported, so that inner runs find it and are quick.
+import harness.pytest_plugin.items
+import harness.report  # noqa: F401
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+
+
+def run(pytester: pytest.Pytester, *arguments: object) -> pytest.RunResult:
+    """In this process."""
+    return pytester.runpytest_inprocess("-p", "no:cacheprovider", *map(str, arguments))
+
+
+def write_scenario(pytester: pytest.Pytester, file: str, **keys: Any) -> Path:
+    """A quick scenario, as YAML with one key a line."""
+    keys = {"name": "inner", "agents": 3, "duration_s": 100, "vehicles": {"kind": "none"}, **keys}
+    path = pytester.path / file
+    path.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in keys.items()))
+    return path
+
+
+def report(result: pytest.RunResult) -> Path:
+    """The report that a failing test names, which has to be there."""
+    found = re.search(r"^report: (\S+)$", result.stdout.str(), re.MULTILINE)
+    assert found, result.stdout.str()
+    path = Path(found[1])
+    assert "<html" in path.read_text()
+    return path
+
+
+def no_internals(result: pytest.RunResult) -> None:
+    """What is shown is the test and sentences: no line of ours."""
+    shown = result.stdout.str() + result.stderr.str()
+    assert "Traceback" not in shown
+    assert not re.search(r"harness/(?!pytest_plugin/trial\.py:\d+: )\w+[\w/]*\.py:\d+", shown), shown
+    assert "During handling" not in shown
+
+
+def run_directories(pytester: pytest.Pytester) -> list[Path]:
+    """Those in the project, and those among the inner pytest's temporary directories."""
+    temporary = Path(os.environ["PYTEST_DEBUG_TEMPROOT"])
+    return [path.parent for place in (pytester.path, temporary) for path in place.rglob("run.json")]

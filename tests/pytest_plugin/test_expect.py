@@ -1,0 +1,46 @@
+"""The key `expect` of a scenario."""
+
+from typing import Any, get_args
+
+import pytest
+
+from harness.checker.verdict import CHECKS
+from harness.scenario.expect import NUMBERS, Expect, FigureName
+from harness.simulate import simulate
+from tests.harness.virtual import scenario
+
+
+def test_the_figures_and_characteristics_that_can_be_expected_are_those_that_there_are() -> None:
+    simulated = simulate(scenario(agents=2, duration_s=60, final_reconcile=True), 1)
+    assert list(get_args(FigureName)) == list(simulated.result.figures)
+    assert NUMBERS.keys() == CHECKS.keys()
+
+
+def test_a_characteristic_that_is_not_named_may_be_anything_but_violated() -> None:
+    expect = Expect.model_validate({"characteristics": {5: "violated", "6": "not applicable"}})
+    verdicts = ("holds", "violated", "not applicable")
+    as_expected = {n: [expect.as_expected(n, verdict) for verdict in verdicts] for n in (1, 5, 6)}
+    assert as_expected == {1: [True, False, True], 5: [False, True, False], 6: [False, False, True]}
+
+
+@pytest.mark.parametrize(
+    ("wanted", "figure", "sentence"),
+    [
+        (3, 3, None),
+        (3, 4, "blocks is 4, and should be 3"),
+        ({"min": 3}, 3, None),
+        ({"min": 3}, 2, "blocks is 2, and should be at least 3"),
+        ({"max": 3}, 3, None),
+        ({"max": 3}, 3.5, "blocks is 3.5, and should be at most 3"),
+        ({"min": 1, "max": 3}, 0, "blocks is 0, and should be at least 1 and at most 3"),
+        ({"min": 0}, None, "blocks is not known, and should be at least 0"),
+    ],
+)
+def test_figures_are_compared_with_what_they_should_be(wanted: Any, figure: float | None, sentence: str | None) -> None:
+    expect = Expect.model_validate({"figures": {"blocks": wanted}})
+    assert list(expect.out_of_range({"blocks": figure})) == ([sentence] if sentence else [])
+
+
+def test_a_scenario_says_what_it_expects_in_json_as_in_yaml() -> None:
+    one = scenario(expect={"characteristics": {1: "holds"}, "figures": {"blocks": 3}, "seeds": [0, 2]})
+    assert type(one).model_validate_json(one.model_dump_json()) == one

@@ -1,0 +1,90 @@
+"""The fixture `scenario`: a scenario played for a test that looks at what came of it."""
+
+import pytest
+
+from tests.pytest_plugin.inner import no_internals, report, run, run_directories, write_scenario
+
+pytest_plugins = "pytester"
+
+
+def test_a_test_sees_what_came_of_the_scenario_that_its_marker_names(pytester: pytest.Pytester) -> None:
+    pytester.mkpydir("deep")
+    write_scenario(pytester, "deep/lossy.yaml", network={"loss": 0.1}, duration_s=300, final_reconcile=True)
+    (pytester.path / "deep" / "test_deep.py").write_text(
+        "import json, pytest\n"
+        '@pytest.mark.scenario("lossy.yaml", backend="sim", seed=3)\n'
+        "def test_lossy(scenario):\n"
+        "    assert scenario.characteristic(6).holds\n"
+        '    assert len(scenario.chain(1)) == scenario.figures["mutual_chain"] > 0\n'
+        '    assert json.loads((scenario.directory / "run.json").read_text())["seed"] == 3\n'
+    )
+    run(pytester).assert_outcomes(passed=1)
+    assert not run_directories(pytester)
+
+
+def test_what_the_scenario_expects_is_judged_with_the_test(pytester: pytest.Pytester) -> None:
+    write_scenario(pytester, "s.yaml", expect={"figures": {"blocks": {"min": 1000}, "distinct_chains": 2, "agents": 3}})
+    pytester.makepyfile('import pytest\n@pytest.mark.scenario("s.yaml")\ndef test_s(scenario): pass')
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        [
+            "*_ test_s _*",
+            "blocks is *, and should be at least 1000",
+            "distinct chains is *, and should be 2",
+            "report: *",
+        ]
+    )
+    result.stdout.no_fnmatch_line("agents is*")
+    no_internals(result)
+    report(result)
+
+
+@pytest.mark.parametrize(
+    ("marker", "sentence"),
+    [
+        ("", "the fixture `scenario` needs a marker that says which, *"),
+        ('@pytest.mark.scenario("s.yaml", agents=3)', "the fixture `scenario` needs a marker that says which, *"),
+        ('@pytest.mark.scenario("none.yaml")', "*none.yaml: cannot be read: No such file or directory"),
+        ('@pytest.mark.scenario("s.yaml", seed="one")', "`seed` is 'one': it should be a number, 0 or more"),
+        ('@pytest.mark.scenario("fates.yaml", backend="process")', "`fates` needs virtual time: use --backend sim"),
+    ],
+)
+def test_a_scenario_that_cannot_be_played_is_one_sentence(
+    pytester: pytest.Pytester, marker: str, sentence: str
+) -> None:
+    write_scenario(pytester, "s.yaml")
+    write_scenario(pytester, "fates.yaml", fates=[{"sender": 1, "count": 1, "drop": True}])
+    pytester.makepyfile(f"import pytest\n{marker}\ndef test_mistake(scenario): pass")
+    result = run(pytester)
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines([sentence])
+    no_internals(result)
+
+
+def test_a_fate_that_never_matched_fails_the_test(pytester: pytest.Pytester) -> None:
+    write_scenario(pytester, "s.yaml", fates=[{"message": "Commit Block", "block": "1.900", "drop": True}])
+    pytester.makepyfile('import pytest\n@pytest.mark.scenario("s.yaml")\ndef test_s(scenario): pass')
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*block 1.900*, so this run does not show what it was meant to"])
+
+
+def test_a_backend_that_this_machine_cannot_is_skipped_with_the_way_out(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(pytester.path))  # where there is neither unshare nor nft
+    write_scenario(pytester, "s.yaml", expect={"backends": ["process"]})
+    pytester.makepyfile("""
+    import pytest
+
+    @pytest.mark.scenario("s.yaml", backend="process")
+    def test_scenario(scenario): pass
+
+    @pytest.mark.swarm(backend="process")
+    def test_swarm(swarm): pass
+    """)
+    result = run(pytester, "-rs", "s.yaml", pytester.path)
+    result.assert_outcomes(skipped=3)
+    result.stdout.fnmatch_lines(["SKIPPED *is not installed*apt install*"] * 1)
+    no_internals(result)

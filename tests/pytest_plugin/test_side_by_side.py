@@ -1,0 +1,143 @@
+"""Tests with runs beside each other, interrupted, and beside tests that have nothing to do with us."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import entry_points
+
+import pytest
+
+from tests.harness.command import processes
+from tests.pytest_plugin.inner import run, run_directories, write_scenario
+
+pytest_plugins = "pytester"
+
+DEADLINE_S = 120.0
+
+PROJECT = """
+    import pytest
+
+    @pytest.mark.parametrize("number", range(6))
+    @pytest.mark.xdist_group("stories")
+    def test_story(swarm, number):
+        swarm.partition([1, 2])
+        swarm.run_for(200)
+        swarm.heal()
+        swarm.wait_idle()
+        assert swarm.characteristic(6).holds
+
+    @pytest.mark.scenario("s.yaml")
+    def test_scenario(scenario):
+        assert scenario.characteristic(3).holds
+
+    @pytest.mark.swarm(expect={"characteristics": {3: "violated"}})
+    def test_that_fails(swarm):
+        swarm.run_for(10)
+"""
+
+
+@pytest.mark.parametrize("workers", [("-n", "1"), ("-n", "4"), ("-n", "2", "--dist=loadgroup")])
+def test_the_same_tests_end_the_same_with_any_number_of_workers(
+    pytester: pytest.Pytester, workers: tuple[str, ...]
+) -> None:
+    pytester.makepyfile(PROJECT)
+    write_scenario(pytester, "s.yaml", expect={"seeds": [1, 2, 3]})
+    result = pytester.runpytest_subprocess(*workers, "--ucp-keep", "kept", "s.yaml", ".")
+    result.assert_outcomes(passed=10, failed=1)
+    assert "characteristic 3, single copy: holds" in result.stdout.str()
+    assert len(list((pytester.path / "kept").iterdir())) == len(run_directories(pytester)) == 11
+
+
+@pytest.mark.lab
+def test_eight_labs_at_once_do_not_meet(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+    import json, pathlib, pytest, time
+
+    @pytest.mark.parametrize("number", range(8))
+    @pytest.mark.swarm(agents=2, backend="process", speedup=20)
+    def test_lab(swarm, number):
+        pathlib.Path(f"here-{number}").touch()
+        deadline = time.monotonic() + 60
+        while len(list(pathlib.Path().glob("here-*"))) < 8:
+            assert time.monotonic() < deadline, "there were never eight"
+            swarm.run_for(5)
+        swarm.run_for(40)
+        swarm.characteristic(1)
+        record = json.loads((swarm.directory / "run.json").read_text())
+        assert not any(agent["dropped"] for agent in record["agents"].values())
+    """)
+    result = pytester.runpytest_subprocess("-n", "8")
+    result.assert_outcomes(passed=8)
+    assert not processes(pytester.path)
+
+
+@pytest.mark.parametrize("backend", [pytest.param("process", marks=pytest.mark.lab), "sim"])
+@pytest.mark.parametrize("what", ["swarm", "s.yaml"])
+def test_ctrl_c_ends_the_session_and_leaves_a_whole_run_and_no_process(
+    pytester: pytest.Pytester, backend: str, what: str
+) -> None:
+    write_scenario(pytester, "s.yaml", duration_s=1e7, settings={"vote_timeout_s": 1}, expect={})
+    pytester.makepyfile("""
+    def test_swarm(swarm):
+        swarm.run_for(1e7)
+    """)
+    project = pytester.popen(
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            *(["s.yaml"] if what == "s.yaml" else []),
+            "--ucp-backend",
+            backend,
+            "--ucp-keep",
+            "kept",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        stdin=subprocess.DEVNULL,
+    )
+    try:
+        deadline = time.monotonic() + DEADLINE_S
+        while not any(path.stat().st_size > 2000 for path in pytester.path.glob("kept/*/agents/*.trace.jsonl")):
+            assert project.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        os.kill(project.pid, signal.SIGINT)
+        said, _ = project.communicate(timeout=DEADLINE_S)
+    finally:
+        project.kill()
+    assert project.returncode == pytest.ExitCode.INTERRUPTED, said.decode()
+    assert b"KeyboardInterrupt" in said
+    assert not processes(pytester.path)
+    (left,) = run_directories(pytester)
+    record = json.loads((left / "run.json").read_text())
+    assert (record["outcome"], record["characteristics"]["3"]["verdict"]) == ("interrupted", "holds")
+    assert (left / "report.html").exists()
+
+
+def test_a_project_that_does_not_use_it_pays_for_no_import(pytester: pytest.Pytester) -> None:
+    for number in range(3):
+        (pytester.path / f"{number}.yaml").write_text("name: x\njobs: []\n")
+    pytester.makepyfile("""
+    import sys
+
+    def test_theirs():
+        assert {name for name in sys.modules if name.split(".")[0] in ("harness", "ucp", "netem", "pydantic")} == {
+            "harness", "harness.pytest_plugin", "harness.pytest_plugin.yaml_files"
+        }
+    """)
+    pytester.makeini("[pytest]\ntestpaths = .\naddopts = -p no:hypothesispytest")
+    pytester.runpytest_subprocess().assert_outcomes(passed=1)
+
+
+def test_nothing_needs_to_be_imported_and_markers_are_known(pytester: pytest.Pytester) -> None:
+    (found,) = entry_points(group="pytest11", name="ucp-harness")
+    assert found.value == "harness.pytest_plugin"
+    result = run(pytester, "--markers")
+    result.stdout.fnmatch_lines(["@pytest.mark.swarm(*", "@pytest.mark.scenario(*"])
+    pytester.makepyfile("def test_story(swarm): swarm.run_for(10)")
+    pytester.makeini("[pytest]\naddopts = --strict-markers --strict-config -W error")
+    run(pytester).assert_outcomes(passed=1)

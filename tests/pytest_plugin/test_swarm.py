@@ -1,0 +1,269 @@
+"""The fixture `swarm`: a run told sentence by sentence, judged when its test ends."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from harness.exports import read_export
+from harness.progress import Silent
+from harness.run import run as play
+from harness.scenario.load import parse
+from tests.pytest_plugin.inner import SCENARIOS, no_internals, report, run, run_directories
+
+pytest_plugins = "pytester"
+
+STORY = """
+    def test_story(swarm):
+        swarm.partition([1, 2], [3, 4, 5])
+        swarm.run_for(600)
+        apart = swarm.characteristic(6)
+        swarm.heal()
+        swarm.wait_idle()
+        assert (apart.verdict, apart.holds) == ("not applicable", False)
+        assert swarm.characteristic(6).holds
+        assert swarm.chain(1) == swarm.chain(4)
+        assert {name.split(".")[0] for name in swarm.chain(1)} == set("12345")
+        assert swarm.figures["mutual_chain"] == len(swarm.chain(1))
+"""
+
+README = Path(__file__).parents[2] / "README.md"
+FORCED_TIE = {**yaml.safe_load((SCENARIOS / "forced_tie.yaml").read_text()), "quirks": {"crash_on_tie": True}}
+
+
+def test_the_story_of_a_partition_passes_and_leaves_nothing(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(STORY)
+    run(pytester).assert_outcomes(passed=1)
+    assert not run_directories(pytester)
+
+
+@pytest.mark.parametrize("seed", range(2, 12))
+def test_the_story_holds_with_any_seed(pytester: pytest.Pytester, seed: int) -> None:
+    pytester.makepyfile(STORY)
+    run(pytester, "--ucp-seed", seed).assert_outcomes(passed=1)
+
+
+@pytest.mark.lab
+def test_the_same_story_is_told_to_processes(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(STORY)
+    run(pytester, "--ucp-backend", "process", "--ucp-speedup", "100").assert_outcomes(passed=1)
+    assert not run_directories(pytester)
+
+
+def test_the_tests_in_the_readme_pass(pytester: pytest.Pytester) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    pytester.makepyfile("import pytest\n" + code)
+    (pytester.path / "scenarios").symlink_to(SCENARIOS)
+    run(pytester).assert_outcomes(passed=3)
+    (expect,) = re.findall(r"```yaml\n(expect:.*?)```", README.read_text(), re.DOTALL)
+    (pytester.path / "my.yaml").write_text((SCENARIOS / "loss_15.yaml").read_text() + expect)
+    run(pytester, "my.yaml", "--ucp-backend", "sim").assert_outcomes(passed=3)
+
+
+FAULTS = """
+    import pytest
+
+    @pytest.mark.swarm(agents=[3, 7, 20, 40], speedup=50)
+    def test_faults(swarm):
+        swarm.run_until(100)
+        swarm.kill(3)
+        with pytest.raises(Exception, match="kill: agent 3 is killed then"):
+            swarm.kill(3)
+        with pytest.raises(Exception, match="agent 3 cannot reconcile: those that run are 7, 20, 40"):
+            swarm.reconcile(3)
+        swarm.pause(7)
+        swarm.run_for(50)
+        swarm.resume(7)
+        swarm.reboot(20, down_s=10, disk="kept")
+        swarm.run_for(200)
+        held = len(swarm.chain(20))
+        assert held > 0
+        swarm.restart(3)
+        swarm.reboot(40, down_s=10, disk="lost")
+        swarm.run_for(200)
+        assert swarm.characteristic(3).holds
+        assert swarm.characteristic(4).holds
+        swarm.loss(0.5)
+        swarm.run_for(20)
+        swarm.final_reconcile()
+        with pytest.raises(Exception, match="the final reconcile has been"):
+            swarm.final_reconcile()
+        assert swarm.characteristic(6).holds
+        assert len(swarm.chain(3)) == len(swarm.chain(20)) > held
+"""
+
+
+def test_agents_are_killed_paused_rebooted_and_come_back(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(FAULTS)
+    run(pytester, "--ucp-keep", "kept").assert_outcomes(passed=1)
+    (kept,) = run_directories(pytester)
+    record = json.loads((kept / "run.json").read_text())
+    assert [fault["what"] for fault in record["faults"]] == [
+        *("kill", "pause", "resume", "reboot", "boot", "restart", "reboot", "boot", "loss", "final reconcile")
+    ]
+    assert [(one["restarts"], one["reboots"]) for one in record["agents"].values()] == [(1, 0), (0, 0), (0, 1), (1, 0)]
+
+
+@pytest.mark.lab
+def test_processes_are_killed_paused_rebooted_and_come_back(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(FAULTS)
+    run(pytester, "--ucp-backend", "process", "--ucp-keep", "kept").assert_outcomes(passed=1)
+    (kept,) = run_directories(pytester)
+    record = json.loads((kept / "run.json").read_text())
+    assert {one["verdict"] for one in record["characteristics"].values()} <= {"holds", "not applicable"}
+    assert not record["errors"]
+
+
+def test_looking_changes_nothing_and_what_was_told_can_be_played_again(
+    pytester: pytest.Pytester, tmp_path: Path
+) -> None:
+    look = "swarm.characteristic(1), swarm.chain(2), swarm.figures"
+    pytester.makepyfile(f"""
+    import pytest
+
+    def tell(swarm, look):
+        swarm.loss(0.1)
+        swarm.partition([1], [2, 3])
+        for _ in range(5):
+            swarm.run_for(41.7)
+            look and ({look})
+        swarm.kill(4)
+        swarm.heal()
+        swarm.run_for(100)
+
+    pytestmark = pytest.mark.swarm(name="told", final_reconcile=True)
+    def test_looking(swarm): tell(swarm, True)
+    def test_not_looking(swarm): tell(swarm, False)
+    """)
+    run(pytester, "--ucp-keep", "kept", "--ucp-seed", 4).assert_outcomes(passed=2)
+    looking, not_looking = sorted(run_directories(pytester))
+    record = json.loads((looking / "run.json").read_text())
+    assert record["scenario"]["duration_s"] == pytest.approx(308.503)
+    play(parse(record["scenario"]), 4, tmp_path / "again", Silent(), "sim")
+    for agent in (1, 2, 3, 5):
+        exports = [read_export(path / "agents" / f"{agent}.chain.json") for path in (looking, not_looking)]
+        assert exports[0] == exports[1] == read_export(tmp_path / "again" / "agents" / f"{agent}.chain.json")
+
+
+def test_a_violation_fails_the_test_with_its_evidence_and_its_report(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(f"""
+    import pytest
+
+    @pytest.mark.swarm(**{FORCED_TIE!r})
+    def test_tie(swarm):
+        swarm.run_for(60)
+    """)
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        [
+            "*_ test_tie _*",
+            "characteristic 1, distributed: violated: 1 time: *",
+            "    agent 1: trace line *, t=* s: a reconcile did not go on within * s",
+            "report: *",
+        ]
+    )
+    no_internals(result)
+    assert json.loads((report(result).parent / "run.json").read_text())["characteristics"]["1"]["verdict"] == "violated"
+
+
+def test_a_violation_that_is_expected_passes_and_one_that_does_not_come_fails(pytester: pytest.Pytester) -> None:
+    expect = {"characteristics": {1: "violated"}}
+    pytester.makepyfile(f"""
+    import pytest
+
+    pytestmark = pytest.mark.swarm(expect={expect!r})
+
+    @pytest.mark.swarm(**{FORCED_TIE!r})
+    def test_tie(swarm):
+        swarm.run_for(60)
+        assert swarm.characteristic(1).verdict == "violated"
+        assert swarm.characteristic(1).evidence[0].agent_id == 1
+
+    def test_no_tie(swarm):
+        swarm.run_for(60)
+    """)
+    result = run(pytester)
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(["characteristic 1, distributed: holds: *", "    expected: violated"])
+
+
+def test_a_failing_assert_shows_the_verdict_and_where_the_report_is(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+    def test_apart(swarm):
+        swarm.partition([1], [2, 3, 4, 5])
+        swarm.run_for(300)
+        assert swarm.characteristic(6).holds
+    """)
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    reason = "not applicable: 2 distinct chains; the system was not fully connected: *partition 1 | 2 3 4 5"
+    result.stdout.fnmatch_lines(
+        [f"E * where False = <characteristic 6, one uniform chain: {reason}>.holds", "*- Captured ucp call -*"]
+    )
+    no_internals(result)
+    report(result)
+
+
+@pytest.mark.parametrize(
+    ("told", "sentence"),
+    [
+        ("swarm.partition([1], [9])", "partition[[]1]: unknown vehicle 9; allowed is any of 1, 2, 3, 4, 5"),
+        ("swarm.loss(2)", "`loss` is 2: *"),
+        ("swarm.restart(2)", "restart: agent 2 is running then, not killed"),
+        ("swarm.kill(1, 2, 3, 4, 5)", "the timeline leaves nobody: *"),
+        ("swarm.characteristic(7)", "there is no characteristic 7: they are 1 to 6"),
+        ("swarm.chain(6)", "there is no chain of agent 6: there are those of [[]1, 2, 3, 4, 5[]]"),
+        ("swarm.pause(1); swarm.wait_idle(20)", "within 20 mission seconds not every agent has voted and become idle"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence_at_the_test_s_own_line(
+    pytester: pytest.Pytester, told: str, sentence: str
+) -> None:
+    pytester.makepyfile(f"def test_mistake(swarm):\n    {told}")
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    shown = f">   *{told.split('; ')[0]}*".replace("[", "[[]")
+    result.stdout.fnmatch_lines([shown, f"E   *Error: {sentence}", "*.py:2: *Error"])
+    no_internals(result)
+
+
+@pytest.mark.parametrize(
+    ("marker", "sentence"),
+    [
+        ("agent=7", "`agent` is unknown: there are name, *"),
+        ("backend='kernel'", "`backend` is 'kernel': it should be 'process' or 'sim'"),
+        ("seed=-1", "`seed` is -1: it should be a number, 0 or more"),
+        ("agent_command=['x']", "`agent_command` needs real processes: *"),
+    ],
+)
+def test_a_swarm_that_cannot_be_is_one_sentence(pytester: pytest.Pytester, marker: str, sentence: str) -> None:
+    pytester.makepyfile(f"import pytest\n@pytest.mark.swarm({marker})\ndef test_mistake(swarm): pass")
+    result = run(pytester)
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines(["*_ ERROR at setup of test_mistake _*", sentence])
+    no_internals(result)
+
+
+@pytest.mark.lab
+def test_an_agent_that_dies_fails_the_sentence_that_it_dies_in(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+    import os, pytest, signal
+    from tests.harness.command import processes
+
+    @pytest.mark.swarm(agents=2, backend="process", speedup=50)
+    def test_dies(swarm):
+        swarm.run_for(10)
+        (pid,) = [pid for pid, command in processes(swarm.directory).items() if "2.mission.json" in command]
+        os.kill(pid, signal.SIGKILL)
+        swarm.run_for(100_000)
+    """)
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        [">       swarm.run_for(100_000)", "E *RunEndedError: agent 2 ended by itself with SIGKILL*"]
+    )
+    no_internals(result)
+    assert json.loads((report(result).parent / "run.json").read_text())["outcome"] == "failed"
