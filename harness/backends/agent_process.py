@@ -6,6 +6,7 @@ directory of its own, so that nothing of an earlier life is overwritten, or foun
 
 import asyncio
 import base64
+import contextlib
 import dataclasses
 import os
 import shutil
@@ -34,6 +35,7 @@ ANSWER_LIMIT_S = 10.0
 """Wall time after which an agent that does not answer counts as hung."""
 STOP_GRACE_S = 5.0
 ASK_AGAIN_S = 0.02
+MOMENT_S = 0.5
 
 
 def agent_command(scenario: Scenario) -> list[str]:
@@ -204,9 +206,16 @@ class AgentProcess:
         except AgentRefusedError as error:
             raise AgentRefusedError(f"agent {self.agent_id} refused to {command}: {error}") from None
         except AgentSilentError as error:
-            if self._process is not None and self._process.returncode is not None:
-                raise self._crashed(self._process.returncode) from None
+            if (returncode := await self._ended()) is not None:
+                raise self._crashed(returncode) from None
             raise self._failed("hung", f"stopped answering: {error}") from None
+
+    async def _ended(self) -> int | None:
+        """The return code if the process has ended, of which one hears a moment after its connection is lost."""
+        if self._process is not None:
+            with contextlib.suppress(TimeoutError):
+                return await asyncio.wait_for(self._process.wait(), MOMENT_S)
+        return None
 
     async def poll(self) -> Status | None:
         """Ask for the status; None of an agent that is dead or paused. Raises AgentFailedError."""
