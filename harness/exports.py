@@ -15,11 +15,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from harness.errors import ExportError
+from harness.errors import ExportError, RunDirectoryError
 from ucp.agent import Agent
 from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
 from ucp.export import SCHEMA
 
+RUN_FILE = "run.json"
 SUFFIX = ".chain.json"
 BEFORE_FINAL_RECONCILE = "before_final_reconcile"
 """Directory in a run's with the exports as the mission left them."""
@@ -234,6 +235,25 @@ def export_paths(directory: Path) -> list[Path]:
     agents = directory / "agents"
     paths = list((agents if agents.is_dir() else directory).glob(f"*{SUFFIX}"))
     return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+
+def export_files(paths: Iterable[Path]) -> list[Path]:
+    """The exports in run directories, in directories that hold exports, and those that are named themselves.
+
+    A run directory may have none. Raises RunDirectoryError if a path does not exist, or is a directory of other things.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            found = export_paths(path)
+            if not found and not (path / RUN_FILE).exists():
+                raise RunDirectoryError(f"{path}: neither a run directory nor a directory with *{SUFFIX} files")
+            files += found
+        elif path.exists():
+            files.append(path)
+        else:
+            raise RunDirectoryError(f"{path}: does not exist; give a run directory or exports (*{SUFFIX})")
+    return files
 
 
 def _first_problem(error: ValidationError) -> str:

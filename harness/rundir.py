@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from harness import traces
-from harness.checker.evidence import RUN_FILE
 from harness.errors import MachineError, RunDirectoryError
-from harness.exports import BEFORE_FINAL_RECONCILE, SUFFIX, export_paths
+from harness.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
 from harness.record import RunRecord
 from netem.radio import Place
 from ucp.files import write_json_atomically

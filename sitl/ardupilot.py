@@ -45,6 +45,13 @@ class ArduPilot:
     vehicle_type: VehicleType = "copter"
     name: str = "ardupilot"
 
+    @property
+    def lack(self) -> str | None:
+        """Without its default parameters a vehicle may refuse to arm."""
+        if self.defaults is not None:
+            return None
+        return f"it flew without default parameters: put ArduPilot's {DEFAULTS[self.vehicle_type]} beside {self.binary}"
+
     @classmethod
     def find(cls, binary: Path | None, environ: Mapping[str, str], vehicle_type: VehicleType = "copter") -> ArduPilot:
         """The binary that the scenario names, else the type's own in ARDUPILOT_SITL, on PATH, or installed.

@@ -43,6 +43,7 @@ class Embedded:
 
     vehicle_type: VehicleType = "copter"
     name: str = "embedded"
+    lack: str | None = None
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """The embedded vehicle keeps no files: `directory` stays as it is. Raises VehicleError."""

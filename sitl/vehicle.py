@@ -110,6 +110,10 @@ class VehicleKind(Protocol):
     @property
     def vehicle_type(self) -> VehicleType: ...
 
+    @property
+    def lack(self) -> str | None:
+        """What it may need to fly and does not have, with the way out; None if nothing is known to be missing."""
+
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """Prepare `directory`, which exists and is the vehicle's working directory, and say how to start it.
 

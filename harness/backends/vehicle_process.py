@@ -121,7 +121,7 @@ class VehicleProcess:
                 raise self._ended(await asyncio.wait_for(self._process.wait(), ENDING_S)) from None
             self._given_up = True
             await self._process.send_signal(signal.SIGKILL)  # it may spin, or fly on who knows where
-            raise VehicleFailedError(str(error)) from None
+            raise VehicleFailedError("; ".join(filter(None, (str(error), self.kind.lack)))) from None
 
     async def watch(self) -> None:
         """Raises VehicleFailedError when the process ends by itself."""

@@ -5,13 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from harness import traces
-from harness.errors import RunDirectoryError
-from harness.exports import BEFORE_FINAL_RECONCILE, SUFFIX, Export, export_paths, read_exports
+from harness.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, Export, export_files, export_paths, read_exports
 from harness.naming import name_blocks
 from harness.record import AgentRecord, JudgedRecord
 from harness.traces import Trace
 
-RUN_FILE = "run.json"
 MAX_RECORD_BYTES = 64 * 1024 * 1024
 
 
@@ -111,23 +109,16 @@ def gather(paths: Iterable[Path]) -> Evidence:
 
     Raises RunDirectoryError if a path does not exist or nothing at all is there.
     """
-    export_files: list[Path] = []
+    paths = list(paths)
+    files = export_files(paths)
     record: JudgedRecord | None = None
     errors: list[str] = []
     for path in paths:
         if path.is_dir():
-            found = export_paths(path)
             record = record or _record(path / RUN_FILE, errors)
-            if not found and record is None:
-                raise RunDirectoryError(f"{path}: neither a run directory nor a directory with *{SUFFIX} files")
-            export_files += found
-        elif path.exists():
-            export_files.append(path)
-        else:
-            raise RunDirectoryError(f"{path}: does not exist; give a run directory or exports (*{SUFFIX})")
-    exports = read_exports(export_files)
+    exports = read_exports(files)
     evidence_traces: dict[int, Trace] = {}
-    for directory in dict.fromkeys(path.parent for path in export_files):
+    for directory in dict.fromkeys(path.parent for path in files):
         for path in sorted(directory.glob(f"*{traces.SUFFIX}")):
             trace = traces.read_trace(path)
             if trace is None:
@@ -139,7 +130,7 @@ def gather(paths: Iterable[Path]) -> Evidence:
             if trace.problem:
                 errors.append(f"{path}: {trace.problem}; what is there is read")
             evidence_traces.setdefault(trace.header.agent_id, trace)
-    return Evidence(exports.by_agent, evidence_traces, record, errors + exports.errors, _before(export_files))
+    return Evidence(exports.by_agent, evidence_traces, record, errors + exports.errors, _before(files))
 
 
 def _before(export_files: list[Path]) -> dict[int, Export]:

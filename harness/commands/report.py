@@ -8,10 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from harness import report
-from harness.checker.evidence import RUN_FILE
 from harness.commands.terminal import complain
 from harness.errors import MachineError, RunDirectoryError
-from harness.exports import export_paths, read_exports
+from harness.exports import RUN_FILE, export_paths, read_exports
 from harness.report.result import mapping, read_result
 from harness.report.swarm import missing
 

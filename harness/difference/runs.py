@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from harness import traces
-from harness.checker.evidence import RUN_FILE
 from harness.difference.keys import KeyDifference, differing_keys
 from harness.difference.steps import Step, completed_blocks, name, read_lines
 from harness.errors import RunDirectoryError
-from harness.exports import export_paths, read_exports
+from harness.exports import RUN_FILE, export_paths, read_exports
 from harness.report.result import agent_ids, listing, mapping, read_result
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from harness.checker.evidence import MAX_RECORD_BYTES, RUN_FILE
+from harness.checker.evidence import MAX_RECORD_BYTES
 from harness.errors import ExportError, RunDirectoryError
-from harness.exports import SUFFIX, Export, export_paths, read_exports
+from harness.exports import RUN_FILE, SUFFIX, Export, export_files, read_exports
 from harness.naming import name_blocks
 from harness.record import AgentRecord
 
@@ -75,17 +75,10 @@ def read(paths: Iterable[Path]) -> Logbook:
 
     Raises RunDirectoryError if a path does not exist, or nothing at all is there.
     """
-    files: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            found = export_paths(path)
-            if not found:
-                raise RunDirectoryError(f"{path}: holds no exports (*{SUFFIX}); give a run directory or exports")
-            files += found
-        elif path.exists():
-            files.append(path)
-        else:
-            raise RunDirectoryError(f"{path}: does not exist; give a run directory or exports (*{SUFFIX})")
+    paths = list(paths)
+    files = export_files(paths)
+    if not files:
+        raise RunDirectoryError(f"{paths[0]}: holds no exports (*{SUFFIX}): no agent of this run left its chain")
     exports = read_exports(files)
     logbook = Logbook(exports.by_agent, name_blocks(exports.by_agent), errors=exports.errors)
     records = dict.fromkeys(directory / RUN_FILE for path in files for directory in (path.parent.parent, path.parent))
