@@ -43,6 +43,7 @@ def test_what_is_scripted_from_a_run_is_that_run(keys: dict[str, Any]) -> None:
         same = again.evidence.traces[agent_id].runs
         assert [(run.t, run.handler, run.branch) for run in same] == steps
     assert not again.played.unmatched_fates
+    assert faithful.network.radio is None and not faithful.flight, "nothing is left to distance"
 
 
 def test_agents_that_are_left_out_fly_no_more() -> None:
