@@ -36,7 +36,8 @@ def _matching(root: Path, pattern: str) -> Iterable[Path]:
 def is_ours(path: Path) -> bool:
     """Whether it looks like a scenario with an `expect` section: by its top-level keys, which begin a line.
 
-    The section has one of its keys; or it is empty, and all top-level keys are those of a scenario.
+    The section has one of its keys. Where it is empty or its keys are misspelt, all top-level keys are a scenario's,
+    and in the second case more than a name: other tools' tests have names and expect things too.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -51,7 +52,8 @@ def is_ours(path: Path) -> bool:
     end = min((key.start() for key in keys.values() if key.start() > begin), default=len(text))
     if EXPECTED.search(text, begin, end):
         return True
-    return NOTHING_SPECIAL.fullmatch(text, begin, end) is not None and _are_keys_of_a_scenario(keys)
+    empty = NOTHING_SPECIAL.fullmatch(text, begin, end) is not None
+    return (empty or keys.keys() > {b"name", b"expect"}) and _are_keys_of_a_scenario(keys)
 
 
 def _are_keys_of_a_scenario(keys: Iterable[bytes]) -> bool:

@@ -12,6 +12,7 @@ import yaml
 from harness.checker.survival import survival
 from harness.checker.uniform_chain import common_prefix
 from harness.scenario import load_scenario
+from harness.scenario.expect import NUMBERS
 from harness.simulate import Simulated, simulate
 from harness.timeline import RANGE
 from ucp.trace import State
@@ -235,6 +236,18 @@ def test_a_scenario_shows_what_it_says(name: str, seed: int) -> None:
     assert not run.result.violated
     assert not run.played.unmatched_fates
     CLAIMS[name](run, seed)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", CLAIMS)
+def test_a_scenario_is_what_it_expects_of_itself(name: str, seed: int) -> None:
+    run, expect = played(name, seed), load_scenario(SCENARIOS / f"{name}.yaml").expect
+    assert expect is not None
+    assert set(expect.characteristics) == set(NUMBERS.values())
+    assert expect.figures
+    for number, found in run.result.characteristics.items():
+        assert expect.as_expected(int(number), found.verdict)
+    assert not list(expect.out_of_range(run.result.figures))
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -51,9 +51,10 @@ def test_a_run_as_expected_passes_and_leaves_nothing(pytester: pytest.Pytester) 
 
 def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester) -> None:
     scenario = yaml.safe_load((SCENARIOS / "forced_tie.yaml").read_text())
-    write_scenario(pytester, "tie.yaml", **scenario, quirks={"crash_on_tie": True}, expect={})
-    expect = {"characteristics": {1: "violated", 5: "holds"}}
-    write_scenario(pytester, "expected.yaml", **scenario, quirks={"crash_on_tie": True}, expect=expect)
+    scenario |= {"quirks": {"crash_on_tie": True}, "expect": {}}
+    write_scenario(pytester, "tie.yaml", **scenario)
+    scenario["expect"] = {"characteristics": {1: "violated", 5: "holds"}}
+    write_scenario(pytester, "expected.yaml", **scenario)
     result = run(pytester, "tie.yaml", "expected.yaml")
     result.assert_outcomes(failed=2)
     result.stdout.fnmatch_lines(
@@ -81,6 +82,7 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
         ({"figures": {"blocks": {"min": 3, "max": 2}}}, "*min 3 is more than max 2"),
         ({"seeds": [1, 1]}, "*`expect.seeds` is *: names one twice: each is a test of its own"),
         ({"backends": ["kernel"]}, "*`expect.backends.0` is 'kernel': it should be 'process' or 'sim'"),
+        ({"characterstics": {1: "holds"}}, "*`expect.characterstics` is unknown: there are characteristics, *"),
         ({"seed": [1], "figures": {}}, "*`expect.seed` is unknown: there are characteristics, figures, *"),
     ],
 )
@@ -104,6 +106,7 @@ FOREIGN = {
     "binary.yaml": "name: \x00\xff\nexpect:\x01 seed\n",
     "deep.yaml": "[" * 100_000,
     "status.yaml": "name: x\nexpect: 200\n",
+    "mapping.yaml": "name: x\nexpect:\n  characterstics: {1: holds}\n",
     "empty.yaml": "",
     "list.yaml": "- name: x\n  expect: {}\n",
 }

@@ -30,7 +30,11 @@ STORY = """
 """
 
 README = Path(__file__).parents[2] / "README.md"
-FORCED_TIE = {**yaml.safe_load((SCENARIOS / "forced_tie.yaml").read_text()), "quirks": {"crash_on_tie": True}}
+FORCED_TIE = {
+    **yaml.safe_load((SCENARIOS / "forced_tie.yaml").read_text()),
+    "quirks": {"crash_on_tie": True},
+    "expect": {},
+}
 
 
 def test_the_story_of_a_partition_passes_and_leaves_nothing(pytester: pytest.Pytester) -> None:
@@ -58,7 +62,8 @@ def test_the_tests_in_the_readme_pass(pytester: pytest.Pytester) -> None:
     (pytester.path / "scenarios").symlink_to(SCENARIOS)
     run(pytester).assert_outcomes(passed=3)
     (expect,) = re.findall(r"```yaml\n(expect:.*?)```", README.read_text(), re.DOTALL)
-    (pytester.path / "my.yaml").write_text((SCENARIOS / "loss_15.yaml").read_text() + expect)
+    scenario, _, _ = (SCENARIOS / "loss_15.yaml").read_text().partition("expect:")
+    (pytester.path / "my.yaml").write_text(scenario + expect)
     run(pytester, "my.yaml", "--ucp-backend", "sim").assert_outcomes(passed=3)
 
 
@@ -176,7 +181,7 @@ def test_a_violation_that_is_expected_passes_and_one_that_does_not_come_fails(py
 
     pytestmark = pytest.mark.swarm(expect={expect!r})
 
-    @pytest.mark.swarm(**{FORCED_TIE!r})
+    @pytest.mark.swarm(**{{**{FORCED_TIE!r}, "expect": {expect!r}}})
     def test_tie(swarm):
         swarm.run_for(60)
         assert swarm.characteristic(1).verdict == "violated"
