@@ -1,6 +1,6 @@
 """From a file to a scenario (or to whatever else is YAML), and from what pydantic found to a sentence for a person."""
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -31,12 +31,26 @@ def parse(document: dict[str, Any]) -> Scenario:
         raise ScenarioError(explain(error, Scenario)) from None
 
 
+class _Loader(yaml.SafeLoader):
+    """One to whom a key that is there twice is a mistake: YAML forbids it, and the safe loader takes the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    problem=f"{key.value} is there twice", problem_mark=key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
     """The mapping in a YAML file that should be a `what`. Raises ScenarioError."""
     try:
         if path.stat().st_size > MAX_SCENARIO_BYTES:
             raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which no {what} is")
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        document = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506  (a safe loader)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:

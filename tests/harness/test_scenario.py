@@ -99,6 +99,11 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nvehicles: {kind: boat}", "it should be 'ardupilot', 'embedded' or 'none'"),
         ("name: x\nvehicles: {home: [100, 0, 0, 0]}", "latitude -90..90"),
         ("name: [x", "not YAML at line 1"),
+        (
+            "name: x\nnetwork: {loss: 0.1}\nagents: 3\nnetwork: {loss: 0.2}",
+            "not YAML at line 4: network is there twice",
+        ),
+        ("name: x\nnetwork: {loss: 0.1, loss: 0.2}", "not YAML at line 2: loss is there twice"),
         ("- 1", "a YAML mapping"),
         ("!!python/object/apply:os.system ['true']", "not YAML"),
     ],
