@@ -5,14 +5,17 @@ the block, so it lives in `ucp.chain`. A block therefore never changes when it i
 """
 
 import hashlib
-import struct
 from dataclasses import dataclass, field
+
+from ucp.wire import Kind, struct_of
 
 HASH_BYTES = 32
 MAX_EVENT_DATA_BYTES = 1024
 MAX_AGENT_ID = 0xFFFF
 
-_BLOCK_DATA_HEADER = struct.Struct("!IQ")
+BLOCK_FIELDS = {"agent_id": Kind.U32, "timestamp_us": Kind.U64}
+"""What stands before a block's event data."""
+BLOCK_HEADER = struct_of(BLOCK_FIELDS)
 
 
 def hash_digest(data: bytes) -> bytes:
@@ -38,8 +41,11 @@ class Block:
     block_hash: bytes = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        block_data = _BLOCK_DATA_HEADER.pack(self.agent_id, self.timestamp_us) + self.event_data
-        object.__setattr__(self, "block_hash", hash_digest(block_data))
+        object.__setattr__(self, "block_hash", hash_digest(self.block_data()))
+
+    def block_data(self) -> bytes:
+        """BD_n (eq. 3.5), which is also what a message carries of it."""
+        return BLOCK_HEADER.pack(self.agent_id, self.timestamp_us) + self.event_data
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,11 +4,14 @@
 big-endian (Section 4.1).
 """
 
-import struct
 from dataclasses import dataclass
 from random import Random
 
-_HEADER = struct.Struct("!QBH")
+from ucp.wire import Kind, struct_of
+
+EVENT_FIELDS = {"timestamp_us": Kind.U64, "event_id": Kind.U8, "length": Kind.U16}
+"""What stands before an event's data."""
+_HEADER = struct_of(EVENT_FIELDS)
 EVENT_HEADER_BYTES = _HEADER.size
 MAX_EVENT_BYTES = EVENT_HEADER_BYTES + 256
 """The largest event of the thesis: 256 bytes of data and its header."""
@@ -41,17 +44,22 @@ def decode_events(event_data: bytes) -> list[LoggableEvent]:
     events = []
     offset = 0
     while offset < len(event_data):
-        body = offset + EVENT_HEADER_BYTES
-        if body > len(event_data):
-            raise MalformedEventsError(f"event header at byte {offset} is cut off")
-        timestamp_us, event_id, length = _HEADER.unpack_from(event_data, offset)
-        if body + length > len(event_data):
-            raise MalformedEventsError(f"event at byte {offset} claims {length} bytes, more than are left")
-        if not 1 <= event_id <= 254:
-            raise MalformedEventsError(f"event at byte {offset} has event_id {event_id}, not in 1..254")
-        events.append(LoggableEvent(timestamp_us, event_id, event_data[body : body + length]))
-        offset = body + length
+        event, offset = decode_event(event_data, offset)
+        events.append(event)
     return events
+
+
+def decode_event(event_data: bytes, offset: int) -> tuple[LoggableEvent, int]:
+    """The event that begins at `offset`, and where it ends. Raises MalformedEventsError."""
+    body = offset + EVENT_HEADER_BYTES
+    if body > len(event_data):
+        raise MalformedEventsError(f"event header at byte {offset} is cut off")
+    timestamp_us, event_id, length = _HEADER.unpack_from(event_data, offset)
+    if body + length > len(event_data):
+        raise MalformedEventsError(f"event at byte {offset} claims {length} bytes, more than are left")
+    if not 1 <= event_id <= 254:
+        raise MalformedEventsError(f"event at byte {offset} has event_id {event_id}, not in 1..254")
+    return LoggableEvent(timestamp_us, event_id, event_data[body : body + length]), body + length
 
 
 class RandomEvents:

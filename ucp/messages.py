@@ -6,22 +6,33 @@ Every datagram is broadcast and begins with one header, big-endian:
 
 The sender's sequence number identifies a datagram in traces and captures; the protocol does not use it. A datagram
 that is not exactly one well-formed message is refused with MalformedDatagramError: a radio delivers anything.
+
+A message's WIRE declares its fields as they are sent, and the layers of `ucp.scapy` are made from it. `body` and
+`from_body` are written out for speed; tests hold them to WIRE.
 """
 
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
+from ucp.block import BLOCK_HEADER, HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
+from ucp.wire import Fields, Kind, struct_of
 
+PORT = 14600
+"""The UDP port of the harness's swarms; an agent is told its own in its mission file."""
 MAGIC = b"UC"
 VERSION = 1
-HEADER = struct.Struct("!2sBBIIH")
+HEADER_FIELDS = {
+    "magic": Kind.MAGIC,
+    "version": Kind.U8,
+    "type": Kind.U8,
+    "sender": Kind.U32,
+    "sequence": Kind.U32,
+    "length": Kind.U16,
+}
+HEADER = struct_of(HEADER_FIELDS)
 MAX_DATAGRAM_BYTES = 1472
 """One UDP datagram without IP fragmentation at MTU 1500."""
-
-_BLOCK_HEADER = struct.Struct("!IQ")
 
 
 class MalformedDatagramError(ValueError):
@@ -37,6 +48,7 @@ class BlockAddRequest:
     """May the block with this hash go on top of the chain with this chain hash? (Algorithms 2 and 3)"""
 
     NAME: ClassVar[str] = "Block Add Request"
+    WIRE: ClassVar[Fields] = {"block_hash": Kind.HASH, "chain_hash": Kind.HASH}
     block_hash: bytes
     chain_hash: bytes
 
@@ -56,6 +68,7 @@ class BlockAddResponse:
     """
 
     NAME: ClassVar[str] = "Block Add Response"
+    WIRE: ClassVar[Fields] = {"approve": Kind.FLAG, "block_hash": Kind.HASH, "chain_hash": Kind.OPTIONAL_HASH}
     block_hash: bytes
     approve: bool
     chain_hash: bytes | None = None
@@ -77,11 +90,12 @@ class CommitBlock:
     """Commit this block; `chain_hash` is its own at its place in the sender's chain (Algorithms 5, 6 and 20)."""
 
     NAME: ClassVar[str] = "Commit Block"
+    WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH, "block": Kind.BLOCK}
     block: Block
     chain_hash: bytes
 
     def body(self) -> bytes:
-        return self.chain_hash + _pack_block(self.block)
+        return self.chain_hash + self.block.block_data()
 
     @classmethod
     def from_body(cls, body: bytes) -> "CommitBlock":
@@ -94,6 +108,7 @@ class ChainContainQuery:
     """Does your chain contain this chain hash? (Algorithms 8 and 9)"""
 
     NAME: ClassVar[str] = "Chain Contain Query"
+    WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH}
     chain_hash: bytes
 
     def body(self) -> bytes:
@@ -109,6 +124,7 @@ class ChainContainResponse:
     """Yes or no to a Chain Contain Query (Algorithms 9 and 10)."""
 
     NAME: ClassVar[str] = "Chain Contain Response"
+    WIRE: ClassVar[Fields] = {"contained": Kind.FLAG, "chain_hash": Kind.HASH}
     chain_hash: bytes
     contained: bool
 
@@ -127,6 +143,7 @@ class ChainHashSuccessorQuery:
     """Which block follows this chain hash in your chain? (Algorithms 12 and 13)"""
 
     NAME: ClassVar[str] = "Chain Hash Successor Query"
+    WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH}
     chain_hash: bytes
 
     def body(self) -> bytes:
@@ -145,6 +162,7 @@ class NextInSequenceResponse:
     """
 
     NAME: ClassVar[str] = "Next in Sequence Response"
+    WIRE: ClassVar[Fields] = {"timestamp_us": Kind.U64, "chain_hash": Kind.HASH, "block_hash": Kind.OPTIONAL_HASH}
     chain_hash: bytes
     block_hash: bytes | None
     timestamp_us: int
@@ -166,6 +184,7 @@ class RequestForBlock:
     """Send me the block with this hash (Algorithms 16 and 17)."""
 
     NAME: ClassVar[str] = "Request for Block"
+    WIRE: ClassVar[Fields] = {"block_hash": Kind.HASH}
     block_hash: bytes
 
     def body(self) -> bytes:
@@ -181,10 +200,11 @@ class BlockResponse:
     """The block that was asked for (Algorithms 17 and 18)."""
 
     NAME: ClassVar[str] = "Block Response"
+    WIRE: ClassVar[Fields] = {"block": Kind.BLOCK}
     block: Block
 
     def body(self) -> bytes:
-        return _pack_block(self.block)
+        return self.block.block_data()
 
     @classmethod
     def from_body(cls, body: bytes) -> "BlockResponse":
@@ -272,14 +292,10 @@ def _flag(body: bytes) -> bool:
     return body[0] == 1
 
 
-def _pack_block(block: Block) -> bytes:
-    return _BLOCK_HEADER.pack(block.agent_id, block.timestamp_us) + block.event_data
-
-
 def _unpack_block(body: bytes) -> Block:
-    if not _BLOCK_HEADER.size < len(body) <= _BLOCK_HEADER.size + MAX_EVENT_DATA_BYTES:
+    if not BLOCK_HEADER.size < len(body) <= BLOCK_HEADER.size + MAX_EVENT_DATA_BYTES:
         raise MalformedDatagramError("wrong length")
-    agent_id, timestamp_us = _BLOCK_HEADER.unpack_from(body)
+    agent_id, timestamp_us = BLOCK_HEADER.unpack_from(body)
     if not 1 <= agent_id <= MAX_AGENT_ID:
         raise MalformedDatagramError("impossible agent")
-    return Block(agent_id, timestamp_us, body[_BLOCK_HEADER.size :])
+    return Block(agent_id, timestamp_us, body[BLOCK_HEADER.size :])

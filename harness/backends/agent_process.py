@@ -27,9 +27,9 @@ from harness.seeds import agent_seed
 from harness.traces import SUFFIX, read_trace
 from netem.lab import Lab, LabProcess
 from sitl.vehicle import AGENT_PORT
+from ucp.messages import PORT
 from ucp.mission import SCHEMA as MISSION_SCHEMA
 
-PORT = 14600
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
 """Wall time after which an agent that does not answer counts as hung."""

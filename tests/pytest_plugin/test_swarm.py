@@ -57,7 +57,7 @@ def test_the_same_story_is_told_to_processes(pytester: pytest.Pytester) -> None:
 
 
 def test_the_tests_in_the_readme_pass(pytester: pytest.Pytester) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (code,) = (it for it in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL) if "def test_" in it)
     pytester.makepyfile("import pytest\n" + code)
     (pytester.path / "scenarios").symlink_to(SCENARIOS)
     run(pytester).assert_outcomes(passed=3)

@@ -1,0 +1,194 @@
+"""The Wireshark dissector, run by tshark, shows each field as it is declared and refuses what the codec refuses."""
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+from scapy.layers.inet import IP, UDP
+from scapy.layers.l2 import Ether
+from scapy.packet import Raw
+from scapy.utils import RawPcapWriter
+
+from ucp.block import BLOCK_FIELDS, Block
+from ucp.events import EVENT_FIELDS, LoggableEvent, decode_events
+from ucp.messages import (
+    HEADER,
+    HEADER_FIELDS,
+    PORT,
+    BlockAddRequest,
+    BlockAddResponse,
+    BlockResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    ChainHashSuccessorQuery,
+    CommitBlock,
+    MalformedDatagramError,
+    Message,
+    NextInSequenceResponse,
+    RequestForBlock,
+    decode,
+    encode,
+)
+from ucp.wireshark import DISSECTOR
+
+TIMEOUT_S = 120.0
+A, B = bytes(range(32)), bytes(range(200, 232))
+EVENTS = [LoggableEvent(2**64 - 1, 254, b"old"), LoggableEvent(7, 1, bytes(256)), LoggableEvent(0, 9, b"")]
+LOGGED = Block(65535, 2**64 - 1, b"".join(event.encode() for event in EVENTS))
+MESSAGES: list[Message] = [
+    BlockAddRequest(A, B),
+    BlockAddResponse(A, True),
+    BlockAddResponse(A, False, B),
+    CommitBlock(LOGGED, A),
+    ChainContainQuery(A),
+    ChainContainResponse(A, True),
+    ChainContainResponse(A, False),
+    ChainHashSuccessorQuery(A),
+    NextInSequenceResponse(A, None, 0),
+    NextInSequenceResponse(A, B, 2**64 - 1),
+    RequestForBlock(A),
+    BlockResponse(LOGGED),
+]
+DATAGRAMS = [encode(65535 - place, 2**32 - 1 - place, message) for place, message in enumerate(MESSAGES)]
+
+
+def frame(datagram: bytes) -> bytes:
+    link = Ether(src="02:00:00:00:00:01", dst="ff:ff:ff:ff:ff:ff") / IP(src="10.77.0.1", dst="10.77.255.255")
+    return bytes(link / UDP(sport=PORT, dport=PORT) / Raw(datagram))
+
+
+def tshark(folder: Path, frames: Sequence[bytes], *options: str, captured: int | None = None) -> str:
+    """What tshark prints of frames of which `captured` bytes were captured (None: all). Skips without tshark."""
+    if (program := shutil.which("tshark")) is None:
+        reason = "no tshark on PATH (Debian package `tshark`)"
+        if "tshark" in os.environ.get("UCP_REQUIRE", "").split(","):
+            pytest.fail(f"UCP_REQUIRE asks for tshark: {reason}")
+        pytest.skip(reason)
+    capture = folder / "air.pcap"
+    with RawPcapWriter(str(capture), linktype=1) as writer:
+        writer.write_header(None)
+        for sent in frames:
+            writer.write_packet(sent[:captured], wirelen=len(sent))
+    command = [program, "-r", str(capture), "-X", f"lua_script:{DISSECTOR}", *options]
+    ran = subprocess.run(
+        command, env={**os.environ, "HOME": str(folder)}, capture_output=True, text=True, timeout=TIMEOUT_S, check=True
+    )
+    assert "Lua" not in ran.stderr
+    assert "Lua Error" not in ran.stdout
+    return ran.stdout
+
+
+def layers(folder: Path, datagrams: Sequence[bytes], captured: int | None = None) -> list[dict[str, Any]]:
+    """The dissector's tree of each datagram, `captured` bytes of its frame having been captured."""
+    options = ("-T", "json", "-J", "ucpchain", "--no-duplicate-keys")
+    packets = json.loads(tshark(folder, [frame(datagram) for datagram in datagrams], *options, captured=captured))
+    return [packet["_source"]["layers"]["ucpchain"] for packet in packets]
+
+
+def experts(tree: Any) -> dict[str, str]:
+    """Expert information anywhere in a tree: its name and its message."""
+    if isinstance(tree, list):
+        return {name: message for part in tree for name, message in experts(part).items()}
+    if not isinstance(tree, dict):
+        return {}
+    own = {name: tree["_ws.expert.message"] for name in tree if "_ws.expert.message" in tree and not tree[name]}
+    return own | experts(list(tree.values()))
+
+
+def shown(prefix: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Values as tshark shows them; what is left out is not shown."""
+    text: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Block):
+            text[f"{prefix}.{name}"] = shown_block(value)
+        elif isinstance(value, bytes) and value:
+            text[f"{prefix}.{name}"] = value.decode() if name == "magic" else value.hex(":")
+        elif isinstance(value, int):
+            text[f"{prefix}.{name}"] = str(int(value))
+    return text
+
+
+def shown_block(block: Block) -> dict[str, Any]:
+    return {
+        **shown("ucpchain.block", {name: getattr(block, name) for name in BLOCK_FIELDS}),
+        "ucpchain.event": [
+            shown("ucpchain.event", {name: getattr(event, name, len(event.data)) for name in [*EVENT_FIELDS, "data"]})
+            for event in decode_events(block.event_data)
+        ],
+    }
+
+
+def test_every_field_of_every_message_is_shown(tmp_path: Path) -> None:
+    assert {type(message) for message in MESSAGES} == set(Message.__args__)
+    for message, datagram, layer in zip(MESSAGES, DATAGRAMS, layers(tmp_path, DATAGRAMS), strict=True):
+        header = dict(zip(HEADER_FIELDS, HEADER.unpack_from(datagram), strict=True))
+        expected = shown("ucpchain", header | {name: getattr(message, name) for name in message.WIRE})
+        if message == NextInSequenceResponse(A, None, 0):
+            expected["ucpchain.is_top_of_chain"] = "1"
+        assert layer == expected
+        assert list(layer) == list(expected), "in the order in which they are sent"
+
+
+def test_the_list_of_packets_names_message_and_sender(tmp_path: Path) -> None:
+    lines = tshark(tmp_path, [frame(datagram) for datagram in DATAGRAMS]).splitlines()
+    for place, (message, line) in enumerate(zip(MESSAGES, lines, strict=True)):
+        assert " UCP " in line
+        assert line.endswith(f"{message.NAME} from {65535 - place}")
+
+
+def damaged(rng: Random) -> bytes:
+    datagram = bytearray(rng.choice(DATAGRAMS))
+    for _ in range(rng.randrange(3)):
+        place = rng.randrange(rng.choice((19, len(datagram))))
+        datagram[place] = rng.choice((rng.randrange(12), rng.randrange(256)))
+    if rng.random() < 0.5:
+        return bytes(datagram)
+    kept = datagram[: rng.randint(1, len(datagram))] + rng.randbytes(rng.choice((0, 1, 32, 1100, 1472)))
+    if rng.random() < 0.8 and len(kept) >= HEADER.size:
+        kept[HEADER.size - 2 : HEADER.size] = (len(kept) - HEADER.size).to_bytes(2, "big")
+    return bytes(kept)
+
+
+def test_what_the_codec_refuses_is_malformed_for_the_same_reason(tmp_path: Path) -> None:
+    rng = Random(7)
+    datagrams = [damaged(rng) for _ in range(3000)] + [rng.randbytes(rng.randint(1, 100)) for _ in range(200)]
+    reasons = set()
+    for datagram, layer in zip(datagrams, layers(tmp_path, datagrams), strict=True):
+        reason = None
+        try:
+            decode(datagram)
+        except MalformedDatagramError as malformed:
+            reason = malformed.reason
+        assert experts(layer).get("ucpchain.malformed") == reason, datagram.hex()
+        reasons.add(reason)
+    assert len(reasons) == 10, "each of the codec's reasons, and none"
+
+
+def test_event_data_that_is_no_run_of_events_is_a_warning(tmp_path: Path) -> None:
+    event = EVENTS[0].encode()
+    wrong = {
+        "the event's header is cut off": event[:10],
+        "the event claims 3 bytes, more than are left": event[:-1],
+        "the event has ID 0, not in 1..254": event[:8] + b"\0" + event[9:],
+    }
+    trees = layers(tmp_path, [encode(1, 0, BlockResponse(Block(1, 2, event + second))) for second in wrong.values()])
+    for tree, what in zip(trees, wrong, strict=True):
+        assert experts(tree) == {"ucpchain.event.malformed": f"At byte {HEADER.size + 12 + len(event)} {what}"}
+        assert tree["ucpchain.block"]["ucpchain.event"]["ucpchain.event.data"] == EVENTS[0].data.hex(":")
+
+
+@pytest.mark.parametrize("captured", [43, 55, 56, 70, 100])
+def test_a_datagram_that_was_not_captured_whole_is_not_called_malformed(tmp_path: Path, captured: int) -> None:
+    for datagram, tree in zip(DATAGRAMS, layers(tmp_path, DATAGRAMS, captured), strict=True):
+        assert set(experts(tree)) == ({"ucpchain.cut_off"} if captured < len(frame(datagram)) else set())
+
+
+def test_an_empty_datagram_breaks_nothing(tmp_path: Path) -> None:
+    assert len(tshark(tmp_path, [frame(b"")], "-V").splitlines()) > 1
+    assert len(tshark(tmp_path, [frame(DATAGRAMS[0])], "-V", captured=42).splitlines()) > 1

@@ -1,0 +1,246 @@
+"""UCP in scapy: a layer for the header, each message, blocks and events, to read captures and to craft packets.
+
+    from scapy.all import IP, UDP, Ether, rdpcap
+    from ucp.scapy import UCP, Block, BlockAddRequest, LoggableEvent
+
+    rdpcap("7.pcapng")[0].show()
+    block = Block(agent_id=1, events=[LoggableEvent(timestamp_us=5, event_id=1, data=b"x")])
+    Ether() / IP() / UDP() / UCP(sender=1) / BlockAddRequest(block_hash=block.block_hash, chain_hash=...)
+
+The layers are made from the declarations in `ucp.messages`, `ucp.block` and `ucp.events`, and bear the thesis's names.
+What is left out is computed: UDP's ports, type and length in the header, an event's length, and a block's timestamp,
+which is that of its newest event (Section 4.2).
+
+What came over the air becomes a message's layer if and only if the codec accepts the datagram. The body of any other
+is Raw behind the UCP header, and a datagram that does not begin with a header of UCP version 1 is Raw as a whole.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from scapy.config import conf
+from scapy.fields import (
+    ByteEnumField,
+    ByteField,
+    FieldLenField,
+    IntField,
+    LenField,
+    LongField,
+    PacketField,
+    PacketListField,
+    ShortField,
+    StrFixedLenField,
+    XStrFixedLenField,
+    XStrLenField,
+)
+from scapy.layers.inet import UDP
+from scapy.packet import Packet, bind_bottom_up, bind_layers, bind_top_down
+
+from ucp import messages
+from ucp.block import BLOCK_FIELDS, HASH_BYTES, hash_digest
+from ucp.events import EVENT_FIELDS, MalformedEventsError, decode_event
+from ucp.messages import (
+    HEADER,
+    HEADER_FIELDS,
+    MAGIC,
+    PORT,
+    TYPE_CODES,
+    VERSION,
+    MalformedDatagramError,
+    Message,
+    decode,
+)
+from ucp.wire import Fields, Kind
+
+
+class HashField(XStrFixedLenField):
+    def __init__(self, name: str, default: bytes | None = bytes(HASH_BYTES)) -> None:
+        super().__init__(name, default, length=HASH_BYTES)
+
+
+class OptionalHashField(HashField):
+    """None where nothing is left for it."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, None)
+
+    def getfield(self, pkt: Packet, s: bytes) -> tuple[bytes, Any]:
+        return super().getfield(pkt, s) if s else (s, None)
+
+    def addfield(self, pkt: Packet, s: bytes, val: bytes | None) -> bytes:
+        return s if val is None else super().addfield(pkt, s, val)
+
+
+class BlockTimestampField(LongField):
+    """If None, the timestamp of the block's newest event."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, None)  # type: ignore[arg-type]
+
+    def i2m(self, pkt: Packet | None, x: int | None) -> int:
+        if x is None and pkt is not None:
+            return max((event.timestamp_us for event in pkt.events if isinstance(event, LoggableEvent)), default=0)
+        return x or 0
+
+
+_FIELDS: dict[Kind, Callable[[str], Any]] = {
+    Kind.U8: lambda name: ByteField(name, 0),
+    Kind.U16: lambda name: ShortField(name, 0),
+    Kind.U32: lambda name: IntField(name, 0),
+    Kind.U64: lambda name: LongField(name, 0),
+    Kind.MAGIC: lambda name: StrFixedLenField(name, MAGIC, len(MAGIC)),
+    Kind.FLAG: lambda name: ByteEnumField(name, 0, {0: "no", 1: "yes"}),
+    Kind.HASH: HashField,
+    Kind.OPTIONAL_HASH: OptionalHashField,
+    Kind.BLOCK: lambda name: PacketField(name, Block(), Block),
+}
+
+
+def _fields(declared: Fields, *last: Any, **special: Any) -> list[Any]:
+    """What is declared, then `last`; `special` fields mean more than their kind says."""
+    return [*(special[name] if name in special else _FIELDS[kind](name) for name, kind in declared.items()), *last]
+
+
+class LoggableEvent(Packet):
+    """One event of a block."""
+
+    name = "Loggable Event"
+    fields_desc = _fields(
+        EVENT_FIELDS,
+        XStrLenField("data", b"", length_from=lambda event: event.length),
+        length=FieldLenField("length", None, length_of="data"),
+    )
+
+    def extract_padding(self, s: bytes) -> tuple[bytes, bytes]:
+        return b"", s
+
+
+def _event_or_raw(block: Packet, before: list[Any], last: Packet | None, rest: bytes) -> type[Packet]:
+    try:
+        decode_event(rest, 0)
+    except MalformedEventsError:
+        return conf.raw_layer
+    return LoggableEvent
+
+
+class Block(Packet):
+    """A block as a message carries it. What is no run of whole events is Raw at the end of `events`."""
+
+    name = "Block"
+    fields_desc = _fields(
+        BLOCK_FIELDS,
+        PacketListField("events", [], next_cls_cb=_event_or_raw),
+        timestamp_us=BlockTimestampField("timestamp_us"),
+    )
+
+    @property
+    def block_hash(self) -> bytes:
+        """BH_n (eq. 3.1); it is never sent with the block."""
+        return hash_digest(bytes(self))
+
+
+class UCP(Packet):
+    """The header. `type` and `length` are those of the message that follows, unless they are given."""
+
+    name = "UCP"
+    fields_desc = _fields(
+        HEADER_FIELDS,
+        version=ByteField("version", VERSION),
+        type=ByteEnumField("type", 0, {code: message.NAME for message, code in TYPE_CODES.items()}),
+        sender=IntField("sender", 1),
+        length=LenField("length", None),
+    )
+
+    @classmethod
+    def dispatch_hook(cls, _pkt: bytes = b"", *_: Any, **__: Any) -> type[Packet]:
+        if _pkt and (len(_pkt) < HEADER.size or HEADER.unpack_from(_pkt)[:2] != (MAGIC, VERSION)):
+            return conf.raw_layer
+        return cls
+
+    def guess_payload_class(self, payload: bytes) -> type[Packet]:
+        try:
+            decode(self.original)
+        except MalformedDatagramError:
+            return conf.raw_layer
+        return super().guess_payload_class(payload)
+
+    def mysummary(self) -> str:
+        return self.sprintf("UCP %UCP.sender%: %UCP.type%")
+
+
+class BlockAddRequest(Packet):
+    name = messages.BlockAddRequest.NAME
+    fields_desc = _fields(messages.BlockAddRequest.WIRE)
+
+
+class BlockAddResponse(Packet):
+    name = messages.BlockAddResponse.NAME
+    fields_desc = _fields(messages.BlockAddResponse.WIRE)
+
+
+class CommitBlock(Packet):
+    name = messages.CommitBlock.NAME
+    fields_desc = _fields(messages.CommitBlock.WIRE)
+
+
+class ChainContainQuery(Packet):
+    name = messages.ChainContainQuery.NAME
+    fields_desc = _fields(messages.ChainContainQuery.WIRE)
+
+
+class ChainContainResponse(Packet):
+    name = messages.ChainContainResponse.NAME
+    fields_desc = _fields(messages.ChainContainResponse.WIRE)
+
+
+class ChainHashSuccessorQuery(Packet):
+    name = messages.ChainHashSuccessorQuery.NAME
+    fields_desc = _fields(messages.ChainHashSuccessorQuery.WIRE)
+
+
+class NextInSequenceResponse(Packet):
+    """`block_hash` None: Is Top Of Chain."""
+
+    name = messages.NextInSequenceResponse.NAME
+    fields_desc = _fields(messages.NextInSequenceResponse.WIRE)
+
+
+class RequestForBlock(Packet):
+    name = messages.RequestForBlock.NAME
+    fields_desc = _fields(messages.RequestForBlock.WIRE)
+
+
+class BlockResponse(Packet):
+    name = messages.BlockResponse.NAME
+    fields_desc = _fields(messages.BlockResponse.WIRE)
+
+
+LAYERS: dict[type[Message], type[Packet]] = {
+    messages.BlockAddRequest: BlockAddRequest,
+    messages.BlockAddResponse: BlockAddResponse,
+    messages.CommitBlock: CommitBlock,
+    messages.ChainContainQuery: ChainContainQuery,
+    messages.ChainContainResponse: ChainContainResponse,
+    messages.ChainHashSuccessorQuery: ChainHashSuccessorQuery,
+    messages.NextInSequenceResponse: NextInSequenceResponse,
+    messages.RequestForBlock: RequestForBlock,
+    messages.BlockResponse: BlockResponse,
+}
+
+for _message, _layer in LAYERS.items():
+    bind_layers(UCP, _layer, type=TYPE_CODES[_message])
+bind_top_down(UDP, UCP, sport=PORT, dport=PORT)
+bind_bottom_up(UDP, UCP, dport=PORT)
+
+
+def to_layer(message: Message) -> Packet:
+    """The layer of a codec's message, to put behind a UCP header."""
+    return LAYERS[type(message)](message.body())
+
+
+def message_of(packet: Packet) -> tuple[int, int, Message]:
+    """(sender, sequence, message) as the codec reads them from a packet. Raises MalformedDatagramError."""
+    header = packet.getlayer(UCP)
+    if header is None:
+        raise MalformedDatagramError("no UCP")
+    return decode(header.do_build())  # without what the link may have added

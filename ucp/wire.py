@@ -1,0 +1,34 @@
+"""Kinds of fields on the wire.
+
+Messages, blocks and events declare their fields: by name, in the order in which they are sent, each with its kind. The
+scapy layers (`ucp.scapy`) are made from the declarations; tests hold the codec and the Wireshark dissector to them.
+"""
+
+from collections.abc import Mapping
+from enum import Enum
+from struct import Struct
+
+
+class Kind(Enum):
+    """What a field is; the value of one that has a fixed size is its format in Python's `struct`, big-endian."""
+
+    U8 = "B"
+    U16 = "H"
+    U32 = "I"
+    U64 = "Q"
+    MAGIC = "2s"
+    FLAG = "?"
+    """One byte, 0 or 1."""
+    HASH = "32s"
+    OPTIONAL_HASH = "hash or nothing"
+    """The last field: all that is left, 32 bytes or none."""
+    BLOCK = "block"
+    """The last field: all that is left is a block."""
+
+
+Fields = Mapping[str, Kind]
+
+
+def struct_of(fields: Fields) -> Struct:
+    """Packs and unpacks fields of fixed size in their order."""
+    return Struct("!" + "".join(kind.value for kind in fields.values()))
