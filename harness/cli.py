@@ -16,6 +16,7 @@ from harness.commands.diff import diff_command
 from harness.commands.doctor import doctor_command
 from harness.commands.explore import explore_command
 from harness.commands.matrix import matrix_command
+from harness.commands.packets import packets_command
 from harness.commands.report import report_command
 from harness.commands.run import run_command
 from harness.commands.scale import scale_command
@@ -33,6 +34,7 @@ app.command("check")(check_command)
 app.command("report")(report_command)
 app.command("diff")(diff_command)
 app.command("chain")(chain_command)
+app.command("packets")(packets_command)
 app.command("matrix")(matrix_command)
 app.command("explore")(explore_command)
 app.command("scale")(scale_command)

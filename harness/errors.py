@@ -19,6 +19,10 @@ class ExportError(HarnessError):
     """A chain export that cannot be used."""
 
 
+class CaptureError(HarnessError):
+    """A capture of packets that cannot be used."""
+
+
 class RunDirectoryError(HarnessError):
     """The run directory cannot be written or read."""
 

@@ -1,18 +1,14 @@
 """`ucp-harness chain`: what the chains say, for people, programs and maps."""
 
 import contextlib
-import io
 import json
-import os
-import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from harness import logbook
-from harness.commands.terminal import complain
+from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST, ExportError, MachineError, RunDirectoryError
 from harness.logbook.geojson import geojson
 from harness.logbook.kml import kml
@@ -36,9 +32,9 @@ def chain_command(
     if geojson_file is not None or kml_file is not None:
         _write_maps(tracks(shown), shown.telemetry, geojson_file, kml_file)
     elif as_json:
-        _print([json.dumps(document(shown, decode), indent=1)])
+        print_lines([json.dumps(document(shown, decode), indent=1)])
     else:
-        _print(lines(shown, decode))
+        print_lines(lines(shown, decode))
     for sentence in (*shown.absent.values(), *shown.errors):
         complain(sentence)
     if shown.errors or not shown.exports:
@@ -55,7 +51,7 @@ def _write_maps(made: list[Track], telemetry: bool, geojson_file: Path | None, k
         _write_new(kml_file, kml(made))
     written = " and ".join(str(path) for path in (geojson_file, kml_file) if path is not None)
     positions = sum(len(track.fixes) for track in made)
-    _print([f"{positions} positions of {len(made)} vehicles: {written}"])
+    print_lines([f"{positions} positions of {len(made)} vehicles: {written}"])
 
 
 def _write_new(path: Path, text: str) -> None:
@@ -73,15 +69,3 @@ def _write_new(path: Path, text: str) -> None:
         with contextlib.suppress(OSError):
             path.unlink()
         raise MachineError(f"{path} cannot be written: {error.strerror}") from None
-
-
-def _print(texts: Iterable[str]) -> None:
-    """Plain lines. A reader that has seen enough (`| head`) ends them, and nothing else."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # a terminal that lacks a vehicle's characters
-    try:
-        for text in texts:
-            sys.stdout.write(text + "\n")
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere

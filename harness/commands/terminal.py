@@ -1,7 +1,10 @@
 """What several commands print, and how: results for people, JSON for programs, complaints on standard error."""
 
+import io
 import json
+import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -53,6 +56,18 @@ def end_sweep(record: MatrixRecord | ScaleRecord, table: RenderableType | None, 
         ended = f"the {record.runs} of {record.runs_asked} runs that had ended are in {picture.parent}"
         complain(f"interrupted; {ended}")
     raise typer.Exit(record.exit_status)
+
+
+def print_lines(texts: Iterable[str]) -> None:
+    """Plain lines. A reader that has seen enough (`| head`) ends them, and nothing else."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal that lacks a vehicle's characters
+    try:
+        for text in texts:
+            sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
 
 
 def print_json(document: Any) -> None:

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from harness.exports import Export
 from harness.matrix import MatrixRecord
+from harness.packets.document import PacketsRecord
 from harness.record import RunRecord
 from harness.scale import ScaleRecord
 from harness.scenario import Scenario
@@ -20,6 +21,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "scenario": Scenario,
     "ucp-chain-export-1": Export,
     "ucp-matrix-1": MatrixRecord,
+    "ucp-packets-1": PacketsRecord,
     "ucp-run-1": RunRecord,
     "ucp-scale-1": ScaleRecord,
 }

@@ -1,0 +1,83 @@
+"""`ucp-harness packets`: what crossed the air, from captures of the vehicles."""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from harness.commands.terminal import complain, print_lines
+from harness.errors import WRONG_REQUEST
+from harness.packets import text
+from harness.packets.document import document
+from harness.packets.exchanges import Exchanges
+from harness.packets.files import Captures, capture_files, read_captures
+from harness.packets.losses import count_losses, matrix
+from harness.packets.names import Names, runs_of
+from harness.packets.selection import Selection
+from harness.packets.story import in_order, story
+from harness.packets.text import Paint, Wording
+from harness.packets.transmissions import join
+
+
+def packets_command(
+    paths: Annotated[list[Path], typer.Argument(metavar="CAPTURE", help="A run directory, or captures of any kind.")],
+    follow: Annotated[
+        str | None, typer.Option(metavar="BLOCK", help="The life of one block: 3.12, or the beginning of its hash.")
+    ] = None,
+    lost: Annotated[
+        bool, typer.Option("--lost", help="Only what did not reach everybody, and how much of all.")
+    ] = False,
+    sender: Annotated[int | None, typer.Option("--from", metavar="ID", help="Only what this vehicle sent.")] = None,
+    receiver: Annotated[
+        int | None, typer.Option("--to", metavar="ID", help="Only what reached this vehicle, or should have.")
+    ] = None,
+    message: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Only messages of this name, such as Commit Block.")
+    ] = None,
+    between: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="S1 S2", help="Only what was sent in these mission seconds.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The same as JSON on standard output.")] = False,
+) -> None:
+    """Print each datagram, who received it and who lost it, and what was answered to it, from the captures of a run."""
+    selection = Selection(sender, receiver, message, between)
+    captures = read_captures(capture_files(paths))
+    if captures.used:
+        print_lines(_told(captures, selection, follow, lost, as_json, runs_of(paths)))
+    for sentence in (*captures.problems, *captures.errors):
+        complain(sentence)
+    if captures.errors:
+        raise typer.Exit(WRONG_REQUEST)
+
+
+def _told(
+    captures: Captures, selection: Selection, follow: str | None, lost: bool, as_json: bool, runs: list[Path]
+) -> Iterator[str]:
+    everything = join(captures)
+    exchanges, names = Exchanges(everything), Names(everything, runs)
+    selected = list(selection.of(everything, captures))
+    shown = [one for one in selected if one.lost_by] if lost else selected
+    chapters = None if follow is None else list(story(names.find(follow), shown, exchanges))
+    if as_json:
+        yield from document(
+            captures, count_losses(selected), shown if chapters is None else in_order(chapters), exchanges, names
+        )
+        return
+    wording = Wording(names, _paint())
+    yield text.head(captures)
+    if chapters is not None:
+        yield from text.life(chapters, exchanges, wording)
+        return
+    yield from text.lines(shown, exchanges, wording, selection.receiver)
+    if lost:
+        yield from matrix(count_losses(selected))
+    yield from text.tail(captures, selected)
+
+
+def _paint() -> Paint:
+    """Colours only on a terminal."""
+    console = Console()
+    return partial(typer.style, fg="red") if console.is_terminal and not console.no_color else str

@@ -1,0 +1,96 @@
+"""Names of blocks and chains for people: `3.12` where it can be known, else the first digits of the hash.
+
+A block's ordinal is known from a run's exports. Without them an agent's first proposals tell it, if the capture saw the
+agent from its first datagram on: it proposes its blocks in the order in which it completed them.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from harness.errors import CaptureError
+from harness.exports import export_paths, read_exports
+from harness.naming import name_blocks
+from harness.packets.files import DIRECTORY
+from harness.packets.transmissions import Transmission
+from ucp.messages import BlockAddRequest, CommitBlock
+
+DIGITS = 8
+
+
+class Names:
+    """Of all blocks and chains that were spoken of."""
+
+    def __init__(self, transmissions: Iterable[Transmission], runs: Iterable[Path]) -> None:
+        """`runs` are directories that may hold exports."""
+        self._blocks: dict[bytes, str] = {}
+        self._top_of: dict[bytes, bytes | None] = {}
+        self._spoken_of: set[bytes] = set()
+        self._from_start: set[int] = set()
+        self._proposed: dict[int, int] = {}
+        for run in runs:
+            self._learn_from_exports(run)
+        known = bool(self._blocks)
+        for one in transmissions:
+            self._learn(one, known)
+
+    def block(self, block_hash: bytes) -> str:
+        return self._blocks.get(block_hash) or block_hash.hex()[:DIGITS]
+
+    def known(self, block_hash: bytes) -> str | None:
+        return self._blocks.get(block_hash)
+
+    def chain(self, chain_hash: bytes) -> str:
+        """With the block on its top, if that is known."""
+        digits = chain_hash.hex()[:DIGITS]
+        if chain_hash not in self._top_of:
+            return digits
+        top = self._top_of[chain_hash]
+        return f"{digits} ({'inception' if top is None else self.block(top)})"
+
+    def find(self, said: str) -> bytes:
+        """The block of that name, or whose hash begins so. Raises CaptureError if there is none, or several."""
+        named = [block_hash for block_hash, name in self._blocks.items() if name == said]
+        found = named or [block_hash for block_hash in self._spoken_of if block_hash.hex().startswith(said.lower())]
+        found = [block_hash for block_hash in found if block_hash in self._spoken_of]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise CaptureError(f"--follow {said} fits {len(found)} blocks: give more digits of the hash")
+        raise CaptureError(
+            f"--follow {said}: no message is about that block; give a name or a hash that is printed here"
+        )
+
+    def _learn_from_exports(self, run: Path) -> None:
+        exports = read_exports(export_paths(run)).by_agent
+        self._blocks |= {bytes.fromhex(block_hash): name for block_hash, name in name_blocks(exports).items()}
+        for export in exports.values():
+            self._top_of[bytes.fromhex(export.inception.chain_hash)] = None
+            for block in export.chain:
+                if block.chain_hash:
+                    self._top_of[bytes.fromhex(block.chain_hash)] = bytes.fromhex(block.block_hash)
+
+    def _learn(self, one: Transmission, known: bool) -> None:
+        said = one.said
+        if said.block_hash is not None:
+            self._spoken_of.add(said.block_hash)
+        if one.origin == "forged":
+            return
+        if said.message == CommitBlock.NAME and said.chain_hash is not None:
+            self._top_of[said.chain_hash] = said.block_hash
+        if one.origin == "captured" and not one.sequence:
+            self._from_start.add(one.sender)
+        proposes = said.message == BlockAddRequest.NAME and said.block_hash is not None
+        if proposes and not known and one.sender in self._from_start and said.block_hash not in self._blocks:
+            assert said.block_hash is not None
+            ordinal = self._proposed[one.sender] = self._proposed.get(one.sender, 0) + 1
+            self._blocks[said.block_hash] = f"{one.sender}.{ordinal}"
+
+
+def runs_of(paths: Iterable[Path]) -> list[Path]:
+    """The run directories among `paths`, or that captures among them lie in."""
+    found = [
+        path if path.is_dir() else path.resolve().parent.parent
+        for path in paths
+        if path.is_dir() or path.resolve().parent.name == DIRECTORY
+    ]
+    return list(dict.fromkeys(found))

@@ -1,0 +1,42 @@
+"""The life of one block on the air: proposals and votes, commits, what reconciles said of it and carried."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+from harness.packets.exchanges import Exchanges
+from harness.packets.said import CARRY_A_BLOCK
+from harness.packets.transmissions import Transmission
+
+
+class Chapter(NamedTuple):
+    """A transmission that is no answer, and the answers to it that are about the block."""
+
+    begins: Transmission
+    answers: Sequence[Transmission]
+
+
+def story(block_hash: bytes, transmissions: Iterable[Transmission], exchanges: Exchanges) -> Iterator[Chapter]:
+    """All that is about the block, in the order of sending; answers are with what they answer."""
+    told: set[int] = set()
+    for one in transmissions:
+        answers = [answer for answer in exchanges.responses(one) if answer.said.block_hash == block_hash]
+        if (one.said.block_hash == block_hash and one.number not in told) or answers:
+            told.update(answer.number for answer in answers)
+            yield Chapter(one, answers)
+
+
+def in_order(chapters: Iterable[Chapter]) -> list[Transmission]:
+    """All of a story's transmissions, each once, in the order of sending."""
+    told = {one.number: one for chapter in chapters for one in (chapter.begins, *chapter.answers)}
+    return [told[number] for number in sorted(told)]
+
+
+def carried_to(chapters: Iterable[Chapter]) -> dict[int, float]:
+    """Vehicle -> the mission second at which the block itself first reached it."""
+    first: dict[int, float] = {}
+    for one in in_order(chapters):
+        if one.said.message in CARRY_A_BLOCK:
+            for reception in one.received:
+                if isinstance(reception.by, int):
+                    first[reception.by] = min(reception.at_s, first.get(reception.by, reception.at_s))
+    return first
