@@ -144,9 +144,9 @@ def read_traces(directory: Path, agents: Collection[int]) -> tuple[dict[int, Tra
     return traces, whole, problems
 
 
-def _only_takes_in(line: str) -> bool:
+def _only_takes_in(line: bytes) -> bool:
     """Whether a handler took a message in without any change; false as well if the line does not look like ours."""
-    return '"changes":[],' in line and '"handler":"receive_' in line
+    return b'"changes":[],' in line and b'"handler":"receive_' in line
 
 
 def _in_time(run: HandlerRun) -> bool:

@@ -7,7 +7,7 @@ vehicles/7/         the vehicle's own files, its output, telemetry.tlog; of its 
 network.jsonl       every change of conditions as the kernel applied it, and its counters at the end
 tracks.jsonl        where the vehicles were, in metres north, east and up from the middle of the field
 lab.log             what the lab itself had to say
-report.html  chains.svg
+report.html  report.md  junit.xml  chains.svg
 """
 
 import json

@@ -4,22 +4,20 @@ A trace that ends in half a line is that of a killed agent, and is read up to th
 is told in `problem`, and what came before it still counts.
 """
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from ucp.trace import SCHEMA, HandlerRun
+from ucp.trace import HandlerRun
 
 SUFFIX = ".trace.jsonl"
-MAX_LINE_CHARACTERS = 1024 * 1024
+MAX_LINE_BYTES = 1024 * 1024
 PLACES = ("chain", "deque", "stack")
-HANDLER_RUN = TypeAdapter(HandlerRun)
 
 
 class Header(BaseModel):
@@ -29,6 +27,14 @@ class Header(BaseModel):
     roster: list[int]
     settings: dict[str, Any]
     clock: dict[str, Any]
+
+
+class _VersionedHeader(Header):
+    schema_: Literal["ucp-trace/1"] = Field(alias="schema")
+
+
+HEADER = TypeAdapter(_VersionedHeader)
+HANDLER_RUN = TypeAdapter(HandlerRun)
 
 
 @dataclass
@@ -106,38 +112,33 @@ class Held:
                     self.not_in_chain.add(block)
 
 
-def read_trace(path: Path, unread: Callable[[str], bool] = lambda line: False) -> Trace | None:
+def read_trace(path: Path, unread: Callable[[bytes], bool] = lambda line: False) -> Trace | None:
     """The trace in `path`; None if there is none, or it does not even begin as one.
 
     Handler runs whose lines are to stay `unread` are left out unseen, and lines are then not counted by `lives`.
     """
     trace: Trace | None = None
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
+        with path.open("rb") as file:
             number = 0
-            while line := file.readline(MAX_LINE_CHARACTERS):
+            while line := file.readline(MAX_LINE_BYTES):
                 number += 1
-                if not line.endswith("\n"):
-                    if trace is not None and len(line) == MAX_LINE_CHARACTERS:
+                if not line.endswith(b"\n"):
+                    if trace is not None and len(line) == MAX_LINE_BYTES:
                         trace.problem = f"line {number} is too long"
                     break
                 if trace is not None and unread(line):
                     continue
                 try:
-                    document = json.loads(line)
-                    if isinstance(document, dict) and "schema" in document:
-                        header = Header.model_validate(document)
-                        if document["schema"] != SCHEMA or (trace and trace.header.agent_id != header.agent_id):
-                            raise ValueError("another header than this trace's")
-                        if trace is None:
-                            trace = Trace(header)
-                        else:
-                            trace.starts.append(len(trace.runs))
-                    elif trace is None:
-                        return None
+                    if trace is None:
+                        trace = Trace(HEADER.validate_json(line))
+                    elif b'"schema"' not in line:
+                        trace.runs.append(HANDLER_RUN.validate_json(line))
                     else:
-                        trace.runs.append(HANDLER_RUN.validate_python(document))
-                except (ValueError, ValidationError, RecursionError):
+                        if HEADER.validate_json(line).agent_id != trace.header.agent_id:
+                            raise ValueError("another agent's header")
+                        trace.starts.append(len(trace.runs))
+                except ValueError:
                     if trace is not None:
                         trace.problem = f"line {number} is damaged"
                     break

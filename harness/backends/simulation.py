@@ -6,15 +6,14 @@ one fault leaves the others as they are. Vehicles are tracks, without telemetry,
 """
 
 import dataclasses
-import gc
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from random import Random
 from typing import Any, Protocol
 
 from harness.backends.fate_script import FateScript, NameOf
 from harness.backends.virtual_air import NEVER, Flight, Happening, Logged, VirtualAir
+from harness.collector import uncollected
 from harness.errors import ScenarioError
 from harness.mission import Played
 from harness.reach import TRACK_S, Reach, tracks_of
@@ -290,7 +289,7 @@ class Simulation:
 
     def _run(self, until: float) -> None:
         """All that happens up to `until`."""
-        with _without_collecting():
+        with uncollected():
             self._play(until)
         self._now = until
 
@@ -459,15 +458,3 @@ def _mission_time(life: Life, local: float) -> float:
     """When the agent's clock shows `local`."""
     clock = life.clock
     return local if clock is None else (local - clock.offset_s) / (1 + clock.drift)
-
-
-@contextmanager
-def _without_collecting() -> Iterator[None]:
-    """Look for no garbage in cycles: there is none, and with traces the looking takes a third of the time."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()

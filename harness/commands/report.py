@@ -3,36 +3,34 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from harness import report
 from harness.commands.terminal import complain
 from harness.errors import MachineError, RunDirectoryError
-from harness.exports import RUN_FILE, export_paths, read_exports
-from harness.report.result import mapping, read_result
-from harness.report.swarm import missing
+from harness.report.result import mapping
 
 
 def report_command(run: Annotated[Path, typer.Argument(help="A run directory.")]) -> None:
-    """Write report.html and chains.svg again, also of a run that was killed half-way, and print the path."""
-    result = read_result(run / RUN_FILE)
+    """Write report.html, report.md, junit.xml and chains.svg again, also of a run that was killed half-way."""
+    left = report.read_remains(run)
     try:
-        page = report.write_report(run)
+        page = report.write(left)
     except RunDirectoryError as error:
         raise MachineError(f"{error}: make room or give yourself the right to write there") from None
-    for sentence in _missing(run, result):
+    for sentence in _missing(left):
         complain(sentence)
     sys.stdout.write(f"{page}\n")
 
 
-def _missing(run: Path, result: dict[str, Any]) -> Iterator[str]:
+def _missing(left: report.Remains) -> Iterator[str]:
     """A sentence for everything that a whole run would have left and this one has not."""
-    if result.get("outcome") in (None, "running"):
+    recorded = "schema" in left.result
+    if recorded and left.result.get("outcome") in (None, "running"):
         yield "the run has not recorded its end: it is still going on, or it was killed"
-    if not mapping(result, "characteristics"):
-        yield f"there is no verdict: `ucp-harness check {run}` judges what there is"
-    exports = read_exports(export_paths(run))
-    yield from missing(result, exports)
-    yield from exports.errors
+    if not mapping(left.result, "characteristics"):
+        yield f"there is no verdict: `ucp-harness check {left.run_dir}` judges what there is"
+    yield from left.chains_missing
+    yield from left.files_missing

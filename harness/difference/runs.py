@@ -1,6 +1,6 @@
 """Comparing two run directories."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -11,6 +11,7 @@ from harness.difference.keys import KeyDifference, differing_keys
 from harness.difference.steps import Step, completed_blocks, name, read_lines
 from harness.errors import RunDirectoryError
 from harness.exports import RUN_FILE, export_paths, read_exports
+from harness.report.chain_tree import ranges
 from harness.report.result import agent_ids, listing, mapping, read_result
 
 
@@ -54,7 +55,7 @@ class Difference:
     agents: every agent of the roster; both None for one that does the same in both.
     handler_runs: how many were the same, of all agents, each counted up to where it parts.
     exact: the traces are the same to the last byte of each handler run.
-    errors: a sentence for each export that could not be used.
+    errors: a sentence for each export that could not be used, and for each run without an end.
     """
 
     keys: list[KeyDifference]
@@ -98,7 +99,7 @@ def compare(a: Path, b: Path) -> Difference:
         handler_runs, exact = handler_runs + same, exact and to_the_byte
         agents[agent_id] = AgentDifference(parting, _compare_chains(one.chain(agent_id), other.chain(agent_id)))
     keys = [*differing_keys(one.asked(), other.asked())]
-    return Difference(keys, agents, handler_runs, exact, one.exports.errors + other.exports.errors)
+    return Difference(keys, agents, handler_runs, exact, [*one.problems(), *other.problems()])
 
 
 class _Run:
@@ -122,6 +123,11 @@ class _Run:
         export = self.exports.by_agent.get(agent_id)
         return [name(block, self.names) for block in export.chain_of_block_hashes] if export else []
 
+    def problems(self) -> Iterator[str]:
+        if self.result.get("outcome") in (None, "running"):
+            yield f"{self.path}: the run has not recorded its end, and is compared up to there"
+        yield from self.exports.errors
+
     def asked(self) -> dict[str, Any]:
         return {"seed": self.result.get("seed"), **mapping(self.result, "scenario")}
 
@@ -131,8 +137,8 @@ def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
         if not run.roster:
             raise RunDirectoryError(f"{run.path / RUN_FILE}: it names no agents: play the run again")
     if a.roster != b.roster:
-        rosters = (" ".join(map(str, run.roster)) for run in (a, b))
-        raise RunDirectoryError("the runs have agents {} and {}: compare runs of the same agents".format(*rosters))
+        one, other = (", ".join(ranges([*run.roster])) for run in (a, b))
+        raise RunDirectoryError(f"A has agents {one}, and B has {other}: compare runs of the same agents")
     if a.result.get("backend") != b.result.get("backend"):
         raise RunDirectoryError(
             "one run was in virtual time, whose traces leave out messages that change nothing, and one was not: "

@@ -3,20 +3,14 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
-from pydantic import Field, TypeAdapter
+from pydantic import TypeAdapter
 
 from harness.errors import RunDirectoryError
-from harness.traces import HANDLER_RUN, MAX_LINE_CHARACTERS, Header
+from harness.traces import HANDLER_RUN, HEADER, MAX_LINE_BYTES
 from ucp.trace import HandlerRun
 
-
-class _VersionedHeader(Header):
-    schema_: Literal["ucp-trace/1"] = Field(alias="schema")
-
-
-_HEADER = TypeAdapter(_VersionedHeader)
 Record = TypeVar("Record")
 
 
@@ -88,14 +82,14 @@ def read_lines(path: Path) -> Iterator[Line]:
     life = number = 0
     try:
         with path.open("rb") as file:
-            while text := file.readline(MAX_LINE_CHARACTERS):
+            while text := file.readline(MAX_LINE_BYTES):
                 number += 1
-                if not text.endswith(b"\n") and len(text) < MAX_LINE_CHARACTERS:
+                if not text.endswith(b"\n") and len(text) < MAX_LINE_BYTES:
                     break
                 if life and b'"schema"' not in text:
                     yield Line(path, number, life, text)
                 else:
-                    _validated(_HEADER, path, number, text)
+                    _validated(HEADER, path, number, text)
                     life += 1
     except OSError as error:
         raise RunDirectoryError(

@@ -1,39 +1,26 @@
-"""junit.xml: a test case for each cell, as build servers read them."""
+"""junit.xml: a test case for each cell."""
 
-import re
-from xml.etree import ElementTree
+from collections.abc import Iterator
 
+from harness.junit import Case, to_xml
 from harness.matrix.record import MatrixRecord
 from harness.matrix.table import name_of, troubles
-
-_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def to_junit(record: MatrixRecord) -> str:
     """A cell fails if a run of it violated a characteristic or failed, or if it is worse than the baseline; a cell
     without all its runs is skipped."""
+    return to_xml(record.matrix.name, "matrix", record.started_at, record.wall_s, _cases(record))
+
+
+def _cases(record: MatrixRecord) -> Iterator[Case]:
     cells = {cell.point: cell for cell in record.cells}
-    suite = ElementTree.Element("testsuite", name=_text(record.matrix.name), timestamp=record.started_at)
-    failures = skipped = 0
     for point in record.matrix.points:
-        case = ElementTree.SubElement(suite, "testcase", classname="matrix", name=name_of(record.matrix, point))
-        cell = cells.get(point)
-        wrong = list(troubles(record, cell)) if cell else []
-        if wrong:
-            failures += 1
-            failure = ElementTree.SubElement(case, "failure", message=_text(wrong[0]))
-            failure.text = _text("\n".join(wrong))
+        name, cell = name_of(record.matrix, point), cells.get(point)
+        if wrong := list(troubles(record, cell)) if cell else []:
+            yield Case(name, wrong)
         elif cell is None or cell.runs < len(record.matrix.seed_list):
-            skipped += 1
             ended = cell.runs if cell else 0
-            message = f"interrupted: {ended} of {len(record.matrix.seed_list)} runs had ended"
-            ElementTree.SubElement(case, "skipped", message=message)
-    suite.attrib |= {"tests": str(len(suite)), "failures": str(failures), "errors": "0", "skipped": str(skipped)}
-    suites = ElementTree.Element("testsuites")
-    suites.append(suite)
-    ElementTree.indent(suites)
-    return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def _text(anything: str) -> str:
-    return _NOT_XML.sub("?", anything)
+            yield Case(name, skipped=f"interrupted: {ended} of {len(record.matrix.seed_list)} runs had ended")
+        else:
+            yield Case(name)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from harness.markdown import escaped, row
 from harness.matrix.cell import Cell
 from harness.matrix.metrics import METRICS
 from harness.matrix.record import MatrixRecord
@@ -19,10 +20,10 @@ from harness.report import words
 
 
 def to_markdown(record: MatrixRecord) -> str:
-    lines = [f"## {_escaped(record.matrix.name)}", "", f"**{_verdict(record)}**", "", *_table(record), ""]
+    lines = [f"## {escaped(record.matrix.name)}", "", f"**{_verdict(record)}**", "", *_table(record), ""]
     lines += [explanation(record) + unjudged(record), ""]
     if found := [*troubles_of_all(record), *improvements(record)]:
-        lines += [*(f"- {_escaped(sentence)}" for sentence in found), ""]
+        lines += [*(f"- {escaped(sentence)}" for sentence in found), ""]
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     lines += [f"<sub>Begun {words.started(record.started_at)}; {versions}</sub>"]
     return "\n".join(lines) + "\n"
@@ -48,10 +49,10 @@ def _verdict(record: MatrixRecord) -> str:
 def _table(record: MatrixRecord) -> Iterator[str]:
     named = axes(record.matrix)
     headers = [*named, "runs", *(metric.label for metric in METRICS), "violated", "failed"]
-    yield _row(headers)
-    yield _row(["--:"] * len(headers))
+    yield row(headers)
+    yield row(["--:"] * len(headers))
     for cell in record.cells:
-        yield _row([*(say(cell.point) for say in named.values()), str(cell.runs), *_figures(cell), *_bad(cell)])
+        yield row([*(say(cell.point) for say in named.values()), str(cell.runs), *_figures(cell), *_bad(cell)])
 
 
 def _figures(cell: Cell) -> Iterator[str]:
@@ -64,13 +65,3 @@ def _figures(cell: Cell) -> Iterator[str]:
 def _bad(cell: Cell) -> Iterator[str]:
     for number in (violated(cell), cell.failed):
         yield f"**{number}**" if number else "0"
-
-
-def _row(fields: list[str]) -> str:
-    return f"| {' | '.join(fields)} |"
-
-
-def _escaped(text: str) -> str:
-    """As words on one line, whatever they hold."""
-    line = " ".join(text.splitlines())
-    return "".join(f"\\{character}" if character in "\\`*_{}[]<>#|~&" else character for character in line)

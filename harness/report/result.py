@@ -14,16 +14,20 @@ from harness.errors import RunDirectoryError
 SCHEMA = "ucp-run/1"
 
 
+class DamagedResultError(RunDirectoryError):
+    """There is no `run.json`, or what there is was cut off or edited."""
+
+
 def read_result(path: Path) -> dict[str, Any]:
-    """Raises RunDirectoryError: one sentence that names the file and what is wrong with it."""
+    """Raises DamagedResultError, or RunDirectoryError for another version: a sentence that names file and trouble."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise RunDirectoryError(f"{path}: cannot be read: {error.strerror}; is this a run directory?") from None
+        raise DamagedResultError(f"{path}: cannot be read: {error.strerror}; is this a run directory?") from None
     except (ValueError, RecursionError):
-        raise RunDirectoryError(f"{path}: truncated or damaged: not a JSON document") from None
+        raise DamagedResultError(f"{path}: truncated or damaged: not a JSON document") from None
     if not isinstance(document, dict) or "schema" not in document:
-        raise RunDirectoryError(f"{path}: not the result of a run (it has no `schema`)")
+        raise DamagedResultError(f"{path}: not the result of a run (it has no `schema`)")
     if document["schema"] != SCHEMA:
         raise RunDirectoryError(f"{path}: its schema is {document['schema']!r}, and this version reads {SCHEMA!r}")
     return document

@@ -27,7 +27,7 @@ def roster(result: dict[str, Any]) -> list[int]:
     if type(agents) is int and 0 < agents <= 1000:
         agents = range(1, agents + 1)
     named = [*(agents if isinstance(agents, list | range) else []), *listing(result, "scenario", "vehicles")]
-    return agent_ids([*named, *mapping(result, "agents"), *mapping(result, "vehicles")])
+    return agent_ids([*listing(result, "roster"), *named, *mapping(result, "agents"), *mapping(result, "vehicles")])
 
 
 def agent_inks(result: dict[str, Any], exports: Mapping[int, Export]) -> dict[int, Ink]:
@@ -36,17 +36,19 @@ def agent_inks(result: dict[str, Any], exports: Mapping[int, Export]) -> dict[in
 
 
 def missing(result: dict[str, Any], exports: Exports) -> list[str]:
-    """A sentence for each agent of the run without a usable export."""
-    sentences = []
+    """A sentence for all agents of the run without a usable export for the same reason."""
+    alike: dict[str, list[int]] = {}
     for agent_id in roster(result):
         if agent_id not in exports.by_agent:
-            agent = mapping(result, "agents", str(agent_id))
-            if agent.get("outcome") == "killed":
-                sentences.append(f"agent {agent_id} was killed, and all that it held with it")
-                continue
-            why = ", ".join(words.value(agent[key]) for key in ("outcome", "detail") if agent.get(key))
-            sentences.append(f"agent {agent_id}: no usable export" + (f" ({why})" if why else ""))
-    return sentences
+            alike.setdefault(_fate(mapping(result, "agents", str(agent_id))), []).append(agent_id)
+    return [f"{'agent' if len(ids) == 1 else 'agents'} {', '.join(ranges(ids))}{fate}" for fate, ids in alike.items()]
+
+
+def _fate(agent: dict[str, Any]) -> str:
+    if agent.get("outcome") == "killed":
+        return ": killed, with all that was held there"
+    why = ", ".join(words.value(agent[key]) for key in ("outcome", "detail") if agent.get(key))
+    return ": no usable export" + (f" ({why})" if why else "")
 
 
 def agents_table(result: dict[str, Any], exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> dict[str, Any]:

@@ -12,12 +12,13 @@ from typing import Any, TypeVar
 from markupsafe import Markup
 from pydantic import ValidationError
 
-from harness.connectivity import NETWORK_FILE, read_connectivity
-from harness.course import LATEST_S, Course, Message, Reconcile, Vote, course, ends_at, possible, read_traces
+from harness.connectivity import Connectivity
+from harness.course import LATEST_S, Course, Message, Reconcile, Vote, course, ends_at, possible
 from harness.record import Fault
-from harness.report import timeline_charts, timeline_lanes, words
+from harness.report import facts, timeline_charts, timeline_lanes, words
 from harness.report.colours import Ink
 from harness.report.map_parts import divisions
+from harness.report.remains import Remains
 from harness.report.result import listing, number
 from harness.report.timeline_lanes import OUTCOMES
 from harness.report.timeline_plot import Shade, axis, seconds
@@ -59,23 +60,22 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """`drawn` is None if there is nothing to draw; `notes` say why, or what was left out."""
+    """`notes` say what was left out."""
 
-    drawn: Drawn | None
+    drawn: Drawn
     notes: list[str]
 
 
-def section(result: dict[str, Any], run_dir: Path, ink: Mapping[int, Ink], names: Mapping[str, str]) -> Section | None:
-    """`names` are those of blocks by hash. None if there is no trace, and nothing was wrong with what was read."""
-    traces, whole, notes = read_traces(run_dir / "agents", ink)
+def section(left: Remains, names: Mapping[str, str]) -> Section | None:
+    """`names` are those of blocks by hash. None if there is no trace."""
+    traces, ink = left.traces, left.ink
     if not traces:
-        return Section(None, notes) if notes else None
-    faults = _faults(result)
-    duration_s = number(result, "scenario", "duration_s") or 0.0
-    known = [fault.at_s for fault in faults]
-    end_s = max(ends_at(traces), *known, duration_s if 0 < duration_s <= LATEST_S else 1.0, 1.0)
-    told = course(traces, faults, end_s, whole=whole)
-    shades, shades_left_out = _shades(run_dir, ink, end_s)
+        return None
+    notes = []
+    faults = _faults(left.result)
+    end_s = max(ends_at(traces), *(fault.at_s for fault in faults), _planned_s(left.result), 1.0)
+    told = course(traces, faults, end_s, whole=left.whole_traces)
+    shades, shades_left_out = _shades(left.network, end_s)
     if shades_left_out:
         notes.append(f"{shades_left_out} shorter stretches of a parted network are not shaded")
     if len(faults) > MAX_FAULTS:
@@ -101,6 +101,12 @@ def section(result: dict[str, Any], run_dir: Path, ink: Mapping[int, Ink], names
     return Section(drawn, [*notes, *without, *picture.notes])
 
 
+def _planned_s(result: dict[str, Any]) -> float:
+    """How long the run was to be, if it did not end before."""
+    duration_s = number(result, "scenario", "duration_s") or 0.0
+    return duration_s if duration_s <= LATEST_S and facts.outcome(result) is None else 0.0
+
+
 def _faults(result: dict[str, Any]) -> list[Fault]:
     found = []
     for fault in listing(result, "faults"):
@@ -111,9 +117,9 @@ def _faults(result: dict[str, Any]) -> list[Fault]:
     return possible(found)
 
 
-def _shades(run_dir: Path, ink: Mapping[int, Ink], end_s: float) -> tuple[list[Shade], int]:
+def _shades(network: Connectivity, end_s: float) -> tuple[list[Shade], int]:
     """When the network was parted, and how many shorter times there were no room for."""
-    known = divisions(read_connectivity(run_dir / NETWORK_FILE, ink).states)
+    known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
     found = [
         Shade(division.at_s, min(until_s, end_s), division.in_words())

@@ -2,6 +2,8 @@
 
 Nothing is told by colour alone: votes that were not approved are hollow, phases have heights, faults have shapes, and
 everything has a tooltip.
+
+Of what there are thousands, `%` makes the marks: it escapes as `format` does, in a third of the time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -196,13 +198,13 @@ def _look(outcome: str) -> str:
 
 
 def _vote(vote: Vote, names: Mapping[str, str]) -> Markup:
-    return Markup('<rect class="vote {}" x="{}" y="3" width="{}" height="{}"><title>{}</title></rect>').format(
+    said = f"agent {vote.agent}: vote on {named(vote.block, names)}, {_from_to(vote)}:"
+    return Markup('<rect class="vote %s" x="%s" y="3" width="%s" height="%s"><title>%s</title></rect>') % (
         _look(vote.outcome),
         short(vote.start_s),
         short(vote.end_s - vote.start_s),
         _VOTE_HEIGHT,
-        f"agent {vote.agent}: vote on {named(vote.block, names)}, {_from_to(vote)}:"
-        f" {OUTCOMES.get(vote.outcome, vote.outcome[:40])}",
+        f"{said} {OUTCOMES.get(vote.outcome, vote.outcome[:40])}",
     )
 
 
@@ -225,7 +227,7 @@ def _bar(reconcile: Reconcile, lane_height: int) -> Markup:
 
 
 def _reconcile_bar(span: Phase | Reconcile, height: int, lane_height: int, said: str) -> Markup:
-    return Markup('<rect class="reconcile" x="{}" y="{}" width="{}" height="{}"><title>{}</title></rect>').format(
+    return Markup('<rect class="reconcile" x="%s" y="%s" width="%s" height="%s"><title>%s</title></rect>') % (
         short(span.start_s),
         lane_height - 3 - height,
         short(span.end_s - span.start_s),
@@ -246,8 +248,11 @@ def _commit(group: Sequence[Commit], lane_height: int, names: Mapping[str, str])
     top, bottom = _VOTE_HEIGHT + 4, lane_height - _PHASES_HEIGHT - 1
     if bottom - top < 6:
         top, bottom = 2, lane_height - 2
-    return Markup('<path class="commit" d="M{} {}V{}"><title>{}</title></path>').format(
-        short(first.at_s), top, bottom, said
+    return Markup('<path class="commit" d="M%s %sV%s"><title>%s</title></path>') % (
+        short(first.at_s),
+        top,
+        bottom,
+        said,
     )
 
 

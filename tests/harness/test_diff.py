@@ -171,7 +171,7 @@ def test_keys_are_told_innermost_and_lists_of_another_length_whole() -> None:
         (lambda b: edit_lines(trace(b), lambda lines: lines[0].update(schema="ucp-trace/2")), "line 1 is damaged, or"),
         (
             lambda b: edit(b / "run.json", lambda it: it.update(roster=[1, 2])),
-            "have agents 1 2 3 and 1 2: compare runs",
+            "A has agents 1\u20133, and B has 1, 2: compare runs of the same agents",
         ),
         (lambda b: edit(b / "run.json", lambda it: it.update(backend="process")), "compare runs of the same backend"),
         (lambda b: edit(b / "run.json", lambda it: it.pop("roster")), "it names no agents"),
@@ -195,6 +195,13 @@ def test_an_export_that_cannot_be_read_is_told_and_counts_as_no_chain(a: Path, b
     assert done.returncode == 1
     assert re.search(r"^  block 1 of its chain is \d\.1 in A, not there in B$", done.stdout, re.MULTILINE)
     assert "2.chain.json: truncated or damaged" in sentences(done.stderr)[0]
+
+
+def test_a_run_that_has_not_recorded_its_end_is_compared_and_that_is_said(a: Path, b: Path) -> None:
+    edit(b / "run.json", lambda record: record.update(outcome="running"))
+    done = harness("diff", a, b)
+    assert done.returncode == 0
+    assert sentences(done.stderr) == [f"{b}: the run has not recorded its end, and is compared up to there"]
 
 
 def test_long_traces_are_never_in_memory_as_a_whole(a: Path, b: Path) -> None:

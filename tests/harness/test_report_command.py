@@ -2,6 +2,7 @@
 
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from tests.harness.command import Running, harness, sentences, write_scenario
 from tests.harness.mission import edit
 from tests.harness.virtual import scenario
 
-PICTURES = ("report.html", "chains.svg")
+WRITTEN = ("report.html", "report.md", "junit.xml", "chains.svg")
 
 
 @pytest.fixture
@@ -23,12 +24,12 @@ def run_dir(tmp_path: Path) -> Path:
 
 
 def test_a_report_is_drawn_again_as_it_was(run_dir: Path) -> None:
-    before = [(run_dir / name).read_bytes() for name in PICTURES]
-    for name in PICTURES:
+    before = [(run_dir / name).read_bytes() for name in WRITTEN]
+    for name in WRITTEN:
         (run_dir / name).unlink()
     done = harness("report", run_dir)
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{run_dir / 'report.html'}\n", "")
-    assert [(run_dir / name).read_bytes() for name in PICTURES] == before
+    assert [(run_dir / name).read_bytes() for name in WRITTEN] == before
 
 
 def test_of_a_run_that_was_killed_there_is_what_is_left(tmp_path: Path) -> None:
@@ -43,9 +44,9 @@ def test_of_a_run_that_was_killed_there_is_what_is_left(tmp_path: Path) -> None:
     assert sentences(done.stderr) == [
         "the run has not recorded its end: it is still going on, or it was killed",
         f"there is no verdict: `ucp-harness check {running.out}` judges what there is",
-        *(f"agent {agent}: no usable export" for agent in (1, 2, 3)),
+        "agents 1\u20133: no usable export",
     ]
-    assert all((running.out / name).stat().st_size for name in PICTURES)
+    assert all((running.out / name).stat().st_size for name in WRITTEN)
 
 
 def test_a_damaged_export_is_told_and_the_rest_is_drawn(run_dir: Path) -> None:
@@ -58,13 +59,72 @@ def test_a_damaged_export_is_told_and_the_rest_is_drawn(run_dir: Path) -> None:
     assert "agent 2: no usable export" in (run_dir / "report.html").read_text()
 
 
-@pytest.mark.parametrize("what", ["nowhere", "no record", "another record"])
+def cut(path: Path) -> None:
+    """As if the writer had been stopped in mid-line."""
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+NO_RECORD = [
+    "there is no verdict: `ucp-harness check {run}` judges what there is",
+    "run.json is missing or damaged: scenario, verdict and figures are not known",
+]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda run: (run / "run.json").unlink(), NO_RECORD),
+        (lambda run: cut(run / "run.json"), NO_RECORD),
+        (
+            lambda run: cut(run / "agents" / "2.trace.jsonl"),
+            ["2.trace.jsonl: cut off in mid-line; what is before it is shown"],
+        ),
+        (
+            lambda run: (run / "agents" / "2.trace.jsonl").unlink(),
+            ["agent 2: no trace, and so no lane in the timeline"],
+        ),
+        (
+            lambda run: [path.unlink() for path in (run / "agents").glob("*.trace.jsonl")],
+            ["no agent has left a trace: there is no timeline"],
+        ),
+        (
+            lambda run: (run / "agents" / "2.chain.json").unlink(),
+            ["agent 2: no usable export (exported)"],
+        ),
+        (
+            lambda run: (run / "network.jsonl").unlink(),
+            ["network.jsonl is missing: who could reach whom is not known"],
+        ),
+        (
+            lambda run: cut(run / "network.jsonl"),
+            ["network.jsonl: 1 line is left out, damaged or of no meaning"],
+        ),
+        (
+            lambda run: edit(run / "run.json", lambda record: record.update(vehicles={"1": {"kind": "embedded"}})),
+            ["tracks.jsonl is missing: where the vehicles were is not known"],
+        ),
+    ],
+)
+def test_what_is_missing_or_cut_off_is_told_and_the_rest_is_drawn(
+    run_dir: Path, spoil: Callable[[Path], object], said: list[str]
+) -> None:
+    spoil(run_dir)
+    done = harness("report", run_dir)
+    assert (done.returncode, done.stdout) == (0, f"{run_dir / 'report.html'}\n")
+    assert sentences(done.stderr) == [sentence.format(run=run_dir) for sentence in said]
+    page, short = ((run_dir / name).read_text() for name in ("report.html", "report.md"))
+    assert said[-1] in page
+    assert said[-1] in short
+    assert "inception block" in page
+
+
+@pytest.mark.parametrize("what", ["nowhere", "no run", "another record"])
 def test_what_is_no_run_directory_is_status_2(run_dir: Path, what: str) -> None:
-    if what == "nowhere":
+    if what != "another record":
         shutil.rmtree(run_dir)
-    elif what == "no record":
-        (run_dir / "run.json").unlink()
-    else:
+    if what == "no run":
+        (run_dir / "agents").mkdir(parents=True)
+    if what == "another record":
         edit(run_dir / "run.json", lambda record: record.update(schema="ucp-scale/1"))
     done = harness("report", run_dir)
     assert (done.returncode, done.stdout) == (2, "")

@@ -58,6 +58,16 @@ def test_it_fits_the_screen_and_the_console_is_silent(
     assert browser.complaints == []
 
 
+def test_large_figures_stay_on_one_line(browser: Browser, tmp_path: Path) -> None:
+    page = write_report(write_run(tmp_path / "run", {1: "1.1"}, {"figures": {"bytes": 129_526_143}}))
+    lines = """(() => { const range = document.createRange();
+      range.selectNodeContents(document.querySelector('.tiles dd'));
+      return range.getClientRects().length; })()"""
+    for width in (360, 1280):
+        browser.show(page, width=width, scheme="light")
+        assert browser.evaluate(lines) == 1
+
+
 def test_the_keyboard_unfolds_the_tree_and_folds_it_again(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     assert browser.evaluate(SHOWN.format("abridged"))

@@ -1,5 +1,6 @@
 """The page says what the run directory holds, whole or not, and nothing from it becomes markup."""
 
+import gc
 import json
 import re
 from html.parser import HTMLParser
@@ -112,7 +113,7 @@ def test_the_page_is_one_file_that_refers_to_no_other(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", CHAINS)
     before = {path.name for path in run_dir.iterdir()}
     html = write_report(run_dir).read_text(encoding="utf-8")
-    assert {path.name for path in run_dir.iterdir()} - before == {"report.html", "chains.svg"}
+    assert {path.name for path in run_dir.iterdir()} - before == {"report.html", "report.md", "junit.xml", "chains.svg"}
     page = Reader(html)
     references = {
         value for _, attributes in page.elements for key, value in attributes.items() if key in ("src", "href")
@@ -199,7 +200,7 @@ def test_a_run_without_any_export_is_still_reported(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", {}, {"scenario": {"name": "all lost", "agents": 2}})
     page = Reader(write_report(run_dir).read_text(encoding="utf-8"))
     assert "No chain to draw" in page.text
-    assert "agent 2: no usable export" in page.text
+    assert "agents 1, 2: no usable export" in page.text
 
 
 def test_a_chain_that_was_not_abridged_has_nothing_to_unfold(tmp_path: Path) -> None:
@@ -213,6 +214,13 @@ def test_a_directory_without_a_readable_result_is_refused_in_one_sentence(tmp_pa
         (tmp_path / "run.json").write_text(content, encoding="utf-8", errors="surrogateescape")
     with pytest.raises(RunDirectoryError, match=r"run\.json: [^\n]*$"):
         write_report(tmp_path)
+
+
+def test_the_cycle_collector_runs_again_afterwards(tmp_path: Path) -> None:
+    report(tmp_path / "run")
+    with pytest.raises(RunDirectoryError):
+        write_report(tmp_path)
+    assert gc.isenabled()
 
 
 def test_a_report_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:

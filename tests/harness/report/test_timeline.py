@@ -198,11 +198,18 @@ def test_hostile_traces_make_no_markup_and_no_large_page(tmp_path: Path) -> None
     assert "handler runs without a possible time are left out" in page.text
 
 
+@pytest.mark.parametrize(("outcome", "end_s"), [("completed", 1200.0), ("running", 950.0), ("interrupted", 950.0)])
+def test_the_timeline_of_a_run_that_was_cut_short_ends_with_it(tmp_path: Path, outcome: str, end_s: float) -> None:
+    lines = [a_line(950.0, "build_data_block", "building")]
+    html = html_of(run_with(tmp_path, *lines, result={"outcome": outcome}))
+    assert f'data-end="{end_s}"' in html
+
+
 def test_a_file_that_is_no_trace_is_said_where_there_is_nothing_to_draw(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", {1: "1.1"})
     (run_dir / "agents" / "1.trace.jsonl").write_text("no trace\n")
     html = html_of(run_dir)
-    assert "1.trace.jsonl: not a trace; it is left out." in Reader(html).text
+    assert "1.trace.jsonl: not a trace; it is left out" in Reader(html).text
     assert "<script" not in html
 
 

@@ -1,0 +1,66 @@
+"""How long a run's report takes: `python -m benchmarks.report [--agents 5 20 50] [--rounds 5] [--json]`.
+
+Each run is 20 minutes at 15 % loss in virtual time, of which 50 agents trace over a million lines, and is judged first
+(for 50 agents two minutes). Its traces are then read line by line, and no more, in turn with the report: by the ratio
+both had the same machine. Processor seconds, without the start of Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.rounds import Spread, show
+from benchmarks.simulation import scenario, seconds
+from harness.progress import Silent
+from harness.report import write_report
+from harness.run import run
+from harness.traces import SUFFIX
+
+MEGABYTE = 1e6
+
+
+def lines_alone(traces: list[Path]) -> int:
+    """Read them; how many lines there are."""
+    count = 0
+    for path in traces:
+        with path.open("rb") as file:
+            count += sum(1 for _ in file)
+    return count
+
+
+def row(agents: int, rounds: int, directory: Path) -> dict[str, Any]:
+    run(scenario(agents, 0.15, 7200.0), 7, directory, Silent(), "sim")
+    traces = list((directory / "agents").glob(f"*{SUFFIX}"))
+    reports, lines = [], []
+    for _ in range(rounds):
+        reports.append(seconds(lambda: write_report(directory)))
+        lines.append(seconds(lambda: lines_alone(traces)))
+    return {
+        "agents": agents,
+        "lines": lines_alone(traces),
+        "traces, MB": round(sum(path.stat().st_size for path in traces) / MEGABYTE),
+        "page, MB": f"{(directory / 'report.html').stat().st_size / MEGABYTE:.2f}",
+        "report, s": Spread.of(reports),
+        "lines alone, s": Spread.of(lines),
+        "ratio": Spread.of_ratios(reports, lines),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--agents", type=int, nargs="+", default=[5, 20, 50])
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    rows = []
+    for agents in arguments.agents:
+        with tempfile.TemporaryDirectory() as directory:
+            rows.append(row(agents, arguments.rounds, Path(directory) / "run"))
+    show(rows, {"report, s": ".2f", "lines alone, s": ".2f", "ratio": ".1f"}, arguments.json)
+
+
+if __name__ == "__main__":
+    main()

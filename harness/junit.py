@@ -1,0 +1,48 @@
+"""JUnit XML, as build servers read it: Jenkins, GitLab, and the actions of GitHub that show test results.
+
+https://github.com/jenkinsci/xunit-plugin, junit-10.xsd: the strictest that anybody holds it to.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from xml.etree import ElementTree
+
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A test case, which passed if it was not `skipped`, with a reason, and nothing is in `wrong`.
+
+    `wrong` are lines, the first of which says it all.
+    """
+
+    name: str
+    wrong: Sequence[str] = ()
+    skipped: str | None = None
+
+
+def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[Case]) -> str:
+    """A file with one suite. Characters that XML cannot hold are written as question marks."""
+    told = list(cases)
+    failures, skipped = sum(bool(case.wrong) for case in told), sum(case.skipped is not None for case in told)
+    counts = {"tests": str(len(told)), "failures": str(failures), "errors": "0"}
+    if wall_s is not None:
+        counts["time"] = f"{max(wall_s, 0.0):.1f}"
+    named = {"name": _text(suite), "timestamp": _text(started_at)}
+    root = ElementTree.Element("testsuites", counts)
+    element = ElementTree.SubElement(root, "testsuite", {**named, **counts, "skipped": str(skipped)})
+    for case in told:
+        one = ElementTree.SubElement(element, "testcase", classname=classname, name=_text(case.name))
+        if case.wrong:
+            failure = ElementTree.SubElement(one, "failure", message=_text(case.wrong[0]))
+            failure.text = _text("\n".join(case.wrong))
+        elif case.skipped is not None:
+            ElementTree.SubElement(one, "skipped", message=_text(case.skipped))
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _text(anything: str) -> str:
+    return _NOT_XML.sub("?", anything)

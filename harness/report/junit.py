@@ -1,0 +1,61 @@
+"""junit.xml: a test case for each characteristic, for expected figures, and for a run that did not complete."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import ValidationError
+
+from harness.junit import Case, to_xml
+from harness.report import facts, words
+from harness.report.result import listing, mapping, number
+from harness.report.verdicts import Verdict, verdicts
+from harness.scenario.expect import NUMBERS, Expect
+
+
+def to_junit(result: dict[str, Any]) -> str:
+    """A characteristic fails if it is violated, or other than its scenario expects: as in pytest. One that was not
+    applicable is skipped, with the reason."""
+    started_at = words.value(result.get("started_at") or "")
+    return to_xml(facts.title(result), "ucp-run", started_at, number(result, "wall_s"), _cases(result))
+
+
+def _cases(result: dict[str, Any]) -> Iterator[Case]:
+    judged, expect = verdicts(result), _expect(result)
+    if wrong := [*_wrong_with_run(result), *([] if judged else ["There is no verdict."])]:
+        yield Case("run", wrong)
+    for one in judged:
+        yield _characteristic(one, expect)
+    if expect.figures:
+        figures: dict[str, float | None] = {name: number(result, "figures", name) for name in expect.figures}
+        yield Case("expected figures", list(expect.out_of_range(figures)))
+
+
+def _wrong_with_run(result: dict[str, Any]) -> Iterator[str]:
+    if ended := facts.outcome(result):
+        yield ": ".join(filter(None, ended))
+    for fate in listing(result, "unmatched_fates"):
+        yield f"{words.value(fate)}, so this run does not show what it was meant to"
+
+
+def _expect(result: dict[str, Any]) -> Expect:
+    """What cannot be read is not expected."""
+    try:
+        return Expect.model_validate(mapping(result, "scenario", "expect"))
+    except ValidationError:
+        return Expect()
+
+
+def _characteristic(one: Verdict, expect: Expect) -> Case:
+    name, known = f"{one.number}. {one.name}", NUMBERS.get(one.number, 0)
+    expected = expect.characteristics.get(known)
+    if one.verdict == (expected or "holds"):
+        return Case(name)
+    said = f"{one.verdict}: {one.reason}" if one.reason else one.verdict
+    if expected is None and one.verdict != "violated":
+        return Case(name, skipped=said)
+    return Case(name, [said, *map(_evidence, one.evidence), *([f"expected: {expected}"] if expected else [])])
+
+
+def _evidence(piece: dict[str, Any]) -> str:
+    where = ", ".join(f"{label} {words.value(content)}" for label, content in piece.items() if label != "detail")
+    return ": ".join(filter(None, (where, words.value(piece.get("detail") or ""))))

@@ -1,0 +1,75 @@
+"""report.md: the run in short, for a pull request or a message to the team."""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from harness.markdown import escaped, row
+from harness.report import facts, network, survival, words
+from harness.report.remains import Remains
+from harness.report.result import mapping
+from harness.report.verdicts import Verdict, headline, verdicts
+
+EVIDENCE_SHOWN = 3
+SENTENCES_SHOWN = 8
+FAULTS_SHOWN = 12
+TEXT_LENGTH = 240
+
+
+def to_markdown(left: Remains) -> str:
+    result = left.result
+    judged, ended = verdicts(result), facts.outcome(result)
+    said, _ = headline(judged, completed=ended is None)
+    lines = [f"## {_short(facts.title(result))}", "", f"**{said}**", ""]
+    lines += [_short(" \u00b7 ".join(facts.summary(result, left.exports))), ""]
+    if ended:
+        lines += [f"**{_short(ended[0])}** {_short(ended[1])}".rstrip(), ""]
+    lines += _listed([*left.chains_missing, *left.files_missing])
+    lines += [*_verdict_table(judged), *_evidence(judged)] if judged else []
+    if figures := facts.figures(result):
+        lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]
+    if survived := survival.section(result, left.ink):
+        lines += _listed(survived.sentences)
+    lines += _faults(network.faults(result))
+    known = mapping(result, "versions")
+    versions = ", ".join(f"{name} {words.value(version)}" for name, version in known.items())
+    return "\n".join([*lines, f"<sub>{_short(versions)}</sub>"]) + "\n"
+
+
+def _verdict_table(judged: Sequence[Verdict]) -> Iterator[str]:
+    yield row(["", "characteristic", "verdict", "reason"])
+    yield row(["--:", "---", "---", "---"])
+    for one in judged:
+        yield row(map(_short, [one.number, one.name, f"{one.icon} {one.verdict}", one.reason]))
+    yield ""
+
+
+def _evidence(judged: Sequence[Verdict]) -> list[str]:
+    return _listed(
+        f"characteristic {one.number}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
+        for one in judged
+        for piece in (one.evidence[:EVIDENCE_SHOWN] if one.kind == "violated" else ())
+    )
+
+
+def _faults(faults: Sequence[tuple[str, str, str]]) -> Iterator[str]:
+    if not faults:
+        return
+    yield row(["mission time", "fault", ""])
+    yield row(["--:", "---", "---"])
+    yield from (row(map(_short, fault)) for fault in faults[:FAULTS_SHOWN])
+    yield ""
+    if len(faults) > FAULTS_SHOWN:
+        yield f"{len(faults) - FAULTS_SHOWN} more are in report.html."
+        yield ""
+
+
+def _listed(sentences: Iterable[str]) -> list[str]:
+    """An item for each; nothing, if there is none."""
+    found = list(sentences)
+    items = [f"- {_short(sentence)}" for sentence in found[:SENTENCES_SHOWN]]
+    if len(found) > SENTENCES_SHOWN:
+        items.append(f"- and {len(found) - SENTENCES_SHOWN} more in report.html")
+    return [*items, ""] if items else []
+
+
+def _short(text: str) -> str:
+    return escaped(text if len(text) <= TEXT_LENGTH else f"{text[: TEXT_LENGTH - 1]}\u2026")

@@ -1,0 +1,39 @@
+"""Writing the report: page, chain tree, Markdown and JUnit XML."""
+
+from pathlib import Path
+
+from harness.collector import uncollected
+from harness.errors import RunDirectoryError
+from harness.report.chain_tree_svg import ChainTreePicture
+from harness.report.junit import to_junit
+from harness.report.markdown import to_markdown
+from harness.report.page import draw
+from harness.report.remains import Remains, read_remains
+from ucp.files import write_atomically
+
+
+def write_report(run_dir: Path) -> Path:
+    """Write `report.html`, `chains.svg`, `report.md` and `junit.xml` into the run directory; the path of the page.
+
+    Raises RunDirectoryError if there is nothing of a run in the directory, or if the disk refuses the report. What is
+    missing or damaged is said on the page.
+    """
+    return write(read_remains(run_dir))
+
+
+@uncollected()
+def write(left: Remains) -> Path:
+    """As `write_report` does."""
+    _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
+    _write(left.run_dir / "report.md", to_markdown(left))
+    _write(left.run_dir / "junit.xml", to_junit(left.result))
+    page = left.run_dir / "report.html"
+    _write(page, draw(left))
+    return page
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        write_atomically(path, text)
+    except OSError as error:
+        raise RunDirectoryError(f"{path}: cannot be written: {error.strerror}") from None

@@ -1,0 +1,117 @@
+"""junit.xml of a run: what a build server shows of it, and that it can read it whatever the run holds."""
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+from harness.report import write_report
+from harness.report.junit import to_junit
+from tests.harness.report.runs import result_of, write_run
+
+Case = tuple[str, str, str] | None
+"""Tag, message and text of what is in a test case; None if it passed."""
+
+
+def suite_of(result: dict[str, Any]) -> ElementTree.Element:
+    (suite,) = ElementTree.fromstring(to_junit(result))  # noqa: S314 - ours
+    return suite
+
+
+def cases(result: dict[str, Any]) -> dict[str, Case]:
+    found: dict[str, Case] = {}
+    for case in suite_of(result):
+        inside = [(one.tag, one.get("message") or "", one.text or "") for one in case]
+        assert len(inside) <= 1
+        found[case.get("name") or ""] = inside[0] if inside else None
+    return found
+
+
+def judged(number: str, **keys: Any) -> dict[str, Any]:
+    """The result of a run whose characteristic of this number is as these keys say; the others hold."""
+    result = result_of([1, 2, 3])
+    for one in result["characteristics"].values():
+        one["verdict"] = "holds"
+    result["characteristics"][number] |= keys
+    return result
+
+
+def test_it_lies_beside_the_page_with_a_test_case_for_each_characteristic(tmp_path: Path) -> None:
+    write_report(write_run(tmp_path / "run", {1: "1.1"}))
+    suites = ElementTree.parse(tmp_path / "run" / "junit.xml").getroot()  # noqa: S314 - ours
+    (suite,) = suites
+    counts = {"tests": "6", "failures": "0", "errors": "0", "time": "61.2"}
+    assert dict(suites.attrib) == counts
+    named = {"name": "15 % loss", "timestamp": "2026-11-21T10:00:00Z", "skipped": "2"}
+    assert dict(suite.attrib) == {**named, **counts}
+    assert [case.get("name") for case in suite][::5] == ["1. distributed", "6. one uniform chain"]
+
+
+def test_a_violation_is_a_failure_with_its_evidence() -> None:
+    evidence = [{"agent_id": 2, "block": "2.1", "block_hash": None, "detail": f"held {count}"} for count in (2, 3)]
+    found = cases(judged("3", verdict="violated", reason="2 times: a block is held twice", evidence=evidence))
+    said = "violated: 2 times: a block is held twice"
+    text = f"{said}\nagent 2, block 2.1: held 2\nagent 2, block 2.1: held 3"
+    assert found["3. single copy"] == ("failure", said, text)
+    assert [name for name, inside in found.items() if inside] == ["3. single copy"]
+
+
+def test_what_was_not_applicable_is_skipped_with_the_reason() -> None:
+    found = cases(judged("5", verdict="not applicable", reason="never fully connected"))
+    assert found["5. all committed everywhere"] == ("skipped", "not applicable: never fully connected", "")
+
+
+@pytest.mark.parametrize(
+    ("expected", "verdict", "tag"),
+    [
+        ("violated", "violated", None),
+        ("violated", "holds", "failure"),
+        ("holds", "not applicable", "failure"),
+        ("not applicable", "not applicable", None),
+    ],
+)
+def test_what_the_scenario_expects_of_a_characteristic_decides(expected: str, verdict: str, tag: str | None) -> None:
+    result = judged("6", verdict=verdict)
+    result["scenario"]["expect"] = {"characteristics": {"6": expected}}
+    inside = cases(result)["6. one uniform chain"]
+    assert (inside and inside[0]) == tag
+    assert inside is None or inside[2].endswith(f"\nexpected: {expected}")
+
+
+def test_expected_figures_are_a_test_case() -> None:
+    result = result_of([1, 2])
+    result["scenario"]["expect"] = {"figures": {"mutual_chain": {"min": 39, "max": None}, "distinct_chains": 2}}
+    assert cases(result)["expected figures"] is None
+    result["figures"]["distinct_chains"] = 3
+    said = "distinct chains is 3, and should be 2"
+    assert cases(result)["expected figures"] == ("failure", said, said)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"outcome": "interrupted", "outcome_detail": "at second 7"}, "did not complete: interrupted: at second 7"),
+        ({"outcome": "running"}, "This run has not recorded its end"),
+        ({"characteristics": {}}, "There is no verdict."),
+        ({"unmatched_fates": ["the first fate never matched"]}, "the first fate never matched, so this run does not"),
+    ],
+)
+def test_a_run_that_did_not_complete_fails_a_test_case_of_its_own(keys: dict[str, Any], said: str) -> None:
+    assert "run" not in cases(result_of([1]))
+    inside = cases({**result_of([1]), **keys})["run"]
+    assert inside is not None
+    assert inside[0] == "failure"
+    assert said in inside[1]
+
+
+def test_whatever_the_run_holds_it_is_xml_that_says_so() -> None:
+    hostile = "]]><failure/>\x00\x1b[31m\ud800\ufffe\x0b&"
+    evidence = [{"agent_id": hostile, "detail": hostile, hostile: hostile}, hostile]
+    result = judged("3", verdict="violated", name=hostile, reason=hostile, evidence=evidence)
+    result |= {"started_at": hostile, "wall_s": -1e300}
+    result["scenario"] |= {"name": hostile, "expect": {"figures": hostile}}
+    suite = suite_of(result)
+    assert suite.get("failures") == "1"
+    assert suite.get("name") == "]]><failure/>??[31m???&"
+    assert suite.get("time") == "0.0"
