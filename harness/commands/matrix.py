@@ -8,6 +8,7 @@ import typer
 
 from harness import matrix
 from harness.commands.terminal import complain, end_sweep
+from harness.matrix import nights as nights_of_matrix
 from harness.matrix import outputs, results, table
 from harness.matrix.baseline import load_baseline
 from harness.matrix.run import compared, on_cluster, on_cores
@@ -36,10 +37,15 @@ def matrix_command(
     against: Annotated[
         Path | None, typer.Option(metavar="BASELINE", help="An earlier matrix.json: exit 1 if a figure is worse.")
     ] = None,
+    nights: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Keep this night there, and draw the trend of those that are there."),
+    ] = None,
 ) -> None:
     """Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated."""
     request = matrix.load_matrix(file, backend.value if backend else None)
     baseline = load_baseline(against, request) if against else None
+    kept = nights_of_matrix.opened(nights) if nights else None
     directory = (out or default_path(request.name)).absolute()
     if scheduler is None:
         spread = on_cores(request, jobs or cores(), shown=True)
@@ -49,7 +55,13 @@ def matrix_command(
         finished = matrix.run_matrix(request, ended, spread)
     if baseline is not None:
         finished = compared(finished, baseline, str(against))
-    outputs.write(finished, directory)
+    earlier = None
+    if kept is not None:
+        nights_of_matrix.keep(finished.record, kept)
+        earlier = nights_of_matrix.read(kept, request)
+        if earlier.left_out:
+            complain(f"{earlier.said_left_out}; {earlier.left_out[0]}")
+    outputs.write(finished, directory, earlier)
     if finished.record.outcome == "interrupted":
         complain(f"the same command with --out {directory} goes on from here")
-    end_sweep(finished.record, None if as_json else table.render(finished.record), directory / "matrix.svg")
+    end_sweep(finished.record, None if as_json else table.render(finished.record), directory / "report.html")

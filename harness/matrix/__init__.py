@@ -5,7 +5,9 @@ metrics.py     what is measured of each run         cell.py       all runs at on
 play.py        one run                              results.py    results.jsonl, from which a matrix goes on
 run.py         all of them                          cluster.py    spread over a Dask cluster
 record.py      matrix.json                          baseline.py, comparison.py   beside an earlier night
-outputs.py     the files                            summary.py  junit.py  picture.py  table.py   four of them
+outputs.py     the files                            summary.py  junit.py  picture.py  scenarios.py   some of them
+report/        report.html                          nights.py     what its trend is drawn from
+table.py       the table on the terminal
 thesis.py      THESIS.md: the figures beside what Section 4.3 observed
 NIGHTLY.md     a matrix every night, on a build server
 """

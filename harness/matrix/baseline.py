@@ -1,4 +1,4 @@
-"""`--against`: an earlier night's matrix.json."""
+"""`--against` and `--nights`: the matrix.json of an earlier night."""
 
 import json
 from pathlib import Path
@@ -9,30 +9,36 @@ from pydantic import ValidationError
 from harness.errors import ScenarioError
 from harness.matrix.model import Matrix
 from harness.matrix.record import SCHEMA, MatrixRecord
+from harness.scenario.model import BOUNDED
 
 _SAYS_NOTHING_OF_RUNS: Any = {"name": True, "about": True, "keep": True, "scenario": {"name", "about"}}
 
 
 def load_baseline(path: Path, matrix: Matrix) -> MatrixRecord:
-    """Raises ScenarioError if it is not the finished record of the same matrix, or nothing can be compared."""
+    """Raises ScenarioError if `load_night` does, or nothing can be compared."""
     if len(matrix.seed_list) < 2:
         raise ScenarioError("--against compares 95 % intervals, which one seed has not: give the matrix more `seeds`")
+    return load_night(path, matrix)
+
+
+def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
+    """Raises ScenarioError if it is not the finished record of the same matrix."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError):
-        raise ScenarioError(f"{path} is not JSON: --against takes an earlier night's matrix.json") from None
+        raise ScenarioError(f"{path} is not JSON: an earlier night is its matrix.json") from None
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema != SCHEMA:
-        said = f"has schema {schema!r}" if schema is not None else "names no schema"
-        raise ScenarioError(f"{path} {said}: --against takes a matrix.json, whose schema is {SCHEMA}")
+        said = f"has schema {BOUNDED.repr(schema)}" if schema is not None else "names no schema"
+        raise ScenarioError(f"{path} {said}: an earlier night is its matrix.json, whose schema is {SCHEMA}")
     try:
         record = MatrixRecord.model_validate(document)
     except ValidationError as error:
         place = ".".join(map(str, error.errors()[0]["loc"]))
         raise ScenarioError(
-            f"{path} says of itself that it is a {SCHEMA}, but its `{place}` is not: make a baseline with this version"
+            f"{path} says of itself that it is a {SCHEMA}, but its `{place}` is not: make one with this version"
         ) from None
     before, now = (one.model_dump(mode="json", exclude=_SAYS_NOTHING_OF_RUNS) for one in (record.matrix, matrix))
     differing = [f"`{key}`" for key in now if before[key] != now[key]]

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 from harness.checker.characteristic import Verdict
 from harness.checker.verdict import CHECKS
 from harness.matrix.estimate import Estimate
-from harness.matrix.metrics import METRICS
+from harness.matrix.metrics import BEFORE_FINAL_RECONCILE, METRICS
 from harness.matrix.model import Point, Task
 from harness.record import Backend
 
@@ -55,12 +55,14 @@ class Cell(Placed):
 
 def sum_up(point: Point, runs: Sequence[Run]) -> Cell:
     judged = [run for run in runs if run.failed is None]
+    estimates = {metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS}
+    before = {metric.name: metric.estimate(run.figures for run in judged) for metric in BEFORE_FINAL_RECONCILE}
     violated = {number: [run.seed for run in judged if run.verdicts[number] == "violated"] for number in CHECKS}
     return Cell(
         **point._asdict(),
         runs=len(runs),
         failed=len(runs) - len(judged),
-        estimates={metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS},
+        estimates=estimates | {name: estimate for name, estimate in before.items() if estimate.n},
         verdicts={number: dict(Counter(run.verdicts[number] for run in judged)) for number in CHECKS},
         violated={number: seeds for number, seeds in violated.items() if seeds},
     )

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from harness.matrix.cell import Cell, Placed
 from harness.matrix.estimate import Estimate
-from harness.matrix.metrics import METRICS
+from harness.matrix.metrics import BY_NAME
 
 
 class Change(Placed):
@@ -39,8 +39,11 @@ def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
     for cell in now:
         if cell.point not in earlier:
             continue
-        for metric in METRICS:
-            was, is_now = earlier[cell.point].estimates[metric.name], cell.estimates[metric.name]
+        figures_before = earlier[cell.point].estimates
+        for metric in BY_NAME.values():
+            if metric.name not in figures_before or metric.name not in cell.estimates:
+                continue
+            was, is_now = figures_before[metric.name], cell.estimates[metric.name]
             direction = _moved(was, is_now)
             if direction and metric.worse:
                 worse = direction == metric.worse

@@ -17,7 +17,7 @@ CONFIDENCE = 0.95
 class Estimate(BaseModel):
     """`mean` of `n` runs; `low` and `high` bound its 95 % interval, null for a single run; all null for none."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
     n: int
     mean: float | None = None

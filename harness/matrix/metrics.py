@@ -33,14 +33,18 @@ def figure(name: str) -> Callable[[Figures], float | None]:
     return lambda figures: figures.get(name)
 
 
-def uniform(figures: Figures) -> float | None:
-    chains = figures.get("distinct_chains")
+def uniform(figures: Figures, when: str = "") -> float | None:
+    chains = figures.get(f"distinct_chains{when}")
     return None if chains is None else float(chains == 1)
 
 
-def _mutual_share(figures: Figures) -> float | None:
-    mutual, blocks = figures.get("mutual_chain"), figures.get("blocks")
+def _mutual_share(figures: Figures, when: str = "") -> float | None:
+    mutual, blocks = figures.get(f"mutual_chain{when}"), figures.get("blocks")
     return None if mutual is None or not blocks else mutual / blocks
+
+
+def _before_final_reconcile(share: Callable[[Figures, str], float | None]) -> Callable[[Figures], float | None]:
+    return lambda figures: share(figures, "_before_final_reconcile")
 
 
 METRICS = (
@@ -52,4 +56,21 @@ METRICS = (
     Metric("copies_min", "copies fewest", figure("copies_min"), worse="lower"),
     Metric("messages_per_block", "messages per block", figure("messages_per_block"), worse="higher"),
 )
-BY_NAME = {metric.name: metric for metric in METRICS}
+BEFORE_FINAL_RECONCILE = (
+    Metric(
+        "uniform_before_final_reconcile",
+        "one chain before final reconcile",
+        _before_final_reconcile(uniform),
+        "share of runs",
+        worse="lower",
+    ),
+    Metric(
+        "mutual_share_before_final_reconcile",
+        "mutual chain before final reconcile",
+        _before_final_reconcile(_mutual_share),
+        "share",
+        worse="lower",
+    ),
+)
+"""Known only where the scenario has a final reconcile, after which the others say little of the network."""
+BY_NAME = {metric.name: metric for metric in METRICS + BEFORE_FINAL_RECONCILE}

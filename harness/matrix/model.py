@@ -22,6 +22,11 @@ class Point(NamedTuple):
     agents: int
     backend: Backend
 
+    @property
+    def file_name(self) -> str:
+        """What its files and directories are called; that of both backends."""
+        return f"loss-{self.loss}-agents-{self.agents}"
+
 
 class Task(NamedTuple):
     """One run that is asked for."""

@@ -4,11 +4,12 @@ matrix.json   all of it, schema `ucp-matrix/1`
 matrix.csv    one row a cell
 runs.csv      one row a run: loss, agents, backend, seed, figures, verdicts
 matrix.svg    the picture
+report.html   all of it for people, one file
 summary.md    table and findings in Markdown
 junit.xml     a test case a cell
 
 results.jsonl, from which all of it is made, is written while runs end (results.py); runs/ has the run directories that
-were kept of runs as processes.
+were kept of runs as processes, cells/ the scenarios with which any run can be played again.
 """
 
 import csv
@@ -22,20 +23,25 @@ from harness.errors import MachineError
 from harness.matrix.cell import Cell, Run
 from harness.matrix.junit import to_junit
 from harness.matrix.metrics import METRICS
+from harness.matrix.nights import Nights
 from harness.matrix.picture import draw
+from harness.matrix.report import to_html
 from harness.matrix.run import Finished
+from harness.matrix.scenarios import write_scenarios
 from harness.matrix.summary import to_markdown
 from ucp.files import write_atomically, write_json_atomically
 
 
-def write(finished: Finished, directory: Path) -> None:
-    """Raises MachineError if the disk refuses."""
+def write(finished: Finished, directory: Path, nights: Nights | None = None) -> None:
+    """`nights` are for the trend. Raises MachineError if the disk refuses."""
     record = finished.record
     try:
         write_json_atomically(directory / "matrix.json", record.to_json())
         write_atomically(directory / "matrix.csv", to_csv(_cell_row(cell) for cell in record.cells))
         write_atomically(directory / "runs.csv", to_csv(_run_rows(finished.runs)))
         write_atomically(directory / "matrix.svg", draw(record))
+        write_scenarios(record.matrix, directory)
+        write_atomically(directory / "report.html", to_html(finished, directory, nights))
         write_atomically(directory / "summary.md", to_markdown(record))
         write_atomically(directory / "junit.xml", to_junit(record))
     except OSError as error:

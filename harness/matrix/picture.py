@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from harness.matrix.cell import Cell
+from harness.matrix.estimate import Estimate
 from harness.matrix.metrics import BY_NAME
 from harness.matrix.record import MatrixRecord
 from harness.matrix.table import say, series, series_name
@@ -42,6 +43,15 @@ PANELS = (
     Panel("Reconciles", (("reconciles", ""),)),
     Panel("Messages per block", (("messages_per_block", ""),)),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Dot:
+    """An estimate somewhere along a line, and what its tooltip says."""
+
+    x: float
+    estimate: Estimate
+    tip: str
 
 
 def draw(record: MatrixRecord) -> str:
@@ -122,14 +132,28 @@ def _panel(panel: Panel, cells: Sequence[Cell], area: Area) -> Markup:
 
 
 def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axis, up: Axis) -> Markup:
-    """Band, line, dots with tooltips, and the line's name beside its middle."""
-    known = [(cell, cell.estimates[name]) for cell in cells if cell.estimates[name].mean is not None]
-    bounded = [(cell.loss, one.low, one.high) for cell, one in known if one.low is not None and one.high is not None]
-    upper = [f"{n(across(loss))} {n(up(high))}" for loss, _, high in bounded]
-    lower = [f"{n(across(loss))} {n(up(low))}" for loss, low, _ in bounded]
-    points = [(across(cell.loss), up(one.mean or 0.0)) for cell, one in known]
+    """With its name beside its middle."""
+    known = [
+        Dot(cell.loss, cell.estimates[name], f"{words.percent(cell.loss)} loss: {_say(name, cell)}") for cell in cells
+    ]
+    drawing, points = curve(number, known, across, up)
+    if label and points:
+        x, y = points[len(points) // 2]
+        above = number == 0
+        place = (x + 6, y - 8, "start") if above else (x - 6, y + 16, "end")
+        drawing += svg.name(*place, number, label)
+    return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[number], drawing)
+
+
+def curve(number: int, dots: Sequence[Dot], across: Axis, up: Axis) -> tuple[Markup, list[tuple[float, float]]]:
+    """A panel's so-many-th line with its band of intervals, and the places of its dots; unknown means are left out."""
+    known = [one for one in dots if one.estimate.mean is not None]
+    bounded = [(one.x, one.estimate.low, one.estimate.high) for one in known]
+    upper = [f"{n(across(x))} {n(up(high))}" for x, _, high in bounded if high is not None]
+    lower = [f"{n(across(x))} {n(up(low))}" for x, low, _ in bounded if low is not None]
+    points = [(across(one.x), up(one.estimate.mean or 0.0)) for one in known]
     parts = []
-    if bounded:
+    if upper:
         parts.append(
             Markup('<path class="band" fill="{}" fill-opacity=".22" d="M{}Z"/>').format(
                 svg.COLOURS[number], "L".join([*upper, *reversed(lower)])
@@ -137,14 +161,8 @@ def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axi
         )
     if points:
         parts.append(svg.line(points, number))
-    for (x, y), (cell, _) in zip(points, known, strict=True):
-        parts.append(svg.dot(x, y, number, f"{words.percent(cell.loss)} loss: {_say(name, cell)}"))
-    if label and points:
-        x, y = points[len(points) // 2]
-        above = number == 0
-        place = (x + 6, y - 8, "start") if above else (x - 6, y + 16, "end")
-        parts.append(svg.name(*place, number, label))
-    return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[number], Markup("").join(parts))
+    parts += [svg.dot(x, y, number, one.tip) for (x, y), one in zip(points, known, strict=True)]
+    return Markup("").join(parts), points
 
 
 def _loss_axis(losses: Sequence[float], area: Area) -> Axis:

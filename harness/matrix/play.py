@@ -68,4 +68,4 @@ class Player:
 
 
 def directory_name(task: Task) -> str:
-    return f"loss-{task.point.loss}-agents-{task.point.agents}-seed-{task.seed}"
+    return f"{task.point.file_name}-seed-{task.seed}"

@@ -20,7 +20,7 @@ from harness.report import words
 
 
 def to_markdown(record: MatrixRecord) -> str:
-    lines = [f"## {escaped(record.matrix.name)}", "", f"**{_verdict(record)}**", "", *_table(record), ""]
+    lines = [f"## {escaped(record.matrix.name)}", "", f"**{verdict(record)}**", "", *_table(record), ""]
     lines += [explanation(record) + unjudged(record), ""]
     if found := [*troubles_of_all(record), *improvements(record)]:
         lines += [*(f"- {escaped(sentence)}" for sentence in found), ""]
@@ -29,7 +29,7 @@ def to_markdown(record: MatrixRecord) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _verdict(record: MatrixRecord) -> str:
+def verdict(record: MatrixRecord) -> str:
     """What a reader in a hurry wants to know."""
     runs = sum(cell.runs for cell in record.cells)
     said = [f"{words.value(runs)} runs"]

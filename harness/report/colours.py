@@ -38,6 +38,12 @@ def inks(agent_ids: Iterable[int]) -> dict[int, Ink]:
     return {agent_id: _ink(position) for position, agent_id in enumerate(sorted(set(agent_ids)))}
 
 
+def ramp(first: Rgb, last: Rgb, steps: int) -> list[Ink]:
+    """From one colour to another, for values that grow: where the second is darker or lighter, anybody sees it."""
+    fills = [_mixed(first, last, step / (steps - 1)) for step in range(steps)]
+    return [Ink(fill, fill, _text_on(fill)) for fill in fills]
+
+
 def contrast(one: str, other: str) -> float:
     """The contrast ratio of WCAG 2, 1 to 21."""
     dark, light = sorted((_luminance(one), _luminance(other)))
@@ -53,8 +59,11 @@ def _ink(position: int) -> Ink:
         fill, stroke = _hex(hue), _mixed(hue, _BLACK, 0.35)
     else:
         fill, stroke = _mixed(hue, _WHITE, 0.72), _mixed(hue, _BLACK, 0.35)
-    text = max(("#111111", "#ffffff"), key=lambda ink: contrast(ink, fill))
-    return Ink(fill, stroke, text, dashed=variant == 3)
+    return Ink(fill, stroke, _text_on(fill), dashed=variant == 3)
+
+
+def _text_on(fill: str) -> str:
+    return max(("#111111", "#ffffff"), key=lambda ink: contrast(ink, fill))
 
 
 def _mixed(colour: Rgb, into: Rgb, share: float) -> str:

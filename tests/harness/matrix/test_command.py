@@ -27,10 +27,10 @@ def test_a_matrix_ends_in_a_table_and_files(tmp_path: Path) -> None:
     assert not sentences(done.stderr)
     assert "Means of 3 runs a cell" in done.stdout
     assert "Not applicable in any run: characteristic 1." in " ".join(done.stdout.split())
-    assert str(tmp_path / "out" / "matrix.svg") in done.stdout
+    assert str(tmp_path / "out" / "report.html") in done.stdout
     files = {path.name for path in (tmp_path / "out").iterdir()}
     figures = {"results.jsonl", "matrix.json", "matrix.csv", "runs.csv"}
-    assert files == {*figures, "matrix.svg", "summary.md", "junit.xml"}
+    assert files == {*figures, "matrix.svg", "report.html", "summary.md", "junit.xml", "cells"}
 
 
 def test_it_finds_one_chain_without_loss_and_none_in_common_without_contact(tmp_path: Path) -> None:

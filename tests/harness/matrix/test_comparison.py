@@ -13,7 +13,7 @@ from harness.matrix.baseline import load_baseline
 from harness.matrix.cell import Cell
 from harness.matrix.comparison import compare
 from harness.matrix.estimate import Estimate
-from harness.matrix.metrics import METRICS
+from harness.matrix.metrics import BY_NAME
 from harness.matrix.run import compared
 from harness.scenario import Scenario
 from tests.harness.matrix.stub import judge, matrix, played
@@ -26,13 +26,15 @@ WORSE = {
     "copies_mean": "lower",
     "copies_min": "lower",
     "messages_per_block": "higher",
+    "uniform_before_final_reconcile": "lower",
+    "mutual_share_before_final_reconcile": "lower",
 }
 
 
 def cell(loss: float = 0.15, **estimates: Estimate) -> Cell:
     """With every figure at 0.5, from 0.4 to 0.6, but for those given."""
     usual = Estimate(n=10, mean=0.5, low=0.4, high=0.6)
-    known = {metric.name: estimates.get(metric.name, usual) for metric in METRICS}
+    known = {name: estimates.get(name, usual) for name in BY_NAME}
     return Cell(loss=loss, agents=5, backend="sim", runs=10, failed=0, estimates=known, verdicts={}, violated={})
 
 
@@ -56,6 +58,13 @@ def test_intervals_that_touch_are_no_change() -> None:
 def test_a_figure_without_an_interval_tells_nothing() -> None:
     assert not list(compare([cell()], [cell(uniform=Estimate(n=1, mean=0.0), reconciles=Estimate(n=0))]))
     assert not list(compare([cell(uniform=Estimate(n=0))], [cell(uniform=at(0.0))]))
+
+
+def test_a_figure_that_only_one_night_has_is_not_compared() -> None:
+    without = cell()
+    del without.estimates["reconciles"]
+    assert not list(compare([without], [cell(reconciles=at(5))]))
+    assert not list(compare([cell(reconciles=at(5))], [without]))
 
 
 def test_cells_are_compared_at_the_same_point_only() -> None:
@@ -135,9 +144,9 @@ def test_another_matrix_is_refused(tmp_path: Path, keys: dict[str, Any], sentenc
     ("content", "sentence"),
     [
         (None, "cannot be read: No such file or directory"),
-        ("", "is not JSON: --against takes an earlier night's matrix.json"),
-        ("[]", "names no schema: --against takes a matrix.json, whose schema is ucp-matrix/1"),
-        ('{"schema": "ucp-run/1"}', "has schema 'ucp-run/1': --against takes a matrix.json"),
+        ("", "is not JSON: an earlier night is its matrix.json"),
+        ("[]", "names no schema: an earlier night is its matrix.json, whose schema is ucp-matrix/1"),
+        ('{"schema": "ucp-run/1"}', "has schema 'ucp-run/1': an earlier night is its matrix.json"),
         ('{"schema": "ucp-matrix/1"}', "says of itself that it is a ucp-matrix/1, but its `matrix` is not"),
     ],
 )

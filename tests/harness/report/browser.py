@@ -70,7 +70,7 @@ class Browser:
         return result["result"].get("value")
 
     def press(self, key: str, text: str = "") -> None:
-        code = {" ": 32, "Tab": 9, "Home": 36, "ArrowLeft": 37, "ArrowRight": 39, "+": 187, "-": 189}[key]
+        code = {" ": 32, "Tab": 9, "Enter": 13, "Home": 36, "ArrowLeft": 37, "ArrowRight": 39, "+": 187, "-": 189}[key]
         self._call("Input.dispatchKeyEvent", type="keyDown", key=key, text=text, windowsVirtualKeyCode=code)
         self._call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
 
@@ -78,6 +78,13 @@ class Browser:
         """With the mouse, from one place in the window to another."""
         for event, (x, y), buttons in (("mousePressed", start, 1), ("mouseMoved", end, 1), ("mouseReleased", end, 0)):
             self._call("Input.dispatchMouseEvent", type=event, x=x, y=y, button="left", buttons=buttons, clickCount=1)
+
+    @contextlib.contextmanager
+    def on_paper(self) -> Iterator[None]:
+        """Laid out as for a printer."""
+        self._call("Emulation.setEmulatedMedia", media="print")
+        yield
+        self._call("Emulation.setEmulatedMedia", media="")
 
     def screenshot(self, path: Path) -> None:
         """The whole page, also what is below the fold."""

@@ -1,0 +1,88 @@
+"""The runs of each cell, those that went wrong first, and how to play one of them again."""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+from harness.checker.verdict import CHECKS
+from harness.matrix.cell import Run
+from harness.matrix.play import directory_name
+from harness.matrix.report.heatmap import anchor
+from harness.matrix.run import Finished
+from harness.matrix.scenarios import scenario_file
+from harness.matrix.table import name_of
+from harness.report import words
+from harness.report.verdicts import ICONS
+
+MAX_ROWS = 12_000
+"""Of all cells together, so that the page stays below 3 MB."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """`href` is the report of the run if it was kept; `failed` why it has no verdicts and figures."""
+
+    seed: int
+    href: str | None
+    verdicts: list[str]
+    figures: list[str]
+    failed: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class CellRuns:
+    """Of one cell: `left_out` says for how many there was no room."""
+
+    anchor: str
+    name: str
+    runs: str
+    command: str
+    figures: list[str]
+    rows: list[Row]
+    left_out: int
+
+
+def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
+    """`directory` is the matrix's, beside whose files the page will be."""
+    by_point = [(point, list(runs)) for point, runs in groupby(finished.runs, key=lambda run: run.point)]
+    room = MAX_ROWS // max(1, len(by_point))
+    found = []
+    for point, runs in by_point:
+        runs.sort(key=lambda run: (run.failed is None, "violated" not in run.verdicts.values()))
+        figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
+        played = ["ucp-harness", "run", scenario_file(point), "--backend", point.backend, "--seed", str(runs[0].seed)]
+        found.append(
+            CellRuns(
+                anchor(point),
+                name_of(finished.record.matrix, point),
+                _count(runs),
+                shlex.join(played),
+                [words.label(name) for name in figures],
+                [_row(run, figures, directory) for run in runs[:room]],
+                max(0, len(runs) - room),
+            )
+        )
+    return found
+
+
+def _count(runs: Sequence[Run]) -> str:
+    said = [f"{words.value(len(runs))} run{'s' if len(runs) > 1 else ''}"]
+    if number := sum("violated" in run.verdicts.values() for run in runs):
+        said.append(f"{number} violated a characteristic")
+    if number := sum(run.failed is not None for run in runs):
+        said.append(f"{number} failed")
+    return ", ".join(said)
+
+
+def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:
+    kept = f"runs/{directory_name(run.task)}/report.html"
+    is_kept = run.backend == "process" and (directory / kept).exists()
+    return Row(
+        run.seed,
+        kept if is_kept else None,
+        [] if run.failed is not None else [ICONS[run.verdicts[number]] for number in CHECKS],
+        [] if run.failed is not None else [words.value(run.figures.get(name)) for name in figures],
+        run.failed,
+    )

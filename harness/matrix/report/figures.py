@@ -1,0 +1,44 @@
+"""The figures that the report lets its reader choose from."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from harness.matrix.cell import Cell
+from harness.matrix.estimate import Estimate, estimate_share
+from harness.matrix.metrics import BEFORE_FINAL_RECONCILE, METRICS, Metric, figure
+from harness.matrix.table import violated
+
+MEANINGS = {
+    "uniform": "Share of the runs that end with one uniform chain on all agents.",
+    "mutual_share": "Share of a run\u2019s blocks that end in the chain that all agents have in common.",
+    "distinct_chains": "How many different chains there are at the end.",
+    "reconciles": "Reconciles of all agents.",
+    "copies_mean": "In how many chains a block is at the end, mean of the blocks.",
+    "copies_min": "In how many chains the block is at the end that fewest have.",
+    "messages_per_block": "Messages that all agents sent for each block.",
+    "uniform_before_final_reconcile": "Share of the runs that the mission left with one uniform chain.",
+    "mutual_share_before_final_reconcile": "Share of a run\u2019s blocks that the mission left in all chains.",
+    "violated": "Share of the runs that violated a characteristic.",
+}
+_VIOLATED = Metric("violated", "violated", figure("violated"), "share of runs")
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    metric: Metric
+
+    @property
+    def meaning(self) -> str:
+        return MEANINGS[self.metric.name]
+
+    def of(self, cell: Cell) -> Estimate:
+        if self.metric is _VIOLATED:
+            return estimate_share(violated(cell), cell.runs - cell.failed)
+        return cell.estimates.get(self.metric.name, Estimate(n=0))
+
+
+def known(cells: Iterable[Cell]) -> list[Figure]:
+    """Those that a run told, first what the mission left; the violated at least."""
+    told = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
+    metrics = [metric for metric in BEFORE_FINAL_RECONCILE + METRICS if metric.name in told]
+    return [Figure(metric) for metric in (*metrics, _VIOLATED)]

@@ -1,0 +1,76 @@
+"""The page: what is shown where. Whatever comes from scenarios, runs and earlier nights is text to the template."""
+
+from pathlib import Path
+
+from markupsafe import Markup
+
+from harness.checker.verdict import CHECKS
+from harness.matrix.nights import Nights
+from harness.matrix.picture import draw
+from harness.matrix.record import MatrixRecord
+from harness.matrix.report import figures, heatmap, trend
+from harness.matrix.report.drilldown import drilldown
+from harness.matrix.run import Finished
+from harness.matrix.summary import verdict
+from harness.matrix.table import explanation, improvements, name_of, troubles, unjudged
+from harness.report import html, svg, words
+from harness.report.verdicts import SHORT_NAMES
+
+_TEMPLATE = Path(__file__).with_name("page.html.j2")
+_STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
+
+
+def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -> str:
+    """`directory` is where the page will be, beside the runs that were kept; `nights` has this one too, if finished."""
+    record = finished.record
+    shown = figures.known(record.cells)
+    drawn = trend.nights_drawn(nights.records, record, len(shown)) if nights else []
+    return html.render(
+        _TEMPLATE,
+        styles=[html.PAGE_STYLE + heatmap.STYLE + _STYLE + _choosing(shown), svg.STYLE],
+        record=record,
+        headline=(verdict(record), _kind(record)),
+        summary=_summary(record),
+        explanation=explanation(record) + unjudged(record),
+        troubles=[
+            (heatmap.anchor(cell.point), name_of(record.matrix, cell.point), sentence)
+            for cell in record.cells
+            for sentence in troubles(record, cell)
+        ],
+        improvements=list(improvements(record)),
+        heatmaps=[heatmap.heatmap(record, figure) for figure in shown],
+        shades=range(heatmap.SHADES),
+        cells=drilldown(finished, directory),
+        characteristics={number: SHORT_NAMES[number] for number in CHECKS},
+        nights=nights,
+        drawn=drawn,
+        trends=[(figure, trend.trend(drawn, record, figure)) for figure in shown] if len(drawn) > 1 else [],
+        picture=Markup(draw(record)),  # noqa: S704 - it has escaped what is not ours
+    )
+
+
+def _choosing(shown: list[figures.Figure]) -> str:
+    """Of what is drawn for each figure only the chosen one's is shown; on paper all heatmaps are."""
+    others = [f"main:has(#show-{one.metric.name}:checked) {{}} .figure:not(.of-{one.metric.name})" for one in shown]
+    on_screen, always = (",\n".join(rule.format(place) for rule in others) for place in ("", ".trend"))
+    return f"@media screen {{\n{on_screen} {{ display: none; }}\n}}\n{always} {{ display: none; }}\n"
+
+
+def _kind(record: MatrixRecord) -> str:
+    """For the style sheet: half a matrix is no success."""
+    if record.outcome == "interrupted":
+        return "violated" if record.failed or any(cell.violated for cell in record.cells) else "unknown"
+    return "violated" if record.exit_status else "holds"
+
+
+def _summary(record: MatrixRecord) -> list[str]:
+    matrix = record.matrix
+    agents = list(dict.fromkeys(point.agents for point in matrix.points))
+    return [
+        f"{', '.join(map(str, agents))} agents",
+        f"{words.duration(matrix.scenario.duration_s)} mission",
+        f"{len(matrix.loss)} loss rates" if len(matrix.loss) > 1 else f"{words.percent(matrix.loss[0])} loss",
+        f"{len(matrix.seed_list)} seeds" if len(matrix.seed_list) > 1 else f"seed {matrix.seed_list[0]}",
+        f"backend {', '.join(matrix.backend)}",
+        f"begun {words.started(record.started_at)}",
+    ]
