@@ -232,9 +232,13 @@ def read_exports(paths: Iterable[Path]) -> Exports:
 
 def export_paths(directory: Path) -> list[Path]:
     """The exports of a run directory, or of a directory that holds exports; by agent ID where the name has one."""
+    return sorted(agents_directory(directory).glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
+
+
+def agents_directory(directory: Path) -> Path:
+    """Where the exports and traces of a run directory are; a directory that holds them by itself is it."""
     agents = directory / "agents"
-    paths = list((agents if agents.is_dir() else directory).glob(f"*{SUFFIX}"))
-    return sorted(paths, key=lambda path: (len(path.name), path.name))
+    return agents if agents.is_dir() else directory
 
 
 def export_files(paths: Iterable[Path]) -> list[Path]:

@@ -5,7 +5,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from harness import traces
-from harness.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, Export, export_files, export_paths, read_exports
+from harness.exports import (
+    BEFORE_FINAL_RECONCILE,
+    RUN_FILE,
+    Export,
+    agents_directory,
+    export_files,
+    export_paths,
+    read_exports,
+)
 from harness.naming import name_blocks
 from harness.record import AgentRecord, JudgedRecord
 from harness.traces import Trace
@@ -113,12 +121,14 @@ def gather(paths: Iterable[Path]) -> Evidence:
     files = export_files(paths)
     record: JudgedRecord | None = None
     errors: list[str] = []
+    directories = [path.parent for path in files]
     for path in paths:
         if path.is_dir():
             record = record or _record(path / RUN_FILE, errors)
+            directories.append(agents_directory(path))  # which has no exports if the run was killed
     exports = read_exports(files)
     evidence_traces: dict[int, Trace] = {}
-    for directory in dict.fromkeys(path.parent for path in files):
+    for directory in dict.fromkeys(directories):
         for path in sorted(directory.glob(f"*{traces.SUFFIX}")):
             trace = traces.read_trace(path)
             if trace is None:

@@ -222,13 +222,24 @@ def test_a_handler_without_a_trigger_of_its_own_violates_1(run_dir: Path, trigge
     assert detail in result.characteristics["1"].evidence[0].detail
 
 
-def test_a_vote_that_never_ends_violates_1(run_dir: Path) -> None:
-    def hang(lines: list[dict]) -> None:
-        lines[:] = [line for line in lines if line.get("handler") != "vote_timer_expiration"]
+def hang(lines: list[dict]) -> None:
+    """In a trace: no vote ends."""
+    lines[:] = [line for line in lines if line.get("handler") != "vote_timer_expiration"]
 
+
+def test_a_vote_that_never_ends_violates_1(run_dir: Path) -> None:
     edit_lines(run_dir / "agents" / "2.trace.jsonl", hang)
     result = check(gather([run_dir]))
     assert any("a vote began and did not end" in one.detail for one in result.characteristics["1"].evidence)
+
+
+def test_a_killed_run_without_exports_is_judged_by_its_traces(run_dir: Path) -> None:
+    for export in (run_dir / "agents").glob("*.chain.json"):
+        export.unlink()
+    result = check(gather([run_dir]))
+    assert verdicts(result) == "hnnnnn"
+    edit_lines(run_dir / "agents" / "2.trace.jsonl", hang)
+    assert check(gather([run_dir])).characteristics["1"].verdict == "violated"
 
 
 def test_a_missing_or_damaged_trace_is_never_taken_for_a_good_one(run_dir: Path) -> None:
