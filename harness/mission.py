@@ -31,6 +31,7 @@ class Played:
     mission_s: float = 0.0
     settled: bool = False
     counters: dict[str, Any] | None = None
+    capture: dict[str, dict[str, int]] | None = None
     agents: dict[str, Any] = field(default_factory=dict)
     vehicles: dict[str, Any] = field(default_factory=dict)
     unmatched_fates: list[str] = field(default_factory=list)

@@ -85,6 +85,13 @@ class AgentRecord(_Model):
     trace_problem: str | None = None
 
 
+class CapturedFrames(_Model):
+    """How many frames crossed a vehicle's interface, and how many of them its capture lacks."""
+
+    received: int
+    dropped: int
+
+
 class BlockHolders(_Model):
     """Who held a block right after vehicles were lost, and at the end; `agent_id` completed it."""
 
@@ -167,6 +174,8 @@ class RunRecord(JudgedRecord):
     """A sentence for each scripted fate that decided nothing."""
     counters: dict[str, Any] | None = None
     """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
+    capture: dict[str, CapturedFrames] | None = None
+    """Of each vehicle, if captures were asked for and came to their end."""
     characteristics: dict[str, CharacteristicVerdict] = {}
     figures: dict[str, float | int | None] = {}
     survival: Survival | None = None

@@ -109,6 +109,7 @@ class Recording:
             vehicles=played.vehicles,
             unmatched_fates=played.unmatched_fates,
             counters=played.counters,
+            capture=played.capture,
         )
 
     def end(self, played: Played) -> Run:

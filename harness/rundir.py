@@ -4,6 +4,7 @@ run.json            scenario as resolved, seed, versions, backend, engine, verdi
 agents/7.*          mission file, chain export, trace and log of agent 7; its store, if it keeps one
 agents/7-2/         those of its second life, if it was killed and began again; export and trace are above, too
 vehicles/7/         the vehicle's own files, its output, telemetry.tlog; of its second life in vehicles/7-2/
+capture/7.pcapng    every frame that vehicle 7 sent and every one that reached it, if asked for (netem.capture)
 network.jsonl       every change of conditions as the kernel applied it, and its counters at the end
 tracks.jsonl        where the vehicles were, in metres north, east and up from the middle of the field
 lab.log             what the lab itself had to say
@@ -46,6 +47,12 @@ class RunDirectory:
         """The directory in which the agent works."""
         path = self.agents if life == 1 else self.agents / f"{agent_id}-{life}"
         path.mkdir(exist_ok=True)
+        return path
+
+    def capture(self) -> Path:
+        """The directory for captures. Raises OSError."""
+        path = self.path / "capture"
+        path.mkdir()
         return path
 
     def write_mission(self, directory: Path, agent_id: int, mission: Mapping[str, Any]) -> Path:

@@ -8,11 +8,14 @@ import dataclasses
 from collections.abc import Coroutine, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from harness import checker, mission
 from harness.agents import Status
+from harness.backends.captured_air import CapturedAir, VirtualCapture
 from harness.backends.simulation import Life, Simulation, refuse_what_needs_processes
+from harness.backends.virtual_air import VirtualAir
 from harness.checker import Evidence
 from harness.errors import InterruptedRunError, MachineError
 from harness.exports import Export, ExportMaker
@@ -68,7 +71,9 @@ async def simulate_into(
             raise InterruptedRunError(f"the run was interrupted at mission second {simulation.now():.0f}")
 
     with closing(OnDisk(rundir)) as files:
-        simulation = Simulation(scenario, seed, files, breathe=breathe)
+        capture = _captures(rundir, scenario) if scenario.capture else None
+        air = partial(CapturedAir, capture) if capture else VirtualAir
+        simulation = Simulation(scenario, seed, files, breathe=breathe, air=air)
         try:
             await story(simulation, scenario)
         except InterruptedRunError as error:
@@ -77,12 +82,21 @@ async def simulate_into(
             simulation.played.end_early("failed", MachineError(f"{error.strerror}: {error.filename or rundir.path}"))
         simulation.end()
         try:
+            if capture:
+                simulation.played.capture = capture.end(simulation.now())
             files.export(simulation)
         except OSError as error:
             simulation.played.end_early("failed", MachineError(f"{error.strerror}: {error.filename or rundir.path}"))
         for agent_id, problem in files.problems().items():
             simulation.played.agents[str(agent_id)]["trace_problem"] = problem
     return simulation.played
+
+
+def _captures(rundir: RunDirectory, scenario: Scenario) -> VirtualCapture:
+    try:
+        return VirtualCapture(rundir.capture(), scenario.roster)
+    except OSError as error:
+        raise MachineError(f"{error.strerror}: {error.filename}") from None
 
 
 def _snapshot(simulation: Simulation) -> Snapshot:

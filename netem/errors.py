@@ -43,3 +43,7 @@ class SpawnError(LabError):
 
 class UmlError(NetemError):
     """User Mode Linux is not here, did not boot, hung or panicked."""
+
+
+class CaptureError(NetemError):
+    """What crosses the air could not be taken down, or not to the end."""

@@ -9,8 +9,10 @@ from __future__ import annotations
 import asyncio
 import functools
 import os
+import shutil
 import tempfile
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -39,11 +41,8 @@ def require(engine: str | None) -> None:
     """Skip, or fail if UCP_REQUIRE says that it has to be there."""
     if (error := unavailable(engine)) is None:
         return
-    required = os.environ.get("UCP_REQUIRE", "").split(",")
-    if ("lab" if error.stage != "engine" else engine) in required:
-        pytest.fail(f"UCP_REQUIRE={os.environ['UCP_REQUIRE']}, but: {error}")
     elsewhere = "; `make test-netem` runs it in User Mode Linux" if engine == "netem" else ""
-    pytest.skip(f"{error.reason}{elsewhere}")
+    do_without("lab" if error.stage != "engine" else str(engine), f"{error.reason}{elsewhere}")
 
 
 def require_uml() -> None:
@@ -51,6 +50,16 @@ def require_uml() -> None:
     try:
         uml.find()
     except UmlError as error:
-        if "uml" in os.environ.get("UCP_REQUIRE", "").split(","):
-            pytest.fail(f"UCP_REQUIRE={os.environ['UCP_REQUIRE']}, but: {error}")
-        pytest.skip(str(error))
+        do_without("uml", str(error))
+
+
+def require_tshark() -> str:
+    """The same of Wireshark's program for terminals; its path."""
+    return shutil.which("tshark") or do_without("tshark", "no tshark on PATH (Debian package `tshark`)")
+
+
+def do_without(what: str, reason: str) -> NoReturn:
+    """Skip the test, for `what` is missing; or fail it if UCP_REQUIRE names that."""
+    if what in os.environ.get("UCP_REQUIRE", "").split(","):
+        pytest.fail(f"UCP_REQUIRE={os.environ['UCP_REQUIRE']}, but: {reason}")
+    pytest.skip(reason)

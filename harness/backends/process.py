@@ -22,8 +22,9 @@ from harness.reach import TRACK_S, Reach
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.timeline import AgentFault, Change, NetworkChange, describe
+from netem.capture import Capture
 from netem.conditions import NetworkConditions
-from netem.errors import LabUnavailable, NetemError
+from netem.errors import CaptureError, LabUnavailable, NetemError
 from netem.lab import Lab
 from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
 from ucp.clock import MICROSECONDS, MissionClock
@@ -68,6 +69,7 @@ class ProcessRun:
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
+        self._capture: Capture | None = None
         self._reach = Reach(scenario)
         self._changing_network = asyncio.Lock()
         self._group = asyncio.TaskGroup()
@@ -95,6 +97,8 @@ class ProcessRun:
                 await self._guarded(story(self, self.scenario))
             except HarnessError as error:
                 self._ended_early(error)
+            except CaptureError as error:
+                self._ended_early(MachineError(str(error)))
             except NetemError as error:
                 self._ended_early(MachineError(f"the lab failed: {error}"))
             except OSError as error:
@@ -140,6 +144,9 @@ class ProcessRun:
         await self._start_vehicles(self._lab)
         await self._start_agents(self._lab)
         await self.apply(first)
+        if self.scenario.capture:
+            self._capture = await Capture.start(self._lab, self.rundir.capture())
+            self._watch(self._capture.watch())
         await self._start_clock()
         self._watch(self._poll_agents())
         if self.vehicles:
@@ -185,6 +192,8 @@ class ProcessRun:
 
     async def _start_clock(self) -> None:
         epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
+        if self._capture:
+            await self._capture.begin(epoch_us, self.scenario.speedup)
         await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
         self.clock.start(epoch_us)
 
@@ -345,7 +354,19 @@ class ProcessRun:
             self._ended_early(MachineError(str(error)))
         except OSError as error:
             self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
+        await self._end_capture()
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+
+    async def _end_capture(self) -> None:
+        if self._capture is None:
+            return
+        try:
+            counted = await self._capture.stop()
+        except CaptureError as error:
+            if self.played.outcome == "completed":
+                self._ended_early(MachineError(str(error)))
+            return
+        self.played.capture = {str(vehicle): frames for vehicle, frames in counted.items()}
 
     def _show(self, stage: str) -> None:
         self.stage = stage

@@ -103,7 +103,8 @@ class Simulation:
     """A swarm in virtual time; see `harness.mission.Swarm`. Agents are numbered in the roster's order.
 
     `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. `breathe` is
-    awaited every few mission seconds. `fate_script` makes what plays the scenario's fates.
+    awaited every few mission seconds. `fate_script` makes what plays the scenario's fates, and `air` what carries
+    messages.
     """
 
     def __init__(
@@ -115,6 +116,7 @@ class Simulation:
         deliver_all: bool = False,
         breathe: Callable[["Simulation"], Awaitable[None]] | None = None,
         fate_script: Callable[[Sequence[Fate], Sequence[int], NameOf], FateScript] = FateScript,
+        air: Callable[..., VirtualAir] = VirtualAir,
     ) -> None:
         self.scenario = scenario
         self.roster = scenario.roster
@@ -141,7 +143,7 @@ class Simulation:
         self._medium = Medium(self.roster, seed)
         self._block_names: dict[bytes, str] = {}
         self._script = fate_script(scenario.fates, self.roster, self._block_name)
-        self._air = VirtualAir(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
+        self._air = air(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
 
     # The swarm, as harness.mission drives it
 

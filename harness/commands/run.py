@@ -13,6 +13,7 @@ from harness import progress
 from harness.commands.terminal import complain, show_result, show_survival
 from harness.errors import HarnessError, ScenarioError
 from harness.kernel import Kernel, run_inside
+from harness.report.capture import gaps
 from harness.run import Run, run
 from harness.rundir import default_path
 from harness.scenario import Scenario, load_scenario
@@ -40,6 +41,9 @@ def run_command(
     backend: Annotated[
         Backend, typer.Option(help="Real processes in a private network, or virtual time.")
     ] = Backend.process,
+    capture: Annotated[
+        bool, typer.Option("--capture", help="Keep each frame that a vehicle sent or got, in capture/<ID>.pcapng.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="Run directory; must be new or empty.")] = None,
     kernel: Annotated[
         Kernel, typer.Option(help="This machine's kernel, or User Mode Linux: it has netem, and needs no rights.")
@@ -47,7 +51,7 @@ def run_command(
 ) -> None:
     """Play a scenario, check the six characteristics, write a report."""
     console = Console()
-    request = _with_options(load_scenario(scenario), speedup, vehicles)
+    request = _with_options(load_scenario(scenario), speedup, vehicles, capture)
     directory = (out or default_path(request.name)).absolute()
     chosen_seed = secrets.randbelow(2**32) if seed is None else seed
     if kernel is Kernel.uml:
@@ -55,6 +59,7 @@ def run_command(
             raise HarnessError("--kernel uml is for real processes: virtual time, --backend sim, needs no kernel")
         options = {"--seed": chosen_seed, "--out": directory, "--speedup": speedup, "--vehicles": vehicles}
         given = [f"{option}={value}" for option, value in options.items() if value is not None]
+        given += ["--capture"] if capture else []
         console.print("Booting User Mode Linux.", style="dim")
         raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
@@ -71,7 +76,7 @@ def run_command(
     raise typer.Exit(finished.exit_status)
 
 
-def _with_options(scenario: Scenario, speedup: float | None, vehicles: Vehicles | None) -> Scenario:
+def _with_options(scenario: Scenario, speedup: float | None, vehicles: Vehicles | None, capture: bool) -> Scenario:
     """The scenario as resolved: the command line's word comes before the file's."""
     document: dict[str, Any] = scenario.model_dump()
     if speedup is not None:
@@ -80,6 +85,7 @@ def _with_options(scenario: Scenario, speedup: float | None, vehicles: Vehicles 
         document["speedup"] = speedup
     if vehicles is not None:
         document["vehicles"]["kind"] = vehicles.value
+    document["capture"] |= capture
     try:
         return Scenario.model_validate(document)
     except ValidationError as error:
@@ -93,6 +99,8 @@ def _show_end(console: Console, finished: Run) -> None:
         complain(error)
     for sentence in finished.played.unmatched_fates:
         complain(f"{sentence}, so this run does not show what it was meant to")
+    if lacks := gaps({"capture": finished.played.capture}):
+        complain(f"{lacks}: choose a smaller --speedup")
     slow = [
         f"{vehicle} ({record['real_time_factor']:.2f})"
         for vehicle, record in finished.played.vehicles.items()

@@ -11,7 +11,7 @@ from harness.collector import uncollected
 from harness.connectivity import NETWORK_FILE, Connectivity, read_connectivity
 from harness.course import read_traces
 from harness.exports import RUN_FILE, Exports, export_paths, read_exports
-from harness.report import swarm
+from harness.report import capture, swarm
 from harness.report.colours import Ink
 from harness.report.result import DamagedResultError, agent_ids, listing, mapping, read_result
 from harness.rundir import TRACKS_FILE
@@ -62,6 +62,7 @@ def read_remains(run_dir: Path) -> Remains:
             *_without_trace(run_dir, result),
             *network.problems,
             *_without_network(run_dir, result),
+            *filter(None, [capture.gaps(result)]),
         ],
     )
 

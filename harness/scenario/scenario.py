@@ -57,6 +57,8 @@ class Scenario(Model):
     fates: Annotated[list[Fate], Field(max_length=100_000)] = []
     settle: Settle = Settle()
     final_reconcile: bool = False
+    capture: bool = False
+    """Keep every frame that a vehicle sent, and every one that reached it, in capture/<ID>.pcapng."""
     expect: Expect | None = None
     """For pytest, which collects the file as tests if it has this."""
 

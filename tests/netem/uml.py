@@ -24,6 +24,7 @@ _FILES = (
     "tests/netem/test_lab.py",
     "tests/netem/test_machine.py",
     "tests/netem/test_agreement.py",
+    "tests/netem/test_capture.py",
     "tests/netem/test_measure.py",
     "tests/harness/test_netem_run.py",
 )

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ from scapy.layers.l2 import Ether
 from scapy.packet import Raw
 from scapy.utils import RawPcapWriter
 
+from tests.machine import require_tshark
 from ucp.block import BLOCK_FIELDS, Block
 from ucp.events import EVENT_FIELDS, LoggableEvent, decode_events
 from ucp.messages import (
@@ -65,11 +65,7 @@ def frame(datagram: bytes) -> bytes:
 
 def tshark(folder: Path, frames: Sequence[bytes], *options: str, captured: int | None = None) -> str:
     """What tshark prints of frames of which `captured` bytes were captured (None: all). Skips without tshark."""
-    if (program := shutil.which("tshark")) is None:
-        reason = "no tshark on PATH (Debian package `tshark`)"
-        if "tshark" in os.environ.get("UCP_REQUIRE", "").split(","):
-            pytest.fail(f"UCP_REQUIRE asks for tshark: {reason}")
-        pytest.skip(reason)
+    program = require_tshark()
     capture = folder / "air.pcap"
     with RawPcapWriter(str(capture), linktype=1) as writer:
         writer.write_header(None)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-import pytest
+from tests.machine import do_without
 
 DEADLINE_S = 60.0
 _FLAGS = [
@@ -30,13 +30,8 @@ _FLAGS = [
 
 def chromium_or_skip() -> str:
     """The browser's path. Without one the test is skipped, or fails where UCP_REQUIRE contains `browser`."""
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if path is None:
-        reason = "no chromium on PATH (Debian package `chromium`)"
-        if "browser" in os.environ.get("UCP_REQUIRE", ""):
-            pytest.fail(f"UCP_REQUIRE asks for a browser: {reason}")
-        pytest.skip(reason)
-    return path
+    found = (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name)))
+    return next(found, None) or do_without("browser", "no chromium on PATH (Debian package `chromium`)")
 
 
 class Browser:

@@ -1,0 +1,102 @@
+"""What captures keep up with, and cost: `python -m benchmarks.capture [--vehicles N] [--bytes B] [--rounds R]`.
+
+In a lab without conditions one vehicle broadcasts as fast as it is told to, at each rate in a lab of its own. Of every
+packet N frames are captured: one where it left, and one at each of the others. `dropped` is the share that the files
+lack, by the kernel's count; `processor_us` is the capture's processor time for one frame, with all that it writes. The
+last row is as fast as the sender can.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks.rounds import Spread, show
+from netem import probe
+from netem.capture import Capture
+from netem.errors import CaptureError
+from netem.lab import Lab, LabError
+
+_PORT = 14600
+_RATES = (5_000, 10_000, 20_000, 40_000)
+_BURST = 20  # of netem.probe, between two pauses
+_FASTEST = 0
+_FASTEST_PACKETS = 200_000
+
+_FORMS = {"packets_per_s": ".0f", "frames_per_s": ".0f", "dropped": ".3f", "processor_us": ".1f"}
+
+_Row = dict[str, Any]
+
+
+async def once(vehicles: int, rate: int, packets: int, size: int, folder: Path) -> dict[str, float]:
+    """Broadcast that many packets of `size` bytes of data; `rate` a second, or 0: as fast as possible."""
+    captures = folder / f"{rate}-{time.monotonic_ns()}"
+    captures.mkdir()
+    async with await Lab.open(range(1, vehicles + 1), log=folder / "lab.log") as lab:
+        capture = await Capture.start(lab, captures)
+        await capture.begin(time.time_ns() // 1000, 1)
+        seconds = await _broadcast(lab, packets, size, _pause_s(rate), folder)
+        counted = (await capture.stop()).values()
+    for path in captures.glob("*.pcapng"):
+        path.unlink()
+    received, dropped = (sum(one[key] for one in counted) for key in ("received", "dropped"))
+    return {
+        "packets_per_s": packets / seconds,
+        "frames_per_s": received / seconds,
+        "dropped": dropped / received,
+        "processor_us": capture.processor_s / (received - dropped) * 1e6,
+    }
+
+
+def _pause_s(rate: int) -> float:
+    """A packet itself takes about 20 us."""
+    return max(0.0, _BURST / rate - _BURST * 20e-6) if rate else 0.0
+
+
+async def _broadcast(lab: Lab, packets: int, size: int, pause_s: float, folder: Path) -> float:
+    """Seconds that it took."""
+    numbers = (_PORT, packets, 0, lab.broadcast, size, pause_s)
+    argv = [sys.executable, "-I", "-S", probe.__file__, "broadcast", *map(str, numbers)]
+    output = folder / "broadcast.log"
+    start = time.perf_counter()
+    sender = await lab.spawn(1, argv, cwd=folder, env=dict(os.environ), stdout=output, stderr=output)
+    if (status := await sender.wait()) != 0:
+        raise LabError(f"The sender ended with status {status}")
+    return time.perf_counter() - start
+
+
+def row(vehicles: int, rate: int, seconds: float, size: int, rounds: int, folder: Path) -> _Row:
+    packets = round(rate * seconds) or _FASTEST_PACKETS
+    found = [asyncio.run(once(vehicles, rate, packets, size, folder)) for _ in range(rounds)]
+    figures = {key: Spread.of(one[key] for one in found) for key in found[0]}
+    return {"asked_per_s": rate or "fastest", **figures}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--vehicles", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=5.0, help="at each rate")
+    parser.add_argument("--bytes", type=int, default=300, help="of data in each packet")
+    parser.add_argument("--rounds", type=int, default=3, help="median and spread are shown")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            rows = [
+                row(options.vehicles, rate, options.seconds, options.bytes, options.rounds, Path(folder))
+                for rate in (*_RATES, _FASTEST)
+            ]
+    except (LabError, CaptureError) as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(3)
+    show(rows, _FORMS, options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""The program that captures: `python -m netem.tap FOLDER VEHICLE...`, in the lab's own network, where the ports are.
+
+It says "ready" as soon as every port is tapped. What crosses the ports then waits in memory until SIGUSR1 says that
+FOLDER/<ID>.pcapng have been begun, and is appended to them. On SIGTERM no more is let in; what there is is written, and
+how much that was: last in each file, and for all in one JSON object on standard output. On a port directions are the
+switch's; in a file they are the vehicle's.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from netem import addresses
+from netem.pcapng import PcapngFile
+from netem.ring import BLOCK_BYTES, RETIRE_MS, Ring
+
+_MEMORY = 256 << 20
+"""Bytes of all rings together, at most: the faster one port is, the slower are the others, on one machine."""
+_RING_MEMORY = 16 << 20
+"""Bytes of one ring, at most: a second of 10,000 of the largest frames."""
+_FEWEST_BLOCKS = 4  # of a ring, even if that is more for all
+_DRAIN_S = 5.0
+"""After a block's age at most, if the kernel keeps its word."""
+
+
+class Tap:
+    """One vehicle's port, and its file."""
+
+    def __init__(self, vehicle: int, blocks: int) -> None:
+        self.vehicle = vehicle
+        self.ring = Ring(addresses.port(vehicle), blocks)
+
+    def open(self, folder: Path) -> None:
+        self._file = PcapngFile(folder / f"{self.vehicle}.pcapng")
+
+    def write(self) -> None:
+        """Raises OSError."""
+        for at_ns, frame, leaves_port in self.ring.take():
+            self._file.packet(at_ns, frame, outbound=not leaves_port)
+        self._file.flush()
+
+    def end(self) -> dict[str, int]:
+        """Raises OSError."""
+        counted = {"received": self.ring.received, "dropped": self.ring.received - self._file.packets}
+        self._file.statistics(time.time_ns(), **counted)
+        self._file.close()
+        return counted
+
+
+def capture(folder: Path, vehicles: Sequence[int]) -> None:
+    """Raises OSError."""
+    asked, wake = socket.socketpair()
+    for number in (signal.SIGUSR1, signal.SIGTERM):
+        signal.signal(number, lambda number, _: wake.send(bytes([number])))
+    blocks = max(_FEWEST_BLOCKS, min(_RING_MEMORY, _MEMORY // len(vehicles)) // BLOCK_BYTES)
+    taps = [Tap(vehicle, blocks) for vehicle in vehicles]
+    _say("ready")
+    if asked.recv(1)[0] == signal.SIGTERM:
+        _say_what_was_counted({})  # the mission never began
+        return
+    for tap in taps:
+        tap.open(folder)
+    while not select.select([asked], [], [], RETIRE_MS / 1000)[0]:
+        for tap in taps:
+            tap.write()
+    for tap in taps:
+        tap.ring.stop()
+    deadline = time.monotonic() + _DRAIN_S
+    waiting = 1
+    while waiting and time.monotonic() < deadline:
+        time.sleep(RETIRE_MS / 1000)
+        for tap in taps:
+            tap.write()
+        waiting = sum(tap.ring.count() for tap in taps)
+    _say_what_was_counted({tap.vehicle: tap.end() for tap in taps})
+
+
+def _say_what_was_counted(vehicles: Mapping[int, Mapping[str, int]]) -> None:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    _say({"vehicles": vehicles, "processor_s": used.ru_utime + used.ru_stime})
+
+
+def _say(what: object) -> None:
+    """One line of JSON on standard output."""
+    sys.stdout.write(f"{json.dumps(what)}\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    try:
+        capture(Path(sys.argv[1]), [int(vehicle) for vehicle in sys.argv[2:]])
+    except OSError as error:
+        sys.exit(f"{error.strerror}{f': {error.filename}' if error.filename else ''}")
+
+
+if __name__ == "__main__":
+    main()
