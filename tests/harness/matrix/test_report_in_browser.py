@@ -1,6 +1,5 @@
 """The matrix report in a real browser: cells lead to their runs by mouse and by key, without any script."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -10,19 +9,13 @@ from harness.matrix import outputs
 from harness.matrix.nights import Nights
 from tests.harness.matrix.stub import matrix, played
 from tests.harness.matrix.test_report import breaks, over
-from tests.harness.report.browser import Browser, open_browser
+from tests.harness.report.browser import Browser
 
 ANCHOR = "loss-0.5-agents-10-sim"
 TILE = f"document.querySelector('.of-uniform .tile[href=\"#{ANCHOR}\"]')"
 SHOWN = "[...document.querySelectorAll('{}')].filter(one => one.checkVisibility()).map(one => one.{})"
 RUNS = SHOWN.format(".runs", "id")
 FIGURES = SHOWN.format(".figure h3", "textContent")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with open_browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

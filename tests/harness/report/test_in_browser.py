@@ -1,6 +1,5 @@
 """The report in a real browser: nothing to complain about, nothing cut off, and the keyboard is enough."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -8,7 +7,7 @@ import pytest
 
 from harness.report import write_report
 from harness.scenario import Scenario
-from tests.harness.report.browser import Browser, chromium_or_skip, open_browser
+from tests.harness.report.browser import Browser, chromium_or_skip
 from tests.harness.report.flights import split_and_rejoin, write_flight
 from tests.harness.report.runs import write_run
 
@@ -31,12 +30,6 @@ TAGS_THAT_DO_NOT_FIT = """
   return text.x < box.x || text.x + text.width > box.x + box.width;
 }).map(t => t.textContent)
 """
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with open_browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module", params=["disconnected", "twenty"])

@@ -1,6 +1,5 @@
 """The timeline in a real browser: its script runs, zooms by button, key and mouse, and draws messages."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -8,7 +7,7 @@ import pytest
 
 from harness.progress import Silent
 from harness.run import run
-from tests.harness.report.browser import Browser, open_browser
+from tests.harness.report.browser import Browser
 from tests.harness.report.test_timeline import TROUBLED
 from tests.harness.virtual import scenario
 
@@ -16,12 +15,6 @@ VIEW = "[...document.querySelectorAll('.view')].map(v => v.getAttribute('viewBox
 PRESS = "document.querySelector('.timeline [data-do={}]').click()"
 ARROWS = "document.querySelectorAll('.arrow').length"
 SAID = "document.querySelector('.timeline output').textContent"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with open_browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")
