@@ -99,7 +99,7 @@ def _ip(*commands: str) -> None:
 def switch(engine: type[Engine] | None) -> Link:
     """As `netem.init` makes it; raises EngineError where the engine does not work."""
     namespaces.unshare_network()
-    fabric = Fabric([1, 2])
+    fabric = Fabric([1, 2], {})
     if engine is not None:
         engine(fabric)
     return Link(engine.name if engine else "switch", fabric.inside)

@@ -12,6 +12,7 @@ import typer
 from harness.commands import sitl
 from harness.commands.chain import chain_command
 from harness.commands.check import check_command
+from harness.commands.clean import clean_command
 from harness.commands.diff import diff_command
 from harness.commands.doctor import doctor_command
 from harness.commands.explore import explore_command
@@ -38,6 +39,7 @@ app.command("packets")(packets_command)
 app.command("matrix")(matrix_command)
 app.command("explore")(explore_command)
 app.command("scale")(scale_command)
+app.command("clean")(clean_command)
 app.command("doctor")(doctor_command)
 app.add_typer(sitl.app, name="sitl")
 

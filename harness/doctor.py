@@ -33,7 +33,7 @@ def examine() -> list[Finding]:
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
     )
     lab = [Finding(one.name, one.ok, one.needed, one.detail, one.way_out) for one in lab_doctor.examine()]
-    return [python, *lab, _user_mode_linux(), _ardupilot()]
+    return [python, *lab, _user_mode_linux(), _docker(), _ardupilot()]
 
 
 def _user_mode_linux() -> Finding:
@@ -42,6 +42,21 @@ def _user_mode_linux() -> Finding:
         return Finding("User Mode Linux", True, False, f"{uml.find()}, for {use}")
     except UmlError as error:
         return Finding("User Mode Linux", False, False, str(error), f"with it there is {use}")
+
+
+def _docker() -> Finding:
+    from harness.backends.containers import backend
+    from harness.backends.containers.engine import DockerError, Engine
+
+    use = "--backend docker: vehicles and agents in containers"
+    try:
+        engine = Engine.connect()
+        version = engine.api.version()["Version"]
+        engine.close()
+        backend.require_root()
+    except DockerError as error:
+        return Finding("Docker", False, False, str(error), f"with it there is {use}")
+    return Finding("Docker", True, False, f"{version}, for {use}")
 
 
 def _ardupilot() -> Finding:

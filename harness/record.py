@@ -4,12 +4,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from harness.backend import Backend
 from harness.scenario import Scenario
 
 SCHEMA = "ucp-run/1"
-
-Backend = Literal["process", "sim"]
-"""Real processes in a private network, or virtual time."""
 
 
 class _Model(BaseModel):

@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from harness import checker, mission, report
+from harness.backend import Backend
 from harness.backends.agent_process import agent_command
-from harness.backends.process import ProcessRun
+from harness.backends.lab import OpenLab
+from harness.backends.process import ProcessRun, open_lab
 from harness.backends.rehearsal import refuse_what_needs_virtual_time, refuse_what_this_machine_cannot
 from harness.backends.simulation import refuse_what_needs_processes
 from harness.backends.vehicle_process import VehicleFailedError
@@ -24,7 +26,7 @@ from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, 
 from harness.lateness import Lateness, lateness
 from harness.mission import Played, Story
 from harness.progress import Progress
-from harness.record import Backend, RunRecord, Survival
+from harness.record import RunRecord, Survival
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.simulate import simulate_into
@@ -125,7 +127,7 @@ class Recording:
         except RunDirectoryError as error:
             raise MachineError(f"{error}; run.json has the verdict") from None
         status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)
-        late = lateness(evidence.traces.values()) if self._record.backend == "process" else None
+        late = None if self._record.backend == "sim" else lateness(evidence.traces.values())
         return Run(self.directory.path, played, result, survived, status, wall_s, page, late)
 
     def _update(self, **keys: Any) -> None:
@@ -150,12 +152,29 @@ def prepare(scenario: Scenario, seed: int, backend: Backend, story: Story | None
     refuse_what_needs_virtual_time(scenario)
     refuse_what_this_machine_cannot(scenario)
     kinds = choose_vehicles(scenario)
-    agent_command(scenario)
+    opener, command = _made_of_containers(scenario) if backend == "docker" else (open_lab, agent_command(scenario))
     # Another run is another mission: its blocks must not be taken for this one's.
     initial_data = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
     return lambda rundir, progress, interrupted: ProcessRun(
-        scenario, seed, kinds, initial_data, rundir, progress, interrupted, keeps_disks=story is not None
+        scenario,
+        seed,
+        kinds,
+        initial_data,
+        rundir,
+        progress,
+        interrupted,
+        agent_command=command,
+        open_lab=opener,
+        keeps_disks=story is not None,
     ).play(told)
+
+
+def _made_of_containers(scenario: Scenario) -> tuple[OpenLab, list[str]]:
+    """What opens the lab, and what starts an agent there. Raises HarnessError."""
+    from harness.backends.containers import backend  # the docker SDK takes its time, which others need not wait
+
+    backend.refuse_what_docker_cannot(scenario)
+    return backend.open_lab, backend.agent_command(scenario)
 
 
 async def _until_interrupted(play: Play, directory: RunDirectory, progress: Progress) -> Played:

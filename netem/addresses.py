@@ -10,6 +10,7 @@ from __future__ import annotations
 MIN_ID = 1
 MAX_ID = 0xFFFF
 
+NETWORK = "10.76.0.0"
 PREFIX_LENGTH = 14
 BROADCAST = "10.79.255.255"
 

@@ -140,7 +140,7 @@ class Channel:
 def _exception(what: str, error: dict[str, Any]) -> Exception:
     message, kind, code = error["message"], error["kind"], error["errno"]
     if what == "spawn" and kind == "os":
-        return SpawnError(f"The program could not be started: {message}")
+        return SpawnError(message)
     if what == "connect" and kind == "os":
         # OSError with a number is of the right class: ConnectionRefusedError, TimeoutError.
         found = OSError(code, message.split("] ", 1)[-1])

@@ -3,14 +3,15 @@
 A vehicle sees `eth0` with its address and a default route on it (ArduPilot built with CAN needs a route
 for its multicast). The other end, `v<ID>`, is a port of the bridge in the lab's own namespace, where the
 engines meet every packet on its way to that vehicle. The vehicles' namespaces have no names: they live as
-long as this process holds them open or someone lives in them.
+long as this process holds them open or someone lives in them. One that is there already, a container's, can
+be a vehicle's too: the cable then ends in it.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -39,15 +40,15 @@ _CARRIER_DEADLINE_S = 5.0
 class Fabric:
     """The lab's network; built in the network namespace that the calling thread is in."""
 
-    def __init__(self, vehicles: Sequence[int]) -> None:
+    def __init__(self, vehicles: Sequence[int], networks: Mapping[int, int]) -> None:
         self.vehicles = tuple(vehicles)
         self.home = namespaces.open_network()
         self.netlink = Netlink()
-        self._namespaces: dict[int, int] = {}
+        self._namespaces = dict(networks)
         _silence_ipv6()
         _bypass_firewall()
         self.netlink.send([_link("lo", index=_LO), _bridge()])
-        inside = {vehicle: self._new_namespace(vehicle) for vehicle in self.vehicles}
+        inside = {vehicle: self._namespace(vehicle) for vehicle in self.vehicles}
         self.netlink.send([self._cable(vehicle) for vehicle in self.vehicles])
         for vehicle, netlink in inside.items():
             netlink.send(_configure(vehicle))
@@ -62,11 +63,14 @@ class Fabric:
         """Run a block in a vehicle's network, or in the lab's own for None."""
         return namespaces.inside(self.home if vehicle is None else self._namespaces[vehicle], self.home)
 
-    def _new_namespace(self, vehicle: int) -> Netlink:
-        """Make a vehicle's namespace, and return a netlink socket that stays in it."""
-        namespaces.unshare_network()
-        try:
+    def _namespace(self, vehicle: int) -> Netlink:
+        """Make a vehicle's namespace, if there is none yet, and return a netlink socket that stays in it."""
+        if vehicle in self._namespaces:
+            namespaces.enter_network(self._namespaces[vehicle])
+        else:
+            namespaces.unshare_network()
             self._namespaces[vehicle] = namespaces.open_network()
+        try:
             _silence_ipv6()
             return Netlink()
         finally:

@@ -151,7 +151,10 @@ class Server:
     def _build(self, message: dict[str, Any]) -> dict[str, Any]:
         if self._fabric is not None:
             raise NetemError("The lab is open already")
-        self._fabric = Fabric(message["vehicles"])
+        networks = {int(vehicle): descriptor for vehicle, descriptor in message["networks"].items()}
+        for descriptor in networks.values():
+            os.set_inheritable(descriptor, False)
+        self._fabric = Fabric(message["vehicles"], networks)
         try:
             self._engine, reason = choice.choose(message["engine"], self._fabric, message["needs"])
         except EngineError as error:

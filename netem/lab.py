@@ -30,7 +30,7 @@ from netem import addresses, namespaces
 from netem.channel import Channel
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
-from netem.errors import ConditionsError, LabError, LabUnavailable
+from netem.errors import ConditionsError, LabError, LabUnavailable, SpawnError
 
 EngineName = Literal["netem", "nftables"]
 
@@ -59,6 +59,11 @@ class LabProcess:
         """None while it runs; then its exit status, or minus the signal that killed it (subprocess)."""
         return self._ended.result() if self._ended.done() else None
 
+    @property
+    def end(self) -> str:
+        """How it ended, for people: the name of the signal that killed it, or its exit status."""
+        return in_words(self._ended.result())
+
     async def wait(self) -> int:
         """Wait for its end; -SIGKILL if it ended with the lab."""
         return await asyncio.shield(self._ended)
@@ -68,10 +73,17 @@ class LabProcess:
         if not self._ended.done():
             await self._channel.ask("signal", pid=self.pid, signal=int(number))
 
+    async def pause(self) -> None:
+        """SIGSTOP: it stands still until `resume`."""
+        await self.send_signal(signal.SIGSTOP)
+
+    async def resume(self) -> None:
+        await self.send_signal(signal.SIGCONT)
+
     async def terminate(self, grace_s: float) -> int:
         """End it with SIGTERM, or after `grace_s` seconds with SIGKILL; returns its return code."""
         await self.send_signal(signal.SIGTERM)
-        await self.send_signal(signal.SIGCONT)  # a stopped process could not obey
+        await self.resume()  # a stopped process could not obey
         try:
             return await asyncio.wait_for(self.wait(), grace_s)
         except TimeoutError:
@@ -93,19 +105,28 @@ class Lab:
 
     @classmethod
     async def open(
-        cls, vehicles: Sequence[int], *, engine: EngineName | None = None, needs: Sequence[str] = (), log: Path
+        cls,
+        vehicles: Sequence[int],
+        *,
+        engine: EngineName | None = None,
+        needs: Sequence[str] = (),
+        networks: Mapping[int, int] | None = None,
+        log: Path,
     ) -> Lab:
         """Bring up a lab for these vehicle IDs (1..65535); `log` takes what its first process says.
 
-        `needs` is what conditions will ask beyond loss and partition (`NetworkConditions.needs`). Raises
-        LabUnavailable if this machine cannot, or cannot with the engine asked for or with one that does all that.
+        `needs` is what conditions will ask beyond loss and partition (`NetworkConditions.needs`). `networks` are
+        descriptors of network namespaces that vehicles have already (root only); they stay the caller's to close.
+        Raises LabUnavailable if this machine cannot, or cannot with the engine asked for or with one that does all
+        that.
         """
         ids = _checked(vehicles)
+        given = dict(networks or {})
         word = ""
-        for user_namespace in namespaces.ways_in():
-            lab = await cls._enter(ids, user_namespace, log)
+        for user_namespace in (False,) if given else namespaces.ways_in():
+            lab = await cls._enter(ids, user_namespace, given, log)
             try:
-                refusal = await asyncio.wait_for(lab._start(engine, needs, log), _OPEN_DEADLINE_S)
+                refusal = await asyncio.wait_for(lab._start(engine, needs, given, log), _OPEN_DEADLINE_S)
             except TimeoutError:
                 await lab.close()
                 raise LabError(f"The lab was not up within {_OPEN_DEADLINE_S:g} s; see {log}") from None
@@ -121,7 +142,9 @@ class Lab:
         )
 
     @classmethod
-    async def _enter(cls, vehicles: tuple[int, ...], user_namespace: bool, log: Path) -> Lab:
+    async def _enter(
+        cls, vehicles: tuple[int, ...], user_namespace: bool, networks: Mapping[int, int], log: Path
+    ) -> Lab:
         ours, theirs = socket.socketpair()
         argv = namespaces.command(
             [sys.executable, "-P", "-m", "netem.init", str(theirs.fileno())],
@@ -138,7 +161,7 @@ class Lab:
                     stdout=output,
                     stderr=output,
                     env={**os.environ, "PYTHONPATH": path},
-                    pass_fds=[theirs.fileno()],
+                    pass_fds=[theirs.fileno(), *networks.values()],
                     start_new_session=True,  # the terminal's Ctrl-C is for the orchestrator alone
                 )
         except FileNotFoundError as error:
@@ -150,7 +173,9 @@ class Lab:
             raise
         return cls(vehicles, process, Channel(ours, log))
 
-    async def _start(self, engine: EngineName | None, needs: Sequence[str], log: Path) -> str | None:
+    async def _start(
+        self, engine: EngineName | None, needs: Sequence[str], networks: Mapping[int, int], log: Path
+    ) -> str | None:
         """Build the network; returns the word of the tool if it could not even get into namespaces."""
         if not await self._channel.inside():
             await self.close()
@@ -159,7 +184,9 @@ class Lab:
                 return word
             raise LabError(f"The lab's first process ended before it began ({word}); see {log}")
         try:
-            result, _ = await self._channel.ask("open", vehicles=self.vehicles, engine=engine, needs=[*needs])
+            result, _ = await self._channel.ask(
+                "open", vehicles=self.vehicles, engine=engine, needs=[*needs], networks={**networks}
+            )
         except LabError as error:
             if not self._channel.open:
                 raise
@@ -179,6 +206,11 @@ class Lab:
         self.engine_reason = result["reason"]
         return None
 
+    @property
+    def network(self) -> Self:
+        """Itself: where vehicles are made of something else, this lab is beneath theirs."""
+        return self
+
     async def spawn(
         self,
         vehicle: int | None,
@@ -188,15 +220,19 @@ class Lab:
         env: Mapping[str, str],
         stdout: Path,
         stderr: Path,
+        role: str = "program",
     ) -> LabProcess:
         """Start a program in a vehicle's network (None: in the lab's own, which nothing reaches).
 
-        `env` is all of its environment, its output is appended to the files, its input is empty.
-        Raises SpawnError with the operating system's word.
+        `env` is all of its environment, its output is appended to the files, its input is empty; `role` says what it
+        is. Raises SpawnError with the operating system's word.
         """
         self._check_vehicle(vehicle)
         where = {"cwd": str(cwd), "stdout": str(stdout), "stderr": str(stderr)}
-        result, _ = await self._channel.ask("spawn", vehicle=vehicle, argv=[*argv], env={**env}, **where)
+        try:
+            result, _ = await self._channel.ask("spawn", vehicle=vehicle, argv=[*argv], env={**env}, **where)
+        except SpawnError as error:
+            raise SpawnError(f"The {role} could not be started: {error}") from None
         return LabProcess(self._channel, vehicle, result["pid"], result["ended"])
 
     async def connect(self, vehicle: int, port: int, *, host: str = "127.0.0.1", timeout_s: float) -> socket.socket:
@@ -228,6 +264,11 @@ class Lab:
         """What the kernel holds and has counted by now."""
         result, _ = await self._channel.ask("read")
         return Applied.from_json(result)
+
+    async def watch(self) -> None:
+        """Raises LabError when the lab has failed by itself."""
+        await self._process.wait()
+        raise LabError("The lab's first process ended unexpectedly")
 
     async def close(self) -> None:
         """End every process in the lab and remove it; may be called again."""
@@ -262,9 +303,17 @@ def _checked(vehicles: Sequence[int]) -> tuple[int, ...]:
     return ids
 
 
+def in_words(returncode: int) -> str:
+    """How a process ended: "SIGKILL", "status 3"."""
+    if returncode >= 0:
+        return f"status {returncode}"
+    number = -returncode
+    return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"  # real-time ones
+
+
 def _last_line(log: Path) -> str:
     lines = log.read_text(errors="replace").strip().splitlines()
     return lines[-1] if lines else "it said nothing"
 
 
-__all__ = ["EngineName", "Lab", "LabError", "LabProcess", "LabUnavailable"]
+__all__ = ["EngineName", "Lab", "LabError", "LabProcess", "LabUnavailable", "in_words"]

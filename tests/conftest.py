@@ -1,9 +1,9 @@
-"""Tests marked `lab` need private network namespaces: skipped where the machine has none, saying why."""
+"""Tests marked `lab` need private network namespaces, `docker` an engine: skipped where there is none, saying why."""
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.machine import require
+from tests.machine import require, require_docker
 
 # How fast a machine is, is no property of the code.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -14,3 +14,5 @@ settings.load_profile("untimed")
 def _machine_can(request: pytest.FixtureRequest) -> None:
     if request.node.get_closest_marker("lab"):
         require(None)
+    if request.node.get_closest_marker("docker"):
+        require_docker()

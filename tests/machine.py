@@ -1,7 +1,7 @@
 """What this machine can do, for tests that need more than Python.
 
-`UCP_REQUIRE` is a list of "lab", "netem", "nftables", "uml", "browser" and "tshark" (comma between): what it names may
-not be missing, a test that would be skipped for the lack of it fails instead.
+`UCP_REQUIRE` is a list of "lab", "netem", "nftables", "uml", "browser", "tshark" and "docker" (comma between): what it
+names may not be missing, a test that would be skipped for the lack of it fails instead.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from typing import NoReturn
 
 import pytest
 
+from harness.backends.containers.backend import require_root
+from harness.backends.containers.engine import DockerError, Engine
 from netem import uml
 from netem.errors import UmlError
 from netem.lab import Lab, LabUnavailable
@@ -51,6 +53,15 @@ def require_uml() -> None:
         uml.find()
     except UmlError as error:
         do_without("uml", str(error))
+
+
+def require_docker() -> None:
+    """The same of a Docker engine that we may use."""
+    try:
+        Engine.connect().close()
+        require_root()
+    except DockerError as error:
+        do_without("docker", str(error))
 
 
 def require_tshark() -> str:

@@ -1,18 +1,17 @@
-"""One agent under test as a process in its vehicle's namespace: started, asked, exported, stopped.
+"""One agent under test as a program in its vehicle's namespace: started, asked, exported, stopped.
 
 An agent that is killed and begins again, or comes back from a brown-out, has another life: another process, with a
 directory of its own, so that nothing of an earlier life is overwritten, or found by an agent that should have nothing.
 """
 
 import asyncio
-import base64
 import contextlib
-import dataclasses
 import os
 import shutil
 import signal
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,15 +19,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.agents import AgentControl, AgentRefusedError, AgentSilentError, Status
+from harness.backends.lab import Lab, Program
+from harness.backends.mission_file import mission_file
 from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
-from harness.seeds import agent_seed
 from harness.traces import SUFFIX, read_trace
-from netem.lab import Lab, LabProcess
-from sitl.vehicle import AGENT_PORT
-from ucp.messages import PORT
-from ucp.mission import SCHEMA as MISSION_SCHEMA
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
@@ -80,13 +76,14 @@ class _Life:
 class AgentProcess:
     """`status` is the agent's last, None while it has none; `outcome` is what became of it, for run.json."""
 
-    def __init__(self, agent_id: int, rundir: RunDirectory) -> None:
+    def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str]) -> None:
         self.agent_id = agent_id
+        self._command = command
         self.outcome = "not started"
         self.detail: str | None = None
         self._rundir = rundir
         self._lives: list[_Life] = []
-        self._process: LabProcess | None = None
+        self._process: Program | None = None
         self._being_asked = asyncio.Lock()
         """Nobody stops or kills it while it is asked for its status."""
         self._completed_before: list[str] = []
@@ -117,29 +114,35 @@ class AgentProcess:
         keeps_disk: bool,
         epoch_us: int | None = None,
     ) -> None:
-        """Start the process and wait until it answers; with `epoch_us` it joins the mission that began then.
+        """Start the program and wait until it answers; with `epoch_us` it joins the mission that began then.
 
         With `keeps_disk` it stores what it holds, to be rebooted with it.
         Raises AgentFailedError, AgentRefusedError.
         """
         life = self._begin_life()
-        mission = {
-            **_mission(self.agent_id, lab, scenario, with_vehicle),
-            "initial_data": base64.b64encode(initial_data).decode("ascii"),
-            "seed": agent_seed(seed, self.agent_id, len(self._lives)),
-            "epoch_us": epoch_us,
-            "store": os.path.relpath(life.store, life.directory) if keeps_disk else None,
-        }
+        mission = mission_file(
+            self.agent_id,
+            scenario,
+            seed,
+            initial_data,
+            address=lab.addresses[self.agent_id],
+            broadcast=lab.broadcast,
+            with_vehicle=with_vehicle,
+            life=len(self._lives),
+            epoch_us=epoch_us,
+            store=os.path.relpath(life.store, life.directory) if keeps_disk else None,
+        )
         path = self._rundir.write_mission(life.directory, self.agent_id, mission)
         output = self._log
         self._control = AgentControl(self._control_path)
         self._process = await lab.spawn(
             self.agent_id,
-            [*agent_command(scenario), path.name],
+            [*self._command, path.name],
             cwd=life.directory,
             env=dict(os.environ),
             stdout=output,
             stderr=output,
+            role="agent",
         )
         await self._wait_until_it_answers(self._process)
         self.outcome = "running"
@@ -151,7 +154,7 @@ class AgentProcess:
         self._lives.append(_Life(directory, store, reboot=kept))
         return self._lives[-1]
 
-    async def _wait_until_it_answers(self, process: LabProcess) -> None:
+    async def _wait_until_it_answers(self, process: Program) -> None:
         deadline = asyncio.get_running_loop().time() + START_LIMIT_S
         while True:
             try:
@@ -159,7 +162,7 @@ class AgentProcess:
                 return
             except AgentSilentError:
                 if process.returncode is not None:
-                    raise self._crashed(process.returncode) from None
+                    raise self._crashed(process) from None
                 if asyncio.get_running_loop().time() > deadline:
                     raise self._failed("hung", f"did not answer within {START_LIMIT_S:g} s of its start") from None
                 await asyncio.sleep(ASK_AGAIN_S)
@@ -167,7 +170,8 @@ class AgentProcess:
     async def watch(self) -> None:
         """Raises AgentFailedError when the process ends."""
         assert self._process is not None
-        raise self._crashed(await self._process.wait())
+        await self._process.wait()
+        raise self._crashed(self._process)
 
     async def kill(self, *, disk_kept: bool = False) -> None:
         """SIGKILL, which no agent survives; what it held is gone but for its disk, if that is kept.
@@ -186,15 +190,15 @@ class AgentProcess:
             self._control_path.unlink(missing_ok=True)
 
     async def pause(self) -> None:
-        """SIGSTOP: it stands still, and what reaches it waits in its socket, as much as fits there."""
+        """It stands still, and what reaches it waits in its socket, as much as fits there."""
         assert self._process is not None
         async with self._being_asked:
-            await self._process.send_signal(signal.SIGSTOP)
+            await self._process.pause()
             self.outcome = "paused"
 
     async def resume(self) -> None:
         assert self._process is not None
-        await self._process.send_signal(signal.SIGCONT)
+        await self._process.resume()
         self.outcome = "running"
 
     # What it is asked
@@ -206,16 +210,15 @@ class AgentProcess:
         except AgentRefusedError as error:
             raise AgentRefusedError(f"agent {self.agent_id} refused to {command}: {error}") from None
         except AgentSilentError as error:
-            if (returncode := await self._ended()) is not None:
-                raise self._crashed(returncode) from None
+            if self._process is not None and await self._has_ended(self._process):
+                raise self._crashed(self._process) from None
             raise self._failed("hung", f"stopped answering: {error}") from None
 
-    async def _ended(self) -> int | None:
-        """The return code if the process has ended, of which one hears a moment after its connection is lost."""
-        if self._process is not None:
-            with contextlib.suppress(TimeoutError):
-                return await asyncio.wait_for(self._process.wait(), MOMENT_S)
-        return None
+    async def _has_ended(self, process: Program) -> bool:
+        """Of which one hears a moment after its connection is lost."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(process.wait(), MOMENT_S)
+        return process.returncode is not None
 
     async def poll(self) -> Status | None:
         """Ask for the status; None of an agent that is dead or paused. Raises AgentFailedError."""
@@ -307,9 +310,8 @@ class AgentProcess:
     def _log(self) -> Path:
         return self._lives[-1].directory / f"{self.agent_id}.log"
 
-    def _crashed(self, returncode: int) -> AgentFailedError:
-        how = signal.Signals(-returncode).name if returncode < 0 else f"status {returncode}"
-        return self._failed("crashed", f"ended by itself with {how}")
+    def _crashed(self, process: Program) -> AgentFailedError:
+        return self._failed("crashed", f"ended by itself with {process.end}")
 
     def _failed(self, outcome: str, detail: str) -> AgentFailedError:
         self.outcome, self.detail = outcome, detail
@@ -319,25 +321,3 @@ class AgentProcess:
 def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:
     """Whether the scenario ever asks for what is on the agent's disk."""
     return any(entry.disk == "kept" and agent_id in (entry.reboot or ()) for entry in scenario.timeline)
-
-
-def _mission(agent_id: int, lab: Lab, scenario: Scenario, with_vehicle: bool) -> dict[str, Any]:
-    """The part of its mission file that does not change from life to life."""
-    events = scenario.events
-    return {
-        "schema": MISSION_SCHEMA,
-        "agent_id": agent_id,
-        "roster": list(scenario.roster),
-        "network": {"address": lab.addresses[agent_id], "broadcast": lab.broadcast, "port": PORT},
-        "events": {
-            "source": events.source if with_vehicle else "random",
-            "mean_s": events.mean_s,
-            "position_interval_s": events.position_interval_s,
-            "log": list(events.log),
-            "vehicle_host": "127.0.0.1",
-            "vehicle_port": AGENT_PORT,
-        },
-        "settings": dataclasses.asdict(scenario.settings),
-        "quirks": dataclasses.asdict(scenario.quirks),
-        "speedup": scenario.speedup,
-    }

@@ -1,4 +1,4 @@
-"""The process backend: a scenario played by real processes in a real, private network.
+"""The process and Docker backends: a scenario played by real programs in a real, private network.
 
 Build the lab, start vehicles and agents and the mission's clock, play the mission while watching everybody, export,
 stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and still exports what there is.
@@ -7,12 +7,13 @@ stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and s
 import asyncio
 import time
 from collections import defaultdict
-from collections.abc import Awaitable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from harness.agents import Status
 from harness.backends.agent_process import AgentFailedError, AgentProcess, reboots_with_disk
+from harness.backends.lab import Lab, OpenLab
 from harness.backends.rehearsal import network_needs
 from harness.backends.vehicle_process import VehicleProcess, system_ids
 from harness.errors import HarnessError, InterruptedRunError, MachineError
@@ -25,7 +26,7 @@ from harness.timeline import AgentFault, Change, NetworkChange, describe
 from netem.capture import Capture
 from netem.conditions import NetworkConditions
 from netem.errors import CaptureError, LabUnavailable, NetemError
-from netem.lab import Lab
+from netem.lab import Lab as ProcessLab
 from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
 from ucp.clock import MICROSECONDS, MissionClock
 
@@ -36,9 +37,15 @@ FOLLOW_S = 0.1
 """Wall time between two looks at where the vehicles are, at least."""
 
 
+async def open_lab(scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> Lab:
+    """The lab of processes. Raises NetemError."""
+    return await ProcessLab.open(scenario.roster, needs=network_needs(scenario), log=rundir.lab_log)
+
+
 class ProcessRun:
     """One run; `play` it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early.
 
+    `open_lab` says what vehicles and agents are made of, `agent_command` what starts an agent there.
     With `keeps_disks` every agent has a disk that it can be rebooted with, else those that the scenario reboots so.
     """
 
@@ -52,6 +59,8 @@ class ProcessRun:
         progress: Progress,
         interrupted: asyncio.Event,
         *,
+        agent_command: Sequence[str],
+        open_lab: OpenLab = open_lab,
         keeps_disks: bool = False,
     ) -> None:
         self.scenario = scenario
@@ -62,9 +71,10 @@ class ProcessRun:
         self.interrupted = interrupted
         self.played = Played()
         self._kinds = kinds
+        self._open_lab = open_lab
         self._keeps_disks = keeps_disks
         self._system_ids = system_ids(scenario.roster)
-        self.agents = [AgentProcess(agent_id, rundir) for agent_id in scenario.roster]
+        self.agents = [AgentProcess(agent_id, rundir, agent_command) for agent_id in scenario.roster]
         self.vehicles = [self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds]
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
@@ -83,9 +93,14 @@ class ProcessRun:
         return VehicleProcess(vehicle_id, self._system_ids[vehicle_id], kind, self.rundir, life)
 
     async def play(self, story: Story) -> Played:
-        """Raises MachineError if this machine cannot build the lab; all else that goes wrong is in the answer."""
+        """Raises HarnessError if there is no lab, MachineError if this machine cannot build it.
+
+        All else that goes wrong is in the answer.
+        """
         try:
-            lab = await Lab.open(self.scenario.roster, needs=network_needs(self.scenario), log=self.rundir.lab_log)
+            lab = await self._unless_interrupted(self._open_lab(self.scenario, self.rundir, self._show))
+        except HarnessError:
+            raise
         except LabUnavailable as error:
             raise MachineError(str(error)) from None
         except NetemError as error:
@@ -106,11 +121,25 @@ class ProcessRun:
             await self._wind_up(lab)
         return self.played
 
+    async def _unless_interrupted(self, opening: Awaitable[Lab]) -> Lab:
+        """Raises InterruptedRunError, once what was begun has been taken back."""
+        opened = asyncio.ensure_future(opening)
+        interruption = asyncio.create_task(self.interrupted.wait())
+        await asyncio.wait({opened, interruption}, return_when=asyncio.FIRST_COMPLETED)
+        interruption.cancel()
+        if not opened.done():
+            opened.cancel()
+            await asyncio.wait({opened})
+        if opened.cancelled():
+            raise InterruptedRunError("the run was interrupted before it began")
+        return opened.result()
+
     async def _guarded(self, story: Awaitable[None]) -> None:
         """Run the mission; the first failure of anything, or the user's interruption, ends it and is raised."""
         try:
             async with asyncio.TaskGroup() as self._group:
                 self._watch(self._watch_for_interruption())
+                self._watch(self._lab.watch())
                 await story
                 for what in list(self._watchers):
                     self._watch_no_more(what)
@@ -145,7 +174,7 @@ class ProcessRun:
         await self._start_agents(self._lab)
         await self.apply(first)
         if self.scenario.capture:
-            self._capture = await Capture.start(self._lab, self.rundir.capture())
+            self._capture = await Capture.start(self._lab.network, self.rundir.capture())
             self._watch(self._capture.watch())
         await self._start_clock()
         self._watch(self._poll_agents())
@@ -355,6 +384,10 @@ class ProcessRun:
         except OSError as error:
             self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
         await self._end_capture()
+        try:
+            await lab.close()
+        except NetemError as error:
+            self._ended_early(MachineError(str(error)))
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
 
     async def _end_capture(self) -> None:

@@ -1,4 +1,4 @@
-"""One vehicle as a process in its own namespace, and the pilot that flies it."""
+"""One vehicle as a program in its own namespace, and the pilot that flies it."""
 
 import asyncio
 import contextlib
@@ -8,9 +8,9 @@ from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
+from harness.backends.lab import Lab, Program
 from harness.errors import HarnessError
 from harness.rundir import RunDirectory
-from netem.lab import Lab, LabProcess
 from netem.radio import Place
 from sitl.pilot import Pilot
 from sitl.plan import By, Plan
@@ -50,7 +50,7 @@ class VehicleProcess:
         self._given_up = False
         self.pilot: Pilot | None = None
         self._directory = rundir.vehicle(vehicle_id, life)
-        self._process: LabProcess | None = None
+        self._process: Program | None = None
 
     @property
     def _output(self) -> Path:
@@ -70,6 +70,7 @@ class VehicleProcess:
             env={**os.environ, **launch.env},
             stdout=self._output,
             stderr=self._output,
+            role="vehicle",
         )
         await self._connect(lab, launch, speedup)
 
@@ -82,7 +83,7 @@ class VehicleProcess:
                 break
             except (ConnectionError, TimeoutError):
                 if self._process.returncode is not None:
-                    raise self._ended(self._process.returncode) from None
+                    raise self._ended(self._process) from None
                 if asyncio.get_running_loop().time() > deadline:
                     raise VehicleFailedError(
                         f"vehicle {self.vehicle_id} ({self.kind.name}) does not listen on port {launch.pilot_port} "
@@ -118,7 +119,8 @@ class VehicleProcess:
         except VehicleError as error:
             assert self._process is not None
             with contextlib.suppress(TimeoutError):  # a connection ends just before its process does
-                raise self._ended(await asyncio.wait_for(self._process.wait(), ENDING_S)) from None
+                await asyncio.wait_for(self._process.wait(), ENDING_S)
+                raise self._ended(self._process) from None
             self._given_up = True
             await self._process.send_signal(signal.SIGKILL)  # it may spin, or fly on who knows where
             raise VehicleFailedError("; ".join(filter(None, (str(error), self.kind.lack)))) from None
@@ -126,9 +128,9 @@ class VehicleProcess:
     async def watch(self) -> None:
         """Raises VehicleFailedError when the process ends by itself."""
         assert self._process is not None
-        returncode = await self._process.wait()
+        await self._process.wait()
         if not self._given_up:
-            raise self._ended(returncode)
+            raise self._ended(self._process)
 
     async def kill(self) -> None:
         """It is shot down: SIGKILL. Neither watch nor fly it any more before."""
@@ -166,10 +168,9 @@ class VehicleProcess:
                 record["last_text"] = state.texts[-1]
         return record
 
-    def _ended(self, returncode: int) -> VehicleFailedError:
-        how = signal.Signals(-returncode).name if returncode < 0 else f"status {returncode}"
+    def _ended(self, process: Program) -> VehicleFailedError:
         return VehicleFailedError(
-            f"vehicle {self.vehicle_id} ({self.kind.name}) ended by itself with {how}{self._last_words()}"
+            f"vehicle {self.vehicle_id} ({self.kind.name}) ended by itself with {process.end}{self._last_words()}"
         )
 
     def _last_words(self) -> str:

@@ -1,12 +1,12 @@
 """`ucp-harness matrix`: a scenario over loss rates, numbers of agents, backends and seeds."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from harness import matrix
+from harness.backend import Backend
 from harness.commands.terminal import complain, end_sweep
 from harness.matrix import nights as nights_of_matrix
 from harness.matrix import outputs, results, table
@@ -14,11 +14,6 @@ from harness.matrix.baseline import load_baseline
 from harness.matrix.run import compared, on_cluster, on_cores
 from harness.rundir import default_path
 from harness.sweep import cores
-
-
-class Backend(StrEnum):
-    process = "process"
-    sim = "sim"
 
 
 def matrix_command(
@@ -43,7 +38,7 @@ def matrix_command(
     ] = None,
 ) -> None:
     """Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated."""
-    request = matrix.load_matrix(file, backend.value if backend else None)
+    request = matrix.load_matrix(file, backend)
     baseline = load_baseline(against, request) if against else None
     kept = nights_of_matrix.opened(nights) if nights else None
     directory = (out or default_path(request.name)).absolute()

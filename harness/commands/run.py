@@ -10,11 +10,13 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from harness import progress
+from harness.backend import Backend
+from harness.backends.vehicle_process import system_ids
 from harness.commands.terminal import complain, show_result, show_survival
 from harness.errors import HarnessError, ScenarioError
 from harness.kernel import Kernel, run_inside
 from harness.report.capture import gaps
-from harness.run import Run, run
+from harness.run import Run, choose_vehicles, run
 from harness.rundir import default_path
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import explain
@@ -26,11 +28,6 @@ class Vehicles(StrEnum):
     none = "none"
 
 
-class Backend(StrEnum):
-    process = "process"
-    sim = "sim"
-
-
 def run_command(
     scenario: Annotated[Path, typer.Argument(help="Scenario file (YAML).")],
     seed: Annotated[
@@ -39,35 +36,48 @@ def run_command(
     speedup: Annotated[float | None, typer.Option(help="Mission seconds per second of wall time.")] = None,
     vehicles: Annotated[Vehicles | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
     backend: Annotated[
-        Backend, typer.Option(help="Real processes in a private network, or virtual time.")
-    ] = Backend.process,
+        Backend, typer.Option(help="Real processes in a private network, the same in containers, or virtual time.")
+    ] = "process",
     capture: Annotated[
         bool, typer.Option("--capture", help="Keep each frame that a vehicle sent or got, in capture/<ID>.pcapng.")
     ] = False,
+    image_from_host: Annotated[
+        bool, typer.Option("--image-from-host", help="Containers of this machine's own files: no image is built.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="Run directory; must be new or empty.")] = None,
+    emit_compose: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Run nothing: write a docker compose file to start by hand.")
+    ] = None,
     kernel: Annotated[
         Kernel, typer.Option(help="This machine's kernel, or User Mode Linux: it has netem, and needs no rights.")
     ] = Kernel.host,
 ) -> None:
     """Play a scenario, check the six characteristics, write a report."""
     console = Console()
-    request = _with_options(load_scenario(scenario), speedup, vehicles, capture)
+    request = _with_options(load_scenario(scenario), speedup, vehicles, capture, image_from_host)
     directory = (out or default_path(request.name)).absolute()
     chosen_seed = secrets.randbelow(2**32) if seed is None else seed
+    if emit_compose is not None:
+        _emit_compose(console, request, chosen_seed, emit_compose)
+        return
     if kernel is Kernel.uml:
-        if backend is Backend.sim:
+        if backend == "sim":
             raise HarnessError("--kernel uml is for real processes: virtual time, --backend sim, needs no kernel")
+        if backend == "docker":
+            raise HarnessError(
+                "there is no Docker engine in User Mode Linux: leave out --kernel uml, or --backend docker"
+            )
         options = {"--seed": chosen_seed, "--out": directory, "--speedup": speedup, "--vehicles": vehicles}
         given = [f"{option}={value}" for option, value in options.items() if value is not None]
         given += ["--capture"] if capture else []
         console.print("Booting User Mode Linux.", style="dim")
         raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
-    if backend is Backend.sim and request.events.source == "mavlink":
+    if backend == "sim" and request.events.source == "mavlink":
         console.print("Virtual time has no telemetry: events are random (Algorithm 21).", style="dim")
     shown = progress.for_console(console)
     try:
-        finished = run(request, chosen_seed, directory, shown, backend.value)
+        finished = run(request, chosen_seed, directory, shown, backend)
     finally:
         shown.close()
     show_result(console, finished.result)
@@ -76,7 +86,16 @@ def run_command(
     raise typer.Exit(finished.exit_status)
 
 
-def _with_options(scenario: Scenario, speedup: float | None, vehicles: Vehicles | None, capture: bool) -> Scenario:
+def _emit_compose(console: Console, scenario: Scenario, seed: int, file: Path) -> None:
+    from harness.backends.containers.compose import write_compose
+
+    beside = write_compose(scenario, seed, choose_vehicles(scenario), system_ids(scenario.roster), file)
+    console.print(f"{file} and {beside}: docker compose -f {file} up", highlight=False, soft_wrap=True)
+
+
+def _with_options(
+    scenario: Scenario, speedup: float | None, vehicles: Vehicles | None, capture: bool, image_from_host: bool
+) -> Scenario:
     """The scenario as resolved: the command line's word comes before the file's."""
     document: dict[str, Any] = scenario.model_dump()
     if speedup is not None:
@@ -86,6 +105,8 @@ def _with_options(scenario: Scenario, speedup: float | None, vehicles: Vehicles 
     if vehicles is not None:
         document["vehicles"]["kind"] = vehicles.value
     document["capture"] |= capture
+    if image_from_host:
+        document["docker"]["image_from_host"] = True
     try:
         return Scenario.model_validate(document)
     except ValidationError as error:

@@ -40,7 +40,7 @@ class _Run(BaseModel):
     def logged_telemetry(self) -> bool:
         """Events are random where no vehicle flies."""
         scenario = self.scenario
-        return self.backend == "process" and scenario.events.source == "mavlink" and scenario.vehicles.kind != "none"
+        return self.backend != "sim" and scenario.events.source == "mavlink" and scenario.vehicles.kind != "none"
 
 
 @dataclass

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from harness.backend import Backend
 from harness.errors import ScenarioError
-from harness.record import Backend
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Probability
 
@@ -24,7 +24,7 @@ class Point(NamedTuple):
 
     @property
     def file_name(self) -> str:
-        """What its files and directories are called; that of both backends."""
+        """What its files and directories are called; those of all backends."""
         return f"loss-{self.loss}-agents-{self.agents}"
 
 
@@ -60,6 +60,11 @@ class Matrix(Model):
     """One or several."""
     keep: Literal["violated", "all"] = "violated"
     """Of which runs as processes the directories are kept: those that violated a characteristic or failed, or all."""
+
+    @property
+    def needs_processes(self) -> bool:
+        """Whether any run is for real, in containers or without."""
+        return any(backend != "sim" for backend in self.backend)
 
     @property
     def seed_list(self) -> list[int]:

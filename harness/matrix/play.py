@@ -1,4 +1,4 @@
-"""One run of a matrix: in the simulation, or as processes in a run directory of its own."""
+"""One run of a matrix: in the simulation, or as processes or containers in a run directory of its own."""
 
 import shutil
 from collections.abc import Callable, Iterable
@@ -41,7 +41,7 @@ class Player:
     def __call__(self, task: Task) -> Run:
         scenario = self.matrix.scenario_at(task.point)
         simulated = task.point.backend == "sim"
-        result = self.judge(scenario, task.seed) if simulated else self._as_processes(scenario, task)
+        result = self.judge(scenario, task.seed) if simulated else self._for_real(scenario, task)
         verdicts = {number: one.verdict for number, one in result.characteristics.items()}
         return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts)
 
@@ -50,12 +50,12 @@ class Player:
         for point in points:
             prepare(self.matrix.scenario_at(point), 0, point.backend)
 
-    def _as_processes(self, scenario: Scenario, task: Task) -> Result:
+    def _for_real(self, scenario: Scenario, task: Task) -> Result:
         """Raises RunFailedError, which names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # of a run that was broken off
         try:
-            finished = run(scenario, task.seed, directory, Silent(), "process")
+            finished = run(scenario, task.seed, directory, Silent(), task.point.backend)
         except HarnessError as error:  # what every run would meet has been refused
             raise RunFailedError(f"{error}; see {directory}") from None
         if finished.played.outcome == "interrupted":
@@ -68,4 +68,4 @@ class Player:
 
 
 def directory_name(task: Task) -> str:
-    return f"{task.point.file_name}-seed-{task.seed}"
+    return f"{task.point.file_name}-{task.point.backend}-seed-{task.seed}"

@@ -4,6 +4,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from harness.backend import Backend
 from harness.errors import INTERRUPTED, VIOLATED
 from harness.matrix.cell import Cell, Placed
 from harness.matrix.comparison import Comparison
@@ -30,7 +31,7 @@ class MatrixRecord(BaseModel):
 
     schema_: Literal["ucp-matrix/1"] = Field(default="ucp-matrix/1", alias="schema")
     matrix: Matrix
-    backend: Literal["sim", "process", "several"]
+    backend: Backend | Literal["several"]
     versions: dict[str, str]
     started_at: str
     wall_s: float

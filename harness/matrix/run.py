@@ -33,14 +33,14 @@ class Finished:
 
 def on_cores(matrix: Matrix, jobs: int, *, shown: bool = False) -> Spread:
     """So many runs at the same time; with processes among them, no more than there are cores."""
-    if "process" in matrix.backend:
+    if matrix.needs_processes:
         jobs = min(jobs, cores())
     return partial(sweep, jobs=jobs, what="runs" if shown else None, in_order=False)
 
 
 def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
     """On the workers of the Dask scheduler at `address`. Raises ScenarioError for processes."""
-    if "process" in matrix.backend:
+    if matrix.needs_processes:
         raise ScenarioError(
             "--scheduler is for virtual time: runs as processes leave their directories here, so play them without it, "
             "or with --backend sim"

@@ -1,6 +1,6 @@
 """UCP in pytest: the fixtures `swarm` and `scenario`, and scenarios with an `expect:` section as tests by themselves.
 
-pytest loads this module wherever the harness is installed, so it imports nothing of the harness before a test asks.
+pytest loads this module wherever the harness is installed, so it imports hardly anything of it before a test asks.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+
+from harness.backend import BACKENDS
 
 if TYPE_CHECKING:
     from harness.pytest_plugin.findings import Findings
@@ -27,9 +29,7 @@ MARKERS = (
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("ucp", "UCP harness")
-    group.addoption(
-        "--ucp-backend", choices=("sim", "process"), help="Play on this backend, whatever tests and scenarios say."
-    )
+    group.addoption("--ucp-backend", choices=BACKENDS, help="Play on this backend, whatever tests and scenarios say.")
     group.addoption("--ucp-seed", type=int, metavar="N", help="Play with this seed, whatever tests and scenarios say.")
     group.addoption("--ucp-speedup", type=float, metavar="X", help="Mission seconds per second, of processes.")
     group.addoption(

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 
+from harness.backend import BACKENDS, Backend
 from harness.errors import ScenarioError
 from harness.progress import Silent
 from harness.pytest_plugin import TRIAL
@@ -14,7 +15,6 @@ from harness.pytest_plugin.findings import Findings
 from harness.pytest_plugin.options import Options
 from harness.pytest_plugin.swarm_in_test import Swarm
 from harness.pytest_plugin.trial import Trial, one_sentence
-from harness.record import Backend
 from harness.run import Run, run
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import parse
@@ -77,8 +77,9 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
 
 def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[Backend, int]:
     """What a marker says of them, unless the command line says something else. Raises ScenarioError."""
-    if backend not in get_args(Backend):
-        raise ScenarioError(f"`backend` is {backend!r}: it should be {' or '.join(map(repr, get_args(Backend)))}")
+    if backend not in BACKENDS:
+        *others, last = map(repr, BACKENDS)
+        raise ScenarioError(f"`backend` is {backend!r}: it should be {', '.join(others)} or {last}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ScenarioError(f"`seed` is {seed!r}: it should be a number, 0 or more")
     return options.backend or backend, seed if options.seed is None else options.seed

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from harness.backend import Backend
 from harness.errors import ScenarioError
-from harness.record import Backend
 from harness.scenario import Scenario
 from harness.scenario.load import parse
 

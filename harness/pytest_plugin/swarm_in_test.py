@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from harness import checker, mission
+from harness.backend import Backend
 from harness.errors import HarnessError, ScenarioError
 from harness.mission import Played
 from harness.progress import Silent
 from harness.pytest_plugin.findings import Findings, Judgement
 from harness.pytest_plugin.told import Sentence, Told
-from harness.record import Backend
 from harness.run import Play, Recording, Run, prepare
 from harness.scenario import Scenario
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
+from harness.scenario.docker import Docker
 from harness.scenario.events import Events
 from harness.scenario.expect import Expect
 from harness.scenario.fates import Fate
@@ -51,6 +52,7 @@ class Scenario(Model):
     flight: Annotated[list[Flight], Field(max_length=MAX_AGENTS)] = []
     agent_command: Annotated[list[str], Field(min_length=1, max_length=100)] | None = None
     """Any program that follows ucp/CONTRACT.md, with its arguments; the mission file's name is added."""
+    docker: Docker = Docker()
     settings: Settings = Settings()
     quirks: Quirks = Quirks()
     clocks: dict[VehicleKey, Clock] = {}

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,10 @@ DEADLINE_S = 60.0
 COMMAND = [sys.executable, "-m", "harness.cli"]
 
 
-def harness(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
+def harness(*arguments: object, deadline_s: float = DEADLINE_S, **options: Any) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=DEADLINE_S, **options
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=deadline_s, **options
     )
 
 
@@ -38,13 +38,16 @@ def write_scenario(directory: Path, **keys: Any) -> Path:
 class Running:
     """A run that goes on while the test looks at it or hurts it."""
 
-    def __init__(self, scenario: Path, out: Path, *options: object) -> None:
+    def __init__(
+        self, scenario: Path, out: Path, *options: object, command: Sequence[str] = COMMAND, **settings: Any
+    ) -> None:
         self.out = out
         self.process = subprocess.Popen(
-            [*COMMAND, "run", str(scenario), "--out", str(out), *map(str, options)],
+            [*command, "run", str(scenario), "--out", str(out), *map(str, options)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            **settings,
         )
 
     def wait_for(self, condition: Callable[[], Any], what: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -49,6 +50,43 @@ def test_a_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_p
         assert "LOOPBACK,UP" in said
 
     in_lab(tmp_path, story, (258,))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may enter a network that somebody else made")
+def test_a_cable_can_end_in_a_network_that_is_there_already(tmp_path: Path) -> None:
+    """Whoever lives there is on the air, under its conditions; when the lab is gone they have what they had."""
+    neighbour = subprocess.Popen(["unshare", "--net", "sleep", "60"])
+    network = Path(f"/proc/{neighbour.pid}/ns/net")
+
+    def inside(*argv: str) -> str:
+        return subprocess.run(["nsenter", f"--net={network}", *argv], capture_output=True, text=True, check=True).stdout
+
+    def links() -> int:
+        return len(inside("ip", "-o", "link").splitlines())
+
+    def broadcast(to: str) -> None:
+        said = "s.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1); s.sendto(b'', (sys.argv[1], 9))"
+        inside(sys.executable, "-c", f"import socket, sys; s = socket.socket(type=socket.SOCK_DGRAM); {said}", to)
+
+    async def run() -> None:
+        await until(lambda: network.readlink() != Path("/proc/self/ns/net").readlink(), "it has a network of its own")
+        before = links()
+        descriptor = os.open(network, os.O_RDONLY)
+        async with await Lab.open((1, 7), networks={7: descriptor}, log=tmp_path / "lab.log") as lab:
+            os.close(descriptor)
+            assert (await output(lab, tmp_path, 7, "readlink", "/proc/self/ns/net")).strip() == str(network.readlink())
+            broadcast(lab.broadcast)
+            await lab.apply(NetworkConditions(partition=(frozenset({1}), frozenset({7}))))
+            broadcast(lab.broadcast)
+            figures = (await lab.read()).receivers[1]
+            assert (figures.passed, figures.cut) == (1, 1)
+        await until(lambda: links() == before, "the cable is gone")
+
+    try:
+        play(run())
+    finally:
+        neighbour.kill()
+        neighbour.wait()
 
 
 def test_an_idle_lab_is_silent(tmp_path: Path) -> None:

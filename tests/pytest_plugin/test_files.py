@@ -81,7 +81,7 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
         ({"figures": {"blocks": "many"}}, "*is 'many': it should be a number, or {min: number, max: number}"),
         ({"figures": {"blocks": {"min": 3, "max": 2}}}, "*min 3 is more than max 2"),
         ({"seeds": [1, 1]}, "*`expect.seeds` is *: names one twice: each is a test of its own"),
-        ({"backends": ["kernel"]}, "*`expect.backends.0` is 'kernel': it should be 'process' or 'sim'"),
+        ({"backends": ["kernel"]}, "*`expect.backends.0` is 'kernel': it should be 'process', 'docker' or 'sim'"),
         ({"characterstics": {1: "holds"}}, "*`expect.characterstics` is unknown: there are characteristics, *"),
         ({"seed": [1], "figures": {}}, "*`expect.seed` is unknown: there are characteristics, figures, *"),
     ],

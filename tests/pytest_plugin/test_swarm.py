@@ -239,7 +239,7 @@ def test_what_cannot_be_is_one_sentence_at_the_test_s_own_line(
     ("marker", "sentence"),
     [
         ("agent=7", "`agent` is unknown: there are name, *"),
-        ("backend='kernel'", "`backend` is 'kernel': it should be 'process' or 'sim'"),
+        ("backend='kernel'", "`backend` is 'kernel': it should be 'process', 'docker' or 'sim'"),
         ("seed=-1", "`seed` is -1: it should be a number, 0 or more"),
         ("agent_command=['x']", "`agent_command` needs real processes: *"),
     ],

@@ -78,7 +78,7 @@ def _count(runs: Sequence[Run]) -> str:
 
 def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:
     kept = f"runs/{directory_name(run.task)}/report.html"
-    is_kept = run.backend == "process" and (directory / kept).exists()
+    is_kept = run.backend != "sim" and (directory / kept).exists()
     return Row(
         run.seed,
         kept if is_kept else None,

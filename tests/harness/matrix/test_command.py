@@ -112,7 +112,7 @@ def test_processes_fly_a_matrix_and_leave_what_the_file_asks_for(tmp_path: Path,
     assert (cell.backend, cell.runs, cell.failed) == ("process", 2, 0)
     assert cell.verdicts["3"] == {"holds": 2}
     kept = sorted(path.parent.name for path in tmp_path.glob("out/runs/*/run.json"))
-    assert kept == (["loss-0.0-agents-2-seed-1", "loss-0.0-agents-2-seed-2"] if keep == "all" else [])
+    assert kept == (["loss-0.0-agents-2-process-seed-1", "loss-0.0-agents-2-process-seed-2"] if keep == "all" else [])
 
 
 @pytest.mark.lab
@@ -127,7 +127,7 @@ def test_a_run_whose_agent_crashes_is_a_result_and_is_kept(tmp_path: Path) -> No
     failed = MatrixRecord.model_validate_json((tmp_path / "out" / "matrix.json").read_text()).failed
     assert [run.loss for run in failed] == [0.0, 0.5]
     for run in failed:
-        kept = tmp_path / "out" / "runs" / f"loss-{run.loss}-agents-2-seed-1"
+        kept = tmp_path / "out" / "runs" / f"loss-{run.loss}-agents-2-process-seed-1"
         assert run.reason.endswith(f"; see {kept}")
         assert (kept / "run.json").exists()
 

@@ -116,7 +116,7 @@ def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
             {"agents": [5, 3], "scenario": {"clocks": {4: {"drift": 0.1}}}},
             "`agents` has 3, for which `scenario` is wrong: clocks names vehicle 4",
         ),
-        ({"backend": "docker"}, "`backend.0` is 'docker': it should be 'process' or 'sim'"),
+        ({"backend": "kernel"}, "`backend.0` is 'kernel': it should be 'process', 'docker' or 'sim'"),
         ({"keep": "none"}, "`keep` is 'none': it should be 'violated' or 'all'"),
         ({"delay": [0.1]}, "`delay` is unknown: there are name, about, scenario, loss, seeds, agents, backend, keep"),
         ({"scenario": "nowhere.yaml"}, "nowhere.yaml: cannot be read: No such file or directory"),

@@ -105,7 +105,7 @@ def test_a_run_that_was_kept_leads_to_its_report(tmp_path: Path) -> None:
     kept.mkdir(parents=True)
     (kept / "report.html").touch()
     cells = drilldown.drilldown(Finished(finished.record, runs), tmp_path)
-    assert [row.href for row in cells[0].rows] == [None, "runs/loss-0.0-agents-5-seed-2/report.html"]
+    assert [row.href for row in cells[0].rows] == [None, "runs/loss-0.0-agents-5-process-seed-2/report.html"]
 
 
 def test_more_runs_than_there_is_room_for_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,82 @@
+"""How long agents take to come up and go away: `python -m benchmarks.containers [--rounds R] [--json] [N ...]`.
+
+In containers (root, a Docker engine; this machine's own files, nothing is built) and as processes, in turn, round by
+round: up is from nothing until the last agent answers, network included; down is from the first SIGTERM until the last
+container, or the lab, is gone. Ratios are of the same round.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks.rounds import Spread, show
+from harness.backends import process
+from harness.backends.agent_process import AgentProcess, agent_command
+from harness.backends.containers import backend
+from harness.backends.lab import OpenLab
+from harness.errors import HarnessError
+from harness.rundir import RunDirectory
+from harness.scenario.load import parse
+from netem.errors import NetemError
+
+_Row = dict[str, Any]
+_FORMS = {f"{key}_s": ".2f" for key in ("docker_up", "process_up", "docker_down", "process_down")} | {
+    f"{key}_ratio": ".1f" for key in ("up", "down")
+}
+
+
+async def once(agents: int, open_lab: OpenLab, directory: Path) -> tuple[float, float]:
+    """Seconds that so many agents take to come up, and to go."""
+    scenario = parse(
+        {"name": "up and down", "agents": agents, "vehicles": {"kind": "none"}, "docker": {"image_from_host": True}}
+    )
+    rundir = RunDirectory(directory)
+    command = agent_command(scenario)
+    started = [AgentProcess(agent, rundir, command) for agent in scenario.roster]
+    begin = time.perf_counter()
+    async with await open_lab(scenario, rundir, lambda _: None) as lab:
+        await asyncio.gather(*(agent.start(lab, scenario, 1, b"benchmark", False, False) for agent in started))
+        up = time.perf_counter()
+        await asyncio.gather(*(agent.stop() for agent in started))
+        await lab.close()
+        down = time.perf_counter()
+    return up - begin, down - up
+
+
+def up_and_down(agents: int, rounds: int, folder: Path) -> _Row:
+    found: dict[str, list[tuple[float, float]]] = {"docker": [], "process": []}
+    for number in range(rounds):
+        for name, open_lab in (("docker", backend.open_lab), ("process", process.open_lab)):
+            found[name].append(asyncio.run(once(agents, open_lab, folder / f"{name}-{agents}-{number}")))
+    row: _Row = {"agents": agents}
+    for place, key in enumerate(("up", "down")):
+        seconds = {name: [one[place] for one in times] for name, times in found.items()}
+        row |= {f"{name}_{key}_s": Spread.of(times) for name, times in seconds.items()}
+        row[f"{key}_ratio"] = Spread.of_ratios(seconds["docker"], seconds["process"])
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("agents", nargs="*", type=int, metavar="N", help="agents (5 20)")
+    parser.add_argument("--rounds", type=int, default=3, help="median and spread are shown")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    try:
+        backend.require_root()
+        with tempfile.TemporaryDirectory() as folder:
+            rows = [up_and_down(agents, options.rounds, Path(folder)) for agents in options.agents or [5, 20]]
+    except (HarnessError, NetemError) as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(3)
+    show(rows, _FORMS, options.json)
+
+
+if __name__ == "__main__":
+    main()

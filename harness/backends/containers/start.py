@@ -1,0 +1,45 @@
+"""Gives the agents of a compose file their start, all the same one: `python start.py DIRECTORY`.
+
+Runs in a container of its own, so it is a file by itself. The control sockets in the directory tell which agents there
+are to be; each gets the command `start` (see ucp/CONTRACT.md) once all of them answer.
+"""
+
+import json
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+
+LIMIT_S = 60.0
+ASK_AGAIN_S = 0.1
+ANSWER_LIMIT_S = 10.0
+
+
+def main(directory: Path) -> int:
+    os.chdir(directory)  # a socket's address holds 107 bytes
+    names = [path.name.replace(".mission.json", ".control") for path in sorted(Path().glob("*.mission.json"))]
+    deadline = time.monotonic() + LIMIT_S
+    while missing := [name for name in names if not Path(name).exists()]:
+        if time.monotonic() > deadline:
+            sys.stderr.write(f"not started: there is no {', '.join(missing)} after {LIMIT_S:g} s\n")
+            return 1
+        time.sleep(ASK_AGAIN_S)
+    epoch_us = time.time_ns() // 1000
+    refused = [f"{name}: {answer['error']}" for name in names if not (answer := ask(name, epoch_us))["ok"]]
+    for sentence in refused:
+        sys.stderr.write(f"{sentence}\n")
+    return 1 if refused else 0
+
+
+def ask(name: str, epoch_us: int) -> dict[str, object]:
+    with socket.socket(socket.AF_UNIX) as control:
+        control.settimeout(ANSWER_LIMIT_S)
+        control.connect(name)
+        control.sendall(json.dumps({"command": "start", "epoch_us": epoch_us}).encode() + b"\n")
+        answer: dict[str, object] = json.loads(control.makefile().readline())
+        return answer
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

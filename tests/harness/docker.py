@@ -1,0 +1,78 @@
+"""A Docker engine as tests see it: which containers there are, and a way to it that can be cut."""
+
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from harness.backends.containers import ownership
+from harness.backends.containers.engine import DEFAULT_HOST, Engine
+from harness.backends.containers.images import HOST_IMAGE, from_host, idle_command
+
+
+def containers(run: Path) -> list[str]:
+    """Names of all containers of the run in this directory, whether they run or not."""
+    engine = Engine.connect()
+    found = engine.api.containers(all=True, filters={"label": f"{ownership.RUN}={ownership.run_name(run)}"})
+    engine.close()
+    return sorted(one["Names"][0].removeprefix("/") for one in found)
+
+
+@contextmanager
+def stranger(name: str) -> Iterator[Engine]:
+    """A container that is nobody's of ours."""
+    engine = Engine.connect()
+    image = from_host(engine)
+    settings = engine.api.create_host_config(network_mode="none", binds=[f"{it}:{it}:ro" for it in image.mounted])
+    made = engine.api.create_container(HOST_IMAGE, idle_command(), name=name, host_config=settings)
+    engine.api.start(made["Id"])
+    try:
+        yield engine
+    finally:
+        engine.api.remove_container(made["Id"], force=True)
+        engine.close()
+
+
+class Way:
+    """A socket that leads to the engine, until it falls `silent` or is `cut`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._engine = (os.environ.get("DOCKER_HOST") or DEFAULT_HOST).removeprefix("unix://")
+        self._open = threading.Event()
+        self._open.set()
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(path))
+        self._listener.listen(100)
+        self._connections: list[socket.socket] = []
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def silent(self) -> None:
+        """From here on connections are taken, and nothing is answered."""
+        self._open.clear()
+
+    def cut(self) -> None:
+        self._listener.close()
+        for connection in self._connections:
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+        self.path.unlink()
+
+    def _serve(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                far = socket.socket(socket.AF_UNIX)
+                far.connect(self._engine)
+                self._connections += [near, far]
+                for one, other in ((near, far), (far, near)):
+                    threading.Thread(target=self._carry, args=(one, other), daemon=True).start()
+
+    def _carry(self, one: socket.socket, other: socket.socket) -> None:
+        with suppress(OSError):
+            while data := one.recv(1 << 16):
+                self._open.wait()
+                other.sendall(data)
+            other.shutdown(socket.SHUT_WR)
