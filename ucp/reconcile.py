@@ -195,7 +195,8 @@ def reconcile_phase_3(agent: "Agent") -> str:
         agent.majority_response_block_hash = None
         agent.trigger(reconcile_finalize)  # no chain in good faith offers it: a second copy is never committed
         return "held already"
-    agent.phase_three_timer.start(agent.now, agent.settings.phase3_timeout_s)
+    timeout_s = 0.0 if agent.quirks.early_phase3_expiry else agent.settings.phase3_timeout_s
+    agent.phase_three_timer.start(agent.now, timeout_s)
     agent.send(RequestForBlock(block_hash))
     return "asked"
 

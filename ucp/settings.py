@@ -55,6 +55,8 @@ class Quirks:
     """Probability 0..1 that Algorithm 6 ignores a Commit Block (Section 4.2's second stage of testing)."""
     crash_on_tie: bool = False
     """Algorithm 15 dies on a tied vote and the reconcile never ends (Section 4.3, second field test)."""
+    early_phase3_expiry: bool = False
+    """The phase 3 timer ends as it starts, so no block ever comes in time (Section 4.3, agents 118 and 120)."""
 
     def set(self, name: str, value: Any) -> None:
         """Set one quirk by name. ValueError says which names there are and what the value may be."""

@@ -332,6 +332,20 @@ def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever()
     assert agent.next_timer() is None
 
 
+def test_the_field_test_s_early_phase_3_expiry_ends_every_reconcile_before_a_block_comes() -> None:
+    air = diverged()
+    agent = air.agents[1]
+    agent.quirks.set("early_phase3_expiry", True)
+    air.reconcile(1)
+    assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
+    assert set(air.branches(1, "receive_response_block_for_hash")) == {"not in phase 3"}
+    assert len(agent.chain) == 1
+    assert agent.idle, "it goes on to take part"
+    agent.quirks.set("early_phase3_expiry", False)
+    air.reconcile(1)
+    assert len(agent.chain) == 2
+
+
 @takes("reconcile_phase_3", "held already")
 def test_a_block_that_is_held_already_is_not_asked_for() -> None:
     air = Air([1, 2], fate=lambda *_: [])
