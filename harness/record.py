@@ -142,6 +142,36 @@ class Survival(_Model):
     before_final_reconcile: LeastHeld | None = None
 
 
+class InjectedMessages(_Model):
+    """Of one injection the messages of one type: how many it sent, and what the agents that heard them did.
+
+    `handled`: branch of the handler -> how often it was taken. `changed`: how many of these handler runs changed what
+    an agent holds. `unhandled`: how many of the messages no agent handled.
+    """
+
+    message: str
+    sent: int
+    handled: dict[str, int] = {}
+    changed: int = 0
+    unhandled: int = 0
+
+
+class RogueInjection(_Model):
+    """What became of one injection. `refused`: datagrams that are no message, by reason; agents only count them.
+
+    `untraced` are copies that are not told from the others.
+    """
+
+    at_s: float
+    what: str
+    detail: str
+    sent: int = 0
+    bytes: int = 0
+    messages: list[InjectedMessages] = []
+    refused: dict[str, int] = {}
+    untraced: int = 0
+
+
 class JudgedRecord(_Model):
     """The part of a record that a judgement of the run needs."""
 
@@ -169,7 +199,7 @@ class RunRecord(JudgedRecord):
     settled: bool = False
     vehicles: dict[str, dict[str, Any]] = {}
     unmatched_fates: list[str] = []
-    """A sentence for each scripted fate that decided nothing."""
+    """A sentence for each scripted fate that decided nothing, and each injection that sent nothing."""
     counters: dict[str, Any] | None = None
     """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
     capture: dict[str, CapturedFrames] | None = None
@@ -177,6 +207,8 @@ class RunRecord(JudgedRecord):
     characteristics: dict[str, CharacteristicVerdict] = {}
     figures: dict[str, float | int | None] = {}
     survival: Survival | None = None
+    rogue: list[RogueInjection] = []
+    """What the rogue node sent and the agents did with it, for each injection of the timeline, in order."""
     errors: list[str] = []
     """A sentence for each file that the checker could not use, or not wholly."""
 

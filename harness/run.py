@@ -26,7 +26,8 @@ from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, 
 from harness.lateness import Lateness, lateness
 from harness.mission import Played, Story
 from harness.progress import Progress
-from harness.record import RunRecord, Survival
+from harness.record import RogueInjection, RunRecord, Survival
+from harness.rogue.account import account
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
 from harness.simulate import simulate_into
@@ -50,6 +51,7 @@ class Run:
     played: Played
     result: checker.Result
     survival: Survival
+    rogue: list[RogueInjection]
     exit_status: int
     wall_s: float
     report: Path
@@ -121,14 +123,15 @@ class Recording:
         evidence = checker.gather([self.directory.path])
         result, survived = checker.check(evidence), survival(evidence)
         wall_s = time.monotonic() - self._started
-        self._update(**result.to_json(), survival=survived, wall_s=round(wall_s, 1))
+        rogue = account(self._record.scenario, self.directory.path, evidence.traces)
+        self._update(**result.to_json(), survival=survived, rogue=rogue, wall_s=round(wall_s, 1))
         try:
             page = report.write_report(self.directory.path)
         except RunDirectoryError as error:
             raise MachineError(f"{error}; run.json has the verdict") from None
         status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)
         late = None if self._record.backend == "sim" else lateness(evidence.traces.values())
-        return Run(self.directory.path, played, result, survived, status, wall_s, page, late)
+        return Run(self.directory.path, played, result, survived, rogue, status, wall_s, page, late)
 
     def _update(self, **keys: Any) -> None:
         self._record = _updated(self._record, **keys)

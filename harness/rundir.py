@@ -7,6 +7,7 @@ vehicles/7/         the vehicle's own files, its output, telemetry.tlog; of its 
 capture/7.pcapng    every frame that vehicle 7 sent and every one that reached it, if asked for (netem.capture)
 network.jsonl       every change of conditions as the kernel applied it, and its counters at the end
 tracks.jsonl        where the vehicles were, in metres north, east and up from the middle of the field
+rogue.jsonl         what the rogue node has sent, if the timeline injects; rogue.log has what it had to say
 lab.log             what the lab itself had to say
 report.html  report.md  junit.xml  chains.svg
 """
@@ -26,6 +27,8 @@ from netem.radio import Place
 from ucp.files import write_json_atomically
 
 TRACKS_FILE = "tracks.jsonl"
+ROGUE_FILE = "rogue.jsonl"
+ROGUE_CONTROL = "rogue.control"
 
 
 class RunDirectory:
@@ -36,6 +39,7 @@ class RunDirectory:
         self.agents = self.path / "agents"
         self.vehicles = self.path / "vehicles"
         self.lab_log = self.path / "lab.log"
+        self.rogue_log = self.path / "rogue.log"
         claim(path, self.agents, self.vehicles)
 
     def vehicle(self, vehicle_id: int, life: int = 1) -> Path:
@@ -93,6 +97,9 @@ class RunDirectory:
 
     def append_network(self, record: Mapping[str, Any]) -> None:
         self._append("network.jsonl", record)
+
+    def append_injected(self, record: Mapping[str, Any]) -> None:
+        self._append(ROGUE_FILE, record)
 
     def append_tracks(self, at_s: float, places: Mapping[int, Place]) -> None:
         """`at_s` in mission seconds."""

@@ -152,6 +152,9 @@ class InMemory:
     def changed(self, record: dict[str, Any]) -> None:
         """The run's record has it."""
 
+    def injected(self, record: dict[str, Any]) -> None:
+        """The account of the rogue node is made of a run directory."""
+
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Nobody asks where vehicles were."""
 
@@ -204,6 +207,9 @@ class OnDisk:
 
     def changed(self, record: dict[str, Any]) -> None:
         self._rundir.append_network(record)
+
+    def injected(self, record: dict[str, Any]) -> None:
+        self._rundir.append_injected(record)
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         self._rundir.append_tracks(at_s, places)

@@ -10,6 +10,7 @@ from itertools import groupby, product
 from typing import Any
 
 from harness.scenario import Scenario
+from harness.scenario.injection import Injection, InjectionName
 from harness.scenario.network import NetworkModel
 from harness.scenario.schedule import UNTOUCHED, Layer
 from harness.scenario.timeline import Disk, FaultName, TimelineEntry
@@ -63,7 +64,25 @@ class AgentFault:
         return record if self.disk is None else {**record, "disk": self.disk}
 
 
-Change = NetworkChange | AgentFault
+@dataclass(frozen=True)
+class Injected:
+    """At `at_s` mission seconds a rogue node begins to send. Injections are numbered from 1, in order."""
+
+    at_s: float
+    what: InjectionName
+    injection: Injection
+    number: int
+
+    @property
+    def detail(self) -> str:
+        return self.injection.in_words()
+
+    def to_json(self, at_s: float) -> dict[str, Any]:
+        """The record of this injection, begun at `at_s`."""
+        return {"at_s": at_s, "what": self.what, "detail": self.detail}
+
+
+Change = NetworkChange | AgentFault | Injected
 
 
 def timeline_of(scenario: Scenario) -> list[Change]:
@@ -74,7 +93,22 @@ def timeline_of(scenario: Scenario) -> list[Change]:
         if entry.fault is not None
     ]
     first, *states = _network_states(scenario)
-    return [first, *sorted([*states, *faults], key=lambda change: change.at_s)]
+    return [first, *sorted([*states, *faults, *injections_of(scenario)], key=lambda change: change.at_s)]
+
+
+def injections_of(scenario: Scenario) -> list[Injected]:
+    """What a rogue node is to send, in order."""
+    entries = [(entry.at_s, *entry.injection) for entry in scenario.timeline_in_order() if entry.injection]
+    return [Injected(at_s, what, injection, number) for number, (at_s, what, injection) in enumerate(entries, 1)]
+
+
+def injected_nothing(scenario: Scenario, sent: Mapping[int, int]) -> list[str]:
+    """A sentence for each injection that came to nothing; `sent` has the datagrams of each that has begun."""
+    return [
+        f"{one.what} at {one.at_s:g} s ({one.detail}) sent nothing, for nothing like it was heard"
+        for one in injections_of(scenario)
+        if sent.get(one.number) == 0
+    ]
 
 
 @dataclass
@@ -116,7 +150,7 @@ class _Network:
 def _network_states(scenario: Scenario) -> list[Change]:
     """Every state of the network; what begins in the same instant makes one state together."""
     network = _Network(scenario.network, scenario.roster, [UNTOUCHED for _ in scenario.schedule])
-    entries = {entry.at_s: entry for entry in scenario.timeline if entry.fault is None}
+    entries = {entry.at_s: entry for entry in scenario.timeline if not (entry.fault or entry.injection)}
     steps: dict[float, list[tuple[int, str, Layer]]] = defaultdict(list)
     for number, schedule in enumerate(scenario.schedule):
         for at_s, what, layer in schedule.steps(scenario.roster, scenario.duration_s):

@@ -17,6 +17,7 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,26 +44,29 @@ def begin_file(folder: Path, vehicle: int, epoch_us: int, speedup: float) -> Pat
 class Capture:
     """Made by `Capture.start` only."""
 
-    def __init__(self, lab: Lab, folder: Path, process: LabProcess) -> None:
-        self._vehicles = lab.vehicles
+    def __init__(self, vehicles: Sequence[int], folder: Path, process: LabProcess) -> None:
+        self._vehicles = vehicles
         self._folder = folder
         self._process = process
         self.processor_s = 0.0
         """Processor time that it has cost, once it is stopped."""
 
     @classmethod
-    async def start(cls, lab: Lab, folder: Path) -> Capture:
-        """Tap every vehicle's port; raises CaptureError. What crosses them from now on waits in memory."""
-        log = _log(folder)
+    async def start(cls, lab: Lab, folder: Path, vehicles: Sequence[int] | None = None) -> Capture:
+        """Tap the ports of `vehicles`, or of all in the lab; raises CaptureError.
+
+        What crosses them from now on waits in memory.
+        """
+        log, tapped = _log(folder), tuple(vehicles or lab.vehicles)
         process = await lab.spawn(
             None,
-            [sys.executable, "-P", "-m", "netem.tap", str(folder), *map(str, lab.vehicles)],
+            [sys.executable, "-P", "-m", "netem.tap", str(folder), *map(str, tapped)],
             cwd=folder,
             env=dict(os.environ),
             stdout=log,
             stderr=log,
         )
-        capture = cls(lab, folder, process)
+        capture = cls(tapped, folder, process)
         try:
             async with asyncio.timeout(_READY_S):
                 while "ready" not in log.read_text():

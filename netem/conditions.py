@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, permutations
 from typing import Any
 
 from netem.addresses import MAX_ID, MIN_ID
@@ -108,6 +108,16 @@ class NetworkConditions:
     def healed(self) -> NetworkConditions:
         """The same conditions without a partition."""
         return replace(self, partition=())
+
+    def with_listener(self, listener: int, vehicles: Iterable[int]) -> NetworkConditions:
+        """The same between `vehicles`, and one more that hears and reaches each of them perfectly.
+
+        A vehicle is in one group alone, so that the partition becomes links that lose everything.
+        """
+        roster, open_air = tuple(vehicles), LinkConditions()
+        cut = {pair: LinkConditions(loss=1.0) for pair in permutations(roster, 2) if self.is_cut(*pair)}
+        heard = {pair: open_air for one in roster for pair in ((listener, one), (one, listener))}
+        return replace(self, links={**self.links, **cut, **heard}, partition=())
 
     def at_speed(self, speedup: float) -> NetworkConditions:
         """These conditions of a mission, in seconds of a clock on which it runs `speedup` times as fast.

@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from harness.backends.virtual_air import Flight, Happening, VirtualAir
+from harness.backends.virtual_air import Flight, Happening, Stray, VirtualAir
 from netem.capture import begin_file
 from netem.frames import udp_broadcast
 from netem.pcapng import PcapngFile
@@ -59,6 +59,9 @@ class CapturedAir(VirtualAir):
             at, _, number, what = happening
             if isinstance(what, Flight):
                 frame = _frame(what.sender, what.sequence, what.message)
+                self._capture.take_down(at, number, frame, outbound=False)
+            elif isinstance(what, Stray):
+                frame = udp_broadcast(what.source, PORT, what.datagram)
                 self._capture.take_down(at, number, frame, outbound=False)
             yield happening
 

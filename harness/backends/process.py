@@ -14,7 +14,8 @@ from typing import Any
 from harness.agents import Status
 from harness.backends.agent_process import AgentFailedError, AgentProcess, reboots_with_disk
 from harness.backends.lab import Lab, OpenLab
-from harness.backends.rehearsal import network_needs
+from harness.backends.rehearsal import network_needs, on_the_air
+from harness.backends.rogue_process import RogueProcess
 from harness.backends.vehicle_process import VehicleProcess, system_ids
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.mission import Played, Story
@@ -22,9 +23,10 @@ from harness.progress import Progress, Snapshot
 from harness.reach import TRACK_S, Reach
 from harness.rundir import RunDirectory
 from harness.scenario import Scenario
-from harness.timeline import AgentFault, Change, NetworkChange, describe
+from harness.timeline import AgentFault, Change, Injected, NetworkChange, describe, injected_nothing
 from netem.capture import Capture
 from netem.conditions import NetworkConditions
+from netem.engine import Applied
 from netem.errors import CaptureError, LabUnavailable, NetemError
 from netem.lab import Lab as ProcessLab
 from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
@@ -39,7 +41,7 @@ FOLLOW_S = 0.1
 
 async def open_lab(scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> Lab:
     """The lab of processes. Raises NetemError."""
-    return await ProcessLab.open(scenario.roster, needs=network_needs(scenario), log=rundir.lab_log)
+    return await ProcessLab.open(scenario.on_the_air, needs=network_needs(scenario), log=rundir.lab_log)
 
 
 class ProcessRun:
@@ -76,6 +78,7 @@ class ProcessRun:
         self._system_ids = system_ids(scenario.roster)
         self.agents = [AgentProcess(agent_id, rundir, agent_command) for agent_id in scenario.roster]
         self.vehicles = [self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds]
+        self._rogue = RogueProcess(scenario.rogue, scenario, seed, rundir) if scenario.rogue else None
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
@@ -174,7 +177,7 @@ class ProcessRun:
         await self._start_agents(self._lab)
         await self.apply(first)
         if self.scenario.capture:
-            self._capture = await Capture.start(self._lab.network, self.rundir.capture())
+            self._capture = await Capture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
             self._watch(self._capture.watch())
         await self._start_clock()
         self._watch(self._poll_agents())
@@ -210,6 +213,9 @@ class ProcessRun:
     async def _start_agents(self, lab: Lab) -> None:
         self._show("starting agents")
         await asyncio.gather(*(self._start_agent(agent, lab) for agent in self.agents))
+        if self._rogue is not None:
+            await self._rogue.start(lab.network)
+            self._watch(self._rogue.watch(), of="rogue")
 
     async def _start_agent(self, agent: AgentProcess, lab: Lab) -> None:
         """Start it, into the mission if that is under way."""
@@ -224,11 +230,18 @@ class ProcessRun:
         if self._capture:
             await self._capture.begin(epoch_us, self.scenario.speedup)
         await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
+        if self._rogue is not None:
+            await self._rogue.begin(epoch_us)
         self.clock.start(epoch_us)
 
     async def apply(self, change: Change) -> None:
         if isinstance(change, NetworkChange):
             await self._put_into_force(self._reach.ask(change), asked=change.conditions)
+            return
+        if isinstance(change, Injected):
+            assert self._rogue is not None, "a scenario that injects has one"
+            self.played.record(change.to_json(round(max(change.at_s, self.clock.now()), 3)))
+            await self._rogue.inject(change)
             return
         await asyncio.gather(*(self._fault(change, agent_id) for agent_id in change.agents))
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
@@ -284,13 +297,21 @@ class ProcessRun:
     async def _put_into_force(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
         """`asked` by the timeline, not by flight, of which it is on record what changed."""
         async with self._changing_network:  # in the order in which they were asked for
-            applied = await self._lab.apply(change.conditions.at_speed(self.scenario.speedup))
+            conditions = on_the_air(change.conditions, self.scenario)
+            applied = await self._lab.apply(conditions.at_speed(self.scenario.speedup))
         self.network = change.detail
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
         self.played.record(record)
         if asked is not None:
-            record |= {"asked": asked.to_json(), "applied": applied.to_json()}
+            record |= {"asked": asked.to_json(), "applied": self._of_the_swarm(applied)}
         self.rundir.append_network(record)
+
+    def _of_the_swarm(self, applied: Applied) -> dict[str, Any]:
+        """What the kernel holds and has counted for receivers that are vehicles."""
+        figures = applied.to_json()
+        if self._rogue is not None:
+            figures["receivers"].pop(str(self._rogue.vehicle), None)
+        return figures
 
     async def _follow_flight(self) -> None:
         """Write down where the vehicles are, and have the network follow them."""
@@ -374,7 +395,9 @@ class ProcessRun:
                 self._ended_early(error)
         self.played.vehicles = {str(vehicle.vehicle_id): vehicle.to_json() for vehicle in self.vehicles}
         try:
-            self.played.counters = (await lab.read()).to_json()
+            if self._rogue is not None:
+                await self._stop_rogue(self._rogue)
+            self.played.counters = self._of_the_swarm(await lab.read())
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
             await asyncio.gather(*(agent.stop() for agent in self.agents), *(one.stop() for one in self.vehicles))
             for agent in self.agents:
@@ -400,6 +423,14 @@ class ProcessRun:
                 self._ended_early(MachineError(str(error)))
             return
         self.played.capture = {str(vehicle): frames for vehicle, frames in counted.items()}
+
+    async def _stop_rogue(self, rogue: RogueProcess) -> None:
+        try:
+            await rogue.stop()
+        except MachineError as error:
+            if self.played.outcome == "completed":
+                self._ended_early(error)
+        self.played.unmatched_fates = injected_nothing(self.scenario, rogue.sent)
 
     def _show(self, stage: str) -> None:
         self.stage = stage

@@ -34,6 +34,11 @@ def network_needs(scenario: Scenario) -> list[str]:
     return list(dict.fromkeys(need for state in _networks(scenario) for need in state.needs()))
 
 
+def on_the_air(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
+    """These conditions between the vehicles, and perfect ones around the rogue node, if the scenario has one."""
+    return conditions.with_listener(scenario.rogue, scenario.roster) if scenario.rogue else conditions
+
+
 def _networks(scenario: Scenario) -> list[NetworkConditions]:
     """Every state of the network, each once, without partitions, on a clock that runs at the scenario's speedup.
 
@@ -44,7 +49,7 @@ def _networks(scenario: Scenario) -> list[NetworkConditions]:
     found: list[NetworkConditions] = []
     for state in states:
         try:
-            network = over_the_air(state, out_of_reach).at_speed(scenario.speedup).healed()
+            network = on_the_air(over_the_air(state, out_of_reach).healed(), scenario).at_speed(scenario.speedup)
         except ConditionsError as error:
             raise ScenarioError(f"`network` at `speedup` {scenario.speedup:g}: {error}") from None
         if network not in found:
@@ -64,7 +69,7 @@ def refuse_what_this_machine_cannot(scenario: Scenario) -> None:
         return
 
     async def attempt(folder: str) -> None:
-        async with await Lab.open(scenario.roster, needs=needs, log=Path(folder, "lab.log")) as lab:
+        async with await Lab.open(scenario.on_the_air, needs=needs, log=Path(folder, "lab.log")) as lab:
             for network in rehearsed:
                 await lab.apply(network)
 

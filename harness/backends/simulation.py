@@ -6,13 +6,14 @@ one fault leaves the others as they are. Vehicles are tracks, without telemetry,
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from harness.backends.fate_script import FateScript, NameOf
-from harness.backends.virtual_air import NEVER, Flight, Happening, Logged, VirtualAir
+from harness.backends.virtual_air import NEVER, Flight, Happening, Logged, Stray, VirtualAir
 from harness.collector import uncollected
 from harness.errors import ScenarioError
 from harness.mission import Played
@@ -21,7 +22,7 @@ from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from harness.scenario.scenario import Clock
 from harness.seeds import agent_seed
-from harness.timeline import AgentFault, Change, NetworkChange, disconnected_until
+from harness.timeline import AgentFault, Change, Injected, NetworkChange, disconnected_until, injected_nothing
 from netem.medium import Medium
 from netem.radio import Place
 from ucp.agent import Agent
@@ -31,6 +32,9 @@ from ucp.interest import ONLY_COUNTED
 from ucp.messages import datagram_bytes
 from ucp.store import Holdings
 from ucp.trace import HandlerRun
+
+if TYPE_CHECKING:
+    from harness.rogue.in_virtual_time import VirtualRogue
 
 ENGINE = "virtual time"
 SCRIPTED_EVENT_ID = 1
@@ -68,6 +72,9 @@ class Recorder(Protocol):
 
     def changed(self, record: dict[str, Any]) -> None:
         """A change of the network, or a fault of agents, was made."""
+
+    def injected(self, record: dict[str, Any]) -> None:
+        """The rogue node has sent something; see `harness.rogue.journal`."""
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Here are the vehicles now, if any fly."""
@@ -133,7 +140,7 @@ class Simulation:
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
         self._lives: list[list[Life]] = [[] for _ in self.roster]
-        self._alive: list[Life | None] = [None for _ in self.roster]
+        self._alive: list[Life | None] = [None for _ in (*self.roster, "the rogue node, which is no agent")]
         self._disks: dict[int, Holdings] = {}
         """What is on the disk of the agents that reboot with it."""
         self._reach = Reach(scenario)
@@ -144,6 +151,12 @@ class Simulation:
         self._block_names: dict[bytes, str] = {}
         self._script = fate_script(scenario.fates, self.roster, self._block_name)
         self._air = air(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
+        self._rogue = self._rogue_node() if scenario.rogue else None
+
+    def _rogue_node(self) -> "VirtualRogue":
+        from harness.rogue.in_virtual_time import VirtualRogue  # scapy takes long to import
+
+        return VirtualRogue(self.roster, self.seed, self._air, len(self.roster), self._recorder.injected)
 
     # The swarm, as harness.mission drives it
 
@@ -178,6 +191,10 @@ class Simulation:
             return
         record = change.to_json(round(self._now, 3))
         self.played.record(record)
+        if isinstance(change, Injected):
+            assert self._rogue is not None, "a scenario that injects has one"
+            self._rogue.begin(change, self._now)
+            return
         for agent_id in change.agents:
             self._fault(change, self._number[agent_id])
         self._recorder.changed(record)
@@ -236,6 +253,8 @@ class Simulation:
 
     def end(self) -> None:
         """Take down what there is at the end."""
+        if self._rogue is not None:
+            self._rogue.close()
         self.played = self._played_by_now()
 
     def _played_by_now(self) -> Played:
@@ -247,9 +266,12 @@ class Simulation:
             self.played,
             mission_s=round(self._now, 3),
             network=network if last_s is None else disconnected_until(last_s, network),
-            unmatched_fates=self._air.unmatched_fates(),
+            unmatched_fates=[*self._air.unmatched_fates(), *self._injected_nothing()],
             agents={str(agent_id): self._agent_to_json(number) for agent_id, number in self._number.items()},
         )
+
+    def _injected_nothing(self) -> list[str]:
+        return injected_nothing(self.scenario, self._rogue.sent) if self._rogue is not None else []
 
     # What is there
 
@@ -267,6 +289,7 @@ class Simulation:
         for block in life.agent.completed if life else ():
             del completed[block.hex()]
         reboots = sum(one.found is not None for one in lives)
+        dropped = sum((one.agent.dropped for one in lives), Counter())
         return {
             "outcome": "exported" if life else "rebooting" if number in self._disks else "killed",
             "restarts": len(lives) - 1 - reboots,
@@ -274,6 +297,7 @@ class Simulation:
             "completed_before": list(completed),
             "idle": life.agent.idle if life else None,
             "bytes_sent": sum(life.bytes_sent for life in lives),
+            **({"dropped": dict(dropped)} if self._rogue is not None else {}),
             "messages_sent": sum(life.agent.sent.total() for life in lives),
             "reconciles": sum(life.agent.reconciles for life in lives),
             "chain_changed_at_s": round(_mission_time(life, life.agent.chain_changed_at), 3) if life else None,
@@ -301,13 +325,15 @@ class Simulation:
             self._now, _, number, what = happening
             life = alive[number]
             if life is None:
+                if self._rogue is not None and number == len(self.roster):
+                    self._rogue.wake(self._now)
                 continue
             if life.waiting is None:
                 self._happen(number, life, what)
             elif what is not None:
                 life.waiting.append(happening)
 
-    def _happen(self, number: int, life: Life, what: Flight | Logged | None) -> None:
+    def _happen(self, number: int, life: Life, what: Flight | Logged | Stray | None) -> None:
         if self._tracing or (isinstance(what, Flight) and type(what.message) in ONLY_COUNTED):
             self._hear(number, life)
         if isinstance(what, Flight):
@@ -320,6 +346,10 @@ class Simulation:
                     self._say(number, life)  # of the handlers of messages only a reconcile's touch timers
         elif what is None:
             self._timer_ends(number, life)
+        elif isinstance(what, Stray):
+            self._hear(number, life)
+            life.agent.receive_datagram(what.datagram, self._local(life))
+            self._after(number, life)
         elif self._generating and what[0] in (ANY_LIFE, len(self._lives[number])):
             _, event_id, data = what
             self._recorder.logged(self._now, life.agent.agent_id, len(data))
@@ -370,6 +400,8 @@ class Simulation:
             data_bytes = datagram_bytes(message)
             life.bytes_sent += data_bytes
             self._air.broadcast(self._now, number, sequence, message, data_bytes)
+            if self._rogue is not None:
+                self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
 
     def _take_down(self, agent: Agent, mission_s: float) -> None:
         runs = agent.trace()
@@ -436,7 +468,7 @@ class Simulation:
         life.waiting, life.resumed_at = None, self._now
         place = self._air.place
         for happening in waiting:
-            if isinstance(happening[3], Flight):
+            if isinstance(happening[3], Flight | Stray):
                 self._air.place = happening[:3]
                 self._happen(number, life, happening[3])
         self._air.place = place
@@ -444,7 +476,7 @@ class Simulation:
         self._hear(number, life)
         self._timer_ends(number, life)
         for happening in waiting:
-            if not isinstance(happening[3], Flight):
+            if not isinstance(happening[3], Flight | Stray):
                 self._happen(number, life, happening[3])
 
     # An agent's clock

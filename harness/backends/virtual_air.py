@@ -77,8 +77,19 @@ Place = tuple[float, int, int]
 Logged = tuple[int, int, bytes]
 """An event that an agent is about to log: in which of its lives (0: whichever it is), event ID, data."""
 
-Happening = tuple[float, int, int, Flight | Logged | None]
+
+@dataclass(frozen=True, slots=True)
+class Stray:
+    """A datagram that no agent has sent, under the address of vehicle `source`."""
+
+    source: int
+    datagram: bytes
+
+
+Happening = tuple[float, int, int, Flight | Logged | Stray | None]
 """(mission seconds, rank, number of the agent, what): a message, an event, or None for the end of a timer.
+
+The number after the last agent's is the rogue node's.
 
 Of two in the same instant the one with the lower rank comes first."""
 
@@ -126,6 +137,13 @@ class VirtualAir:
         """The agent's timer ends, or it logs an event, at `at`."""
         self._rank += 1
         heappush(self._coming, (at, self._rank, number, what))
+
+    def inject(self, at: float, stray: Stray, numbers: Iterable[int]) -> None:
+        """`stray` reaches the agents with these numbers at `at`."""
+        self._rank += 1
+        self.quiet_at = max(self.quiet_at, at)
+        for number in numbers:
+            heappush(self._coming, (at, self._rank, number, stray))
 
     def broadcast(self, now: float, number: int, sequence: int, message: Message, data_bytes: int) -> None:
         """The agent with this number sends `message`, in a datagram with so many bytes of data."""

@@ -5,6 +5,7 @@ import base64
 from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
 from harness.exports import Export
+from harness.traces import Trace
 from ucp.block import Block, InceptionBlock, next_chain_hash
 
 NAME = "genuine"
@@ -29,6 +30,7 @@ def check(evidence: Evidence) -> Characteristic:
                 continue
             elif completed.get(block.block_hash) != block.agent_id:
                 detail = f"holds block {name}, which agent {block.agent_id} never completed"
+                detail += _since(evidence.traces.get(agent_id), block.block_hash)
             else:
                 continue
             findings.append(Finding(agent_id, detail, name, block.block_hash))
@@ -45,6 +47,15 @@ def check(evidence: Evidence) -> Characteristic:
     return Characteristic(
         NAME, "holds", f"all hashes recompute, and each of {blocks} blocks was completed by the agent that it names"
     )
+
+
+def _since(trace: Trace | None, block_hash: str) -> str:
+    """When and by what the block came to the agent, as far as its trace tells: the end of a sentence."""
+    came = ("chain+", block_hash)
+    for run in trace.runs if trace else ():
+        if came in map(tuple, run.changes):
+            return f"; it came at t={run.t:g} s, by {run.handler}"
+    return ""
 
 
 def _hashes_that_do_not_recompute(agent_id: int, export: Export, evidence: Evidence) -> list[Finding]:

@@ -12,7 +12,7 @@ from rich.console import Console
 from harness import progress
 from harness.backend import Backend
 from harness.backends.vehicle_process import system_ids
-from harness.commands.terminal import complain, show_result, show_survival
+from harness.commands.terminal import complain, show_result, show_rogue, show_survival
 from harness.errors import HarnessError, ScenarioError
 from harness.kernel import Kernel, run_inside
 from harness.report.capture import gaps
@@ -82,6 +82,7 @@ def run_command(
         shown.close()
     show_result(console, finished.result)
     show_survival(console, finished.survival)
+    show_rogue(console, finished.rogue)
     _show_end(console, finished)
     raise typer.Exit(finished.exit_status)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from harness.explore.tape import Logged, Lost
 from harness.scenario import Scenario
+from harness.scenario.injection import INJECTIONS
 from harness.scenario.timeline import FAULTS
 
 Document = dict[str, Any]
@@ -150,6 +151,8 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
         groups = [[agent for agent in group if agent in kept] for group in entry["partition"]]
         groups = [group for group in groups if group]
         return {**entry, "partition": groups} if groups else None
+    if not {sender for name in INJECTIONS if (sender := at(entry, f"{name}.sender")) is not None} <= {*kept}:
+        return None
     entry = _of(entry, FAULTS, kept)
     return entry if all(entry.get(fault) != [] for fault in FAULTS) else None
 

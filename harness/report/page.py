@@ -11,7 +11,7 @@ from typing import Any
 
 from harness.exports import BEFORE_FINAL_RECONCILE, Export, Exports, export_paths, read_exports
 from harness.naming import name_blocks
-from harness.report import facts, html, map_section, network, survival, swarm, timeline, verdicts
+from harness.report import facts, html, map_section, network, rogue, survival, swarm, timeline, verdicts
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.colours import Ink
@@ -52,6 +52,7 @@ def draw(left: Remains) -> str:
         strip=network.strip(result),
         network=network.start(result),
         faults=network.faults(result),
+        rogue=rogue.section(result),
         flight=map_section.section(left.run_dir, ink),
         agents=swarm.agents_table(result, exports.by_agent, ink),
         versions=mapping(result, "versions"),

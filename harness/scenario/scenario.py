@@ -69,6 +69,19 @@ class Scenario(Model):
         """The agents' IDs, ascending."""
         return tuple(range(1, self.agents + 1)) if isinstance(self.agents, int) else tuple(sorted(self.agents))
 
+    @property
+    def rogue(self) -> int | None:
+        """The rogue node's ID on the air, which no agent has; None if the timeline injects nothing."""
+        if not any(entry.injection for entry in self.timeline):
+            return None
+        taken = set(self.roster)
+        return next(vehicle for vehicle in range(MAX_AGENT_ID, 0, -1) if vehicle not in taken)
+
+    @property
+    def on_the_air(self) -> tuple[int, ...]:
+        """The vehicles, and the rogue node if there is one."""
+        return self.roster if self.rogue is None else (*self.roster, self.rogue)
+
     def flight_of(self, vehicle: int) -> Flight | None:
         """The flight that names this vehicle, if one does."""
         return next((flight for flight in self.flight if vehicle in flight.vehicles), None)
@@ -141,6 +154,9 @@ class Scenario(Model):
             if entry.fault is not None:
                 what, agents = entry.fault
                 yield from ((f"timeline.{index}.{what}", agent) for agent in agents)
+            if entry.injection is not None:
+                injected, it = entry.injection
+                yield from ((f"timeline.{index}.{injected}.sender", agent) for agent in (it.sender,) if agent)
 
     @model_validator(mode="after")
     def _plans_can_be_flown(self) -> "Scenario":
@@ -189,6 +205,11 @@ class Scenario(Model):
             where = f"timeline.{index}"
             if entry.at_s > self.duration_s:
                 raise ValueError(f"{where}.at_s {entry.at_s:g} is after the mission's end at {self.duration_s:g} s")
+            if entry.injection is not None and entry.at_s + entry.injection[1].lasts_s > self.duration_s:
+                raise ValueError(
+                    f"{where}.{entry.injection[0]} would last until {entry.at_s + entry.injection[1].lasts_s:g} s, "
+                    f"after the mission's end at {self.duration_s:g} s"
+                )
             if instants[entry.at_s] > 1:
                 raise ValueError(f"{where}.at_s {entry.at_s:g} has two entries: which comes first?")
             try:

@@ -1,9 +1,20 @@
-"""What a scenario changes while it runs: the network, and who is alive."""
+"""What a scenario changes while it runs: the network, who is alive, and what a rogue node sends."""
 
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from harness.scenario.injection import (
+    INJECTIONS,
+    Corrupt,
+    Delay,
+    Duplicate,
+    Flood,
+    Forge,
+    Injection,
+    InjectionName,
+    Replay,
+)
 from harness.scenario.model import Instant, Model, Seconds, VehicleId
 from harness.scenario.network import Loss
 
@@ -35,13 +46,13 @@ Agents = Annotated[list[VehicleId], Field(min_length=1)]
 
 
 class TimelineEntry(Model):
-    """At `at_s` mission seconds, one change: a new loss, a partition, heal; or something happens to agents.
+    """At `at_s` mission seconds, one change: a new loss, a partition, heal; something happens to agents; an injection.
 
     `kill`: they are gone with their vehicles, and all that they held with them (Section 3.3). `crash`: the same, after
     their vehicles have fallen to the ground. `restart`: killed agents begin anew on vehicles at their homes, holding
     nothing but the inception block. `pause`: they stand still, and what reaches them waits until `resume`. `reboot`:
     their computers brown out and are back after `down_s` mission seconds, with what was on their `disk` or with
-    nothing; their vehicles fly on.
+    nothing; their vehicles fly on. Injections, from `replay` to `flood`: `harness.scenario.injection`.
     """
 
     at_s: Instant
@@ -56,6 +67,17 @@ class TimelineEntry(Model):
     reboot: Agents | None = None
     down_s: Seconds | None = None
     disk: Disk | None = None
+    replay: Replay | None = None
+    duplicate: Duplicate | None = None
+    delay: Delay | None = None
+    corrupt: Corrupt | None = None
+    forge: Forge | None = None
+    flood: Flood | None = None
+
+    @property
+    def injection(self) -> tuple[InjectionName, Injection] | None:
+        """What a rogue node sends, if it does."""
+        return next(((name, found) for name in INJECTIONS if (found := getattr(self, name)) is not None), None)
 
     @property
     def fault(self) -> tuple[FaultName, tuple[int, ...]] | None:
@@ -75,7 +97,7 @@ class TimelineEntry(Model):
 
     @model_validator(mode="after")
     def _one_change(self) -> "TimelineEntry":
-        changes = ("loss", "partition", "heal", *FAULTS)
+        changes = ("loss", "partition", "heal", *FAULTS, *INJECTIONS)
         if sum(getattr(self, change) is not None for change in changes) != 1:
             named = (f"`{change}{': true' if change == 'heal' else ''}`" for change in changes)
             raise ValueError(f"needs exactly one of {', '.join(named)}")

@@ -198,6 +198,21 @@ def lost_last_commit(run: Simulated, seed: int) -> None:
     assert reconciles(run) == 0
 
 
+def rogue(run: Simulated, seed: int) -> None:
+    violated = {number: one for number, one in run.result.characteristics.items() if one.verdict == "violated"}
+    assert set(violated) == {"1", "4"}
+    assert {finding.agent_id for finding in violated["4"].evidence} == {1, 2, 3, 4, 5}
+    (forged,) = {finding.block for finding in violated["4"].evidence}
+    assert forged not in map(run.evidence.name, run.evidence.completed_blocks())
+    at_600_s = f"holds block {forged}, which agent 2 never completed; it came at t=600.026 s, by receive_commit_block"
+    assert [finding.detail for finding in violated["4"].evidence if finding.agent_id != 2] == [at_600_s] * 4
+    assert all("Commit Block" in finding.detail for finding in violated["1"].evidence)
+    assert all("which agent 2 never sent" in finding.detail for finding in violated["1"].evidence)
+    again = [step for trace in run.evidence.traces.values() for step in trace.runs if round(step.t, 3) == 300.026]
+    assert len(again) == 3 * 4
+    assert {(step.trigger["message"], step.branch) for step in again} == {("Commit Block", "does not succeed")}
+
+
 CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
     claim.__name__: claim
     for claim in (
@@ -220,8 +235,12 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         large_divergence,
         split_rejoin,
         lost_last_commit,
+        rogue,
     )
 }
+
+
+RECONCILED = [name for name in CLAIMS if name != "rogue" and load_scenario(SCENARIOS / f"{name}.yaml").final_reconcile]
 
 
 def test_every_scenario_of_the_library_claims_something() -> None:
@@ -233,7 +252,7 @@ def test_every_scenario_of_the_library_claims_something() -> None:
 def test_a_scenario_shows_what_it_says(name: str, seed: int) -> None:
     run = played(name, seed)
     assert run.played.settled
-    assert not run.result.violated
+    assert run.result.violated == (name == "rogue")
     assert not run.played.unmatched_fates
     CLAIMS[name](run, seed)
 
@@ -251,7 +270,7 @@ def test_a_scenario_is_what_it_expects_of_itself(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", [name for name in CLAIMS if load_scenario(SCENARIOS / f"{name}.yaml").final_reconcile])
+@pytest.mark.parametrize("name", RECONCILED)
 def test_a_final_reconcile_makes_one_chain_of_all_that_is_left(name: str, seed: int) -> None:
     run = played(name, seed)
     assert run.result.figures["distinct_chains"] == 1

@@ -126,7 +126,9 @@ class ContainerLab:
             for identity, vehicle in self._holders.items():
                 networks[vehicle] = await self._engine.in_thread(self._open_network, identity)
             self._networks = {os.fstat(descriptor).st_ino for descriptor in networks.values()}
-            self.network = await Lab.open(scenario.roster, needs=network_needs(scenario), networks=networks, log=log)
+            self.network = await Lab.open(
+                scenario.on_the_air, needs=network_needs(scenario), networks=networks, log=log
+            )
         finally:
             for descriptor in networks.values():
                 os.close(descriptor)

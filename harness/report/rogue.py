@@ -1,0 +1,55 @@
+"""What the rogue node sent, and what the agents did with it, as the page says it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+
+from harness.record import RogueInjection
+from harness.report import words
+from harness.report.result import listing
+from harness.rogue.account import done_with
+
+MAX_ROWS = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """`message` is a type of message, or says why agents refuse the datagrams."""
+
+    at: str
+    what: str
+    detail: str
+    message: str
+    sent: str
+    done: str
+    changed: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """`left_out` says how many rows there were no room for."""
+
+    rows: list[Row]
+    left_out: int
+
+
+def section(result: dict[str, Any]) -> Section | None:
+    """None if no rogue node was on the air, or the record says nothing of it that can be read."""
+    try:
+        injections = [RogueInjection.model_validate(one) for one in listing(result, "rogue")]
+    except ValidationError:
+        return None
+    rows = [row for one in injections for row in _rows(one)]
+    return Section(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
+
+
+def _rows(one: RogueInjection) -> list[Row]:
+    told = [(of.message, of.sent, done_with(of), words.value(of.changed)) for of in one.messages]
+    told += [(f"none: {reason}", count, "refused", "\u2013") for reason, count in one.refused.items()]
+    told += [("any", one.untraced, "not told from their originals", "\u2013")] if one.untraced else []
+    begun = (words.duration(one.at_s), one.what, one.detail)
+    return [
+        Row(*begun, message, words.value(sent), done, changed)
+        for message, sent, done, changed in told or [("\u2013", 0, "nothing sent", "\u2013")]
+    ]

@@ -1,0 +1,59 @@
+"""Datagrams that no agent has sent, made with the layers of `ucp.scapy`."""
+
+from collections.abc import Callable, Sequence
+from random import Random
+from typing import Any
+
+from scapy.packet import Packet
+
+from ucp.block import HASH_BYTES
+from ucp.events import MAX_EVENT_BYTES
+from ucp.messages import Message
+from ucp.scapy import LAYERS, UCP, Block, CommitBlock, LoggableEvent, to_layer
+from ucp.wire import Kind
+
+FORGED_EVENT_ID = 1
+FORGED_DATA = b"forged by a rogue node"
+
+
+def datagram(sender: int, sequence: int, message: Message | Packet) -> bytes:
+    layer = message if isinstance(message, Packet) else to_layer(message)
+    return bytes(UCP(sender=sender, sequence=sequence) / layer)
+
+
+def forged_block(agent_id: int, timestamp_us: int) -> Block:
+    """A block that claims to be the agent's."""
+    event = LoggableEvent(timestamp_us=timestamp_us, event_id=FORGED_EVENT_ID, data=FORGED_DATA)
+    return Block(agent_id=agent_id, events=[event])
+
+
+def forged_commit(block: Block, chain_hash: bytes) -> CommitBlock:
+    """`chain_hash` is the block's own at its place in the chain."""
+    return CommitBlock(chain_hash=chain_hash, block=block)
+
+
+def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, rng: Random) -> Packet:
+    """A well-formed message of this type (None: of any), with whatever content; a block in it is of the roster's."""
+
+    def block() -> Block:
+        data = rng.randbytes(rng.randint(1, MAX_EVENT_BYTES))
+        event = LoggableEvent(timestamp_us=timestamp_us, event_id=rng.randint(1, 254), data=data)
+        return Block(agent_id=rng.choice(roster), events=[event])
+
+    content: dict[Kind, Callable[[], Any]] = {
+        Kind.U64: lambda: timestamp_us,
+        Kind.FLAG: lambda: rng.getrandbits(1),
+        Kind.HASH: lambda: rng.randbytes(HASH_BYTES),
+        Kind.OPTIONAL_HASH: lambda: rng.choice([None, rng.randbytes(HASH_BYTES)]),
+        Kind.BLOCK: block,
+    }
+    message, layer = rng.choice([(it, layer) for it, layer in LAYERS.items() if name in (None, it.NAME)])
+    return layer(**{field: content[kind]() for field, kind in message.WIRE.items()})
+
+
+def corrupted(data: bytes, bits: int, rng: Random) -> bytes:
+    """With so many of its bits flipped, or all if it has fewer."""
+    flipped = bytearray(data)
+    for bit in rng.sample(range(8 * len(data)), min(bits, 8 * len(data))):
+        flipped[bit // 8] ^= 1 << bit % 8
+    return bytes(flipped)

@@ -1,0 +1,158 @@
+"""Injections: what a rogue node on the air sends into the mission, in the names of agents that never sent it.
+
+timeline:
+  - {at_s: 100, replay: {message: Commit Block, sender: 2, count: 3}}
+  - {at_s: 200, duplicate: {for_s: 60, copies: 2}}
+  - {at_s: 300, delay: {for_s: 60, by_s: 30, message: Block Add Request}}
+  - {at_s: 400, corrupt: {for_s: 60, bits: 3, sender: 4}}
+  - {at_s: 500, forge: {message: Commit Block, sender: 2}}
+  - {at_s: 600, forge: {message: Block Add Response, sender: 3, approve: false, for_s: 60}}
+  - {at_s: 700, flood: {for_s: 10, per_s: 50, message: Chain Contain Query}}
+
+`message` and `sender` that are left out mean any. The rogue hears everything that agents send, and everybody hears the
+rogue, whatever keeps agents apart. It adds to what is on the air and can take nothing away: an original that it delays,
+corrupts or forges an answer to arrives as well.
+"""
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from harness.scenario.fates import MessageName
+from harness.scenario.model import Model, Seconds, VehicleId
+
+InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood"]
+INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood")
+"""Keys of a timeline entry."""
+
+MAX_FLOOD = 100_000
+"""Datagrams of one flood."""
+
+
+class _Matching(Model):
+    """Of what is heard, the messages of this type and sender."""
+
+    message: MessageName | None = None
+    sender: VehicleId | None = None
+
+    def matches(self, message: str, sender: int) -> bool:
+        return self.message in (None, message) and self.sender in (None, sender)
+
+    @property
+    def lasts_s(self) -> float:
+        """Mission seconds from its beginning until nothing more comes of it."""
+        return 0.0
+
+    def in_words(self) -> str:
+        whose = f" from {self.sender}" if self.sender is not None else ""
+        return f"{self.message or 'every message'}{whose}"
+
+
+class Replay(_Matching):
+    """What was heard before and matches: the last `count` of it once more, byte for byte."""
+
+    count: Annotated[int, Field(ge=1, le=1000)] = 1
+
+    def in_words(self) -> str:
+        return f"the last {self.count} of {super().in_words()}"
+
+
+class _Lasting(_Matching):
+    for_s: Seconds
+
+    @property
+    def lasts_s(self) -> float:
+        return self.for_s
+
+    def in_words(self) -> str:
+        return f"{super().in_words()} for {self.for_s:g} s"
+
+
+class Duplicate(_Lasting):
+    """For `for_s` whatever matches is sent again at once, `copies` times."""
+
+    copies: Annotated[int, Field(ge=1, le=100)] = 1
+
+    def in_words(self) -> str:
+        return f"{super().in_words()}, {self.copies} more of each"
+
+
+class Delay(_Lasting):
+    """For `for_s` whatever matches is sent again `by_s` later."""
+
+    by_s: Seconds
+
+    @property
+    def lasts_s(self) -> float:
+        return self.for_s + self.by_s
+
+    def in_words(self) -> str:
+        return f"{super().in_words()}, again {self.by_s:g} s later"
+
+
+class Corrupt(_Lasting):
+    """For `for_s` whatever matches is sent again at once with `bits` of it flipped, under a good UDP checksum."""
+
+    bits: Annotated[int, Field(ge=1, le=1000)] = 1
+
+    def in_words(self) -> str:
+        return f"{super().in_words()}, {self.bits} bit{'s' if self.bits > 1 else ''} flipped"
+
+
+class Forge(Model):
+    """A message that `sender` never sent.
+
+    Commit Block, at once: a block that claims to be the sender's, on top of the chain that the rogue has heard of last.
+    The others, for `for_s`: an answer to each question, ahead of the sender's own; to a query for a successor always
+    "Is Top Of Chain". `approve` is what the answer says.
+    """
+
+    ANSWERS: ClassVar = ("Block Add Response", "Chain Contain Response", "Next in Sequence Response")
+
+    message: Literal["Commit Block", "Block Add Response", "Chain Contain Response", "Next in Sequence Response"]
+    sender: VehicleId
+    for_s: Seconds | None = None
+    approve: bool | None = None
+
+    @property
+    def lasts_s(self) -> float:
+        return self.for_s or 0.0
+
+    @model_validator(mode="after")
+    def _means_something(self) -> "Forge":
+        if (self.for_s is None) != (self.message == "Commit Block"):
+            raise ValueError(f"`for_s` belongs to a forged answer, and each needs it: {', '.join(self.ANSWERS)}")
+        if self.approve is not None and self.message not in self.ANSWERS[:2]:
+            raise ValueError(f"`approve` belongs to {' and '.join(self.ANSWERS[:2])}: a {self.message} says neither")
+        return self
+
+    def in_words(self) -> str:
+        says = "" if self.message not in self.ANSWERS[:2] else f" saying {'yes' if self.approve else 'no'}"
+        span = "" if self.for_s is None else f" to every question for {self.for_s:g} s"
+        return f"{self.message} from {self.sender}{says}{span}"
+
+
+class Flood(_Lasting):
+    """For `for_s`, `per_s` well-formed messages a mission second, of random content and in random names."""
+
+    per_s: Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
+
+    @model_validator(mode="after")
+    def _can_be_counted(self) -> "Flood":
+        if self.for_s * self.per_s > MAX_FLOOD:
+            raise ValueError(f"{self.for_s * self.per_s:g} messages are too many: a flood has {MAX_FLOOD} at most")
+        return self
+
+    def in_words(self) -> str:
+        return f"{super().in_words()}, {self.per_s:g} a second"
+
+
+Injection = Replay | Duplicate | Delay | Corrupt | Forge | Flood
+MODELS: dict[str, type[Injection]] = {
+    "replay": Replay,
+    "duplicate": Duplicate,
+    "delay": Delay,
+    "corrupt": Corrupt,
+    "forge": Forge,
+    "flood": Flood,
+}

@@ -1,0 +1,203 @@
+"""The rogue node by itself: what it makes of what it hears."""
+
+from random import Random
+from typing import Any
+
+import pytest
+
+from harness.rogue import journal
+from harness.rogue.crafted import corrupted, random_message
+from harness.rogue.rogue import Injected, Rogue
+from harness.rogue.sequences import forged_sequence, injection_of
+from harness.scenario.injection import MAX_FLOOD, MODELS
+from ucp.block import Block, next_chain_hash
+from ucp.messages import (
+    TYPE_CODES,
+    BlockAddRequest,
+    BlockAddResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    ChainHashSuccessorQuery,
+    CommitBlock,
+    Message,
+    NextInSequenceResponse,
+    RequestForBlock,
+    decode,
+    encode,
+)
+
+ROSTER = (1, 2, 3)
+TOP = bytes(range(32))
+BLOCK = Block(1, 5_000_000, b"0123456789a")
+COMMIT = encode(1, 7, CommitBlock(BLOCK, TOP))
+REQUEST = encode(3, 8, BlockAddRequest(BLOCK.block_hash, TOP))
+
+
+def rogue() -> Rogue:
+    return Rogue(ROSTER, seed=1)
+
+
+def begin(one: Rogue, what: str, now: float = 100.0, number: int = 1, **keys: Any) -> list[Injected]:
+    one.begin(number, MODELS[what].model_validate(keys), now)
+    return one.to_send()
+
+
+def hears(one: Rogue, datagram: bytes, now: float) -> list[Injected]:
+    one.hears(datagram, now)
+    return one.to_send()
+
+
+def wait(one: Rogue, until: float) -> list[tuple[float, Injected]]:
+    """What it sends when."""
+    sent = []
+    while (at := one.next_timer()) is not None and at <= until:
+        one.handle_timer(at)
+        sent += [(at, injected) for injected in one.to_send()]
+    return sent
+
+
+def said(injected: Injected) -> Message:
+    return decode(injected.datagram)[2]
+
+
+def test_it_replays_the_last_that_match_byte_for_byte_in_their_order() -> None:
+    one = rogue()
+    commits = [
+        encode(sender, sequence, CommitBlock(BLOCK, TOP)) for sender, sequence in ((1, 1), (2, 1), (1, 2), (1, 3))
+    ]
+    for datagram in [*commits, REQUEST]:
+        assert hears(one, datagram, 1.0) == []
+    again = begin(one, "replay", message="Commit Block", sender=1, count=2)
+    assert [(it.source, it.datagram) for it in again] == [(1, commits[2]), (1, commits[3])]
+    assert [it.datagram for it in begin(one, "replay")] == [REQUEST]
+    assert one.next_timer() is None
+
+
+def test_what_it_has_not_heard_it_cannot_send() -> None:
+    one = rogue()
+    hears(one, b"no message", 1.0)
+    assert begin(one, "replay", number=1) == []
+    assert begin(one, "forge", number=2, message="Commit Block", sender=2) == []
+    assert one.sent == {1: 0, 2: 0}
+
+
+def test_it_duplicates_what_matches_as_long_as_it_is_asked_to() -> None:
+    one = rogue()
+    begin(one, "duplicate", for_s=10, copies=2, message="Commit Block")
+    assert [it.datagram for it in hears(one, COMMIT, 109.9)] == [COMMIT, COMMIT]
+    assert hears(one, REQUEST, 109.9) == []
+    assert hears(one, COMMIT, 110.0) == []
+
+
+def test_it_sends_again_later_what_it_has_heard_in_time() -> None:
+    one = rogue()
+    begin(one, "delay", for_s=10, by_s=30, sender=3)
+    assert hears(one, REQUEST, 101.0) == hears(one, REQUEST, 109.0) == hears(one, COMMIT, 109.0) == []
+    hears(one, REQUEST, 110.0)
+    assert [(at, it.datagram) for at, it in wait(one, 1000)] == [(131.0, REQUEST), (139.0, REQUEST)]
+
+
+def test_it_flips_as_many_bits_as_asked() -> None:
+    one = rogue()
+    begin(one, "corrupt", for_s=10, bits=3)
+    (changed,) = hears(one, COMMIT, 101.0)
+    assert changed.source == 1
+    assert sum((a ^ b).bit_count() for a, b in zip(changed.datagram, COMMIT, strict=True)) == 3
+    assert corrupted(b"\x0f", 1000, Random(1)) == b"\xf0"
+
+
+def test_a_forged_commit_goes_on_top_of_what_was_heard_last() -> None:
+    one = rogue()
+    hears(one, COMMIT, 1.0)
+    other = bytes(32)
+    hears(one, encode(3, 9, BlockAddRequest(BLOCK.block_hash, other)), 2.0)
+    (first,) = begin(one, "forge", number=4, message="Commit Block", sender=2)
+    sender, sequence, commit = decode(first.datagram)
+    assert isinstance(commit, CommitBlock)
+    assert (first.source, sender, commit.block.agent_id, commit.block.timestamp_us) == (2, 2, 2, 100_000_000)
+    assert commit.chain_hash == next_chain_hash(other, commit.block.block_hash)
+    assert injection_of(sequence) == 4
+    (second,) = begin(one, "forge", 101.0, number=5, message="Commit Block", sender=3)
+    on_top = said(second)
+    assert isinstance(on_top, CommitBlock)
+    assert on_top.chain_hash == next_chain_hash(commit.chain_hash, on_top.block.block_hash)
+
+
+@pytest.mark.parametrize(
+    ("keys", "question", "answer"),
+    [
+        ({}, BlockAddRequest(TOP, TOP), BlockAddResponse(TOP, False)),
+        ({"approve": True}, BlockAddRequest(TOP, TOP), BlockAddResponse(TOP, True)),
+        ({"approve": True}, ChainContainQuery(TOP), ChainContainResponse(TOP, True)),
+        ({}, ChainHashSuccessorQuery(TOP), NextInSequenceResponse(TOP, None, 0)),
+    ],
+)
+def test_it_answers_every_question_in_an_agent_s_name(keys: dict[str, Any], question: Message, answer: Message) -> None:
+    one = rogue()
+    begin(one, "forge", message=answer.NAME, sender=2, for_s=10, **keys)
+    assert [(it.source, said(it)) for it in hears(one, encode(1, 1, question), 101.0)] == [(2, answer)]
+    assert hears(one, encode(2, 1, question), 101.0) == []
+    assert hears(one, encode(1, 2, RequestForBlock(TOP)), 101.0) == []
+    assert hears(one, encode(1, 3, question), 110.0) == []
+
+
+def test_a_forged_vote_names_the_chain_where_votes_do() -> None:
+    one = rogue()
+    begin(one, "forge", message="Block Add Response", sender=2, for_s=10)
+    hears(one, encode(1, 1, BlockAddResponse(TOP, True, TOP)), 101.0)
+    (vote,) = hears(one, REQUEST, 101.0)
+    assert said(vote) == BlockAddResponse(BLOCK.block_hash, False, TOP)
+
+
+def test_a_flood_is_well_formed_evenly_spaced_and_the_same_for_the_same_seed() -> None:
+    sent = []
+    for _ in range(2):
+        one = rogue()
+        first = begin(one, "flood", for_s=10, per_s=20)
+        sent.append([(100.0, it) for it in first] + wait(one, 1000))
+    assert sent[0] == sent[1]
+    assert len(sent[0]) == 200
+    assert [at for at, _ in sent[0]] == pytest.approx([100 + count / 20 for count in range(200)])
+    decoded = [decode(it.datagram) for _, it in sent[0]]
+    assert {sender for sender, _, _ in decoded} == set(ROSTER)
+    assert {type(message) for _, _, message in decoded} == set(TYPE_CODES)
+    assert len({sequence for _, sequence, _ in decoded}) == 200
+
+
+def test_a_machine_that_is_too_slow_floods_less_not_longer() -> None:
+    one = rogue()
+    begin(one, "flood", for_s=10, per_s=1000)
+    one.handle_timer(109.0)
+    assert 0 < len(one.to_send()) < 9000
+    one.handle_timer(110.0)
+    assert (one.to_send(), one.next_timer()) == ([], None)
+
+
+@pytest.mark.parametrize("message", TYPE_CODES)
+def test_random_messages_of_every_type_are_well_formed(message: type[Message]) -> None:
+    for seed in range(50):
+        layer = random_message(message.NAME, ROSTER, 5, Random(seed))
+        assert type(decode(bytes(encode(1, 1, message.from_body(bytes(layer)))))[2]) is message
+
+
+def test_sequence_numbers_tell_the_injection_and_are_no_agent_s() -> None:
+    assert injection_of(2**31 - 1) is None
+    for number in (1, 2, 10_000):
+        for count in (0, 1, MAX_FLOOD - 1):
+            assert injection_of(forged_sequence(number, count)) == number
+    assert forged_sequence(10_000, MAX_FLOOD) < 2**32
+
+
+def test_the_journal_has_a_line_for_each_datagram_and_counts_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal, "LINES", 2)
+    lines: list[dict[str, Any]] = []
+    book = journal.Journal(lines.append)
+    for at_s, datagram in ((1.0, COMMIT), (1.1, COMMIT[:-1]), (2.1, COMMIT), (2.9, COMMIT[:5]), (3.0, COMMIT)):
+        book.add(Injected(1, "replay", 1, datagram), at_s)
+    book.close()
+    assert [line.get("message", line.get("refused")) for line in lines[:2]] == ["Commit Block", "wrong length"]
+    assert lines[0]["block"] == BLOCK.block_hash.hex()
+    assert [(line["at_s"], line["count"], line["messages"], line["refused"]) for line in lines[2:]] == [
+        (2, 2, {"Commit Block": 1}, {"truncated": 1}),
+        (3, 1, {"Commit Block": 1}, {}),
+    ]
