@@ -6,17 +6,17 @@ stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and s
 
 import asyncio
 import time
-from collections import defaultdict
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from harness.agents import Status
-from harness.backends.agent_process import AgentFailedError, AgentProcess, reboots_with_disk
+from harness.backends.agent_process import AgentProcess, reboots_with_disk
 from harness.backends.lab import Lab, OpenLab
 from harness.backends.rehearsal import network_needs, on_the_air
 from harness.backends.rogue_process import RogueProcess
 from harness.backends.vehicle_process import VehicleProcess, system_ids
+from harness.backends.watchers import Watchers, unless_interrupted
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.mission import Played, Story
 from harness.progress import Progress, Snapshot
@@ -85,9 +85,7 @@ class ProcessRun:
         self._capture: Capture | None = None
         self._reach = Reach(scenario)
         self._changing_network = asyncio.Lock()
-        self._group = asyncio.TaskGroup()
-        self._watchers: dict[str, list[asyncio.Task[None]]] = defaultdict(list)
-        """Of what -> the tasks that watch it, or fly it."""
+        self._watchers = Watchers()
         self._starting: dict[int, asyncio.Task[None]] = {}
         """Agents that begin again and do not answer yet."""
 
@@ -101,7 +99,7 @@ class ProcessRun:
         All else that goes wrong is in the answer.
         """
         try:
-            lab = await self._unless_interrupted(self._open_lab(self.scenario, self.rundir, self._show))
+            lab = await unless_interrupted(self._open_lab(self.scenario, self.rundir, self._show), self.interrupted)
         except HarnessError:
             raise
         except LabUnavailable as error:
@@ -112,7 +110,8 @@ class ProcessRun:
             self._lab = lab
             self.played.engine = lab.engine
             try:
-                await self._guarded(story(self, self.scenario))
+                mission = story(self, self.scenario)
+                await self._watchers.guard(mission, self._watch_for_interruption(), lab.watch())
             except HarnessError as error:
                 self._ended_early(error)
             except CaptureError as error:
@@ -123,42 +122,6 @@ class ProcessRun:
                 self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
             await self._wind_up(lab)
         return self.played
-
-    async def _unless_interrupted(self, opening: Awaitable[Lab]) -> Lab:
-        """Raises InterruptedRunError, once what was begun has been taken back."""
-        opened = asyncio.ensure_future(opening)
-        interruption = asyncio.create_task(self.interrupted.wait())
-        await asyncio.wait({opened, interruption}, return_when=asyncio.FIRST_COMPLETED)
-        interruption.cancel()
-        if not opened.done():
-            opened.cancel()
-            await asyncio.wait({opened})
-        if opened.cancelled():
-            raise InterruptedRunError("the run was interrupted before it began")
-        return opened.result()
-
-    async def _guarded(self, story: Awaitable[None]) -> None:
-        """Run the mission; the first failure of anything, or the user's interruption, ends it and is raised."""
-        try:
-            async with asyncio.TaskGroup() as self._group:
-                self._watch(self._watch_for_interruption())
-                self._watch(self._lab.watch())
-                await story
-                for what in list(self._watchers):
-                    self._watch_no_more(what)
-        except BaseExceptionGroup as errors:
-            raise _first(errors) from None
-
-    def _watch(self, coroutine: Coroutine[Any, Any, None], of: str = "mission") -> None:
-        """Run something beside the mission: what it raises ends the mission, and it ends with the mission.
-
-        Or before, by `_watch_no_more(of)`.
-        """
-        self._watchers[of].append(self._group.create_task(coroutine))
-
-    def _watch_no_more(self, of: str) -> None:
-        for watcher in self._watchers.pop(of, ()):
-            watcher.cancel()
 
     async def _watch_for_interruption(self) -> None:
         await self.interrupted.wait()
@@ -178,11 +141,11 @@ class ProcessRun:
         await self.apply(first)
         if self.scenario.capture:
             self._capture = await Capture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
-            self._watch(self._capture.watch())
+            self._watchers.start(self._capture.watch())
         await self._start_clock()
-        self._watch(self._poll_agents())
+        self._watchers.start(self._poll_agents())
         if self.vehicles:
-            self._watch(self._follow_flight())
+            self._watchers.start(self._follow_flight())
         for vehicle in self.vehicles:
             self._fly(vehicle)
 
@@ -193,7 +156,7 @@ class ProcessRun:
             if flight is None
             else vehicle.fly(flight.planned(), flight.by)
         )
-        self._watch(flown, of=f"flight {vehicle.vehicle_id}")
+        self._watchers.start(flown, of=f"flight {vehicle.vehicle_id}")
 
     def _home(self, number: int) -> Home:
         vehicles = self.scenario.vehicles
@@ -208,14 +171,14 @@ class ProcessRun:
             *(vehicle.start(lab, self._home(number), speedup) for number, vehicle in enumerate(self.vehicles))
         )
         for vehicle in self.vehicles:
-            self._watch(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
+            self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
 
     async def _start_agents(self, lab: Lab) -> None:
         self._show("starting agents")
         await asyncio.gather(*(self._start_agent(agent, lab) for agent in self.agents))
         if self._rogue is not None:
             await self._rogue.start(lab.network)
-            self._watch(self._rogue.watch(), of="rogue")
+            self._watchers.start(self._rogue.watch(), of="rogue")
 
     async def _start_agent(self, agent: AgentProcess, lab: Lab) -> None:
         """Start it, into the mission if that is under way."""
@@ -223,7 +186,7 @@ class ProcessRun:
         keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
         epoch_us = self.clock.epoch_us
         await agent.start(lab, self.scenario, self.seed, self.initial_data, with_vehicle, keeps_disk, epoch_us)
-        self._watch(agent.watch(), of=f"agent {agent.agent_id}")
+        self._watchers.start(agent.watch(), of=f"agent {agent.agent_id}")
 
     async def _start_clock(self) -> None:
         epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
@@ -266,20 +229,20 @@ class ProcessRun:
                 await asyncio.gather(self._kill(agent), *([self._shoot_down(vehicle)] if vehicle else []))
             case "crash":
                 assert vehicle is not None, "without vehicles a crash is refused"
-                self._watch(vehicle.fall(), of=f"flight {agent_id}")
+                self._watchers.start(vehicle.fall(), of=f"flight {agent_id}")
                 await self._kill(agent)
             case "boot":
-                self._starting[agent_id] = self._group.create_task(self._start_agent(agent, self._lab))
+                self._starting[agent_id] = self._watchers.task(self._start_agent(agent, self._lab))
             case "restart":
-                self._starting[agent_id] = self._group.create_task(self._start_again(agent, number))
+                self._starting[agent_id] = self._watchers.task(self._start_again(agent, number))
 
     async def _kill(self, agent: AgentProcess, *, disk_kept: bool = False) -> None:
-        self._watch_no_more(f"agent {agent.agent_id}")
+        self._watchers.stop(f"agent {agent.agent_id}")
         await agent.kill(disk_kept=disk_kept)
 
     async def _shoot_down(self, vehicle: VehicleProcess) -> None:
-        self._watch_no_more(f"flight {vehicle.vehicle_id}")
-        self._watch_no_more(f"vehicle {vehicle.vehicle_id}")
+        self._watchers.stop(f"flight {vehicle.vehicle_id}")
+        self._watchers.stop(f"vehicle {vehicle.vehicle_id}")
         await vehicle.kill()
 
     async def _start_again(self, agent: AgentProcess, number: int) -> None:
@@ -290,7 +253,7 @@ class ProcessRun:
             vehicle = self._vehicle(agent.agent_id, life)
             self.vehicles[number] = vehicle
             await vehicle.start(self._lab, self._home(number), self.scenario.speedup)
-            self._watch(vehicle.watch(), of=f"vehicle {agent.agent_id}")
+            self._watchers.start(vehicle.watch(), of=f"vehicle {agent.agent_id}")
             self._fly(vehicle)
         await self._start_agent(agent, self._lab)
 
@@ -443,11 +406,3 @@ class ProcessRun:
                 {agent.agent_id: agent.status for agent in self.agents},
             )
         )
-
-
-def _first(errors: BaseExceptionGroup[BaseException]) -> BaseException:
-    """The error to report: an agent's or vehicle's own before what followed from it."""
-    flat: list[BaseException] = []
-    for error in errors.exceptions:
-        flat += [_first(error)] if isinstance(error, BaseExceptionGroup) else [error]
-    return min(flat, key=lambda error: (not isinstance(error, HarnessError), not isinstance(error, AgentFailedError)))

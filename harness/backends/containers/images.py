@@ -26,7 +26,7 @@ HOST_IMAGE = "ucp-harness-host:empty"
 PROJECT_IMAGE = "ucp-harness-agent"
 PACKAGES = ("sitl", "ucp")
 SYSTEM = ("/bin", "/lib", "/lib32", "/lib64", "/libx32", "/usr")
-INSTEAD = "use this machine's own files (--image-from-host, or `docker.image_from_host`), or name an image (`docker.image`)"
+INSTEAD = "use this machine's files (--image-from-host, `docker.image_from_host`), or name an image (`docker.image`)"
 
 
 @dataclass(frozen=True)
