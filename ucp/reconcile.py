@@ -218,7 +218,7 @@ def receive_response_block_for_hash(agent: "Agent", sender: int, message: BlockR
     """Algorithm 18, Receive Response Block for Hash: commit the block that was asked for.
 
     The thesis pauses the timer while it looks; a handler is atomic here, so the pause costs nothing and changes
-    nothing. `Agent.commit` computes the chain hash anew, which the field test forgot.
+    nothing. `Agent.commit` computes the chain hash anew, which the field test forgot, as the quirk does.
     """
     if not agent.phase_three_timer.active:
         return "not in phase 3"
@@ -227,7 +227,10 @@ def receive_response_block_for_hash(agent: "Agent", sender: int, message: BlockR
         agent.phase_three_timer.resume(agent.now)
         return "another block"
     agent.phase_three_timer.stop()
+    chain_hash_before = agent.chain.top_chain_hash
     agent.commit(message.block)
+    if agent.quirks.stale_chain_hash:
+        agent.chain.top_chain_hash = chain_hash_before
     agent.majority_response_block_hash = None
     agent.trigger(reconcile_phase_2)
     return "committed"

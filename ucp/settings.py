@@ -57,6 +57,8 @@ class Quirks:
     """Algorithm 15 dies on a tied vote and the reconcile never ends (Section 4.3, second field test)."""
     early_phase3_expiry: bool = False
     """The phase 3 timer ends as it starts, so no block ever comes in time (Section 4.3, agents 118 and 120)."""
+    stale_chain_hash: bool = False
+    """Algorithm 18 commits the block without computing the chain hash anew (Section 4.2, the field tests' last bug)."""
 
     def set(self, name: str, value: Any) -> None:
         """Set one quirk by name. ValueError says which names there are and what the value may be."""

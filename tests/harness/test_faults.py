@@ -120,6 +120,13 @@ def test_a_crash_is_a_kill_in_virtual_time() -> None:
     assert crashed.played.agents == killed.played.agents
 
 
+def test_a_chain_hash_that_was_not_computed_anew_is_not_genuine() -> None:
+    simulated = played([], network={"loss": 0.3}, quirks={"stale_chain_hash": True})
+    genuine = simulated.result.characteristics["4"]
+    assert genuine.verdict == "violated"
+    assert {one.detail.partition(" at block ")[0] for one in genuine.evidence} == {"the chain hash"}
+
+
 def test_losing_a_block_over_a_brown_out_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that is kept excuses nothing."""
     alone = [{"at_s": 0, "partition": [[2], [1, 3, 4, 5]]}, {"at_s": 400, "heal": True}]

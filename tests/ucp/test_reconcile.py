@@ -1,6 +1,6 @@
 """Algorithms 7-20, handler by handler, with divergences and ties that the thesis could not force."""
 
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from random import Random
 
 import pytest
@@ -8,7 +8,7 @@ import pytest
 from tests.ucp.air import Air, uniform_latency
 from tests.ucp.branches import takes
 from ucp.agent import Agent
-from ucp.block import Block
+from ucp.block import Block, next_chain_hash
 from ucp.messages import (
     BlockResponse,
     ChainContainQuery,
@@ -344,6 +344,19 @@ def test_the_field_test_s_early_phase_3_expiry_ends_every_reconcile_before_a_blo
     agent.quirks.set("early_phase3_expiry", False)
     air.reconcile(1)
     assert len(agent.chain) == 2
+
+
+def test_the_field_test_s_stale_chain_hash_makes_an_agent_ask_for_what_it_has_just_got() -> None:
+    air = diverged(blocks_on_2=2)
+    agent = air.agents[1]
+    agent.quirks.set("stale_chain_hash", True)
+    air.reconcile(1)
+    assert air.branches(1, "receive_response_block_for_hash")[0] == "committed"
+    assert air.branches(1, "reconcile_phase_3") == ["asked", "held already"]
+    right = accumulate(
+        (block.block_hash for block in agent.chain), next_chain_hash, initial=agent.chain.inception.chain_hash
+    )
+    assert [chain_hash for _, chain_hash in agent.chain.with_chain_hashes()] != list(right)[1:]
 
 
 @takes("reconcile_phase_3", "held already")
