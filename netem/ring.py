@@ -1,6 +1,6 @@
 """All frames that cross one switch port, by AF_PACKET and a ring of memory that we share with the kernel (TPACKET_V3).
 
-The kernel fills a ring's blocks, and hands over a block when it is full or 50 ms old; a reader that is late finds them
+The kernel fills a ring's blocks, and hands over a block when it is full or 100 ms old; a reader that is late finds them
 all, as long as there is room. The kernel counts what crosses the port and what it had no room for, so that nobody has
 to trust a reader. See packet(7), and packet_mmap in the kernel's documentation.
 
@@ -38,9 +38,10 @@ _CHECKSUM = struct.Struct("=6xHH")  # virtio_net_hdr: csum_start, csum_offset
 _COUNTS = struct.Struct("=III")
 _MACS = 12  # bytes of both addresses, before a VLAN tag
 
-BLOCK_BYTES = 1 << 18  # more than any frame, also those that veth pairs carry before TCP has cut them up
+BLOCK_BYTES = 1 << 17  # more than any frame, also those that veth pairs carry before TCP has cut them up
 _SLOT_BYTES = 2048  # means nothing to TPACKET_V3, but has to divide a block
-RETIRE_MS = 50
+RETIRE_MS = 100
+"""Age at which a block is handed over, full or not: what is quiet fills a ring in as many blocks times this."""
 
 
 class Ring:

@@ -26,8 +26,8 @@ _MEMORY = 256 << 20
 """Bytes of all rings together, at most: the faster one port is, the slower are the others, on one machine."""
 _RING_MEMORY = 16 << 20
 """Bytes of one ring, at most: a second of 10,000 of the largest frames."""
-_FEWEST_BLOCKS = 4  # of a ring, even if that is more for all
-_DRAIN_S = 5.0
+_FEWEST_BLOCKS = 8  # of a ring, even if that is more for all
+_DRAIN_S = 10.0
 """After a block's age at most, if the kernel keeps its word."""
 
 
