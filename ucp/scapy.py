@@ -5,11 +5,12 @@
 
     rdpcap("7.pcapng")[0].show()
     block = Block(agent_id=1, events=[LoggableEvent(timestamp_us=5, event_id=1, data=b"x")])
-    Ether() / IP() / UDP() / UCP(sender=1) / BlockAddRequest(block_hash=block.block_hash, chain_hash=...)
+    air = Ether(dst="ff:ff:ff:ff:ff:ff") / IP(src="10.77.0.1", dst="10.79.255.255") / UDP()
+    air / UCP(sender=1) / BlockAddRequest(block_hash=block.block_hash, chain_hash=...)
 
 The layers are made from the declarations in `ucp.messages`, `ucp.block` and `ucp.events`, and bear the thesis's names.
 What is left out is computed: UDP's ports, type and length in the header, an event's length, and a block's timestamp,
-which is that of its newest event (Section 4.2).
+which is that of its newest event (Section 4.2). Addresses that are left out scapy itself looks up, by ARP for one.
 
 What came over the air becomes a message's layer if and only if the codec accepts the datagram. The body of any other
 is Raw behind the UCP header, and a datagram that does not begin with a header of UCP version 1 is Raw as a whole.

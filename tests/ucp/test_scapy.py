@@ -142,7 +142,8 @@ def test_a_capture_shows_messages_and_what_is_left_out_is_computed(tmp_path: Pat
 
 
 def test_what_a_link_adds_behind_a_frame_is_no_part_of_the_message() -> None:
-    frame = bytes(Ether() / IP(src="10.77.0.1", dst="10.77.0.2") / UDP() / UCP() / RequestForBlock())
+    link = Ether(dst="ff:ff:ff:ff:ff:ff") / IP(src="10.77.0.1", dst="10.79.255.255")
+    frame = bytes(link / UDP() / UCP() / RequestForBlock())
     assert message_of(Ether(frame + b"\xde\xad\xbe\xef"))[2] == ucp.messages.RequestForBlock(bytes(32))
 
 
