@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 
 from harness.markdown import escaped, row
-from harness.report import facts, network, survival, words
+from harness.report import facts, network, rogue, survival, words
 from harness.report.remains import Remains
 from harness.report.result import mapping
 from harness.report.verdicts import Verdict, headline, verdicts
@@ -29,6 +29,7 @@ def to_markdown(left: Remains) -> str:
     if survived := survival.section(result, left.ink):
         lines += _listed(survived.sentences)
     lines += _faults(network.faults(result))
+    lines += _listed(rogue.sentences(result))
     known = mapping(result, "versions")
     versions = ", ".join(f"{name} {words.value(version)}" for name, version in known.items())
     return "\n".join([*lines, f"<sub>{_short(versions)}</sub>"]) + "\n"

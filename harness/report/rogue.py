@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from harness.record import RogueInjection
 from harness.report import words
 from harness.report.result import listing
-from harness.rogue.account import done_with
+from harness.rogue.account import done_with, in_words
 
 MAX_ROWS = 500
 
@@ -36,12 +36,20 @@ class Section:
 
 def section(result: dict[str, Any]) -> Section | None:
     """None if no rogue node was on the air, or the record says nothing of it that can be read."""
-    try:
-        injections = [RogueInjection.model_validate(one) for one in listing(result, "rogue")]
-    except ValidationError:
-        return None
-    rows = [row for one in injections for row in _rows(one)]
+    rows = [row for one in _injections(result) for row in _rows(one)]
     return Section(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
+
+
+def sentences(result: dict[str, Any]) -> list[str]:
+    """One for each injection."""
+    return [in_words(one) for one in _injections(result)]
+
+
+def _injections(result: dict[str, Any]) -> list[RogueInjection]:
+    try:
+        return [RogueInjection.model_validate(one) for one in listing(result, "rogue")]
+    except ValidationError:
+        return []
 
 
 def _rows(one: RogueInjection) -> list[Row]:

@@ -130,6 +130,9 @@ def test_a_forged_commit_is_noticed_and_the_report_says_what_became_of_it(tmp_pa
     assert '<h2 id="rogue">Rogue node</h2>' in page
     assert "<td>forge</td>" in page
     assert "committed 4" in page
+    assert (
+        "- forge at 200 s, Commit Block from 2: 1 sent; committed 4\n" in (finished.directory / "report.md").read_text()
+    )
     (injection,) = json.loads((tmp_path / "run" / "run.json").read_text())["rogue"]
     assert (injection["at_s"], injection["detail"], injection["sent"]) == (200, "Commit Block from 2", 1)
 
