@@ -23,7 +23,7 @@ from typing import Any
 
 from netem import pcapng
 from netem.errors import CaptureError
-from netem.lab import Lab, LabProcess
+from netem.lab import Lab, LabProcess, in_words
 
 _READY_S = 20.0
 _LOOK_AGAIN_S = 0.01
@@ -100,7 +100,7 @@ class Capture:
         return {int(vehicle): counted for vehicle, counted in said["vehicles"].items()}
 
     def _ended(self, returncode: int) -> CaptureError:
-        how = f"{signal.Signals(-returncode).name}" if returncode < 0 else self._last_word()
+        how = in_words(returncode) if returncode < 0 else self._last_word()
         return CaptureError(f"The capture of packets failed: {how}")
 
     def _last_word(self) -> str:

@@ -15,7 +15,7 @@ import pytest
 from netem.channel import Channel
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError, LabError, SpawnError
-from netem.lab import Lab, LabProcess
+from netem.lab import Lab, LabProcess, in_words
 from tests.netem.conftest import DEADLINE_S, PORT, Air, play, until
 
 pytestmark = pytest.mark.lab
@@ -325,3 +325,7 @@ def test_a_request_that_makes_no_sense_is_answered_and_survived(
         assert "alive" in await output(lab, tmp_path, 1, sys.executable, "-S", "-c", "print('alive')")
 
     in_lab(tmp_path, story)
+
+
+def test_an_end_in_words() -> None:
+    assert [in_words(returncode) for returncode in (0, 3, -9, -40)] == ["status 0", "status 3", "SIGKILL", "signal 40"]
