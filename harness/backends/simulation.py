@@ -140,7 +140,8 @@ class Simulation:
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
         self._lives: list[list[Life]] = [[] for _ in self.roster]
-        self._alive: list[Life | None] = [None for _ in (*self.roster, "the rogue node, which is no agent")]
+        self._alive: list[Life | None] = [None] * (len(self.roster) + 1)
+        """By number; the last is the rogue node's, which is no agent and has no life."""
         self._disks: dict[int, Holdings] = {}
         """What is on the disk of the agents that reboot with it."""
         self._reach = Reach(scenario)
