@@ -38,8 +38,10 @@ def examine() -> list[Finding]:
 
 def _user_mode_linux() -> Finding:
     use = "--kernel uml: all of netem, in a process without privileges"
+    if uml.inside():
+        return Finding("User Mode Linux", True, False, "this is it")
     try:
-        return Finding("User Mode Linux", True, False, f"{uml.find()}, for {use}")
+        return Finding("User Mode Linux", True, False, f"{uml.examine()}; for {use}")
     except UmlError as error:
         return Finding("User Mode Linux", False, False, str(error), f"with it there is {use}")
 

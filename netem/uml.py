@@ -10,6 +10,9 @@ What the command prints comes out here as it comes. Its terminal is a console of
 are typed as Ctrl-C, and nothing else is. On another console the guest says an empty line every few seconds, and at
 last the command's exit status: without that last word there is an error, never a status.
 
+Its programs keep their floating point and vector registers also on processors that it does not know
+(`netem.uml_registers`).
+
 Whatever happens to the caller, nothing stays: User Mode Linux is one process group of the host, led by a shell that
 kills the group and removes its directory as soon as the caller closes its end of a pipe, or dies.
 """
@@ -32,6 +35,7 @@ from pathlib import Path
 from types import FrameType
 from typing import BinaryIO
 
+from netem import uml_registers
 from netem.errors import UmlError
 
 MODULES = Path("/usr/lib/uml/modules")
@@ -102,11 +106,23 @@ def find() -> Path:
         "user-mode-linux": kernel is not None and MODULES.is_dir(),
         "kmod": shutil.which("modprobe", path=path),
         "iproute2": shutil.which("ip", path=path),
+        "gcc": uml_registers.has_compiler() or not uml_registers.needed(Path(kernel) if kernel else None),
     }
     missing = [package for package, here in packages.items() if not here]
     if kernel is None or missing:
-        raise UmlError(f"User Mode Linux is not installed (Debian, Ubuntu: apt install {' '.join(missing)})")
-    return Path(kernel)
+        what = "User Mode Linux is not installed" if kernel is None else "User Mode Linux lacks what it needs here"
+        raise UmlError(f"{what} (Debian, Ubuntu: apt install {' '.join(missing)})")
+    return Path(kernel).absolute()
+
+
+def examine() -> str:
+    """Boot it; which it is, and how it keeps registers. Raises UmlError, as `run` does."""
+    kernel = find()
+    status = run(["true"], cwd=Path("/"), env={"PATH": SYSTEM_PATH})
+    if status != 0:
+        raise UmlError(f"User Mode Linux failed: it boots, but `true` ends in it with status {status}")
+    how = "kept by a library that is preloaded" if uml_registers.needed(kernel) else "kept by itself"
+    return f"{kernel}, in which this processor's registers are {how}"
 
 
 def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
@@ -122,7 +138,7 @@ def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
         (folder / "command").write_text(_command(argv, cwd, env))
         (folder / "init").write_text(_init(folder / "command"))
         (folder / "init").chmod(0o755)
-        guest = _Guest(kernel, folder)
+        guest = _Guest(kernel, folder, uml_registers.preload(folder) if uml_registers.needed(kernel) else {})
         try:
             with _typing_ctrl_c(guest):
                 return guest.follow()
@@ -164,7 +180,7 @@ class _Guest:
     refuse to write instead of waiting.
     """
 
-    def __init__(self, kernel: Path, folder: Path) -> None:
+    def __init__(self, kernel: Path, folder: Path, preload: Mapping[str, str]) -> None:
         self.up = False
         self._folder = folder
         typed, self._keyboard = os.pipe()
@@ -175,8 +191,8 @@ class _Guest:
                 for name in ("kernel", "stdout", "stdout", "stderr", "word")
             )
             options = [
-                f"mem={MEMORY}", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"init={folder / 'init'}",
-                f"uml_dir={folder}", "con=null", "con0=null,fd:1",
+                f"mem={MEMORY}", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw",
+                f'init="{folder / "init"}"', f"uml_dir={folder}", "con=null", "con0=null,fd:1",
                 f"con1=fd:{typed},fd:{terminal}", f"con2=null,fd:{stdout}", f"con3=null,fd:{stderr}",
                 f"con4=null,fd:{word}", "quiet", "selinux=0", "panic=-1",
             ]  # fmt: skip
@@ -185,7 +201,8 @@ class _Guest:
                 stdin=subprocess.DEVNULL,
                 stdout=kernel_log,
                 stderr=kernel_log,
-                env={**os.environ, "UML_CALLER": str(caller), "UML_FOLDER": str(folder)},
+                cwd=folder,
+                env={**os.environ, **preload, "UML_CALLER": str(caller), "UML_FOLDER": str(folder)},
                 pass_fds=(typed, terminal, stdout, stderr, word, caller),
                 start_new_session=True,
             )
@@ -224,7 +241,7 @@ class _Guest:
     def _failed(self, what: str) -> UmlError:
         lines = (self._folder / "kernel").read_text(errors="replace").splitlines()
         told = [line.strip() for line in lines if line.strip()] or ["nothing"]
-        last = next((line for line in told if "panic" in line), told[-1])
+        last = next((line for line in told if "LD_PRELOAD" in line or "panic" in line), told[-1])
         return UmlError(f"User Mode Linux failed: {what}; it last said: {last}")
 
     def end(self) -> None:
