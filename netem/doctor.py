@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from netem import namespaces
-from netem.lab import Lab, LabError, LabUnavailable
+from netem.lab import Lab, LabError
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,10 @@ def examine() -> list[Finding]:
         log = Path(folder, "lab.log")
         tried = {name: _try(name, log) for name in ("netem", "nftables")}
         chosen = _try(None, log)
-    broken = next((e for e in tried.values() if isinstance(e, LabUnavailable) and e.stage == "fabric"), None)
+    broken = next((e for e in tried.values() if isinstance(e, LabError) and getattr(e, "stage", "") != "engine"), None)
     if broken is not None:
-        return [*found, Finding("network", False, broken.reason, broken.way_out)]
+        reason = str(getattr(broken, "reason", broken))
+        return [*found, Finding("network", False, reason, getattr(broken, "way_out", ""))]
     found.append(Finding("network", True, "bridge, veth pairs and a namespace for each vehicle"))
     for name, result in tried.items():
         if isinstance(result, str):

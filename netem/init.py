@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from errno import EINPROGRESS, ETIMEDOUT
 from typing import Any
 
-from netem import choice
+from netem import choice, namespaces
 from netem.conditions import NetworkConditions
 from netem.engine import Engine
 from netem.errors import ConditionsError, EngineError, NetemError
@@ -178,6 +178,8 @@ class Server:
                     stderr=files[1],
                     start_new_session=True,
                 )
+        except PermissionError as error:
+            raise PermissionError(error.errno, f"{error.strerror} to {namespaces.user()}", error.filename) from None
         finally:
             for file in files:
                 os.close(file)

@@ -136,6 +136,10 @@ class Lab:
             if refusal is None:
                 return lab
             word = refusal
+        if (failure := namespaces.not_executed(word)) is not None:
+            program, why = failure
+            reason = f"{namespaces.user()} cannot execute {program} ({why})"
+            raise LabUnavailable(f"The lab's first process could not be started: {reason}", namespaces.way_out(word))
         raise LabUnavailable(
             f"This machine does not let us make a private network ({word})",
             f"{namespaces.way_out(word)} Or run it inside User Mode Linux: --kernel uml.",
@@ -160,7 +164,7 @@ class Lab:
                     stdin=asyncio.subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,
-                    env={**os.environ, "PYTHONPATH": path},
+                    env={**os.environ, "PYTHONPATH": path, "LC_ALL": "C.UTF-8"},  # the tools' words are in English
                     pass_fds=[theirs.fileno(), *networks.values()],
                     start_new_session=True,  # the terminal's Ctrl-C is for the orchestrator alone
                 )

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import ctypes
 import os
+import pwd
+import re
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -86,10 +88,32 @@ def probe() -> tuple[bool, str]:
     return False, word
 
 
+def not_executed(word: str) -> tuple[str, str] | None:
+    """The program that a tool did not start, and why, if that is what its `word` says: namespaces were allowed."""
+    found = re.fullmatch(r"(?:unshare|setpriv): failed to execute (.+): (.+)", word)
+    return (found[1], found[2]) if found else None
+
+
+def user() -> str:
+    """Who executes what we execute: "user nobody"; the one outside, where we are root of a user namespace."""
+    uid = os.geteuid()
+    for line in Path("/proc/self/uid_map").read_text().splitlines():
+        inside, outside, count = map(int, line.split())
+        if inside <= uid < inside + count:
+            uid += outside - inside
+            break
+    try:
+        return f"user {pwd.getpwuid(uid).pw_name}"
+    except KeyError:
+        return f"user {uid}"
+
+
 def way_out(word: str) -> str:
     """What to do about namespaces that were refused with `word`, from what this machine says of itself."""
     if "not installed" in word:
         return "Install util-linux (Debian, Ubuntu: apt install util-linux)."
+    if not_executed(word):
+        return "Let that user reach it, or use a Python that every user can execute (Debian, Ubuntu: /usr/bin/python3)."
     as_root = "or run as root"
     if _sysctl("user/max_user_namespaces") == 0:
         return f"User namespaces are switched off: sudo sysctl user.max_user_namespaces=15000, {as_root}."

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,18 +21,19 @@ from tests.machine import unavailable
 REPOSITORY = Path(__file__).parents[2]
 
 
-def as_nobody(argv: list[str]) -> list[str]:
-    """The command line as an ordinary user: this one, or nobody if this one is root."""
-    if os.geteuid() != 0:
-        return argv
-    return ["setpriv", "--reuid", "nobody", "--regid", "nogroup", "--clear-groups", "--inh-caps=-all", *argv]
+def run_as_nobody(argv: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command as an ordinary user: this one, or nobody if this one is root."""
+    nobody = {"user": "nobody", "group": "nogroup", "extra_groups": []} if os.geteuid() == 0 else {}
+    return subprocess.run(argv, capture_output=True, text=True, check=False, **nobody, **options)
 
 
 def require_nobody_can() -> None:
     """Skip where root keeps its Python or this checkout to itself; an ordinary user needs no nobody."""
     probe = [sys.executable, "-c", "import netem.lab"]
-    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(REPOSITORY)}
-    done = subprocess.run(as_nobody(probe), env=environment, capture_output=True, text=True, check=False)
+    try:
+        done = run_as_nobody(probe, env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(REPOSITORY)}, cwd="/")
+    except PermissionError as error:
+        pytest.skip(f"the user nobody cannot execute {error.filename}: {error.strerror}")
     if done.returncode != 0:
         word = (done.stderr.strip().splitlines() or ["it gave no reason"])[-1]
         pytest.skip(f"the user nobody cannot run {sys.executable} with this checkout: {word}")
@@ -40,17 +42,13 @@ def require_nobody_can() -> None:
 def run_script(script: str, *, prefix: list[str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run a Python script as an ordinary user, in a folder of that user's own."""
     require_nobody_can()
-    made = subprocess.run(as_nobody(["mktemp", "-d"]), capture_output=True, text=True, check=True)
-    folder = made.stdout.strip()
+    folder = run_as_nobody(["mktemp", "-d"], cwd="/").stdout.strip()
     try:
-        return subprocess.run(
-            as_nobody([*(prefix or []), sys.executable, "-c", textwrap.dedent(script)]),
+        return run_as_nobody(
+            [*(prefix or []), sys.executable, "-c", textwrap.dedent(script)],
             cwd=folder,
             env={"PATH": "/usr/bin:/bin", "HOME": folder, "PYTHONPATH": str(REPOSITORY), "TMPDIR": folder},
-            capture_output=True,
-            text=True,
             timeout=120,
-            check=False,
         )
     finally:
         subprocess.run(["rm", "-rf", folder], check=True)
@@ -112,6 +110,40 @@ def test_where_user_namespaces_are_forbidden_the_refusal_says_so_and_what_to_do(
     assert "sudo sysctl user.max_user_namespaces=15000, or run as root" in lines[1]
     assert lines[2].startswith("This machine does not let us make a private network (unshare:")
     assert lines[3].startswith("namespaces False User namespaces are switched off")
+
+
+_INTERPRETER_OUT_OF_REACH = """
+    import asyncio, sys
+    from pathlib import Path
+    from netem.doctor import examine
+    from netem.lab import Lab, LabUnavailable
+
+    program = Path("program")
+    program.touch(0o600)
+    sys.executable = str(program.absolute())
+    try:
+        asyncio.run(Lab.open([1, 2], log=Path("lab.log")))
+    except LabUnavailable as error:
+        print(error)
+    print([(finding.name, finding.ok) for finding in examine()])
+"""
+
+
+@pytest.mark.lab
+def test_an_interpreter_that_a_user_cannot_reach_is_named_and_nothing_else_is_blamed() -> None:
+    done = run_script(_INTERPRETER_OUT_OF_REACH)
+    said, findings = done.stdout.splitlines()
+    user = pwd.getpwuid(os.geteuid() or pwd.getpwnam("nobody").pw_uid).pw_name
+    assert said.startswith(f"The lab's first process could not be started: user {user} cannot execute /"), done.stderr
+    assert "/program (Permission denied). Let that user reach it" in said
+    assert findings == "[('namespaces', True), ('network', False)]"
+
+
+@pytest.mark.lab
+def test_a_program_that_a_user_cannot_execute_is_named_with_the_user() -> None:
+    done = run_script(_STORY.replace('["/bin/true"]', '["/etc/shadow"]'))
+    assert "The program could not be started: [Errno 13] Permission denied to user" in done.stderr
+    assert done.stderr.rstrip().endswith(": '/etc/shadow'")
 
 
 @pytest.mark.parametrize(
