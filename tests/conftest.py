@@ -1,11 +1,14 @@
-"""Tests marked `lab` need private network namespaces, `docker` an engine: skipped where there is none, saying why."""
+"""Tests marked `lab` need private network namespaces, `docker` an engine, `uml` User Mode Linux.
+
+They are skipped where there is none, and say why.
+"""
 
 import signal
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.machine import require, require_docker
+from tests.machine import require, require_docker, require_uml
 
 # How fast a machine is, is no property of the code.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -23,3 +26,5 @@ def _machine_can(request: pytest.FixtureRequest) -> None:
         require(None)
     if request.node.get_closest_marker("docker"):
         require_docker()
+    if request.node.get_closest_marker("uml"):
+        require_uml()

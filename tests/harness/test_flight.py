@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -134,7 +135,7 @@ def test_a_mixed_swarm_flies_its_plans(tmp_path: Path) -> None:
     assert vehicles["300"]["last_text"].startswith("Reached command")
 
 
-STRANGER = """#!{python}
+STRANGER = """
 import socket, time
 from pymavlink.dialects.v20 import common
 mav = common.MAVLink(None, srcSystem=9, srcComponent=1)
@@ -149,7 +150,8 @@ while True:
 @pytest.mark.lab
 def test_a_vehicle_that_is_given_up_is_named_and_killed(tmp_path: Path) -> None:
     binary = tmp_path / "arducopter"
-    binary.write_text(STRANGER.format(python=sys.executable))
+    (tmp_path / "stranger.py").write_text(STRANGER)
+    binary.write_text(f"#!/bin/sh\nexec {shlex.quote(sys.executable)} '{tmp_path}/stranger.py'\n")
     binary.chmod(0o755)
     scenario = write_scenario(tmp_path, vehicles={"binary": str(binary)}, duration_s=2000)
     out = tmp_path / "run"

@@ -13,48 +13,43 @@ import pytest
 from netem import uml
 from netem.errors import UmlError
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences, write_scenario
-from tests.machine import require_uml
 
 QUICK = {"agents": 2, "duration_s": 20, "speedup": 20, "events": {"source": "random", "mean_s": 2}}
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """An empty directory, where User Mode Linux is installed."""
-    require_uml()
-    return tmp_path
-
-
-def test_a_run_leaves_verdict_report_and_status_as_on_the_host(folder: Path) -> None:
-    scenario = write_scenario(folder, **QUICK, network={"delay": 0.1})
-    done = harness("run", scenario, "--kernel", "uml", "--vehicles", "none", "--seed", "7", "--out", folder / "run")
+@pytest.mark.uml
+def test_a_run_leaves_verdict_report_and_status_as_on_the_host(tmp_path: Path) -> None:
+    scenario = write_scenario(tmp_path, **QUICK, network={"delay": 0.1})
+    done = harness("run", scenario, "--kernel", "uml", "--vehicles", "none", "--seed", "7", "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("holds") == 6
-    record = json.loads((folder / "run" / "run.json").read_text())
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (record["outcome"], record["engine"], record["seed"]) == ("completed", "netem", 7)
     assert "User Mode Linux" in record["versions"]["kernel"]
-    left = {path.name for path in folder.glob("run/**/*")}
+    left = {path.name for path in tmp_path.glob("run/**/*")}
     assert {"report.html", "network.jsonl", "1.chain.json", "2.trace.jsonl"} <= left
-    assert all(path.stat().st_uid == os.geteuid() for path in folder.glob("run/**/*"))
-    assert harness("check", folder / "run").returncode == 0
+    assert all(path.stat().st_uid == os.geteuid() for path in tmp_path.glob("run/**/*"))
+    assert harness("check", tmp_path / "run").returncode == 0
 
 
+@pytest.mark.uml
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_is_exported_and_judged(folder: Path, number: signal.Signals) -> None:
-    with _Started(folder) as started:
+def test_an_interrupted_run_is_exported_and_judged(tmp_path: Path, number: signal.Signals) -> None:
+    with _Started(tmp_path) as started:
         started.wait_for_mission()
         started.process.send_signal(number)
         rest, errors = started.process.communicate(timeout=DEADLINE_S)
     assert started.process.returncode == 130
     assert "interrupted at mission second" in errors
     assert "holds" in rest
-    assert {path.name for path in folder.glob("run/agents/*.chain.json")} == {"1.chain.json", "2.chain.json"}
-    assert (folder / "run" / "report.html").exists()
+    assert {path.name for path in tmp_path.glob("run/agents/*.chain.json")} == {"1.chain.json", "2.chain.json"}
+    assert (tmp_path / "run" / "report.html").exists()
     started.wait_until_nothing_is_left()
 
 
-def test_a_killed_harness_leaves_nothing_behind(folder: Path) -> None:
-    with _Started(folder) as started:
+@pytest.mark.uml
+def test_a_killed_harness_leaves_nothing_behind(tmp_path: Path) -> None:
+    with _Started(tmp_path) as started:
         started.wait_for_mission()
         assert started.left()
         started.process.kill()
@@ -62,7 +57,8 @@ def test_a_killed_harness_leaves_nothing_behind(folder: Path) -> None:
         started.wait_until_nothing_is_left()
 
 
-def test_the_exit_status_and_both_outputs_come_out_whole(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.uml
+def test_the_exit_status_and_both_outputs_come_out_whole(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     lines = 20000
     assert _run(f"seq {lines}; echo complaint >&2; exit 7") == 7
     out, err = capfd.readouterr()
@@ -70,19 +66,22 @@ def test_the_exit_status_and_both_outputs_come_out_whole(folder: Path, capfd: py
     assert err == "complaint\n"
 
 
-def test_a_kernel_that_panics_is_an_error_not_a_status(folder: Path) -> None:
+@pytest.mark.uml
+def test_a_kernel_that_panics_is_an_error_not_a_status(tmp_path: Path) -> None:
     with pytest.raises(UmlError, match="panic"):
         _run("echo c >/proc/sysrq-trigger; sleep 60")
 
 
-def test_a_kernel_that_falls_silent_is_an_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.uml
+def test_a_kernel_that_falls_silent_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uml, "SILENCE_LIMIT_S", 3.0)
     monkeypatch.setattr(uml, "BEAT_S", 60)
     with pytest.raises(UmlError, match="nothing came from it for 3 s"):
         _run("sleep 60")
 
 
-def test_a_kernel_that_does_not_boot_is_an_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.uml
+def test_a_kernel_that_does_not_boot_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uml, "MEMORY", "nonsense")
     with pytest.raises(UmlError, match="it did not boot"):
         _run("true")

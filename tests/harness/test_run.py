@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -244,7 +245,8 @@ def test_where_user_namespaces_are_forbidden_a_run_and_doctor_say_so_with_status
 
 def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: Path) -> None:
     agent = executable(
-        tmp_path / "my-agent", f"#!/bin/sh\necho $1 >>{tmp_path}/started\nexec {sys.executable} -m ucp.node $2\n"
+        tmp_path / "my-agent",
+        f"#!/bin/sh\necho $1 >>'{tmp_path}/started'\nexec {shlex.quote(sys.executable)} -m ucp.node \"$2\"\n",
     )
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=[str(agent), "--mine"])
     done = harness("run", scenario, "--seed", 1, "--out", tmp_path / "run")
@@ -291,8 +293,9 @@ with socket.socket(socket.AF_UNIX) as server:
     client.sendall(b'{"ok": true, "idle": true}\\n')
     client.recv(1000)
 """
-    agent = executable(tmp_path / "my-agent", f"#!{sys.executable}\n{program}")
-    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=[str(agent)])
+    (tmp_path / "my_agent.py").write_text(program)
+    command = [sys.executable, str(tmp_path / "my_agent.py")]
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=command)
     done = harness("run", scenario, "--out", tmp_path / "run")
     assert done.returncode == 1
     assert "does not follow the agent contract: in its status started, reconcile_in_progress" in done.stderr

@@ -84,7 +84,7 @@ class Both:
         """What comes through both comes at the same time, but for the lateness of this machine."""
         pairs = zip(self.kernel.delays, self.medium[0].delays, strict=True)
         later = statistics.quantiles(one[0] - other[0] for one, other in pairs if one and other)
-        assert all(-EARLY_S < late_s < LATE_S for late_s in later), later
+        assert all(-EARLY_S < late_s < self.late_s for late_s in later), later
 
     @property
     def sides(self) -> tuple[Heard, Heard]:
