@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.rounds import Spread, show
-from harness.backends import process
-from harness.backends.agent_process import AgentProcess, agent_command
-from harness.backends.containers import backend
-from harness.backends.lab import OpenLab
+from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
-from harness.rundir import RunDirectory
+from harness.play.containers import backend
+from harness.play.process import backend as process
+from harness.play.process.agent import AgentProcess, agent_command
+from harness.play.process.lab import OpenLab
 from harness.scenario.load import parse
 from netem.errors import NetemError
 

@@ -14,10 +14,10 @@ from typing import Any
 
 from benchmarks.rounds import Spread, show
 from benchmarks.simulation import scenario, seconds
-from harness.progress import Silent
+from harness.archive.traces import SUFFIX
+from harness.play.progress import Silent
 from harness.report import write_report
-from harness.run import run
-from harness.traces import SUFFIX
+from harness.run.run import run
 
 MEGABYTE = 1e6
 

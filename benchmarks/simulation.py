@@ -19,8 +19,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.simulate import simulate
 
 MISSION_S = 1200.0
 MATRIX_LOSS = [0.0, 0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35]

@@ -4,8 +4,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from harness import traces
-from harness.exports import (
+from harness.archive import traces
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import (
     BEFORE_FINAL_RECONCILE,
     RUN_FILE,
     Export,
@@ -14,9 +15,8 @@ from harness.exports import (
     export_paths,
     read_exports,
 )
-from harness.naming import name_blocks
-from harness.record import AgentRecord, JudgedRecord
-from harness.traces import Trace
+from harness.archive.record import AgentRecord, JudgedRecord
+from harness.archive.traces import Trace
 
 MAX_RECORD_BYTES = 64 * 1024 * 1024
 

@@ -2,10 +2,10 @@
 
 import base64
 
+from harness.archive.exports import Export
+from harness.archive.traces import Trace
 from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
-from harness.exports import Export
-from harness.traces import Trace
 from ucp.block import Block, InceptionBlock, next_chain_hash
 
 NAME = "genuine"

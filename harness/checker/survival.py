@@ -9,11 +9,11 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 
+from harness.archive.exports import Export
+from harness.archive.record import BlockHolders, Fault, LeastHeld, Loss, Survival
+from harness.archive.traces import Held, Trace
 from harness.checker.characteristic import agents
 from harness.checker.evidence import Evidence
-from harness.exports import Export
-from harness.record import BlockHolders, Fault, LeastHeld, Loss, Survival
-from harness.traces import Held, Trace
 
 LOSSES = ("kill", "crash")
 LOSSES_TOLD = 5

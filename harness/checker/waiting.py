@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from harness.archive.traces import Trace
 from harness.checker.characteristic import Finding
 from harness.checker.evidence import Evidence
-from harness.traces import Trace
 from ucp.trace import HandlerRun
 
 SLACK_WALL_S = 1.0

@@ -5,8 +5,8 @@ from rich.console import Console
 
 def clean_command() -> None:
     """Remove the containers of runs on Docker that are over; those of a run that goes on, and all others, stay."""
-    from harness.backends.containers.engine import Engine
-    from harness.backends.containers.leftovers import clean
+    from harness.play.containers.engine import Engine
+    from harness.play.containers.leftovers import clean
 
     engine = Engine.connect()
     try:

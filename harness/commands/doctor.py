@@ -7,11 +7,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from harness import measured
 from harness.commands.terminal import print_json
-from harness.doctor import examine
 from harness.errors import CANNOT_HERE, VIOLATED
-from harness.kernel import Kernel, run_inside
+from harness.machine import calibration
+from harness.machine.doctor import examine
+from harness.machine.kernel import Kernel, run_inside
 
 
 def doctor_command(
@@ -37,13 +37,13 @@ def doctor_command(
         Console().print(table)
     engines = []
     if measure and able:
-        with measured.saying(Console(stderr=True)) as say:
-            engines = measured.measure_engines(findings, say)
+        with calibration.saying(Console(stderr=True)) as say:
+            engines = calibration.measure_engines(findings, say)
     found = [finding.to_json() for finding in findings]
     if as_json:
         print_json({"findings": found, "measured": [one.to_json() for one in engines]} if measure else found)
     elif engines:
-        Console().print(measured.render(engines))
+        Console().print(calibration.render(engines))
     if not able:
         raise typer.Exit(CANNOT_HERE)
     if not all(one.ok for one in engines):

@@ -8,8 +8,8 @@ from rich.console import Console
 
 from harness import explore
 from harness.commands.terminal import complain
+from harness.run.sweep import cores
 from harness.scenario import load_scenario
-from harness.sweep import cores
 
 
 def explore_command(

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from harness import report
+from harness.archive.result import mapping
 from harness.commands.terminal import complain
 from harness.errors import MachineError, RunDirectoryError
-from harness.report.result import mapping
 
 
 def report_command(run: Annotated[Path, typer.Argument(help="A run directory.")]) -> None:

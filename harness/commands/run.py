@@ -9,16 +9,16 @@ import typer
 from pydantic import ValidationError
 from rich.console import Console
 
-from harness import progress
-from harness.backend import Backend
-from harness.backends.vehicle_process import system_ids
+from harness.archive.directory import default_path
 from harness.commands.terminal import complain, show_result, show_rogue, show_survival
 from harness.errors import HarnessError, ScenarioError
-from harness.kernel import Kernel, run_inside
+from harness.machine.kernel import Kernel, run_inside
+from harness.play import progress
+from harness.play.process.vehicle import system_ids
 from harness.report.capture import gaps
-from harness.run import Run, choose_vehicles, run
-from harness.rundir import default_path
+from harness.run.run import Run, choose_vehicles, run
 from harness.scenario import Scenario, load_scenario
+from harness.scenario.backend import Backend
 from harness.scenario.load import explain
 
 
@@ -88,7 +88,7 @@ def run_command(
 
 
 def _emit_compose(console: Console, scenario: Scenario, seed: int, file: Path) -> None:
-    from harness.backends.containers.compose import write_compose
+    from harness.play.containers.compose import write_compose
 
     beside = write_compose(scenario, seed, choose_vehicles(scenario), system_ids(scenario.roster), file)
     console.print(f"{file} and {beside}: docker compose -f {file} up", highlight=False, soft_wrap=True)

@@ -6,10 +6,10 @@ from typing import Annotated
 import typer
 
 from harness import scale
+from harness.archive.directory import claim, default_path
 from harness.commands.terminal import end_sweep
-from harness.rundir import claim, default_path
+from harness.run.sweep import cores
 from harness.scale import model, outputs, table
-from harness.sweep import cores
 
 
 def scale_command(

@@ -14,10 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from harness import checker
-from harness.checker.survival import in_words
+from harness.archive.record import RogueInjection, Survival
+from harness.checker import injections, survival
 from harness.matrix.record import MatrixRecord
-from harness.record import RogueInjection, Survival
-from harness.rogue import account
 from harness.scale.record import ScaleRecord
 
 STYLES = {"holds": "green", "violated": "bold red", "not applicable": "yellow"}
@@ -41,13 +40,13 @@ def show_result(console: Console, result: checker.Result) -> None:
 
 
 def show_survival(console: Console, survived: Survival) -> None:
-    for sentence in in_words(survived):
+    for sentence in survival.in_words(survived):
         console.print(sentence, highlight=False, soft_wrap=True)
 
 
-def show_rogue(console: Console, injections: list[RogueInjection]) -> None:
-    for one in injections:
-        console.print(account.in_words(one), highlight=False, soft_wrap=True)
+def show_rogue(console: Console, injected: list[RogueInjection]) -> None:
+    for injection in injected:
+        console.print(injections.in_words(injection), highlight=False, soft_wrap=True)
 
 
 def end_sweep(record: MatrixRecord | ScaleRecord, table: RenderableType | None, picture: Path) -> NoReturn:

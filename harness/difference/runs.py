@@ -6,13 +6,13 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from harness import traces
+from harness.archive import traces
+from harness.archive.exports import RUN_FILE, export_paths, read_exports
+from harness.archive.result import agent_ids, listing, mapping, read_result
 from harness.difference.keys import KeyDifference, differing_keys
 from harness.difference.steps import Step, completed_blocks, name, read_lines
 from harness.errors import RunDirectoryError
-from harness.exports import RUN_FILE, export_paths, read_exports
 from harness.report.chain_tree import ranges
-from harness.report.result import agent_ids, listing, mapping, read_result
 
 
 @dataclass(frozen=True)

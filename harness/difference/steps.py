@@ -7,8 +7,8 @@ from typing import NamedTuple, TypeVar
 
 from pydantic import TypeAdapter
 
+from harness.archive.traces import HANDLER_RUN, HEADER, MAX_LINE_BYTES
 from harness.errors import RunDirectoryError
-from harness.traces import HANDLER_RUN, HEADER, MAX_LINE_BYTES
 from ucp.trace import HandlerRun
 
 Record = TypeVar("Record")

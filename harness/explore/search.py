@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from harness.checker import Result
+from harness.run.simulate import simulate
+from harness.run.sweep import Failed, sweep
 from harness.scenario import Scenario
-from harness.simulate import simulate
-from harness.sweep import Failed, sweep
 
 Judge = Callable[[Scenario, int], Result]
 """Plays a scenario with a seed, and judges it."""

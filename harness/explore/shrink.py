@@ -13,8 +13,8 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from harness.explore.document import Document
+from harness.run.sweep import sweep
 from harness.scenario import Scenario
-from harness.sweep import sweep
 
 T = TypeVar("T")
 

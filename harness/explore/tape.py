@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from harness.backends.fate_script import Decided, FateScript, NameOf
 from harness.checker import Result
+from harness.play.simulation.fate_script import Decided, FateScript, NameOf
+from harness.run.simulate import InMemory, simulate_in_memory
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
-from harness.simulate import InMemory, simulate_in_memory
 from netem.medium import Lots
 from ucp.messages import CommitBlock, Message, block_named
 from ucp.trace import HandlerRun

@@ -6,11 +6,11 @@ from typing import Any
 
 import yaml
 
+from harness.archive.directory import default_path
 from harness.checker.characteristic import Characteristic
 from harness.errors import MachineError, RunDirectoryError
 from harness.explore.document import Document, at
 from harness.explore.tape import Lost, Recording
-from harness.rundir import default_path
 
 EVIDENCE_SHOWN = 5
 ORDER = (

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import RUN_FILE, SUFFIX, Export, export_files, read_exports
+from harness.archive.record import AgentRecord
 from harness.checker.evidence import MAX_RECORD_BYTES
 from harness.errors import ExportError, RunDirectoryError
-from harness.exports import RUN_FILE, SUFFIX, Export, export_files, read_exports
-from harness.naming import name_blocks
-from harness.record import AgentRecord
 
 
 class _Events(BaseModel):

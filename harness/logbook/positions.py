@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from harness.exports import ExportedBlock
+from harness.archive.exports import ExportedBlock
 from harness.logbook.book import Logbook
 from ucp.events import LoggableEvent, MalformedEventsError, decode_events
 from ucp.telemetry import Position, position_of

@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from typing import Any
 
-from harness.exports import Export, ExportedBlock
+from harness.archive.exports import Export, ExportedBlock
 from harness.logbook.book import Logbook
-from harness.report.words import moment
+from harness.present.words import moment
 from ucp.events import LoggableEvent, MalformedEventsError, decode_events
 from ucp.telemetry import describe
 

@@ -1,4 +1,4 @@
-"""Many tasks on a Dask cluster: outcomes as they end, as `harness.sweep` has them of one machine.
+"""Many tasks on a Dask cluster: outcomes as they end, as `harness.run.sweep` has them of one machine.
 
 Dask hands a lost worker's tasks to others. Each task is one future, so its outcome comes once, however often it had to
 be worked on.
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from harness.errors import HarnessError, MachineError
-from harness.sweep import Failed, outcome_of, raised, shown, terminated_is_interrupted
+from harness.run.sweep import Failed, outcome_of, raised, shown, terminated_is_interrupted
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -30,7 +30,7 @@ def cluster(
 ) -> Iterator[Iterator[tuple[T, R | Failed]]]:
     """Each task with its outcome, as they end, from the workers of the scheduler at `address`, tcp://host:port.
 
-    Outcomes, errors and interrupts as `harness.sweep.sweep` has them; `work` has to be importable on the workers.
+    Outcomes, errors and interrupts as `harness.run.sweep.sweep` has them; `work` has to be importable on the workers.
     Raises MachineError if there is no such scheduler, it has no workers, its versions differ, or it is lost;
     HarnessError for an address that is none. Leaving the block takes back what has not been worked on.
     """

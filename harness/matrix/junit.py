@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 
-from harness.junit import Case, to_xml
 from harness.matrix.record import MatrixRecord
 from harness.matrix.table import name_of, troubles
+from harness.present.junit import Case, to_xml
 
 
 def to_junit(record: MatrixRecord) -> str:

@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from harness.backend import Backend
 from harness.errors import ScenarioError
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
+from harness.scenario.backend import Backend
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Probability
 
 MAX_SEEDS = 10_000

@@ -16,8 +16,8 @@ from harness.matrix.estimate import Estimate
 from harness.matrix.metrics import BY_NAME
 from harness.matrix.record import MatrixRecord
 from harness.matrix.table import say, series, series_name
-from harness.report import svg, words
-from harness.report.svg import Area, Axis, n
+from harness.present import svg, words
+from harness.present.svg import Area, Axis, n
 
 COLUMNS = 3
 HEAD, SERIES_HEAD, PANEL_HEIGHT, FOOT = 74, 26, 218, 26

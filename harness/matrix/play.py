@@ -9,8 +9,8 @@ from harness.checker import Result
 from harness.errors import VIOLATED, HarnessError, InterruptedRunError
 from harness.matrix.cell import Run
 from harness.matrix.model import Matrix, Point, Task
-from harness.progress import Silent
-from harness.run import prepare, run
+from harness.play.progress import Silent
+from harness.run.run import prepare, run
 from harness.scenario import Scenario
 
 Judge = Callable[[Scenario, int], Result]
@@ -25,7 +25,7 @@ class RunFailedError(HarnessError):
 
 def simulated(scenario: Scenario, seed: int) -> Result:
     """Without traces, which cost more than the run: characteristic 1 is then not judged, 2 and 3 only at the end."""
-    from harness.simulate import simulate
+    from harness.run.simulate import simulate
 
     return simulate(scenario, seed).result
 

@@ -13,10 +13,10 @@ from typing import Any, BinaryIO
 
 from pydantic import ValidationError
 
+from harness.archive.directory import claim
 from harness.errors import MachineError, RunDirectoryError
 from harness.matrix.cell import Run
 from harness.matrix.model import Matrix, Task
-from harness.rundir import claim
 from ucp.files import write_atomically
 
 FILE = "results.jsonl"

@@ -15,8 +15,8 @@ from harness.matrix.model import Matrix, Point, Task
 from harness.matrix.play import Judge, Player, simulated
 from harness.matrix.record import FailedRun, MatrixRecord
 from harness.matrix.results import Results
-from harness.run import versions
-from harness.sweep import Failed, cores, sweep
+from harness.run.run import versions
+from harness.run.sweep import Failed, cores, sweep
 
 Outcomes = Iterator[tuple[Task, Run | Failed]]
 Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]

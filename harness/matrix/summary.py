@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-from harness.markdown import escaped, row
 from harness.matrix.cell import Cell
 from harness.matrix.metrics import METRICS
 from harness.matrix.record import MatrixRecord
@@ -16,7 +15,8 @@ from harness.matrix.table import (
     unjudged,
     violated,
 )
-from harness.report import words
+from harness.present import words
+from harness.present.markdown import escaped, row
 
 
 def to_markdown(record: MatrixRecord) -> str:

@@ -13,7 +13,7 @@ from harness.matrix.estimate import Estimate
 from harness.matrix.metrics import BY_NAME, METRICS, Metric
 from harness.matrix.model import Matrix, Point
 from harness.matrix.record import MatrixRecord
-from harness.report import words
+from harness.present import words
 
 NAMED = 5
 """More runs of a cell than these are counted, not named; matrix.json names them all."""

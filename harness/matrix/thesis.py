@@ -11,7 +11,7 @@ from harness.matrix.metrics import METRICS
 from harness.matrix.picture import draw
 from harness.matrix.record import MatrixRecord
 from harness.matrix.table import say_interval, say_mean
-from harness.report import words
+from harness.present import words
 from ucp.files import write_atomically
 
 PAGE = Path(__file__).parent / "THESIS.md"

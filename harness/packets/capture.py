@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, ValidationError
 
-from harness.exports import AgentId
+from harness.archive.exports import AgentId
 from harness.packets.datagram import NotUcpError, unwrap
 from harness.packets.pcap import INBOUND, OUTBOUND, CaptureFile, Frame
 from harness.packets.said import Said, summarize

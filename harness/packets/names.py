@@ -7,9 +7,9 @@ agent from its first datagram on: it proposes its blocks in the order in which i
 from collections.abc import Iterable
 from pathlib import Path
 
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import export_paths, read_exports
 from harness.errors import CaptureError
-from harness.exports import export_paths, read_exports
-from harness.naming import name_blocks
 from harness.packets.files import DIRECTORY
 from harness.packets.transmissions import Transmission
 from ucp.messages import BlockAddRequest, CommitBlock

@@ -10,7 +10,7 @@ from harness.packets.names import Names
 from harness.packets.said import Said
 from harness.packets.story import Chapter, carried_to
 from harness.packets.transmissions import Transmission
-from harness.report.words import moment
+from harness.present.words import moment
 from ucp.messages import (
     BlockAddRequest,
     BlockAddResponse,

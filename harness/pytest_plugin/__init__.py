@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from harness.backend import BACKENDS
+from harness.scenario.backend import BACKENDS
 
 if TYPE_CHECKING:
     from harness.pytest_plugin.findings import Findings

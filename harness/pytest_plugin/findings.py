@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import export_paths, read_exports
 from harness.checker import Result
 from harness.checker.characteristic import Characteristic, Finding, Verdict
 from harness.errors import ScenarioError
-from harness.exports import export_paths, read_exports
-from harness.naming import name_blocks
 
 EVIDENCE_SHOWN = 5
 

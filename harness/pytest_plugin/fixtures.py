@@ -6,17 +6,17 @@ from typing import Any
 
 import pytest
 
-from harness.backend import BACKENDS, Backend
 from harness.errors import ScenarioError
-from harness.progress import Silent
+from harness.play.progress import Silent
 from harness.pytest_plugin import TRIAL
 from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.findings import Findings
 from harness.pytest_plugin.options import Options
 from harness.pytest_plugin.swarm_in_test import Swarm
 from harness.pytest_plugin.trial import Trial, one_sentence
-from harness.run import Run, run
+from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
+from harness.scenario.backend import BACKENDS, Backend
 from harness.scenario.load import parse
 
 DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}

@@ -7,15 +7,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from harness import checker, mission
-from harness.backend import Backend
+from harness import checker
 from harness.errors import HarnessError, ScenarioError
-from harness.mission import Played
-from harness.progress import Silent
+from harness.play import mission
+from harness.play.mission import Played
+from harness.play.progress import Silent
 from harness.pytest_plugin.findings import Findings, Judgement
 from harness.pytest_plugin.told import Sentence, Told
-from harness.run import Play, Recording, Run, prepare
+from harness.run.run import Play, Recording, Run, prepare
 from harness.scenario import Scenario
+from harness.scenario.backend import Backend
 
 
 class RunEndedError(Exception):

@@ -12,12 +12,12 @@ from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
 from typing import Any
 
-from harness import mission
 from harness.errors import ScenarioError
-from harness.mission import Played
+from harness.play import mission
+from harness.play.mission import Played
 from harness.scenario import Scenario
+from harness.scenario.changes import timeline_of
 from harness.scenario.load import parse
-from harness.timeline import timeline_of
 
 INSTANT_S = 0.001
 """Of two sentences in one instant the second comes a millisecond later."""

@@ -7,7 +7,7 @@ import pytest
 
 from harness.errors import HarnessError, MachineError
 from harness.pytest_plugin.findings import Judgement
-from harness.run import Run
+from harness.run.run import Run
 from harness.scenario.expect import Expect
 
 

@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from harness.archive.result import agent_ids, mapping, number
 from harness.report.chain_tree import ranges
-from harness.report.result import agent_ids, mapping, number
 
 
 def gaps(result: dict[str, Any]) -> str | None:

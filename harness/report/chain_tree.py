@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from harness.exports import Export, ExportedBlock
+from harness.archive.exports import Export, ExportedBlock
 
 KEPT_AT_EACH_END = 3
 """Blocks of a stretch that are drawn before and after its ellipsis."""
@@ -76,7 +76,7 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def marks(inception: Node, names: Mapping[str, str], *, abridged: bool) -> Mark:
-    """What to draw, from the inception block up; `names` are those of `harness.naming.name_blocks`.
+    """What to draw, from the inception block up; `names` are those of `harness.archive.block_names.name_blocks`.
 
     What stands on a block is ordered by the lowest agent ID that it leads to.
     """

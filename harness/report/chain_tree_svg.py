@@ -9,9 +9,10 @@ from typing import Literal
 
 from markupsafe import Markup
 
-from harness.exports import Export
-from harness.naming import name_blocks
-from harness.report import words
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import Export
+from harness.present import words
+from harness.present.colours import Ink
 from harness.report.chain_tree import Node, chain_tree, holders, marks, ranges
 from harness.report.chain_tree_layout import (
     BOX_HEIGHT,
@@ -22,7 +23,6 @@ from harness.report.chain_tree_layout import (
     Placed,
     lay_out,
 )
-from harness.report.colours import Ink
 
 STYLE = (Path(__file__).parent / "chain_tree.css").read_text(encoding="utf-8")
 

@@ -2,9 +2,10 @@
 
 from typing import Any
 
-from harness.exports import Exports
-from harness.report import swarm, words
-from harness.report.result import mapping, number
+from harness.archive.exports import Exports
+from harness.archive.result import mapping, number
+from harness.present import words
+from harness.report import swarm
 
 FIGURES = {
     "blocks": "blocks completed",

@@ -5,9 +5,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from harness.junit import Case, to_xml
-from harness.report import facts, words
-from harness.report.result import listing, mapping, number
+from harness.archive.result import listing, mapping, number
+from harness.present import words
+from harness.present.junit import Case, to_xml
+from harness.report import facts
 from harness.report.verdicts import Verdict, verdicts
 from harness.scenario.expect import NUMBERS, Expect
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from harness.report import svg
-from harness.tracks import Fix
+from harness.archive.tracks import Fix
+from harness.present import svg
 
 Point = tuple[float, float]
 """x and y in CSS pixels; y grows downwards."""

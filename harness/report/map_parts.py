@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from itertools import count
 from operator import attrgetter
 
-from harness.connectivity import Connectivity, State
+from harness.archive.connectivity import Connectivity, State
+from harness.archive.tracks import Fix, Tracks, between
 from harness.report.chain_tree import ranges
-from harness.tracks import Fix, Tracks, between
 
 MAX_STRETCHES = 4000
 """Of all vehicles together; nobody could tell more of them apart."""

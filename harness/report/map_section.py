@@ -6,14 +6,15 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from harness.connectivity import NETWORK_FILE, Connectivity, read_connectivity
-from harness.report import map_svg, words
-from harness.report.colours import Ink
+from harness.archive.connectivity import NETWORK_FILE, Connectivity, read_connectivity
+from harness.archive.directory import TRACKS_FILE
+from harness.archive.tracks import Tracks, read_tracks
+from harness.present import words
+from harness.present.colours import Ink
+from harness.report import map_svg
 from harness.report.map_geometry import Extent, extent
 from harness.report.map_parts import MAX_STRETCHES, Division, Life, divisions, letter, lives, longest
-from harness.rundir import TRACKS_FILE
-from harness.timeline import RANGE
-from harness.tracks import Tracks, read_tracks
+from harness.scenario.changes import RANGE
 
 MOVES_M = 1.0
 """A vehicle that stays within so many metres stands."""

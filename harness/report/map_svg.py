@@ -10,13 +10,13 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from harness.report import words
-from harness.report.colours import Ink
+from harness.archive.tracks import Fix
+from harness.present import words
+from harness.present.colours import Ink
+from harness.present.svg import FONT, n
 from harness.report.map_geometry import Extent, Point, Projection, thinned
 from harness.report.map_parts import Division, Life, Stretch, letter, listed
 from harness.report.map_tags import tags
-from harness.report.svg import FONT, n
-from harness.tracks import Fix
 
 STYLE = (Path(__file__).parent / "map.css").read_text(encoding="utf-8")
 

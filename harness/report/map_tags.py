@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 from markupsafe import Markup
 
-from harness.report.colours import Ink
+from harness.present.colours import Ink
+from harness.present.svg import n
 from harness.report.map_geometry import Point, Projection
-from harness.report.svg import n
 
 HEIGHT, DIGIT, PADDING = 16, 7.5, 8
 NEAR, FAR = 14, 34

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from harness.markdown import escaped, row
-from harness.report import facts, network, rogue, survival, words
+from harness.archive.result import mapping
+from harness.present import words
+from harness.present.markdown import escaped, row
+from harness.report import facts, network, rogue, survival
 from harness.report.remains import Remains
-from harness.report.result import mapping
 from harness.report.verdicts import Verdict, headline, verdicts
 
 EVIDENCE_SHOWN = 3

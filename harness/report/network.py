@@ -4,9 +4,10 @@ from typing import Any
 
 from markupsafe import Markup
 
-from harness.report import network_strip, words
+from harness.archive.result import agent_ids, listing, mapping, number
+from harness.present import words
+from harness.report import network_strip
 from harness.report.chain_tree import ranges
-from harness.report.result import agent_ids, listing, mapping, number
 
 
 def strip(result: dict[str, Any]) -> Markup | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.report import words
+from harness.present import words
 
 _LANE = 24
 _AXIS_MARKS = 4

@@ -9,15 +9,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from harness.exports import BEFORE_FINAL_RECONCILE, Export, Exports, export_paths, read_exports
-from harness.naming import name_blocks
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import BEFORE_FINAL_RECONCILE, Export, Exports, export_paths, read_exports
+from harness.archive.result import mapping
+from harness.present.colours import Ink
 from harness.report import facts, html, map_section, network, rogue, survival, swarm, timeline, verdicts
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
-from harness.report.colours import Ink
 from harness.report.map_svg import STYLE as MAP_STYLE
 from harness.report.remains import Remains
-from harness.report.result import mapping
 
 EVIDENCE_SHOWN = 3
 LONG_TEXT = 240

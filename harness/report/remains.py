@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from harness.archive.connectivity import NETWORK_FILE, Connectivity, read_connectivity
+from harness.archive.directory import TRACKS_FILE
+from harness.archive.exports import RUN_FILE, Exports, export_paths, read_exports
+from harness.archive.history import read_traces
+from harness.archive.result import DamagedResultError, agent_ids, listing, mapping, read_result
+from harness.archive.traces import SUFFIX, Trace
 from harness.collector import uncollected
-from harness.connectivity import NETWORK_FILE, Connectivity, read_connectivity
-from harness.course import read_traces
-from harness.exports import RUN_FILE, Exports, export_paths, read_exports
+from harness.present.colours import Ink
 from harness.report import capture, swarm
-from harness.report.colours import Ink
-from harness.report.result import DamagedResultError, agent_ids, listing, mapping, read_result
-from harness.rundir import TRACKS_FILE
-from harness.traces import SUFFIX, Trace
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from harness.record import RogueInjection
-from harness.report import words
-from harness.report.result import listing
-from harness.rogue.account import done_with, in_words
+from harness.archive.record import RogueInjection
+from harness.archive.result import listing
+from harness.checker.injections import done_with, in_words
+from harness.present import words
 
 MAX_ROWS = 500
 

@@ -6,11 +6,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from harness.archive.record import Loss, Survival
 from harness.checker.survival import in_words
-from harness.record import Loss, Survival
-from harness.report import words
+from harness.present import words
+from harness.present.colours import Ink
 from harness.report.chain_tree import ranges
-from harness.report.colours import Ink
 
 
 @dataclass(frozen=True, slots=True)

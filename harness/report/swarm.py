@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from harness.exports import Export, Exports
-from harness.naming import name_blocks
-from harness.report import words
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import Export, Exports
+from harness.archive.result import agent_ids, listing, mapping
+from harness.present import words
+from harness.present.colours import Ink, inks
 from harness.report.chain_tree import holders, ranges
-from harness.report.colours import Ink, inks
-from harness.report.result import agent_ids, listing, mapping
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,17 +12,18 @@ from typing import Any, TypeVar
 from markupsafe import Markup
 from pydantic import ValidationError
 
-from harness.connectivity import Connectivity
-from harness.course import LATEST_S, Course, Message, Reconcile, Vote, course, ends_at, possible
-from harness.record import Fault
-from harness.report import facts, timeline_charts, timeline_lanes, words
-from harness.report.colours import Ink
+from harness.archive.connectivity import Connectivity
+from harness.archive.history import LATEST_S, Course, Message, Reconcile, Vote, course, ends_at, possible
+from harness.archive.record import Fault
+from harness.archive.replication import spread
+from harness.archive.result import listing, number
+from harness.present import words
+from harness.present.colours import Ink
+from harness.report import facts, timeline_charts, timeline_lanes
 from harness.report.map_parts import divisions
 from harness.report.remains import Remains
-from harness.report.result import listing, number
 from harness.report.timeline_lanes import OUTCOMES
 from harness.report.timeline_plot import Shade, axis, seconds
-from harness.spread import spread
 
 _HERE = Path(__file__).parent
 STYLE = (_HERE / "timeline.css").read_text(encoding="utf-8")

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.record import Fault
-from harness.report import words
-from harness.report.svg import n
+from harness.archive.record import Fault
+from harness.archive.replication import Spread
+from harness.present import words
+from harness.present.svg import n
 from harness.report.timeline_plot import Shade, plot, seconds, shaded, short
-from harness.spread import Spread
 
 HEIGHT = 72
 MAX_MOMENTS = 600

@@ -13,10 +13,10 @@ from typing import TypeVar
 
 from markupsafe import Markup
 
-from harness.connectivity import LOST_WITH
-from harness.course import CUT_SHORT, Commit, Course, Phase, Reconcile, Tie, Vote
-from harness.record import Fault
-from harness.report.svg import n
+from harness.archive.connectivity import LOST_WITH
+from harness.archive.history import CUT_SHORT, Commit, Course, Phase, Reconcile, Tie, Vote
+from harness.archive.record import Fault
+from harness.present.svg import n
 from harness.report.timeline_plot import Shade, pin, plot, seconds, shaded, short, told
 
 OUTCOMES = {

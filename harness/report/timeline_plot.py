@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.record import Fault
-from harness.report.svg import linear_axis, n
+from harness.archive.record import Fault
+from harness.present.svg import linear_axis, n
 
 TICK_HEIGHT = 22
 

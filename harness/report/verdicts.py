@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from harness.report import words
-from harness.report.result import listing, mapping
+from harness.archive.result import listing, mapping
+from harness.present import words
 
 SHORT_NAMES = {
     "1": "distributed",

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from harness.matrix.thesis import BEGIN, END, put_between_markers
-from harness.report import words
+from harness.present import words
 from harness.scale.metrics import BY_NAME
 from harness.scale.picture import draw
 from harness.scale.record import ScaleRecord

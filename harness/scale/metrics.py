@@ -5,7 +5,7 @@ Most of it is virtual, and the same on every machine. What a run costs this mach
 
 from harness.checker import Result
 from harness.matrix.metrics import Figures, Metric, figure, uniform
-from harness.mission import Played
+from harness.play.mission import Played
 from harness.scenario import Scenario
 
 METRICS = (

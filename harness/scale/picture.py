@@ -12,8 +12,8 @@ from typing import Literal
 
 from markupsafe import Markup
 
-from harness.report import svg, words
-from harness.report.svg import Area, Axis
+from harness.present import svg, words
+from harness.present.svg import Area, Axis
 from harness.scale.cell import Cell, Growth
 from harness.scale.growth import Law
 from harness.scale.metrics import BY_NAME

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from harness.checker import Result
-from harness.mission import Played
-from harness.run import versions
+from harness.play.mission import Played
+from harness.run.run import versions
+from harness.run.sweep import Failed, sweep
 from harness.scale.cell import Run, growths, sum_up
 from harness.scale.metrics import FITTED, MACHINE_METRICS, measure
 from harness.scale.model import Scale, Size
 from harness.scale.record import Blemish, ScaleRecord
 from harness.scenario import Scenario
-from harness.sweep import Failed, sweep
 
 Judge = Callable[[Scenario, int], tuple[Played, Result]]
 """Plays a scenario with a seed, and judges it."""
@@ -87,7 +87,7 @@ def _effort(scale: Scale, size: Size) -> float:
 
 def _simulated(scenario: Scenario, seed: int) -> tuple[Played, Result]:
     """Without traces, which cost more than the run: characteristic 1 is then not judged, 2 and 3 only at the end."""
-    from harness.simulate import simulate
+    from harness.run.simulate import simulate
 
     simulated = simulate(scenario, seed)
     return simulated.played, simulated.result

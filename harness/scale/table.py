@@ -9,7 +9,7 @@ from rich.text import Text
 
 from harness.matrix.estimate import Estimate
 from harness.matrix.metrics import Metric
-from harness.report import words
+from harness.present import words
 from harness.scale.cell import Cell, Growth
 from harness.scale.growth import Exponent, Law, Variable
 from harness.scale.metrics import BY_NAME

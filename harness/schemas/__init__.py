@@ -9,10 +9,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from harness.exports import Export
+from harness.archive.exports import Export
+from harness.archive.record import RunRecord
 from harness.matrix import MatrixRecord
 from harness.packets.document import PacketsRecord
-from harness.record import RunRecord
 from harness.scale import ScaleRecord
 from harness.scenario import Scenario
 

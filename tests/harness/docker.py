@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from harness.backends.containers import ownership
-from harness.backends.containers.engine import DEFAULT_HOST, Engine
-from harness.backends.containers.images import HOST_IMAGE, from_host, idle_command
+from harness.play.containers import ownership
+from harness.play.containers.engine import DEFAULT_HOST, Engine
+from harness.play.containers.images import HOST_IMAGE, from_host, idle_command
 
 
 def containers(run: Path) -> list[str]:

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
+from harness.archive.traces import read_trace
+from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.simulate import simulate
-from harness.traces import read_trace
 from tests.harness.command import Running, harness, processes, sentences, write_scenario
 
 pytestmark = pytest.mark.lab

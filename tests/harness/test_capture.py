@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from harness.progress import Silent
+from harness.play.progress import Silent
 from harness.report.capture import gaps
-from harness.run import run
+from harness.run.run import run
 from netem.frames import udp_broadcast
 from tests.captured import Frame, comment, frames, statistics
 from tests.harness.command import Running, harness, processes, sentences, write_scenario

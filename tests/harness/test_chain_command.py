@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
 from harness import logbook
-from harness.exports import ExportedBlock, ExportMaker
+from harness.archive.exports import ExportedBlock, ExportMaker
 from harness.logbook import Logbook
 from harness.logbook.geojson import geojson
 from harness.logbook.kml import kml

@@ -13,8 +13,8 @@ import pytest
 from harness.difference import AgentDifference, ChainParting, KeyDifference, compare
 from harness.difference.keys import differing_keys
 from harness.errors import RunDirectoryError
-from harness.progress import Silent
-from harness.run import run
+from harness.play.progress import Silent
+from harness.run.run import run
 from harness.scenario import load_scenario
 from tests.harness.command import harness, sentences
 from tests.harness.mission import edit, edit_lines

@@ -17,9 +17,9 @@ import pytest
 import requests
 import yaml
 
-from harness.backends.containers import backend, engine, images, ownership
-from harness.backends.containers.container import STDERR, STDOUT, Output
-from harness.backends.containers.images import Image
+from harness.play.containers import backend, engine, images, ownership
+from harness.play.containers.container import STDERR, STDOUT, Output
+from harness.play.containers.images import Image
 from tests.harness.command import harness, sentences, write_scenario
 
 
@@ -59,7 +59,7 @@ def test_an_engine_that_this_user_may_not_use(tmp_path: Path) -> None:
     server = listening(path)
     path.chmod(0o600)
     code = f"""
-import os; from harness.backends.containers import engine; os.environ["DOCKER_HOST"] = "unix://{path}"; os.setuid(65534)
+import os; from harness.play.containers import engine; os.environ["DOCKER_HOST"] = "unix://{path}"; os.setuid(65534)
 try: engine.Engine.connect()
 except engine.DockerError as error: print(error)
 """
@@ -244,7 +244,7 @@ def test_in_a_compose_file_an_image_of_ones_own_runs_ones_own_command(tmp_path: 
 
 
 def test_the_start_of_a_compose_file_is_one_for_all(tmp_path: Path) -> None:
-    from harness.backends.containers import start
+    from harness.play.containers import start
 
     heard: list[Any] = []
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from harness.backends.containers import ownership
+from harness.play.containers import ownership
 from tests.harness.command import Running, harness, processes, sentences, write_scenario
 from tests.harness.docker import Way, containers, stranger
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.docker
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 ON_DOCKER = ("--backend", "docker", "--image-from-host")
 NO_VEHICLES = {"vehicles": {"kind": "none"}}
-IMPATIENT = "import harness.backends.containers.engine as it; it.ANSWER_LIMIT_S = 6; import harness.cli as c; c.main()"
+IMPATIENT = "import harness.play.containers.engine as it; it.ANSWER_LIMIT_S = 6; import harness.cli as c; c.main()"
 """The command line with an engine that has 6 s to answer, which is enough for one that is not hurt."""
 
 

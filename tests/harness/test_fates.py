@@ -8,10 +8,10 @@ import pytest
 from pydantic import ValidationError
 
 from harness.errors import WRONG_REQUEST
-from harness.progress import Silent
-from harness.run import run
+from harness.play.progress import Silent
+from harness.run.run import run
+from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
-from harness.simulate import Simulated, simulate
 from tests.harness.virtual import scenario
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from harness.archive.record import JudgedRecord
+from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
 from harness.checker.agreement import had_a_chance
-from harness.record import JudgedRecord
+from harness.play.seeds import agent_seed
+from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
-from harness.seeds import agent_seed
-from harness.simulate import Simulated, simulate
-from harness.traces import Header, Trace
 from tests.harness.virtual import scenario
 from ucp.events import RandomEvents
 from ucp.store import Holdings
@@ -132,7 +132,7 @@ def test_losing_a_block_over_a_brown_out_is_a_violation(monkeypatch: pytest.Monk
     alone = [{"at_s": 0, "partition": [[2], [1, 3, 4, 5]]}, {"at_s": 400, "heal": True}]
     reboot = {"at_s": 300, "reboot": [2], "down_s": 30, "disk": "kept"}
     assert verdicts(played([*alone, reboot], final_reconcile=True)) == {"holds"}
-    monkeypatch.setattr("harness.backends.simulation.Holdings.of", lambda agent: Holdings())
+    monkeypatch.setattr("harness.play.simulation.backend.Holdings.of", lambda agent: Holdings())
     assert played([*alone, reboot], final_reconcile=True).result.characteristics["5"].verdict == "violated"
 
 

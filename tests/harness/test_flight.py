@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import yaml
 
-from harness.backends.vehicle_process import system_ids
 from harness.errors import MachineError, ScenarioError
-from harness.run import choose_vehicles
+from harness.play.process.vehicle import system_ids
+from harness.run.run import choose_vehicles
 from harness.scenario import Scenario, load_scenario
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
 from tests.harness.command import harness, processes, write_scenario

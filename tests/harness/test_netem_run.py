@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.progress import Silent
-from harness.run import run
+from harness.play.progress import Silent
+from harness.run.run import run
 from harness.scenario import Scenario
 from tests.machine import require
 

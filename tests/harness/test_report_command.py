@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.progress import Silent
-from harness.run import run
+from harness.play.progress import Silent
+from harness.run.run import run
 from tests.harness.command import Running, harness, sentences, write_scenario
 from tests.harness.mission import edit
 from tests.harness.virtual import scenario

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from harness.rogue import journal
-from harness.rogue.crafted import corrupted, random_message
-from harness.rogue.rogue import Injected, Rogue
-from harness.rogue.sequences import forged_sequence, injection_of
+from harness.play.rogue import journal
+from harness.play.rogue.crafted import corrupted, random_message
+from harness.play.rogue.rogue import Injected, Rogue
+from harness.play.rogue.sequences import forged_sequence, injection_of
 from harness.scenario.injection import MAX_FLOOD, MODELS
 from ucp.block import Block, next_chain_hash
 from ucp.messages import (

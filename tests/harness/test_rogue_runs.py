@@ -11,16 +11,16 @@ from scapy.layers.l2 import Ether
 from scapy.packet import Packet
 from scapy.utils import rdpcap
 
-from harness.backends.rehearsal import on_the_air
+from harness.archive.record import InjectedMessages
 from harness.errors import ScenarioError
-from harness.progress import Silent
-from harness.record import InjectedMessages
+from harness.play.process.preflight import on_the_air
+from harness.play.progress import Silent
+from harness.play.rogue.sequences import injection_of
 from harness.report.rogue import section
-from harness.rogue.sequences import injection_of
-from harness.run import Run, run
+from harness.run.run import Run, run
+from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.scenario.load import parse
-from harness.simulate import simulate
 from netem import addresses
 from netem.conditions import LinkConditions, NetworkConditions
 from tests.harness.command import Running, processes, sentences, write_scenario
@@ -192,7 +192,7 @@ def test_a_rogue_node_that_dies_ends_the_run_as_a_failure_of_the_harness(tmp_pat
     keys = {"duration_s": 2000, "speedup": 20, "vehicles": {"kind": "none"}, "timeline": [FORGE]}
     running = Running(write_scenario(tmp_path, **keys), tmp_path / "run", "--seed", 1)
     running.wait_for_mission(1)
-    (pid,) = [pid for pid, command in processes(tmp_path / "run").items() if "harness.rogue" in command]
+    (pid,) = [pid for pid, command in processes(tmp_path / "run").items() if "harness.play.rogue" in command]
     os.kill(pid, signal.SIGKILL)
     status, _, err = running.end()
     assert status == 3

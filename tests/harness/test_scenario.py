@@ -6,7 +6,7 @@ import pytest
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario, load_scenario
-from harness.timeline import NetworkChange, describe, timeline_of
+from harness.scenario.changes import NetworkChange, describe, timeline_of
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 LIBRARY = sorted((Path(__file__).parents[2] / "scenarios").glob("*.yaml"))

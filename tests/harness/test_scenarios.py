@@ -11,10 +11,10 @@ import yaml
 
 from harness.checker.survival import survival
 from harness.checker.uniform_chain import common_prefix
+from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
+from harness.scenario.changes import RANGE
 from harness.scenario.expect import NUMBERS
-from harness.simulate import Simulated, simulate
-from harness.timeline import RANGE
 from ucp.trace import State
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

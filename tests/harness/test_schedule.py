@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.simulate import simulate
-from harness.timeline import NetworkChange, timeline_of
+from harness.scenario.changes import NetworkChange, timeline_of
 from tests.harness.virtual import scenario
 
 NEMESES = ("halves", "isolate", "majorities ring", "bridge", "flapping")

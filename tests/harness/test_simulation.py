@@ -11,12 +11,12 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from harness import checker
+from harness.archive.exports import read_export
 from harness.errors import MachineError, ScenarioError
-from harness.exports import read_export
-from harness.progress import Silent
-from harness.run import run
+from harness.play.progress import Silent
+from harness.run.run import run
+from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
-from harness.simulate import Simulated, simulate
 from tests.harness.command import Running, sentences, write_scenario
 from tests.harness.virtual import scenario
 from tests.machine import require, unavailable

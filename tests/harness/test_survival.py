@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
+from harness.archive.record import Loss, Survival
 from harness.checker import Evidence, gather
 from harness.checker.survival import in_words, survival
-from harness.progress import Silent
-from harness.record import Loss, Survival
-from harness.run import run
+from harness.play.progress import Silent
+from harness.run.run import run
+from harness.run.simulate import simulate
 from harness.scenario import load_scenario
-from harness.simulate import simulate
 from tests.harness.virtual import scenario
 
 ONE_EVENT_ONE_BLOCK = {"max_block_bytes": 267, "max_event_bytes": 267}

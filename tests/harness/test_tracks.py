@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from harness import jsonlines
-from harness.rundir import TRACKS_FILE
-from harness.tracks import Fix, read_tracks
+from harness.archive import jsonlines
+from harness.archive.directory import TRACKS_FILE
+from harness.archive.tracks import Fix, read_tracks
 
 GOOD = {"at_s": 1.0, "places": {"1": [10.0, 20.0, 5.0], "2": [-1, 0, 0]}}
 

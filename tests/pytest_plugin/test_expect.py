@@ -5,8 +5,8 @@ from typing import Any, get_args
 import pytest
 
 from harness.checker.verdict import CHECKS
+from harness.run.simulate import simulate
 from harness.scenario.expect import NUMBERS, Expect, FigureName
-from harness.simulate import simulate
 from tests.harness.virtual import scenario
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from harness.exports import read_export
-from harness.progress import Silent
-from harness.run import run as play
+from harness.archive.exports import read_export
+from harness.play.progress import Silent
+from harness.run.run import run as play
 from harness.scenario.load import parse
 from tests.pytest_plugin.inner import SCENARIOS, no_internals, report, run, run_directories
 

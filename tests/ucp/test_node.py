@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 
-from harness.agents import AgentControl, AgentRefusedError, AgentSilentError
-from harness.exports import read_export
-from harness.traces import read_trace
+from harness.archive.exports import read_export
+from harness.archive.traces import read_trace
+from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError
 from ucp.block import Block
 from ucp.messages import BlockAddRequest, RequestForBlock, decode, encode
 from ucp.mission import parse_mission
@@ -247,7 +247,7 @@ def test_a_full_disk_fails_the_export_keeps_the_old_one_and_the_agent_lives(tmp_
 import json, pathlib, subprocess, sys, time
 sys.path.insert(0, sys.argv[2])
 from tests.ucp.test_node import AgentUnderTest, mission
-from harness.agents import AgentRefusedError
+from harness.play.control import AgentRefusedError
 disk = pathlib.Path(sys.argv[1])
 subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], check=True)
 agent = AgentUnderTest(disk, mission(events={"source": "random", "mean_s": 1.0}))

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from harness.archive.exports import read_export
 from harness.errors import ScenarioError
-from harness.exports import read_export
 from harness.scenario import load_scenario
 from harness.scenario.events import Events
 from tests.ucp.test_node import AgentUnderTest, mission

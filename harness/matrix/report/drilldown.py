@@ -13,7 +13,7 @@ from harness.matrix.report.heatmap import anchor
 from harness.matrix.run import Finished
 from harness.matrix.scenarios import scenario_file
 from harness.matrix.table import name_of
-from harness.report import words
+from harness.present import words
 from harness.report.verdicts import ICONS
 
 MAX_ROWS = 12_000

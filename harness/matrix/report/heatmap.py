@@ -12,8 +12,8 @@ from harness.matrix.model import Point
 from harness.matrix.record import MatrixRecord
 from harness.matrix.report.figures import Figure
 from harness.matrix.table import name_of, say, say_interval, say_mean, violated
-from harness.report import words
-from harness.report.colours import ramp
+from harness.present import words
+from harness.present.colours import ramp
 
 SHADES = 11
 _LIGHT = ramp((236, 244, 250), (0, 78, 122), SHADES)

@@ -13,7 +13,8 @@ from harness.matrix.report.drilldown import drilldown
 from harness.matrix.run import Finished
 from harness.matrix.summary import verdict
 from harness.matrix.table import explanation, improvements, name_of, troubles, unjudged
-from harness.report import html, svg, words
+from harness.present import svg, words
+from harness.report import html
 from harness.report.verdicts import SHORT_NAMES
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")

@@ -15,8 +15,8 @@ from harness.matrix.picture import Dot, curve
 from harness.matrix.record import MatrixRecord
 from harness.matrix.report.figures import Figure
 from harness.matrix.table import say, series, series_name
-from harness.report import svg, words
-from harness.report.svg import Area, Axis, n
+from harness.present import svg, words
+from harness.present.svg import Area, Axis, n
 
 COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
 MAX_DOTS = 12_000

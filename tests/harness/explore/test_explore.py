@@ -12,8 +12,8 @@ from harness.checker import Result
 from harness.errors import RunDirectoryError
 from harness.explore import Explored, explore
 from harness.explore.search import simulated, violated
+from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
-from harness.simulate import simulate
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.virtual import scenario
 

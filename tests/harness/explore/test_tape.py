@@ -7,7 +7,7 @@ import pytest
 from harness.explore.document import document_of, with_agents
 from harness.explore.smaller import replays, scenario_of
 from harness.explore.tape import record
-from harness.simulate import simulate
+from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
 
 APART = [

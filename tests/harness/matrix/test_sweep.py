@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from harness.errors import MachineError
-from harness.sweep import Failed, sweep
+from harness.run.sweep import Failed, sweep
 from tests.harness.command import DEADLINE_S
 
 INTERRUPTED = r"""
 import os, sys, time
 from pathlib import Path
-from harness.sweep import sweep
+from harness.run.sweep import sweep
 
 def work(n):
     if n == 0:

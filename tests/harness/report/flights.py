@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from harness.reach import Reach
-from harness.rundir import TRACKS_FILE
+from harness.archive.directory import TRACKS_FILE
+from harness.play.radio_range import Reach
 from harness.scenario import Scenario
-from harness.timeline import NetworkChange, timeline_of
+from harness.scenario.changes import NetworkChange, timeline_of
 from netem.radio import Place
 
 Way = Callable[[float], tuple[float, float]]

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.exports import Export
+from harness.archive.exports import Export
 from ucp.agent import Agent
 from ucp.block import Block
 from ucp.export import export_chain

@@ -3,8 +3,8 @@
 import re
 from xml.etree import ElementTree
 
+from harness.present.colours import inks
 from harness.report.chain_tree_svg import ChainTreePicture
-from harness.report.colours import inks
 from tests.harness.report.runs import Chains, block, exports
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -1,6 +1,6 @@
 """Agents' colours: told apart, and readable under their labels."""
 
-from harness.report.colours import contrast, inks
+from harness.present.colours import contrast, inks
 
 
 def test_thirty_two_agents_have_different_inks() -> None:

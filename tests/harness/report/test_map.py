@@ -8,12 +8,12 @@ from xml.etree import ElementTree
 
 import pytest
 
-from harness.connectivity import State
+from harness.archive.connectivity import State
+from harness.archive.directory import TRACKS_FILE
+from harness.present.colours import Ink, inks
 from harness.report import map_section, write_report
-from harness.report.colours import Ink, inks
 from harness.report.map_parts import divisions, letter, longest
 from harness.report.map_section import Section
-from harness.rundir import TRACKS_FILE
 from harness.scenario import Scenario
 from tests.harness.report.flights import Way, split_and_rejoin, still, write_flight, write_lines
 from tests.harness.report.runs import write_run

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from harness.archive.exports import BEFORE_FINAL_RECONCILE
 from harness.errors import RunDirectoryError
-from harness.exports import BEFORE_FINAL_RECONCILE
 from harness.report import write_report
 from tests.harness.report.runs import result_of, write_exports, write_run
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from harness import course as told
-from harness.course import Commit, Course, Phase, Reconcile, Tie, Vote
-from harness.progress import Silent
+from harness.archive import history as told
+from harness.archive.history import Commit, Course, Phase, Reconcile, Tie, Vote
+from harness.archive.replication import Spread
+from harness.play.progress import Silent
 from harness.report import timeline, timeline_charts, timeline_lanes, write_report
-from harness.run import run
-from harness.spread import Spread
+from harness.run.run import run
 from tests.harness.report.runs import write_run
 from tests.harness.report.test_page import HOSTILE, Reader
 from tests.harness.virtual import scenario

@@ -5,8 +5,8 @@ from typing import Literal
 
 import pytest
 
-from harness.progress import Silent
-from harness.run import run
+from harness.play.progress import Silent
+from harness.run.run import run
 from tests.harness.report.browser import Browser
 from tests.harness.report.test_timeline import TROUBLED
 from tests.harness.virtual import scenario

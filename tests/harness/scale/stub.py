@@ -2,7 +2,7 @@
 
 from harness.checker import Result
 from harness.checker.characteristic import Characteristic
-from harness.mission import Played
+from harness.play.mission import Played
 from harness.scale import Scale
 from harness.scenario import Scenario
 

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from harness.checker import Result
-from harness.mission import Played
+from harness.play.mission import Played
 from harness.scale import Scale, ScaleRecord, outputs, run_scale, table
 from harness.scale.complexity import BEGIN, END, PAGE, tables
 from harness.scale.picture import PANELS, draw

@@ -1,0 +1,170 @@
+"""Who could reach whom at which second of a run: `network.jsonl` read back.
+
+A link is between two vehicles that hear each other, both ways, directly; one that loses everything is none. A change
+that the scenario made is on record as the conditions that it asked for; one that flight made, as the pairs whose loss
+over the radio changed. A pair is cut while either loses everything.
+"""
+
+from bisect import bisect_right
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.archive.jsonlines import JsonLines
+from harness.archive.tracks import MissionSeconds
+from netem.conditions import NetworkConditions
+from netem.radio import components
+
+NETWORK_FILE = "network.jsonl"
+
+Pair = tuple[int, int]
+"""Two vehicles, the lower ID first."""
+Components = tuple[frozenset[int], ...]
+
+LOST_WITH: tuple[str, ...] = ("kill", "crash")
+"""What takes a vehicle out of the air, until it is restarted."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """From `at_s` on the living vehicles fell into these components, the largest first; `what` changed them."""
+
+    at_s: float
+    what: str
+    components: Components
+
+
+@dataclass(frozen=True)
+class Connectivity:
+    """The states of the network, no two in a row alike; none if there is no record of it."""
+
+    vehicles: tuple[int, ...]
+    states: list[State]
+    reboots: list[tuple[float, int]]
+    """When an agent went down, while its vehicle flew on."""
+    problems: list[str]
+    _cut: dict[Pair, list[float]]
+    """When each pair was cut, joined, cut again, and so on."""
+    _lost: dict[int, list[float]]
+    """When each vehicle was lost, back, lost again, and so on."""
+
+    def links(self, at_s: float) -> list[Pair]:
+        """The links between living vehicles."""
+        living = [vehicle for vehicle in self.vehicles if not _switched(self._lost.get(vehicle, ()), at_s)]
+        return [pair for pair in combinations(living, 2) if not _switched(self._cut.get(pair, ()), at_s)]
+
+    def lives(self, vehicle: int, end_s: float) -> list[tuple[float, float, bool]]:
+        """From when to when the vehicle was in the air, and whether it was then lost; nothing goes beyond `end_s`."""
+        times = [at_s for at_s in self._lost.get(vehicle, ()) if at_s <= end_s]
+        ends = [0.0, *times, *([end_s] if len(times) % 2 == 0 else [])]
+        return [(ends[at], ends[at + 1], at < len(times)) for at in range(0, len(ends) - 1, 2)]
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+    at_s: MissionSeconds
+    what: Annotated[str, Field(max_length=200)]
+    asked: dict[str, Any] | None = None
+    losses: dict[str, float] = {}
+    agents: list[int] = []
+
+
+class _Network:
+    """The network while its record is read."""
+
+    def __init__(self, vehicles: Collection[int]) -> None:
+        self.vehicles = tuple(sorted(vehicles))
+        self.lost: set[int] = set()
+        self._pairs = {f"{one}-{other}": (one, other) for one, other in combinations(self.vehicles, 2)}
+        self._out_of_range: set[Pair] = set()
+        self._cut_off: set[Pair] = set()
+
+    @property
+    def cut(self) -> set[Pair]:
+        return self._out_of_range | self._cut_off
+
+    def play(self, line: _Line) -> None:
+        """Raises ValueError, TypeError, AttributeError or KeyError if the line means nothing."""
+        losses = {self._pairs[name]: loss for name, loss in line.losses.items()}
+        if line.asked is not None:
+            conditions = NetworkConditions.from_json(line.asked)
+            self._cut_off = {pair for pair in self._pairs.values() if len(components(conditions, pair)) > 1}
+        self._out_of_range -= losses.keys()
+        self._out_of_range |= {pair for pair, loss in losses.items() if loss == 1.0}
+        if line.what in LOST_WITH:
+            self.lost |= set(line.agents) & set(self.vehicles)
+        elif line.what == "restart":
+            self.lost -= set(line.agents)
+
+    def components(self) -> Components:
+        left = set(self.vehicles) - self.lost
+        reaches = {vehicle: left - {vehicle} for vehicle in left}
+        for one, other in self.cut:
+            if one in left and other in left:
+                reaches[one].discard(other)
+                reaches[other].discard(one)
+        found = []
+        while left:
+            reached: set[int] = set()
+            ahead = {min(left)}
+            while ahead:
+                reached |= ahead
+                ahead = set().union(*(reaches[vehicle] for vehicle in ahead)) - reached
+            found.append(frozenset(reached))
+            left -= reached
+        return tuple(sorted(found, key=lambda group: (-len(group), min(group))))
+
+
+def read_connectivity(path: Path, vehicles: Collection[int]) -> Connectivity:
+    """The network among `vehicles`. A line that means nothing, or comes before the first conditions, is left out."""
+    lines = JsonLines(path, _Line)
+    network = _Network(vehicles)
+    states: list[State] = []
+    reboots: list[tuple[float, int]] = []
+    cut: dict[Pair, list[float]] = {}
+    lost: dict[int, list[float]] = {}
+    now_s = 0.0
+    for line in lines:
+        cut_before, lost_before = network.cut, set(network.lost)
+        try:
+            if not states and line.asked is None:
+                raise ValueError("the record begins with conditions")
+            network.play(line)
+        except (ValueError, TypeError, AttributeError, KeyError):
+            lines.leave_out()
+            continue
+        now_s = max(now_s, line.at_s)
+        switched, fallen = cut_before ^ network.cut, lost_before ^ network.lost
+        _switch(cut, switched, now_s)
+        _switch(lost, fallen, now_s)
+        if line.what == "reboot":
+            reboots += [(now_s, vehicle) for vehicle in line.agents if vehicle in network.vehicles]
+        if switched or fallen or not states:
+            _enter(states, State(now_s, line.what, network.components()))
+    return Connectivity(network.vehicles, states, reboots, lines.problems(), cut, lost)
+
+
+def _enter(states: list[State], state: State) -> None:
+    """Add the state if it is another than the last; one that lasted no time was none."""
+    if states and states[-1].at_s == state.at_s:
+        states.pop()
+    if not states or states[-1].components != state.components:
+        states.append(state)
+
+
+Key = TypeVar("Key", Pair, int)
+
+
+def _switch(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> None:
+    for key in keys:
+        times.setdefault(key, []).append(at_s)
+
+
+def _switched(times: Sequence[float], at_s: float) -> bool:
+    """Whether what is switched at these times is on."""
+    return bisect_right(times, at_s) % 2 == 1

@@ -1,0 +1,275 @@
+"""The course of a run: what each agent voted on, committed and reconciled when, and which messages went between them.
+
+Everything comes from the traces. A vote or reconcile that an agent's loss or the end of the run cut short ends there.
+"""
+
+import math
+from bisect import bisect_right
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import Literal
+
+from harness.archive.record import Fault
+from harness.archive.traces import SUFFIX, Trace, read_trace
+from ucp.trace import HandlerRun
+
+LATEST_S = 1e7
+"""No mission is as long; a handler run with a later time, or with none that can be, is left out."""
+MESSAGES_UP_TO_BYTES = 16 * 1024 * 1024
+"""Of traces that are larger together, handlers that only took a message in are left out, and so are messages."""
+
+TAKES_DOWN = ("kill", "crash", "reboot")
+"""Faults that end a life of an agent."""
+
+PhaseName = Literal["phase 1", "phase 2", "phase 3", "finalize"]
+PHASES: dict[str, PhaseName] = {
+    "reconcile_phase_1": "phase 1",
+    "reconcile_phase_2": "phase 2",
+    "reconcile_phase_3": "phase 3",
+    "reconcile_finalize": "finalize",
+}
+"""Handler -> the phase that it begins."""
+
+CUT_SHORT = "cut short"
+COMMITTED_BY = {
+    "vote_timer_expiration": "voted for",
+    "receive_commit_block": "heard",
+    "reconcile_phase_3": "from its stack",
+    "receive_response_block_for_hash": "fetched",
+    "reconcile_finalize": "put back",
+}
+"""Handler -> how it came to the block that it committed."""
+REASONS = {
+    "vote_timer_expiration": "vote not approved",
+    "receive_request_next_in_sequence": "chain diverged",
+}
+"""Handler -> why it began a reconcile."""
+
+
+@dataclass(frozen=True, slots=True)
+class Vote:
+    """From proposal to outcome, in mission seconds; the outcome is the branch of Algorithm 5, or CUT_SHORT."""
+
+    agent: int
+    block: str
+    start_s: float
+    end_s: float
+    outcome: str
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """Rounds of one phase in a row."""
+
+    name: PhaseName
+    start_s: float
+    end_s: float
+    rounds: int
+
+
+@dataclass(frozen=True, slots=True)
+class Reconcile:
+    """`phases` follow each other without a gap. `done` is False if it was cut short."""
+
+    agent: int
+    start_s: float
+    end_s: float
+    reason: str
+    phases: list[Phase]
+    done: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """A block came onto the chain; `how` is a value of COMMITTED_BY."""
+
+    agent: int
+    at_s: float
+    block: str
+    how: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tie:
+    """Phase 2 ended in a tie, which went as `branch` says."""
+
+    agent: int
+    at_s: float
+    branch: str
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A broadcast, and the handler runs that it triggered: (agent, mission second)."""
+
+    sender: int
+    at_s: float
+    name: str
+    block: str | None
+    receipts: list[tuple[int, float]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """All in order of time, agent by agent. `messages` is None where they were left out."""
+
+    votes: list[Vote]
+    reconciles: list[Reconcile]
+    commits: list[Commit]
+    ties: list[Tie]
+    messages: list[Message] | None
+
+
+def read_traces(directory: Path, agents: Collection[int]) -> tuple[dict[int, Trace], bool, list[str]]:
+    """The traces of `agents`, whether they are whole, and a sentence for each that is not, or is left out."""
+    paths = sorted(directory.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
+    whole = sum(path.stat().st_size for path in paths if path.is_file()) <= MESSAGES_UP_TO_BYTES
+    traces: dict[int, Trace] = {}
+    problems = []
+    for path in paths:
+        trace = read_trace(path) if whole else read_trace(path, unread=_only_takes_in)
+        if trace is None:
+            problems.append(f"{path.name}: not a trace; it is left out")
+        elif trace.header.agent_id not in agents or trace.header.agent_id in traces:
+            problems.append(f"{path.name}: of an agent that is not of this run, or has a trace already; it is left out")
+        else:
+            traces[trace.header.agent_id] = trace
+            if trace.problem:
+                problems.append(f"{path.name}: {trace.problem}; what is before it is shown")
+            if not all(_in_time(run) for run in trace.runs):
+                problems.append(f"{path.name}: handler runs without a possible time are left out")
+    return traces, whole, problems
+
+
+def _only_takes_in(line: bytes) -> bool:
+    """Whether a handler took a message in without any change; false as well if the line does not look like ours."""
+    return b'"changes":[],' in line and b'"handler":"receive_' in line
+
+
+def _in_time(run: HandlerRun) -> bool:
+    return 0 <= run.t <= LATEST_S
+
+
+def lives(trace: Trace) -> list[list[HandlerRun]]:
+    """The handler runs of each life of an agent that have a possible time."""
+    return [[run for _, run in life if _in_time(run)] for life in trace.lives()]
+
+
+def course(traces: Mapping[int, Trace], faults: Iterable[Fault], end_s: float, *, whole: bool = True) -> Course:
+    """`end_s` is when the run ended, in mission seconds; without `whole` traces there are no messages."""
+    falls: dict[int, list[float]] = defaultdict(list)
+    for fault in faults:
+        if fault.what in TAKES_DOWN:
+            for agent in fault.agents or ():
+                falls[agent].append(fault.at_s)
+    found = Course([], [], [], [], [] if whole else None)
+    for agent, trace in sorted(traces.items()):
+        every = [runs for runs in lives(trace) if runs]
+        for runs, later in zip_longest(every, every[1:]):
+            known = [at_s for at_s in falls[agent] if at_s >= runs[-1].t]
+            _Life(agent, found).follow(runs, min([*known, later[0].t if later else end_s]))
+    return replace(found, messages=_messages(traces)) if whole else found
+
+
+class _Life:
+    """An agent between its start and its end, while its trace is read."""
+
+    def __init__(self, agent: int, found: Course) -> None:
+        self._agent = agent
+        self._found = found
+        self._vote: tuple[str, float] | None = None
+        self._reconcile: tuple[str, float] | None = None
+        self._phase: tuple[PhaseName, float, int] | None = None
+        self._phases: list[Phase] = []
+
+    def follow(self, runs: Iterable[HandlerRun], end_s: float) -> None:
+        now_s = 0.0
+        for run in runs:
+            now_s = run.t
+            if run.handler == "process_next_deque_block" and run.branch == "proposed":
+                self._vote = next((sent.block or "" for sent in run.sent), ""), run.t
+            elif run.handler == "vote_timer_expiration":
+                self._end_vote(run.t, run.branch)
+            elif run.handler == "reconcile_begin" and run.branch == "begun":
+                by = next(iter(run.trigger.items()), ("", ""))
+                self._reconcile = REASONS.get(str(by[1]), "asked by the operator"), run.t
+            elif self._reconcile is not None:
+                self._go_on(run)
+            self._found.commits.extend(
+                Commit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
+                for operation, block in run.changes
+                if operation == "chain+"
+            )
+        end_s = max(end_s, now_s)
+        self._end_vote(end_s, CUT_SHORT)
+        self._end_reconcile(end_s, done=False)
+
+    def _end_vote(self, at_s: float, outcome: str) -> None:
+        if self._vote is not None:
+            block, since_s = self._vote
+            self._found.votes.append(Vote(self._agent, block, since_s, max(at_s, since_s), outcome))
+            self._vote = None
+
+    def _go_on(self, run: HandlerRun) -> None:
+        """A step of the reconcile that is under way."""
+        if run.branch.startswith("tie:"):
+            self._found.ties.append(Tie(self._agent, run.t, run.branch))
+        if run.handler == "reconcile_finalize" and run.branch == "done":
+            self._end_reconcile(run.t, done=True)
+        elif name := PHASES.get(run.handler):
+            if self._phase is not None and self._phase[0] == name:
+                self._phase = name, self._phase[1], self._phase[2] + 1
+            else:
+                self._end_phase(run.t)
+                self._phase = name, run.t, 1
+
+    def _end_phase(self, at_s: float) -> None:
+        if self._phase is not None:
+            name, since_s, rounds = self._phase
+            if at_s > since_s:
+                self._phases.append(Phase(name, since_s, at_s, rounds))
+            self._phase = None
+
+    def _end_reconcile(self, at_s: float, *, done: bool) -> None:
+        self._end_phase(at_s)
+        if self._reconcile is not None:
+            reason, since_s = self._reconcile
+            ended_s = max(at_s, since_s)
+            self._found.reconciles.append(Reconcile(self._agent, since_s, ended_s, reason, self._phases, done))
+        self._reconcile, self._phases = None, []
+
+
+def _messages(traces: Mapping[int, Trace]) -> list[Message]:
+    """Sequence numbers begin anew with each life: a message is the last of its number that was sent by then."""
+    sent: dict[tuple[object, object], list[Message]] = defaultdict(list)
+    for agent, trace in sorted(traces.items()):
+        for run in trace.runs:
+            if _in_time(run):
+                for one in run.sent:
+                    sent[agent, one.seq].append(Message(agent, run.t, one.message, one.block))
+    for agent, trace in sorted(traces.items()):
+        for run in trace.runs:
+            of_this_number = sent.get((run.trigger.get("from"), run.trigger.get("seq")))
+            if of_this_number and _in_time(run):
+                by_then = bisect_right([message.at_s for message in of_this_number], run.t)
+                of_this_number[max(by_then - 1, 0)].receipts.append((agent, run.t))
+    return sorted(
+        (message for messages in sent.values() for message in messages),
+        key=lambda message: (message.at_s, message.sender),
+    )
+
+
+def ends_at(traces: Mapping[int, Trace]) -> float:
+    """When the last handler ran, in mission seconds; 0 if none did."""
+    return max((run.t for trace in traces.values() for run in trace.runs if _in_time(run)), default=0.0)
+
+
+def possible(faults: Iterable[Fault]) -> list[Fault]:
+    """Those with a possible time, in order."""
+    return sorted(
+        (fault for fault in faults if math.isfinite(fault.at_s) and 0 <= fault.at_s <= LATEST_S),
+        key=lambda fault: fault.at_s,
+    )

@@ -1,0 +1,216 @@
+"""What run.json says: the record of one run, schema `ucp-run/1`. Keys are added, never removed or renamed."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.scenario import Scenario
+from harness.scenario.backend import Backend
+
+SCHEMA = "ucp-run/1"
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="ignore", populate_by_name=True)
+
+
+class Evidence(_Model):
+    """One piece of evidence; `block` is its name for people, such as 4.11."""
+
+    agent_id: int
+    detail: str
+    block: str | None
+    block_hash: str | None
+
+
+class CharacteristicVerdict(_Model):
+    name: str
+    verdict: Literal["holds", "violated", "not applicable"]
+    reason: str
+    evidence: list[Evidence]
+
+
+class NetworkState(_Model):
+    """From mission second `at_s` on, `detail` holds; `fully_connected` means that nothing is lost or cut."""
+
+    at_s: float
+    what: str
+    detail: str
+    fully_connected: bool
+
+
+class Fault(_Model):
+    """What a scenario did to the network or to agents at `at_s`; `detail` says it to people."""
+
+    at_s: float
+    what: str
+    detail: str
+    fully_connected: bool | None = None
+    agents: list[int] | None = None
+    disk: Literal["kept", "lost"] | None = None
+    """What a reboot left of it."""
+
+
+class FinalReconcile(_Model):
+    """`complete` once a round of reconciles changed no chain."""
+
+    at_s: float
+    rounds: int
+    complete: bool
+
+
+class AgentRecord(_Model):
+    """`outcome` is exported, not exported, killed, rebooting, crashed, hung, paused, running or not started.
+
+    Counters are those of all its lives, if it had more than one, and null if unknown.
+    """
+
+    outcome: str
+    detail: str | None = None
+    restarts: int = 0
+    """How often it began anew with nothing."""
+    reboots: int = 0
+    """How often it came back with what was on its disk."""
+    completed_before: list[str] = []
+    """Hashes of the blocks that it completed in lives that left no export, since it was killed."""
+    idle: bool | None = None
+    reconciles: int | None = None
+    chain_changed_at_s: float | None = None
+    messages_sent: int | None = None
+    bytes_sent: int | None = None
+    dropped: dict[str, int] | None = None
+    send_failures: int | None = None
+    trace_problem: str | None = None
+
+
+class CapturedFrames(_Model):
+    """How many frames crossed a vehicle's interface, and how many of them its capture lacks."""
+
+    received: int
+    dropped: int
+
+
+class BlockHolders(_Model):
+    """Who held a block right after vehicles were lost, and at the end; `agent_id` completed it."""
+
+    block: str
+    block_hash: str
+    agent_id: int
+    holders: list[int]
+    holders_at_end: list[int]
+
+
+class Loss(_Model):
+    """Vehicles were lost at `at_s`, and all that they held with them. Counts are null where traces are missing.
+
+    Of the blocks `completed` by then, by anybody, `survived` are those that some other vehicle held, `gone` those that
+    only the lost ones did, and `gone_at_end` those that nobody holds at the end, whatever took them.
+    """
+
+    at_s: float
+    what: str
+    vehicles: list[int]
+    completed: int | None = None
+    survived: int | None = None
+    gone: int | None = None
+    gone_at_end: int | None = None
+    blocks: list[BlockHolders] = []
+    """Those that the lost vehicles had completed, and those that are gone; the oldest first."""
+
+
+class LeastHeld(_Model):
+    """The smallest set of vehicles whose loss would lose a block: the holders of the block that the fewest hold."""
+
+    vehicles: int
+    """How many there are to hold it."""
+    holders: list[int]
+    block: str
+    block_hash: str
+    blocks: int
+    """How many blocks are on as few vehicles."""
+    of: int
+    """How many blocks there are."""
+
+
+class Survival(_Model):
+    """What became of the `completed` blocks where vehicles were lost; `gone` are on no vehicle at the end."""
+
+    losses: list[Loss] = []
+    completed: int
+    gone: int
+    at_end: LeastHeld | None = None
+    before_final_reconcile: LeastHeld | None = None
+
+
+class InjectedMessages(_Model):
+    """Of one injection the messages of one type: how many it sent, and what the agents that heard them did.
+
+    `handled`: branch of the handler -> how often it was taken. `changed`: how many of these handler runs changed what
+    an agent holds. `unhandled`: how many of the messages no agent handled.
+    """
+
+    message: str
+    sent: int
+    handled: dict[str, int] = {}
+    changed: int = 0
+    unhandled: int = 0
+
+
+class RogueInjection(_Model):
+    """What became of one injection. `refused`: datagrams that are no message, by reason; agents only count them.
+
+    `untraced` are copies that are not told from the others.
+    """
+
+    at_s: float
+    what: str
+    detail: str
+    sent: int = 0
+    bytes: int = 0
+    messages: list[InjectedMessages] = []
+    refused: dict[str, int] = {}
+    untraced: int = 0
+
+
+class JudgedRecord(_Model):
+    """The part of a record that a judgement of the run needs."""
+
+    schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
+    roster: list[int]
+    network: list[NetworkState] = []
+    faults: list[Fault] = []
+    final_reconcile: FinalReconcile | None = None
+    mission_s: float | None = None
+    agents: dict[str, AgentRecord] = {}
+
+
+class RunRecord(JudgedRecord):
+    """All of a record. Times are mission seconds except `wall_s`; what is not known yet is null or empty."""
+
+    scenario: Scenario
+    seed: int
+    backend: Backend
+    engine: str | None = None
+    versions: dict[str, str]
+    started_at: str
+    wall_s: float | None = None
+    outcome: Literal["running", "completed", "interrupted", "failed"] = "running"
+    outcome_detail: str | None = None
+    settled: bool = False
+    vehicles: dict[str, dict[str, Any]] = {}
+    unmatched_fates: list[str] = []
+    """A sentence for each scripted fate that decided nothing, and each injection that sent nothing."""
+    counters: dict[str, Any] | None = None
+    """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
+    capture: dict[str, CapturedFrames] | None = None
+    """Of each vehicle, if captures were asked for and came to their end."""
+    characteristics: dict[str, CharacteristicVerdict] = {}
+    figures: dict[str, float | int | None] = {}
+    survival: Survival | None = None
+    rogue: list[RogueInjection] = []
+    """What the rogue node sent and the agents did with it, for each injection of the timeline, in order."""
+    errors: list[str] = []
+    """A sentence for each file that the checker could not use, or not wholly."""
+
+    def to_json(self) -> dict[str, Any]:
+        return self.model_dump(mode="json", by_alias=True)

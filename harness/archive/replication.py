@@ -1,0 +1,139 @@
+"""How far the data had spread when: the agents' chains along mission time, from their traces.
+
+The figures are those of the checker (`harness.checker.figures`), at every moment instead of at the end: chains are
+those of living agents, and copies those of each completed block in these chains.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from harness.archive.connectivity import LOST_WITH
+from harness.archive.history import lives
+from harness.archive.record import Fault
+from harness.archive.traces import Trace
+from ucp.trace import HandlerRun
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """From `at_s` on: blocks in the mutual and in the longest chain, and distinct chains.
+
+    Copies are None until a block is completed.
+    """
+
+    at_s: float
+    mutual_chain: int
+    longest_chain: int
+    distinct_chains: int
+    copies_min: int | None
+    copies_mean: float | None
+
+
+def spread(traces: Mapping[int, Trace], faults: Iterable[Fault]) -> list[Spread]:
+    """How things stood from 0 s on, and after each moment that changed it."""
+    steps: list[tuple[float, int, int, Fault | HandlerRun]] = []
+    for fault in faults:
+        steps += [(fault.at_s, 0, agent, fault) for agent in fault.agents or () if agent in traces]
+    for agent, trace in traces.items():
+        for life, runs in enumerate(lives(trace), 1):
+            steps += [(run.t, life, agent, run) for run in runs if run.changes]
+    steps.sort(key=lambda step: step[:3])
+    chains = _Chains(traces)
+    found = [chains.spread(0.0)]
+    for number, (at_s, life, agent, step) in enumerate(steps):
+        if isinstance(step, Fault):
+            chains.suffer(agent, step)
+        else:
+            chains.play(agent, life, step)
+        if number + 1 == len(steps) or steps[number + 1][0] > at_s:
+            now = chains.spread(at_s)
+            if found[-1].at_s == at_s:
+                found[-1] = now
+            elif replace(now, at_s=found[-1].at_s) != found[-1]:
+                found.append(now)
+    return found
+
+
+class _Chains:
+    """The chains of the living agents, each a path of prefixes: what two chains share, they share by prefix."""
+
+    def __init__(self, agents: Iterable[int]) -> None:
+        self._paths: dict[int, list[tuple[int, str]]] = {agent: [] for agent in agents}
+        self._life = dict.fromkeys(self._paths, 1)
+        self._prefixes: dict[tuple[int, str], int] = {}
+        self._sharing: Counter[int] = Counter()
+        self._mutual = 0  # at most as long as the mutual chain
+        self._copies: Counter[str] = Counter()
+        self._completed: set[str] = set()
+        self._blocks_with: Counter[int] = Counter()  # so many copies
+        self._copies_of_completed = 0
+
+    def suffer(self, agent: int, fault: Fault) -> None:
+        if fault.what in LOST_WITH or (fault.what == "reboot" and fault.disk == "lost"):
+            self._empty(agent)
+            self._paths.pop(agent, None)
+        elif fault.what in ("restart", "boot"):
+            self._mutual = 0 if agent not in self._paths else self._mutual
+            self._paths.setdefault(agent, [])
+
+    def play(self, agent: int, life: int, run: HandlerRun) -> None:
+        """A run of a life that was taken already changes nothing any more."""
+        if life > self._life[agent]:
+            self._life[agent] = life
+            self._empty(agent)
+            self._paths[agent] = []
+            self._mutual = 0
+        if agent not in self._paths:
+            return
+        for operation, block in run.changes:
+            if operation == "complete" and block not in self._completed:
+                self._completed.add(block)
+                self._blocks_with[self._copies[block]] += 1
+                self._copies_of_completed += self._copies[block]
+            elif operation == "chain+":
+                self._append(agent, block)
+            elif operation == "chain-" and self._paths[agent]:
+                self._pop(agent)
+
+    def _append(self, agent: int, block: str) -> None:
+        path = self._paths[agent]
+        below = path[-1][0] if path else 0
+        prefix = self._prefixes.setdefault((below, block), len(self._prefixes) + 1)
+        path.append((prefix, block))
+        self._sharing[prefix] += 1
+        self._count(block, 1)
+
+    def _pop(self, agent: int) -> None:
+        path = self._paths[agent]
+        prefix, block = path.pop()
+        self._sharing[prefix] -= 1
+        self._mutual = min(self._mutual, len(path))
+        self._count(block, -1)
+
+    def _empty(self, agent: int) -> None:
+        for prefix, block in self._paths.get(agent, ()):
+            self._sharing[prefix] -= 1
+            self._count(block, -1)
+
+    def _count(self, block: str, more: int) -> None:
+        if block in self._completed:
+            self._blocks_with[self._copies[block]] -= 1
+            self._blocks_with[self._copies[block] + more] += 1
+            self._copies_of_completed += more
+        self._copies[block] += more
+
+    def spread(self, at_s: float) -> Spread:
+        paths = list(self._paths.values())
+        first: list[tuple[int, str]] = paths[0] if paths else []
+        while self._mutual < len(first) and self._sharing[first[self._mutual][0]] == len(paths):
+            self._mutual += 1
+        completed = len(self._completed)
+        return Spread(
+            at_s,
+            self._mutual,
+            max(map(len, paths), default=0),
+            len({path[-1][0] if path else 0 for path in paths}),
+            min((copies for copies, blocks in self._blocks_with.items() if blocks), default=None),
+            self._copies_of_completed / completed if completed else None,
+        )

@@ -1,0 +1,72 @@
+"""Where the vehicles of a run were: `tracks.jsonl` read back, in mission seconds and metres from the field's centre."""
+
+from bisect import bisect_right
+from collections.abc import Collection
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.archive.jsonlines import JsonLines
+
+MissionSeconds = Annotated[float, Field(ge=0, le=1e9)]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+"""Nothing flies a thousand kilometres from the field."""
+
+
+class Fix(NamedTuple):
+    """A vehicle was here at `at_s`."""
+
+    at_s: float
+    north_m: float
+    east_m: float
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """The fixes of each vehicle, one at least, in order of time; `problems` are sentences on what could not be read."""
+
+    by_vehicle: dict[int, list[Fix]]
+    problems: list[str]
+
+    def at(self, vehicle: int, at_s: float) -> Fix:
+        """Where it was at any second: straight between two fixes, still before the first and after the last."""
+        fixes = self.by_vehicle[vehicle]
+        position = bisect_right(fixes, at_s, key=attrgetter("at_s"))
+        before, after = fixes[max(position - 1, 0)], fixes[min(position, len(fixes) - 1)]
+        return between(before, after, at_s) if before.at_s < at_s < after.at_s else before._replace(at_s=at_s)
+
+
+def between(before: Fix, after: Fix, at_s: float) -> Fix:
+    """Where a vehicle is that goes straight from one place to the next at one speed."""
+    share = (at_s - before.at_s) / (after.at_s - before.at_s)
+    return Fix(
+        at_s,
+        before.north_m + share * (after.north_m - before.north_m),
+        before.east_m + share * (after.east_m - before.east_m),
+    )
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+    at_s: MissionSeconds
+    places: dict[int, tuple[Metres, Metres, Metres]]
+
+
+def read_tracks(path: Path, vehicles: Collection[int]) -> Tracks:
+    """The tracks of those of `vehicles` that have any. A line that names another vehicle means nothing."""
+    lines = JsonLines(path, _Line)
+    found: dict[int, list[Fix]] = {}
+    known = set(vehicles)
+    for line in lines:
+        if not line.places.keys() <= known:
+            lines.leave_out()
+            continue
+        for vehicle, (north_m, east_m, _) in line.places.items():
+            found.setdefault(vehicle, []).append(Fix(line.at_s, north_m, east_m))
+    for track in found.values():
+        track.sort(key=attrgetter("at_s"))
+    return Tracks(dict(sorted(found.items())), lines.problems())

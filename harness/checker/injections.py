@@ -1,0 +1,163 @@
+"""What the agents did with what the rogue node sent: its journal beside their traces.
+
+A forged message has a sequence number that no agent uses, so every run of a handler that it triggered is the rogue's. A
+copy looks as its original does: of the runs that agent and message have in common, the last are the copies', as many as
+were sent before them.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.archive.directory import ROGUE_FILE
+from harness.archive.jsonlines import JsonLines
+from harness.archive.record import InjectedMessages, RogueInjection
+from harness.archive.traces import Trace
+from harness.play.rogue.sequences import injection_of
+from harness.scenario import Scenario
+from harness.scenario.changes import injections_of
+from ucp.trace import HandlerRun
+
+SKEW_S = 0.05
+"""Mission seconds by which clocks of two processes may differ."""
+BRANCHES_NAMED = 6
+
+Count = Annotated[int, Field(ge=0, le=10**9)]
+
+
+class _Line(BaseModel):
+    """A datagram, or several that are only counted."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    at_s: float
+    injection: int
+    what: str
+    bytes: Count
+    message: str | None = None
+    sender: int | None = None
+    sequence: int | None = None
+    refused: str | dict[str, Count] | None = None
+    messages: dict[str, Count] = {}
+
+
+_Key = tuple[Any, Any, Any]
+"""Sender, sequence number, type: what a trace tells of a message."""
+
+
+@dataclass
+class _Tally:
+    sent: Counter[str] = field(default_factory=Counter)
+    bytes: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    untraced: int = 0
+    handled: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    changed: Counter[str] = field(default_factory=Counter)
+    reached: dict[str, set[tuple[_Key, int]]] = field(default_factory=lambda: defaultdict(set))
+    """The messages that some agent has handled."""
+
+
+def account(scenario: Scenario, run_dir: Path, traces: Mapping[int, Trace]) -> list[RogueInjection]:
+    """Of each injection of the scenario, in order; what no trace tells is not known."""
+    injections = injections_of(scenario)
+    if not injections:
+        return []
+    tallies = {one.number: _Tally() for one in injections}
+    copies: dict[_Key, list[tuple[float, int]]] = defaultdict(list)
+    for line in JsonLines(run_dir / ROGUE_FILE, _Line):
+        if line.injection in tallies:
+            _take_down(line, tallies[line.injection], copies)
+    for trace in traces.values():
+        for key, runs in _triggered_by(trace, copies).items():
+            for number, copy, run in _paired(copies.get(key), key, runs):
+                if number in tallies:
+                    tally, message = tallies[number], str(key[2])
+                    tally.handled[message][run.branch] += 1
+                    tally.changed[message] += bool(run.changes)
+                    tally.reached[message].add((key, copy))
+    return [_told(one.at_s, one.what, one.detail, tallies[one.number]) for one in injections]
+
+
+def in_words(one: RogueInjection) -> str:
+    """One line for people."""
+    branches = sum((Counter(of.handled) for of in one.messages), Counter()).most_common()
+    done = [f"{branch} {count}" for branch, count in branches[:BRANCHES_NAMED]]
+    if len(branches) > BRANCHES_NAMED:
+        done.append(f"and {sum(count for _, count in branches[BRANCHES_NAMED:])} more")
+    of_them = [f"{sum(one.refused.values())} of them malformed"] if one.refused else []
+    of_them += [f"{one.untraced} not told from their originals"] if one.untraced else []
+    said = "; ".join([f"{one.sent} sent", *of_them, *([", ".join(done)] if done else [])])
+    return f"{one.what} at {one.at_s:g} s, {one.detail}: {said}"
+
+
+def done_with(messages: InjectedMessages) -> str:
+    """What the agents did: "held already 4, committed 1"."""
+    done = [f"{branch} {count}" for branch, count in messages.handled.items()]
+    return ", ".join([*done, *([f"{messages.unhandled} handled by nobody"] if messages.unhandled else [])]) or "unknown"
+
+
+def _take_down(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]]) -> None:
+    tally.bytes += line.bytes
+    if line.message is not None:
+        tally.sent[line.message] += 1
+        copies[line.sender, line.sequence, line.message].append((line.at_s, line.injection))
+    elif isinstance(line.refused, str):
+        tally.refused[line.refused] += 1
+    else:
+        tally.sent.update(line.messages)
+        tally.refused.update(line.refused or {})
+        if line.what not in ("forge", "flood"):
+            tally.untraced += sum(line.messages.values())
+
+
+def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
+    """The handler runs that these messages triggered, or forged ones."""
+    found: dict[_Key, list[HandlerRun]] = defaultdict(list)
+    for run in trace.runs:
+        sequence = run.trigger.get("seq")
+        if isinstance(sequence, int):
+            key = (run.trigger.get("from"), sequence, run.trigger.get("message"))
+            if key in copies or injection_of(sequence) is not None:
+                found[key].append(run)
+    return found
+
+
+def _paired(
+    copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
+) -> Iterator[tuple[int, int, HandlerRun]]:
+    """(number of the injection, which of the copies, run) of the runs that copies triggered, the last with the last."""
+    forged = injection_of(key[1])
+    if copies is None and forged is not None:
+        yield from ((forged, 0, run) for run in runs)
+        return
+    left = list(runs)
+    for copy, (at_s, number) in sorted(enumerate(copies or ()), key=lambda it: it[1], reverse=True):
+        if left and left[-1].t >= at_s - SKEW_S:
+            yield number, copy, left.pop()
+
+
+def _told(at_s: float, what: str, detail: str, tally: _Tally) -> RogueInjection:
+    messages = [
+        InjectedMessages(
+            message=message,
+            sent=sent,
+            handled=dict(tally.handled[message].most_common()),
+            changed=tally.changed[message],
+            unhandled=max(0, sent - len(tally.reached[message]) - tally.untraced),
+        )
+        for message, sent in tally.sent.most_common()
+    ]
+    return RogueInjection(
+        at_s=at_s,
+        what=what,
+        detail=detail,
+        sent=tally.sent.total() + tally.refused.total(),
+        bytes=tally.bytes,
+        messages=messages,
+        refused=dict(tally.refused.most_common()),
+        untraced=tally.untraced,
+    )

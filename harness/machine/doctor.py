@@ -1,0 +1,72 @@
+"""What this machine can do for us: facts and ways out. `ucp-harness doctor` prints them."""
+
+import os
+import platform
+import sys
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from netem import doctor as lab_doctor
+from netem import uml
+from netem.errors import UmlError
+from sitl.ardupilot import ArduPilot
+from sitl.vehicle import VehicleError
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fact; `needed` if a run is impossible without it, and what would mend it."""
+
+    name: str
+    ok: bool
+    needed: bool
+    detail: str
+    way_out: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def examine() -> list[Finding]:
+    """Look at this machine; builds and removes a small lab to find out what the kernel allows."""
+    python = Finding(
+        "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
+    )
+    lab = [Finding(one.name, one.ok, one.needed, one.detail, one.way_out) for one in lab_doctor.examine()]
+    return [python, *lab, _user_mode_linux(), _docker(), _ardupilot()]
+
+
+def _user_mode_linux() -> Finding:
+    use = "--kernel uml: all of netem, in a process without privileges"
+    if uml.inside():
+        return Finding("User Mode Linux", True, False, "this is it")
+    try:
+        return Finding("User Mode Linux", True, False, f"{uml.examine()}; for {use}")
+    except UmlError as error:
+        return Finding("User Mode Linux", False, False, str(error), f"with it there is {use}")
+
+
+def _docker() -> Finding:
+    from harness.play.containers import backend
+    from harness.play.containers.engine import DockerError, Engine
+
+    use = "--backend docker: vehicles and agents in containers"
+    try:
+        engine = Engine.connect()
+        version = engine.api.version()["Version"]
+        engine.close()
+        backend.require_root()
+    except DockerError as error:
+        return Finding("Docker", False, False, str(error), f"with it there is {use}")
+    return Finding("Docker", True, False, f"{version}, for {use}")
+
+
+def _ardupilot() -> Finding:
+    try:
+        found = ArduPilot.find(None, os.environ)
+    except VehicleError as error:
+        return Finding("ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle")
+    if found.defaults is None:
+        way_out = "put ArduPilot's default parameters, copter.parm, beside it: without them it may refuse to arm"
+        return Finding("ArduPilot SITL", False, False, f"{found.binary}, without copter.parm", way_out)
+    return Finding("ArduPilot SITL", True, False, str(found.binary))

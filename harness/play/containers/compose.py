@@ -1,0 +1,150 @@
+"""A compose file with the vehicles and agents of a scenario, to start them by hand and look inside.
+
+It stands alone: beside it lies a directory with the mission files, and with what the image is built from. Docker
+builds the network, so there are no conditions and no faults, and the containers are the same otherwise.
+"""
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from harness.errors import RunDirectoryError
+from harness.play.containers import images, ownership
+from harness.play.containers.backend import agent_command
+from harness.play.containers.images import Image
+from harness.play.process.mission_file import mission_file
+from harness.scenario import Scenario
+from netem import addresses
+from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
+from ucp.files import write_json_atomically
+
+INSIDE = "/ucp"
+"""Where the directory beside the compose file is in every container."""
+
+TOP = """\
+# {name}: {count} agents{vehicles}, to start by hand and look inside:
+#
+#   docker compose -f {file} up
+#
+# The network is Docker's, and perfect: no loss, no partition, no timeline{grounded}.
+# Mission time runs {speedup:g} times as fast as the clock, from the moment at which the service `start` has found all
+# agents ready. The agents' files are in {directory}/agents; when they have been stopped,
+# ucp-harness check {directory}/agents/*.chain.json judges the chains.
+"""
+
+
+def write_compose(
+    scenario: Scenario, seed: int, kinds: dict[VehicleType, VehicleKind], system_ids: dict[int, int], file: Path
+) -> Path:
+    """Write `file` and the directory beside it, which is returned. Raises RunDirectoryError if one is there already."""
+    beside = file.with_suffix("")
+    for path in (file, beside):
+        if path.exists():
+            raise RunDirectoryError(f"{path} is there already: choose another name, nothing is overwritten")
+    try:
+        (beside / "agents").mkdir(parents=True)
+        services = _services(scenario, seed, kinds, system_ids, beside)
+        document = {"services": services, "networks": {"air": _network()}}
+        top = TOP.format(
+            name=scenario.name.replace("\n", " "),
+            count=len(scenario.roster),
+            vehicles=" on their vehicles" if kinds else "",
+            grounded="; and nobody flies the vehicles" if kinds else "",
+            file=file.name,
+            directory=beside.name,
+            speedup=scenario.speedup,
+        )
+        file.write_text(top + yaml.safe_dump(document, sort_keys=False, width=120), encoding="utf-8")
+    except OSError as error:
+        raise RunDirectoryError(f"{error.filename or file} cannot be written: {error.strerror}") from None
+    return beside
+
+
+def _network() -> dict[str, Any]:
+    subnet = f"{addresses.NETWORK}/{addresses.PREFIX_LENGTH}"
+    return {"driver": "bridge", "internal": True, "ipam": {"config": [{"subnet": subnet}]}}
+
+
+def _services(
+    scenario: Scenario, seed: int, kinds: dict[VehicleType, VehicleKind], system_ids: dict[int, int], beside: Path
+) -> dict[str, Any]:
+    ours, build = _our_image(scenario, beside)
+    asked = scenario.docker.image
+    agents = ours if asked is None else Image(asked, "python3", foreign=True)
+    services: dict[str, Any] = {}
+    for number, vehicle in enumerate(scenario.roster):
+        mission = f"{vehicle}.mission.json"
+        write_json_atomically(
+            beside / "agents" / mission,
+            mission_file(
+                vehicle,
+                scenario,
+                seed,
+                f"{scenario.name}, seed {seed}, by hand".encode(),
+                address=addresses.address(vehicle),
+                broadcast=addresses.BROADCAST,
+                with_vehicle=bool(kinds),
+            ),
+        )
+        network: dict[str, Any] = {"networks": {"air": {"ipv4_address": addresses.address(vehicle)}}}
+        if kinds:
+            directory = beside / "vehicles" / str(vehicle)
+            directory.mkdir(parents=True)
+            centre = Home(*scenario.vehicles.home)
+            home = home_in_field(number, centre, scenario.vehicles.spacing_m)
+            kind = kinds[scenario.vehicles.type_of(vehicle)]
+            launch = kind.launch(system_ids[vehicle], home, scenario.speedup, directory)
+            name = f"vehicle-{vehicle}"
+            services[name] = _service(scenario, ours, launch.argv, f"vehicles/{vehicle}", beside) | build | network
+            services[name] |= {"environment": dict(launch.env)} if launch.env else {}
+            network = {"network_mode": f"service:{name}", "depends_on": [name]}
+        argv = [*agent_command(scenario), mission]
+        services[f"agent-{vehicle}"] = _service(scenario, agents, argv, "agents", beside) | network
+        services[f"agent-{vehicle}"] |= build if asked is None else {}
+    waits = {"network_mode": "none", "depends_on": [f"agent-{vehicle}" for vehicle in scenario.roster]}
+    (beside / "start.py").write_bytes(Path(__file__).with_name("start.py").read_bytes())
+    argv = [sys.executable, f"{INSIDE}/start.py", f"{INSIDE}/agents"]
+    services["start"] = _service(scenario, ours, argv, "agents", beside) | build | waits
+    return services
+
+
+def _our_image(scenario: Scenario, beside: Path) -> tuple[Image, dict[str, Any]]:
+    """The image, and how compose gets it: from a directory beside the file."""
+    context = beside / "image"
+    context.mkdir()
+    if scenario.docker.image_from_host:
+        image = images.host_image()
+        (context / "Dockerfile").write_text(f"FROM scratch\nLABEL {ownership.PROJECT}=host\n", encoding="utf-8")
+        return image, {"build": f"./{beside.name}/image"}
+    for name, content in images.context().items():
+        (context / name).parent.mkdir(parents=True, exist_ok=True)
+        (context / name).write_bytes(content)
+    build = {"context": f"./{beside.name}/image", "network": "host", "args": images.build_arguments()}
+    return Image(images.project_name(), "python3"), {"build": build}
+
+
+def _service(scenario: Scenario, image: Image, argv: list[str], directory: str, beside: Path) -> dict[str, Any]:
+    command = image.command(argv)
+    asked = scenario.docker
+    service: dict[str, Any] = {
+        "image": image.name,
+        "entrypoint": command[:1],
+        "command": command[1:],
+        "working_dir": f"{INSIDE}/{directory}",
+        "user": f"{os.getuid()}:{os.getgid()}",
+        "volumes": [f"./{beside.name}:{INSIDE}", *(f"{path}:{path}:ro" for path in image.shared(argv))],
+        "tmpfs": ["/tmp"],  # noqa: S108  (the container's own)
+        "read_only": True,
+        "init": True,
+        "cap_drop": ["ALL"],
+        "security_opt": ["no-new-privileges"],
+    }
+    limits = {
+        "mem_limit": None if asked.memory_mib is None else f"{asked.memory_mib}m",
+        "cpus": asked.cpus,
+        "pids_limit": asked.pids,
+    }
+    return service | {key: value for key, value in limits.items() if value is not None}

@@ -1,0 +1,184 @@
+"""What containers are made from.
+
+project     built from the Dockerfile beside this file, out of the installed packages `ucp` and `sitl`
+named       an image that the scenario names
+from_host   an empty image, with this machine's programs, interpreter and packages mounted read-only: no registry needed
+"""
+
+import hashlib
+import importlib.util
+import io
+import os
+import shutil
+import sys
+import tarfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import docker.errors
+
+from harness.play.containers import ownership
+from harness.play.containers.engine import DockerError, Engine
+
+HOST_IMAGE = "ucp-harness-host:empty"
+PROJECT_IMAGE = "ucp-harness-agent"
+PACKAGES = ("sitl", "ucp")
+SYSTEM = ("/bin", "/lib", "/lib32", "/lib64", "/libx32", "/usr")
+INSTEAD = "use this machine's files (--image-from-host, `docker.image_from_host`), or name an image (`docker.image`)"
+
+
+@dataclass(frozen=True)
+class Image:
+    """`python` is the interpreter in it; `mounted` are directories of this machine that it shares, read-only.
+
+    Into an image that is `foreign` nothing is mounted: a path there is a path in the image.
+    """
+
+    name: str
+    python: str
+    mounted: tuple[Path, ...] = ()
+    foreign: bool = False
+
+    def command(self, argv: Sequence[str]) -> list[str]:
+        """What starts there that which `argv` starts here."""
+        return [self.python if word == sys.executable else word for word in argv]
+
+    def environment(self, env: Mapping[str, str]) -> dict[str, str]:
+        """Of a program whose environment here would be `env`: an image has its own, but for what was set for it."""
+        return {key: value for key, value in env.items() if self.mounted or os.environ.get(key) != value}
+
+    def shared(self, argv: Sequence[str]) -> list[Path]:
+        """What of this machine to mount so that `argv` can be started: programs and scripts by their paths."""
+        files = [Path(word) for word in self.command(argv) if Path(word).is_absolute() and Path(word).is_file()]
+        return outermost([*self.mounted, *([] if self.foreign else files)])
+
+
+def from_host(engine: Engine) -> Image:
+    """Raises DockerError."""
+    if not _exists(engine, HOST_IMAGE):
+        repository, tag = HOST_IMAGE.split(":")
+        engine.do(
+            "import an empty image",
+            engine.api.import_image_from_data,
+            _tar({}),
+            repository=repository,
+            tag=tag,
+            changes=[f"LABEL {ownership.PROJECT}=host"],
+        )
+    return host_image()
+
+
+def host_image() -> Image:
+    return Image(HOST_IMAGE, sys.executable, tuple(outermost(_host_directories())))
+
+
+def named(engine: Engine, name: str) -> Image:
+    """Raises DockerError if it is not here."""
+    if not _exists(engine, name):
+        raise DockerError(f"there is no image {name} on this machine: docker pull {name}, or build it")
+    return Image(name, "python3", foreign=True)
+
+
+def project(engine: Engine, say: Callable[[str], object]) -> Image:
+    """The project's image; built, with a word of every step, if it is not here. Raises DockerError."""
+    name = project_name()
+    if not _exists(engine, name):
+        say("building the image")
+        _build(engine, name, say)
+    return Image(name, "python3")
+
+
+def project_name() -> str:
+    """Of other packages, or another Dockerfile, it is another image."""
+    return f"{PROJECT_IMAGE}:{version('ucp-harness')}-{hashlib.sha256(_tar(context())).hexdigest()[:12]}"
+
+
+def build_arguments() -> dict[str, str]:
+    return {"PYMAVLINK": version("pymavlink")}
+
+
+def _build(engine: Engine, name: str, say: Callable[[str], object]) -> None:
+    steps = engine.do(
+        "build the image",
+        engine.api.build,
+        fileobj=io.BytesIO(_tar(context())),
+        custom_context=True,
+        tag=name,
+        rm=True,
+        forcerm=True,
+        decode=True,
+        network_mode="host",
+        labels={ownership.PROJECT: "agent"},
+        buildargs=build_arguments(),
+    )
+    now = ""
+    for step in steps:
+        if "error" in step:
+            raise DockerError(f"the project's image could not be built ({step['error'].strip()}): {INSTEAD}")
+        word = step.get("stream", "").strip()
+        now = word if word.startswith("Step ") else now
+        say(f"building the image: {now}")
+
+
+def context() -> dict[str, bytes]:
+    """What the project's image is built from: the Dockerfile and the packages, as files by name."""
+    files = {"Dockerfile": Path(__file__).with_name("Dockerfile").read_bytes()}
+    for package in PACKAGES:
+        root = _package(package)
+        for path in sorted(root.rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                files[f"{package}/{path.relative_to(root)}"] = path.read_bytes()
+    return files
+
+
+def _tar(files: Mapping[str, bytes]) -> bytes:
+    """The same files, the same bytes."""
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w") as tar:
+        for name, content in files.items():
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mode = len(content), 0o644
+            tar.addfile(entry, io.BytesIO(content))
+    return archive.getvalue()
+
+
+def _exists(engine: Engine, name: str) -> bool:
+    try:
+        engine.do(f"look for the image {name}", engine.api.inspect_image, name)
+    except docker.errors.APIError as error:
+        if error.status_code in (400, 404):  # 400: no name that an image could have
+            return False
+        raise DockerError(f"the image {name} cannot be used: {error.explanation}") from None
+    return True
+
+
+def _host_directories() -> Iterable[Path]:
+    yield from filter(Path.exists, map(Path, SYSTEM))
+    yield from (Path(sys.prefix), Path(sys.base_prefix))
+    yield from map(_package, PACKAGES)
+    yield _package("pymavlink").parent
+
+
+def _package(name: str) -> Path:
+    spec = importlib.util.find_spec(name)
+    assert spec is not None and spec.submodule_search_locations, "we depend on it"
+    return Path(next(iter(spec.submodule_search_locations))).absolute()
+
+
+def outermost(paths: Iterable[Path]) -> list[Path]:
+    """Each directory once, without those that lie in another."""
+    found: list[Path] = []
+    for path in sorted(set(paths)):
+        if not any(path.is_relative_to(outer) for outer in found):
+            found.append(path)
+    return found
+
+
+def idle_command() -> list[str]:
+    """A program of this machine that does nothing, for ever. Raises DockerError."""
+    sleep = shutil.which("sleep")
+    if sleep is None:
+        raise DockerError("there is no sleep(1) on PATH, which the containers that hold a network run")
+    return [sleep, "infinity"]

@@ -1,0 +1,139 @@
+"""The story of a mission, whichever backend runs the agents: a `Swarm` is what a backend must be able to do.
+
+Play the timeline, stop the events, let the agents settle, and reconcile finally if the scenario asks for it.
+"""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from harness.errors import HarnessError
+from harness.scenario import Scenario
+from harness.scenario.changes import RANGE, Change, final_reconcile, timeline_of
+
+MAX_FINAL_ROUNDS = 20
+"""Bound on the rounds of a final reconcile; each lets every agent reconcile once."""
+
+Outcome = Literal["completed", "interrupted", "failed"]
+
+
+@dataclass
+class Played:
+    """What became of a run, before anybody judges it."""
+
+    outcome: Outcome = "completed"
+    outcome_detail: str | None = None
+    exit_status: int = 0
+    engine: str | None = None
+    network: list[dict[str, Any]] = field(default_factory=list)
+    faults: list[dict[str, Any]] = field(default_factory=list)
+    final_reconcile: dict[str, Any] | None = None
+    mission_s: float = 0.0
+    settled: bool = False
+    counters: dict[str, Any] | None = None
+    capture: dict[str, dict[str, int]] | None = None
+    agents: dict[str, Any] = field(default_factory=dict)
+    vehicles: dict[str, Any] = field(default_factory=dict)
+    unmatched_fates: list[str] = field(default_factory=list)
+
+    def end_early(self, outcome: Outcome, error: HarnessError) -> None:
+        """The mission did not come to its end, because of `error`."""
+        self.outcome = outcome
+        self.outcome_detail = str(error)
+        self.exit_status = error.exit_status
+
+    def record(self, change: dict[str, Any]) -> None:
+        """Take down a change that was made; of those that flight makes, only who is connected to whom."""
+        if change["what"] == RANGE and self.network and _same_connections(change, self.network[-1]):
+            return
+        if "fully_connected" in change:
+            self.network.append(change)
+        if change["what"] != "start":
+            self.faults.append(change)
+
+
+def _same_connections(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return all(one[key] == other[key] for key in ("what", "detail", "fully_connected"))
+
+
+class Swarm(Protocol):
+    """Agents that a mission is played with; times are mission seconds."""
+
+    played: Played
+
+    def now(self) -> float: ...
+
+    def enter(self, stage: str) -> None:
+        """Say to whoever watches what comes now."""
+
+    async def begin(self, first: Change) -> None:
+        """Start everybody, under these conditions, and with them the mission's clock."""
+
+    async def until(self, mission_s: float) -> None: ...
+
+    async def apply(self, change: Change) -> None:
+        """Make the change, and take it down in `played`."""
+
+    async def stop_events(self) -> None: ...
+
+    async def until_idle(self, limit_s: float) -> bool:
+        """Wait until all living agents are idle and nothing is on its way; False if `limit_s` pass before."""
+
+    async def keep_chains(self) -> None:
+        """Keep the chains as they stand, before anybody puts them in order."""
+
+    async def reconcile(self, agent_id: int) -> None:
+        """Have the agent begin a reconcile."""
+
+    async def top_chain_hashes(self) -> dict[int, str]:
+        """Of every living agent."""
+
+    async def completed(self) -> dict[int, int]:
+        """How many blocks of its own each agent has completed that is neither dead nor paused."""
+
+    async def take_stock(self) -> Played:
+        """What has been played by now, with exports and traces up to now, for whoever judges a run that goes on."""
+
+
+Story = Callable[[Swarm, Scenario], Awaitable[None]]
+"""What a swarm is led through, from its beginning to its end."""
+
+
+async def play(swarm: Swarm, scenario: Scenario) -> None:
+    """Play the mission with `swarm`; `swarm.played` tells how it went."""
+    first, *changes = timeline_of(scenario)
+    await swarm.begin(first)
+    swarm.enter("mission")
+    for change in changes:
+        await swarm.until(change.at_s)
+        await swarm.apply(change)
+    await swarm.until(scenario.duration_s)
+    await settle(swarm, scenario)
+
+
+async def settle(swarm: Swarm, scenario: Scenario) -> None:
+    """The end of a mission: no more events; the agents finish, and reconcile finally if the scenario asks for it."""
+    swarm.enter("settling")
+    await swarm.stop_events()
+    swarm.played.settled = await swarm.until_idle(scenario.settle.limit_s)
+    if scenario.final_reconcile:
+        await reconcile_finally(swarm, scenario.settle.limit_s)
+
+
+async def reconcile_finally(swarm: Swarm, limit_s: float) -> None:
+    """Clear all conditions and let one agent after another reconcile, until a round changes no chain."""
+    await swarm.keep_chains()
+    swarm.enter("final reconcile")
+    began_s = swarm.now()
+    swarm.played.final_reconcile = {"at_s": round(began_s, 3), "rounds": 0, "complete": False}
+    await swarm.apply(final_reconcile(began_s))
+    for number in range(1, MAX_FINAL_ROUNDS + 1):
+        before = await swarm.top_chain_hashes()
+        for agent_id in before:
+            await swarm.reconcile(agent_id)
+            if not await swarm.until_idle(limit_s):
+                return
+        swarm.played.final_reconcile["rounds"] = number
+        if await swarm.top_chain_hashes() == before:
+            swarm.played.final_reconcile["complete"] = True
+            return

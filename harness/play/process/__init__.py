@@ -1,0 +1,1 @@
+"""Vehicles and agents as real processes in a real, private network."""

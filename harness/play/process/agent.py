@@ -1,0 +1,323 @@
+"""One agent under test as a program in its vehicle's namespace: started, asked, exported, stopped.
+
+An agent that is killed and begins again, or comes back from a brown-out, has another life: another process, with a
+directory of its own, so that nothing of an earlier life is overwritten, or found by an agent that should have nothing.
+"""
+
+import asyncio
+import contextlib
+import os
+import shutil
+import signal
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from harness.archive.directory import RunDirectory
+from harness.archive.traces import SUFFIX, read_trace
+from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
+from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, Status
+from harness.play.process.lab import Lab, Program
+from harness.play.process.mission_file import mission_file
+from harness.scenario import Scenario
+
+START_LIMIT_S = 30.0
+ANSWER_LIMIT_S = 10.0
+"""Wall time after which an agent that does not answer counts as hung."""
+STOP_GRACE_S = 5.0
+ASK_AGAIN_S = 0.02
+MOMENT_S = 0.5
+
+
+def agent_command(scenario: Scenario) -> list[str]:
+    """What starts an agent, but for the mission file. Raises ScenarioError if there is no such program."""
+    if scenario.agent_command is None:
+        return [sys.executable, "-P", "-m", "ucp.node"]
+    program, *arguments = scenario.agent_command
+    found = shutil.which(program)
+    if found is None:
+        raise ScenarioError(f"`agent_command`: {program} is no program: give a path, or a name on PATH")
+    return [str(Path(found).absolute()), *arguments]  # agents work in a directory of their own
+
+
+class AgentFailedError(HarnessError):
+    """An agent crashed, hung, or did not start: the thing under test failed."""
+
+    exit_status = VIOLATED
+
+    def __init__(self, agent_id: int, outcome: str, detail: str, log: Path) -> None:
+        super().__init__(f"agent {agent_id} {detail}; its log is {log}")
+        self.agent_id = agent_id
+        self.outcome = outcome
+
+
+@dataclass
+class _Life:
+    """`store` is where it keeps what it holds, if the scenario asks for that; `status` is its last."""
+
+    directory: Path
+    store: Path
+    status: Status | None = None
+    killed: bool = False
+    """The data that it held is gone."""
+    reboot: bool = False
+    """It began with what was on disk."""
+    counted: bool = False
+    """What it completed is known, though it was killed."""
+    trace_brought: int = 0
+    """Bytes of its trace that are where the checker looks for them."""
+
+
+class AgentProcess:
+    """`status` is the agent's last, None while it has none; `outcome` is what became of it, for run.json."""
+
+    def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str]) -> None:
+        self.agent_id = agent_id
+        self._command = command
+        self.outcome = "not started"
+        self.detail: str | None = None
+        self._rundir = rundir
+        self._lives: list[_Life] = []
+        self._process: Program | None = None
+        self._being_asked = asyncio.Lock()
+        """Nobody stops or kills it while it is asked for its status."""
+        self._completed_before: list[str] = []
+
+    @property
+    def lives(self) -> int:
+        """How many it has had, this one included."""
+        return len(self._lives)
+
+    @property
+    def awake(self) -> bool:
+        """Whether it runs and answers."""
+        return self.outcome == "running"
+
+    @property
+    def status(self) -> Status | None:
+        return self._lives[-1].status if self.outcome in ("running", "paused") else None
+
+    # A life
+
+    async def start(
+        self,
+        lab: Lab,
+        scenario: Scenario,
+        seed: int,
+        initial_data: bytes,
+        with_vehicle: bool,
+        keeps_disk: bool,
+        epoch_us: int | None = None,
+    ) -> None:
+        """Start the program and wait until it answers; with `epoch_us` it joins the mission that began then.
+
+        With `keeps_disk` it stores what it holds, to be rebooted with it.
+        Raises AgentFailedError, AgentRefusedError.
+        """
+        life = self._begin_life()
+        mission = mission_file(
+            self.agent_id,
+            scenario,
+            seed,
+            initial_data,
+            address=lab.addresses[self.agent_id],
+            broadcast=lab.broadcast,
+            with_vehicle=with_vehicle,
+            life=len(self._lives),
+            epoch_us=epoch_us,
+            store=os.path.relpath(life.store, life.directory) if keeps_disk else None,
+        )
+        path = self._rundir.write_mission(life.directory, self.agent_id, mission)
+        output = self._log
+        self._control = AgentControl(self._control_path)
+        self._process = await lab.spawn(
+            self.agent_id,
+            [*self._command, path.name],
+            cwd=life.directory,
+            env=dict(os.environ),
+            stdout=output,
+            stderr=output,
+            role="agent",
+        )
+        await self._wait_until_it_answers(self._process)
+        self.outcome = "running"
+
+    def _begin_life(self) -> _Life:
+        directory = self._rundir.agent(self.agent_id, len(self._lives) + 1)
+        kept = self.outcome == "rebooting"
+        store = self._lives[-1].store if kept else directory / f"{self.agent_id}.store"
+        self._lives.append(_Life(directory, store, reboot=kept))
+        return self._lives[-1]
+
+    async def _wait_until_it_answers(self, process: Program) -> None:
+        deadline = asyncio.get_running_loop().time() + START_LIMIT_S
+        while True:
+            try:
+                self._take(await self._control.ask("status", timeout_s=ANSWER_LIMIT_S))
+                return
+            except AgentSilentError:
+                if process.returncode is not None:
+                    raise self._crashed(process) from None
+                if asyncio.get_running_loop().time() > deadline:
+                    raise self._failed("hung", f"did not answer within {START_LIMIT_S:g} s of its start") from None
+                await asyncio.sleep(ASK_AGAIN_S)
+
+    async def watch(self) -> None:
+        """Raises AgentFailedError when the process ends."""
+        assert self._process is not None
+        await self._process.wait()
+        raise self._crashed(self._process)
+
+    async def kill(self, *, disk_kept: bool = False) -> None:
+        """SIGKILL, which no agent survives; what it held is gone but for its disk, if that is kept.
+
+        Stop watching it before. Raises AgentFailedError if it had failed by itself.
+        """
+        assert self._process is not None
+        async with self._being_asked:
+            if self.awake:
+                self._take(await self.ask("status"))  # its counters die with it
+            self._control.close()
+            self.outcome = "rebooting" if disk_kept else "killed"
+            self._lives[-1].killed = not disk_kept
+            await self._process.send_signal(signal.SIGKILL)
+            await self._process.wait()
+            self._control_path.unlink(missing_ok=True)
+
+    async def pause(self) -> None:
+        """It stands still, and what reaches it waits in its socket, as much as fits there."""
+        assert self._process is not None
+        async with self._being_asked:
+            await self._process.pause()
+            self.outcome = "paused"
+
+    async def resume(self) -> None:
+        assert self._process is not None
+        await self._process.resume()
+        self.outcome = "running"
+
+    # What it is asked
+
+    async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
+        """Raises AgentFailedError if the agent does not answer, AgentRefusedError if it cannot."""
+        try:
+            return await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
+        except AgentRefusedError as error:
+            raise AgentRefusedError(f"agent {self.agent_id} refused to {command}: {error}") from None
+        except AgentSilentError as error:
+            if self._process is not None and await self._has_ended(self._process):
+                raise self._crashed(self._process) from None
+            raise self._failed("hung", f"stopped answering: {error}") from None
+
+    async def _has_ended(self, process: Program) -> bool:
+        """Of which one hears a moment after its connection is lost."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(process.wait(), MOMENT_S)
+        return process.returncode is not None
+
+    async def poll(self) -> Status | None:
+        """Ask for the status; None of an agent that is dead or paused. Raises AgentFailedError."""
+        async with self._being_asked:
+            return self._take(await self.ask("status")) if self.awake else None
+
+    def _take(self, answer: dict[str, Any]) -> Status:
+        try:
+            status = Status.model_validate(answer)
+        except ValidationError as error:
+            wrong = ", ".join(dict.fromkeys(str(problem["loc"][0]) for problem in error.errors()))
+            detail = f"does not follow the agent contract: in its status {wrong} is missing or wrong"
+            raise self._failed("broken", detail) from None
+        self._lives[-1].status = status
+        return status
+
+    async def export(self) -> None:
+        """Have the chain exported. Raises AgentFailedError, or MachineError if the agent could not write it."""
+        await self.poll()
+        try:
+            await self.ask("export")
+        except AgentRefusedError as error:
+            self.outcome, self.detail = "not exported", str(error)
+            raise MachineError(f"{error}; what was written before is there") from None
+        self._rundir.bring_export(self.agent_id, self._lives[-1].directory)
+
+    async def export_finally(self) -> None:
+        """The last export, of an agent that is still alive. Raises as `export`."""
+        if self.outcome == "paused":
+            await self.resume()
+        if self.awake:
+            await self.export()
+            self.outcome = "exported"
+
+    # The end
+
+    async def stop(self) -> None:
+        if self._process is None:
+            return
+        self._control.close()
+        if self._process.returncode is None:
+            if self.outcome == "hung":
+                await self._process.send_signal(signal.SIGKILL)
+                await self._process.wait()
+            else:
+                await self._process.terminate(STOP_GRACE_S)
+
+    def put_together(self) -> None:
+        """Put what all lives have left where that of one life would be: for the checker. Raises OSError.
+
+        May be done again and again: what is there is not put there twice.
+        """
+        for number, life in enumerate(self._lives, 1):
+            if life.killed and not life.counted:
+                trace = read_trace(life.directory / f"{self.agent_id}{SUFFIX}")
+                self._completed_before += trace.completed() if trace else []
+                life.counted = True
+            if number > 1:
+                life.trace_brought += self._rundir.bring_trace(self.agent_id, life.directory, life.trace_brought)
+                self._rundir.bring_export(self.agent_id, life.directory)
+
+    def to_json(self) -> dict[str, Any]:
+        lives = self._lives
+        record = {
+            "outcome": self.outcome,
+            "detail": self.detail,
+            "restarts": sum(not life.reboot for life in lives[1:]),
+            "reboots": sum(life.reboot for life in lives),
+            "completed_before": list(dict.fromkeys(self._completed_before)),
+        }
+        statuses = [life.status for life in lives if life.status is not None]
+        if not statuses:
+            return record
+        last_words_of = lives[-1].status if self.outcome not in ("killed", "rebooting") else None
+        failures = [status.send_failures for status in statuses if status.send_failures is not None]
+        return record | {
+            "idle": last_words_of.idle if last_words_of else None,
+            "bytes_sent": sum(status.bytes_sent for status in statuses),
+            "dropped": dict(sum((Counter(status.dropped) for status in statuses), Counter())),
+            "send_failures": sum(failures) if failures else None,
+            "trace_problem": next((status.trace_problem for status in statuses if status.trace_problem), None),
+        }
+
+    @property
+    def _control_path(self) -> Path:
+        return self._lives[-1].directory / f"{self.agent_id}.control"
+
+    @property
+    def _log(self) -> Path:
+        return self._lives[-1].directory / f"{self.agent_id}.log"
+
+    def _crashed(self, process: Program) -> AgentFailedError:
+        return self._failed("crashed", f"ended by itself with {process.end}")
+
+    def _failed(self, outcome: str, detail: str) -> AgentFailedError:
+        self.outcome, self.detail = outcome, detail
+        return AgentFailedError(self.agent_id, outcome, detail, self._log.relative_to(self._rundir.path))
+
+
+def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:
+    """Whether the scenario ever asks for what is on the agent's disk."""
+    return any(entry.disk == "kept" and agent_id in (entry.reboot or ()) for entry in scenario.timeline)

@@ -1,0 +1,408 @@
+"""The process and Docker backends: a scenario played by real programs in a real, private network.
+
+Build the lab, start vehicles and agents and the mission's clock, play the mission while watching everybody, export,
+stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and still exports what there is.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from harness.archive.directory import RunDirectory
+from harness.errors import HarnessError, InterruptedRunError, MachineError
+from harness.play.control import Status
+from harness.play.mission import Played, Story
+from harness.play.process.agent import AgentProcess, reboots_with_disk
+from harness.play.process.lab import Lab, OpenLab
+from harness.play.process.preflight import network_needs, on_the_air
+from harness.play.process.rogue import RogueProcess
+from harness.play.process.vehicle import VehicleProcess, system_ids
+from harness.play.process.watchers import Watchers, unless_interrupted
+from harness.play.progress import Progress, Snapshot
+from harness.play.radio_range import TRACK_S, Reach
+from harness.scenario import Scenario
+from harness.scenario.changes import AgentFault, Change, Injected, NetworkChange, describe, injected_nothing
+from netem.capture import Capture
+from netem.conditions import NetworkConditions
+from netem.engine import Applied
+from netem.errors import CaptureError, LabUnavailable, NetemError
+from netem.lab import Lab as ProcessLab
+from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
+from ucp.clock import MICROSECONDS, MissionClock
+
+POLL_S = 0.25
+QUIET_POLL_S = 0.1
+START_DELAY_S = 0.05
+FOLLOW_S = 0.1
+"""Wall time between two looks at where the vehicles are, at least."""
+
+
+async def open_lab(scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> Lab:
+    """The lab of processes. Raises NetemError."""
+    return await ProcessLab.open(scenario.on_the_air, needs=network_needs(scenario), log=rundir.lab_log)
+
+
+class ProcessRun:
+    """One run; `play` it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early.
+
+    `open_lab` says what vehicles and agents are made of, `agent_command` what starts an agent there.
+    With `keeps_disks` every agent has a disk that it can be rebooted with, else those that the scenario reboots so.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        kinds: Mapping[VehicleType, VehicleKind],
+        initial_data: bytes,
+        rundir: RunDirectory,
+        progress: Progress,
+        interrupted: asyncio.Event,
+        *,
+        agent_command: Sequence[str],
+        open_lab: OpenLab = open_lab,
+        keeps_disks: bool = False,
+    ) -> None:
+        self.scenario = scenario
+        self.seed = seed
+        self.initial_data = initial_data
+        self.rundir = rundir
+        self.progress = progress
+        self.interrupted = interrupted
+        self.played = Played()
+        self._kinds = kinds
+        self._open_lab = open_lab
+        self._keeps_disks = keeps_disks
+        self._system_ids = system_ids(scenario.roster)
+        self.agents = [AgentProcess(agent_id, rundir, agent_command) for agent_id in scenario.roster]
+        self.vehicles = [self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds]
+        self._rogue = RogueProcess(scenario.rogue, scenario, seed, rundir) if scenario.rogue else None
+        self.stage = "building the lab"
+        self.network = describe(NetworkConditions())
+        self.clock = MissionClock(scenario.speedup)
+        self._capture: Capture | None = None
+        self._reach = Reach(scenario)
+        self._changing_network = asyncio.Lock()
+        self._watchers = Watchers()
+        self._starting: dict[int, asyncio.Task[None]] = {}
+        """Agents that begin again and do not answer yet."""
+
+    def _vehicle(self, vehicle_id: int, life: int = 1) -> VehicleProcess:
+        kind = self._kinds[self.scenario.vehicles.type_of(vehicle_id)]
+        return VehicleProcess(vehicle_id, self._system_ids[vehicle_id], kind, self.rundir, life)
+
+    async def play(self, story: Story) -> Played:
+        """Raises HarnessError if there is no lab, MachineError if this machine cannot build it.
+
+        All else that goes wrong is in the answer.
+        """
+        try:
+            lab = await unless_interrupted(self._open_lab(self.scenario, self.rundir, self._show), self.interrupted)
+        except HarnessError:
+            raise
+        except LabUnavailable as error:
+            raise MachineError(str(error)) from None
+        except NetemError as error:
+            raise MachineError(f"the lab could not be built: {error}; see {self.rundir.lab_log}") from None
+        async with lab:
+            self._lab = lab
+            self.played.engine = lab.engine
+            try:
+                mission = story(self, self.scenario)
+                await self._watchers.guard(mission, self._watch_for_interruption(), lab.watch())
+            except HarnessError as error:
+                self._ended_early(error)
+            except CaptureError as error:
+                self._ended_early(MachineError(str(error)))
+            except NetemError as error:
+                self._ended_early(MachineError(f"the lab failed: {error}"))
+            except OSError as error:
+                self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
+            await self._wind_up(lab)
+        return self.played
+
+    async def _watch_for_interruption(self) -> None:
+        await self.interrupted.wait()
+        raise InterruptedRunError(f"the run was interrupted at mission second {self.clock.now():.0f}")
+
+    # The story, as harness.play.mission tells it
+
+    def now(self) -> float:
+        return self.clock.now()
+
+    def enter(self, stage: str) -> None:
+        self.stage = stage
+
+    async def begin(self, first: Change) -> None:
+        await self._start_vehicles(self._lab)
+        await self._start_agents(self._lab)
+        await self.apply(first)
+        if self.scenario.capture:
+            self._capture = await Capture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
+            self._watchers.start(self._capture.watch())
+        await self._start_clock()
+        self._watchers.start(self._poll_agents())
+        if self.vehicles:
+            self._watchers.start(self._follow_flight())
+        for vehicle in self.vehicles:
+            self._fly(vehicle)
+
+    def _fly(self, vehicle: VehicleProcess) -> None:
+        flight = self.scenario.flight_of(vehicle.vehicle_id)
+        flown = (
+            vehicle.take_off(self.scenario.vehicles.takeoff_altitude_m)
+            if flight is None
+            else vehicle.fly(flight.planned(), flight.by)
+        )
+        self._watchers.start(flown, of=f"flight {vehicle.vehicle_id}")
+
+    def _home(self, number: int) -> Home:
+        vehicles = self.scenario.vehicles
+        return home_in_field(number, Home(*vehicles.home), vehicles.spacing_m)
+
+    async def _start_vehicles(self, lab: Lab) -> None:
+        if not self.vehicles:
+            return
+        self._show("starting vehicles")
+        speedup = self.scenario.speedup
+        await asyncio.gather(
+            *(vehicle.start(lab, self._home(number), speedup) for number, vehicle in enumerate(self.vehicles))
+        )
+        for vehicle in self.vehicles:
+            self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
+
+    async def _start_agents(self, lab: Lab) -> None:
+        self._show("starting agents")
+        await asyncio.gather(*(self._start_agent(agent, lab) for agent in self.agents))
+        if self._rogue is not None:
+            await self._rogue.start(lab.network)
+            self._watchers.start(self._rogue.watch(), of="rogue")
+
+    async def _start_agent(self, agent: AgentProcess, lab: Lab) -> None:
+        """Start it, into the mission if that is under way."""
+        with_vehicle = bool(self.vehicles)
+        keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
+        epoch_us = self.clock.epoch_us
+        await agent.start(lab, self.scenario, self.seed, self.initial_data, with_vehicle, keeps_disk, epoch_us)
+        self._watchers.start(agent.watch(), of=f"agent {agent.agent_id}")
+
+    async def _start_clock(self) -> None:
+        epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
+        if self._capture:
+            await self._capture.begin(epoch_us, self.scenario.speedup)
+        await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
+        if self._rogue is not None:
+            await self._rogue.begin(epoch_us)
+        self.clock.start(epoch_us)
+
+    async def apply(self, change: Change) -> None:
+        if isinstance(change, NetworkChange):
+            await self._put_into_force(self._reach.ask(change), asked=change.conditions)
+            return
+        if isinstance(change, Injected):
+            assert self._rogue is not None, "a scenario that injects has one"
+            self.played.record(change.to_json(round(max(change.at_s, self.clock.now()), 3)))
+            await self._rogue.inject(change)
+            return
+        await asyncio.gather(*(self._fault(change, agent_id) for agent_id in change.agents))
+        record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
+        self.played.record(record)
+        self.rundir.append_network(record)
+
+    async def _fault(self, fault: AgentFault, agent_id: int) -> None:
+        """What the timeline does to an agent, and to its vehicle if it has one."""
+        if agent_id in self._starting:
+            await self._starting.pop(agent_id)
+        number = self.scenario.roster.index(agent_id)
+        agent = self.agents[number]
+        vehicle = self.vehicles[number] if self.vehicles else None
+        match fault.what:
+            case "pause":
+                await agent.pause()
+            case "resume":
+                await agent.resume()
+            case "reboot":
+                await self._kill(agent, disk_kept=fault.disk == "kept")
+            case "kill":
+                await asyncio.gather(self._kill(agent), *([self._shoot_down(vehicle)] if vehicle else []))
+            case "crash":
+                assert vehicle is not None, "without vehicles a crash is refused"
+                self._watchers.start(vehicle.fall(), of=f"flight {agent_id}")
+                await self._kill(agent)
+            case "boot":
+                self._starting[agent_id] = self._watchers.task(self._start_agent(agent, self._lab))
+            case "restart":
+                self._starting[agent_id] = self._watchers.task(self._start_again(agent, number))
+
+    async def _kill(self, agent: AgentProcess, *, disk_kept: bool = False) -> None:
+        self._watchers.stop(f"agent {agent.agent_id}")
+        await agent.kill(disk_kept=disk_kept)
+
+    async def _shoot_down(self, vehicle: VehicleProcess) -> None:
+        self._watchers.stop(f"flight {vehicle.vehicle_id}")
+        self._watchers.stop(f"vehicle {vehicle.vehicle_id}")
+        await vehicle.kill()
+
+    async def _start_again(self, agent: AgentProcess, number: int) -> None:
+        """A new agent, on a new vehicle in the place of the one that was lost."""
+        if self._kinds:
+            await self._shoot_down(self.vehicles[number])  # a wreck still holds its ports
+            life = agent.lives + 1
+            vehicle = self._vehicle(agent.agent_id, life)
+            self.vehicles[number] = vehicle
+            await vehicle.start(self._lab, self._home(number), self.scenario.speedup)
+            self._watchers.start(vehicle.watch(), of=f"vehicle {agent.agent_id}")
+            self._fly(vehicle)
+        await self._start_agent(agent, self._lab)
+
+    async def _put_into_force(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
+        """`asked` by the timeline, not by flight, of which it is on record what changed."""
+        async with self._changing_network:  # in the order in which they were asked for
+            conditions = on_the_air(change.conditions, self.scenario)
+            applied = await self._lab.apply(conditions.at_speed(self.scenario.speedup))
+        self.network = change.detail
+        record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
+        self.played.record(record)
+        if asked is not None:
+            record |= {"asked": asked.to_json(), "applied": self._of_the_swarm(applied)}
+        self.rundir.append_network(record)
+
+    def _of_the_swarm(self, applied: Applied) -> dict[str, Any]:
+        """What the kernel holds and has counted for receivers that are vehicles."""
+        figures = applied.to_json()
+        if self._rogue is not None:
+            figures["receivers"].pop(str(self._rogue.vehicle), None)
+        return figures
+
+    async def _follow_flight(self) -> None:
+        """Write down where the vehicles are, and have the network follow them."""
+        field, radio = Home(*self.scenario.vehicles.home), self.scenario.network.radio
+        every_s = max(FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
+        while True:
+            places = {vehicle.vehicle_id: vehicle.place(field) for vehicle in self.vehicles}
+            self.rundir.append_tracks(self.clock.now(), places)
+            if change := self._reach.move(self.clock.now(), places):
+                await self._put_into_force(change)
+            await asyncio.sleep(every_s)
+
+    async def until(self, mission_s: float) -> None:
+        while (left_s := mission_s - self.clock.now()) > 0:  # a clock that is about to start stands at 0
+            await asyncio.sleep(self.clock.wall_s(left_s))
+
+    async def stop_events(self) -> None:
+        await asyncio.gather(*self._starting.values())
+        await asyncio.gather(*(agent.ask("stop_events") for agent in self._awake()))
+
+    async def until_idle(self, limit_s: float) -> bool:
+        deadline_s = self.clock.now() + limit_s
+        handled: list[int] | None = None
+        while self.clock.now() < deadline_s:
+            statuses = (await self._statuses()).values()
+            before, handled = handled, [status.handled for status in statuses]
+            if all(status.idle for status in statuses) and handled == before:
+                return not any(agent.outcome == "paused" for agent in self.agents)
+            await asyncio.sleep(QUIET_POLL_S)
+        return False
+
+    async def keep_chains(self) -> None:
+        await asyncio.gather(*(agent.export() for agent in self._awake()))
+        self.rundir.keep_exports_before_final_reconcile()
+
+    async def reconcile(self, agent_id: int) -> None:
+        await next(agent for agent in self.agents if agent.agent_id == agent_id).ask("reconcile")
+
+    async def top_chain_hashes(self) -> dict[int, str]:
+        return {agent_id: status.top_chain_hash for agent_id, status in (await self._statuses()).items()}
+
+    async def completed(self) -> dict[int, int]:
+        return {agent_id: status.completed for agent_id, status in (await self._statuses()).items()}
+
+    async def take_stock(self) -> Played:
+        await asyncio.gather(*(agent.export() for agent in self._awake()))
+        for agent in self.agents:
+            agent.put_together()
+        agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+        return replace(self.played, mission_s=round(self.clock.now(), 1), agents=agents)
+
+    def _awake(self) -> list[AgentProcess]:
+        """The agents that are neither dead nor paused."""
+        return [agent for agent in self.agents if agent.awake]
+
+    async def _statuses(self) -> dict[int, Status]:
+        """The status of each agent that is neither dead nor paused."""
+        polled = await asyncio.gather(*(agent.poll() for agent in self.agents))
+        return {agent.agent_id: status for agent, status in zip(self.agents, polled, strict=True) if status}
+
+    async def _poll_agents(self) -> None:
+        while True:
+            await self._statuses()
+            self._show(self.stage)
+            await asyncio.sleep(POLL_S)
+
+    # The end
+
+    def _ended_early(self, error: HarnessError) -> None:
+        self.played.end_early("interrupted" if isinstance(error, InterruptedRunError) else "failed", error)
+
+    async def _wind_up(self, lab: Lab) -> None:
+        """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""
+        self._show("exporting")
+        self.played.mission_s = round(self.clock.now(), 1)
+        exported = await asyncio.gather(*(agent.export_finally() for agent in self.agents), return_exceptions=True)
+        for error in exported:
+            if error is not None and not isinstance(error, HarnessError):
+                raise error
+            if error is not None and self.played.outcome == "completed":
+                self._ended_early(error)
+        self.played.vehicles = {str(vehicle.vehicle_id): vehicle.to_json() for vehicle in self.vehicles}
+        try:
+            if self._rogue is not None:
+                await self._stop_rogue(self._rogue)
+            self.played.counters = self._of_the_swarm(await lab.read())
+            self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
+            await asyncio.gather(*(agent.stop() for agent in self.agents), *(one.stop() for one in self.vehicles))
+            for agent in self.agents:
+                agent.put_together()
+        except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed
+            self._ended_early(MachineError(str(error)))
+        except OSError as error:
+            self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
+        await self._end_capture()
+        try:
+            await lab.close()
+        except NetemError as error:
+            self._ended_early(MachineError(str(error)))
+        self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+
+    async def _end_capture(self) -> None:
+        if self._capture is None:
+            return
+        try:
+            counted = await self._capture.stop()
+        except CaptureError as error:
+            if self.played.outcome == "completed":
+                self._ended_early(MachineError(str(error)))
+            return
+        self.played.capture = {str(vehicle): frames for vehicle, frames in counted.items()}
+
+    async def _stop_rogue(self, rogue: RogueProcess) -> None:
+        try:
+            await rogue.stop()
+        except MachineError as error:
+            if self.played.outcome == "completed":
+                self._ended_early(error)
+        self.played.unmatched_fates = injected_nothing(self.scenario, rogue.sent)
+
+    def _show(self, stage: str) -> None:
+        self.stage = stage
+        self.progress.show(
+            Snapshot(
+                stage,
+                self.clock.now(),
+                self.scenario.duration_s,
+                self.network,
+                {agent.agent_id: agent.status for agent in self.agents},
+            )
+        )

@@ -1,0 +1,49 @@
+"""What an agent is told before it starts: its mission file (`ucp-mission/1`, see ucp/CONTRACT.md)."""
+
+import base64
+import dataclasses
+from typing import Any
+
+from harness.play.seeds import agent_seed
+from harness.scenario import Scenario
+from sitl.vehicle import AGENT_PORT
+from ucp.messages import PORT
+from ucp.mission import SCHEMA
+
+
+def mission_file(
+    agent_id: int,
+    scenario: Scenario,
+    seed: int,
+    initial_data: bytes,
+    *,
+    address: str,
+    broadcast: str,
+    with_vehicle: bool,
+    life: int = 1,
+    epoch_us: int | None = None,
+    store: str | None = None,
+) -> dict[str, Any]:
+    """`seed` is the run's; an agent has one of its own in each `life`. With `epoch_us` it joins a mission under way."""
+    events = scenario.events
+    return {
+        "schema": SCHEMA,
+        "agent_id": agent_id,
+        "roster": list(scenario.roster),
+        "initial_data": base64.b64encode(initial_data).decode("ascii"),
+        "network": {"address": address, "broadcast": broadcast, "port": PORT},
+        "events": {
+            "source": events.source if with_vehicle else "random",
+            "mean_s": events.mean_s,
+            "position_interval_s": events.position_interval_s,
+            "log": list(events.log),
+            "vehicle_host": "127.0.0.1",
+            "vehicle_port": AGENT_PORT,
+        },
+        "settings": dataclasses.asdict(scenario.settings),
+        "quirks": dataclasses.asdict(scenario.quirks),
+        "seed": agent_seed(seed, agent_id, life),
+        "speedup": scenario.speedup,
+        "epoch_us": epoch_us,
+        "store": store,
+    }

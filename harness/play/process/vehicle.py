@@ -1,0 +1,183 @@
+"""One vehicle as a program in its own namespace, and the pilot that flies it."""
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections.abc import Coroutine, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness.archive.directory import RunDirectory
+from harness.errors import HarnessError
+from harness.play.process.lab import Lab, Program
+from netem.radio import Place
+from sitl.pilot import Pilot
+from sitl.plan import By, Plan
+from sitl.vehicle import MAX_SYSID, Home, Launch, VehicleError, VehicleKind
+
+LISTEN_LIMIT_S = 20.0
+CONNECT_LIMIT_S = 2.0
+ASK_AGAIN_S = 0.05
+STOP_GRACE_S = 3.0
+ENDING_S = 0.5
+LAST_WORDS = 3
+
+
+class VehicleFailedError(HarnessError):
+    """A vehicle could not be started or flown, or ended by itself."""
+
+
+def system_ids(vehicle_ids: Sequence[int]) -> dict[int, int]:
+    """A MAVLink system ID, 1 to 255, for each vehicle of a run: its own where that is one, else one that is free.
+
+    Of more than 255 vehicles some share theirs; each is alone in its namespace.
+    """
+    taken = {vehicle_id for vehicle_id in vehicle_ids if vehicle_id <= MAX_SYSID}
+    free = [sysid for sysid in range(1, MAX_SYSID + 1) if sysid not in taken] or [MAX_SYSID]
+    others = (vehicle_id for vehicle_id in vehicle_ids if vehicle_id > MAX_SYSID)
+    lent = {vehicle_id: free[number % len(free)] for number, vehicle_id in enumerate(others)}
+    return {vehicle_id: lent.get(vehicle_id, vehicle_id) for vehicle_id in vehicle_ids}
+
+
+class VehicleProcess:
+    """One vehicle, with `sysid` its MAVLink system ID; one that takes the place of a lost one has another `life`."""
+
+    def __init__(self, vehicle_id: int, sysid: int, kind: VehicleKind, rundir: RunDirectory, life: int = 1) -> None:
+        self.vehicle_id = vehicle_id
+        self.sysid = sysid
+        self.kind = kind
+        self._given_up = False
+        self.pilot: Pilot | None = None
+        self._directory = rundir.vehicle(vehicle_id, life)
+        self._process: Program | None = None
+
+    @property
+    def _output(self) -> Path:
+        return self._directory / "output.log"
+
+    async def start(self, lab: Lab, home: Home, speedup: float) -> None:
+        """Start the vehicle and connect its pilot. Raises VehicleFailedError."""
+        self._home = home
+        try:
+            launch = self.kind.launch(self.sysid, home, speedup, self._directory)
+        except VehicleError as error:
+            raise VehicleFailedError(str(error)) from None
+        self._process = await lab.spawn(
+            self.vehicle_id,
+            launch.argv,
+            cwd=self._directory,
+            env={**os.environ, **launch.env},
+            stdout=self._output,
+            stderr=self._output,
+            role="vehicle",
+        )
+        await self._connect(lab, launch, speedup)
+
+    async def _connect(self, lab: Lab, launch: Launch, speedup: float) -> None:
+        assert self._process is not None
+        deadline = asyncio.get_running_loop().time() + LISTEN_LIMIT_S
+        while True:
+            try:
+                sock = await lab.connect(self.vehicle_id, launch.pilot_port, timeout_s=CONNECT_LIMIT_S)
+                break
+            except (ConnectionError, TimeoutError):
+                if self._process.returncode is not None:
+                    raise self._ended(self._process) from None
+                if asyncio.get_running_loop().time() > deadline:
+                    raise VehicleFailedError(
+                        f"vehicle {self.vehicle_id} ({self.kind.name}) does not listen on port {launch.pilot_port} "
+                        f"after {LISTEN_LIMIT_S:g} s{self._last_words()}"
+                    ) from None
+                await asyncio.sleep(ASK_AGAIN_S)
+        tlog = self._directory / "telemetry.tlog"
+        self.pilot = Pilot(self.sysid, sock, tlog, speedup, self.kind.vehicle_type, self.vehicle_id)
+        await self.pilot.start()
+
+    def place(self, field: Home) -> Place:
+        """Where it last said that it is, as seen from the middle of the field; at its home until it knows."""
+        position = self.pilot.state.position if self.pilot else None
+        if position is None:
+            return Place(*field.metres_to(self._home.lat_deg, self._home.lon_deg, self._home.alt_m))
+        return Place(*field.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
+
+    async def take_off(self, altitude_m: float) -> None:
+        """And stay in touch with it as long as the mission takes. Raises VehicleFailedError, having killed it."""
+        assert self.pilot is not None
+        await self._piloted(self.pilot.take_off(altitude_m))
+        await self._piloted(self.pilot.stay_in_touch())
+
+    async def fly(self, plan: Plan, by: By) -> None:
+        """As `take_off`, but fly the plan."""
+        assert self.pilot is not None
+        await self._piloted(self.pilot.fly(plan, by, self._home))
+        await self._piloted(self.pilot.stay_in_touch())
+
+    async def _piloted(self, flight: Coroutine[Any, Any, None]) -> None:
+        try:
+            await flight
+        except VehicleError as error:
+            assert self._process is not None
+            with contextlib.suppress(TimeoutError):  # a connection ends just before its process does
+                await asyncio.wait_for(self._process.wait(), ENDING_S)
+                raise self._ended(self._process) from None
+            self._given_up = True
+            await self._process.send_signal(signal.SIGKILL)  # it may spin, or fly on who knows where
+            raise VehicleFailedError("; ".join(filter(None, (str(error), self.kind.lack)))) from None
+
+    async def watch(self) -> None:
+        """Raises VehicleFailedError when the process ends by itself."""
+        assert self._process is not None
+        await self._process.wait()
+        if not self._given_up:
+            raise self._ended(self._process)
+
+    async def kill(self) -> None:
+        """It is shot down: SIGKILL. Neither watch nor fly it any more before."""
+        assert self._process is not None
+        await self._process.send_signal(signal.SIGKILL)
+        await self._process.wait()
+        if self.pilot is not None:
+            await self.pilot.close()
+
+    async def fall(self) -> None:
+        """Its motors stop, what it was flying ends, and it falls to the ground. Raises VehicleFailedError."""
+        assert self.pilot is not None
+        await self._piloted(self.pilot.terminate_flight())
+
+    async def stop(self) -> None:
+        if self.pilot is not None:
+            await self.pilot.close()
+        if self._process is not None and self._process.returncode is None:
+            await self._process.terminate(STOP_GRACE_S)
+
+    def to_json(self) -> dict[str, Any]:
+        record: dict[str, Any] = {"kind": self.kind.name, "type": self.kind.vehicle_type, "sysid": self.sysid}
+        if self.pilot is not None:
+            state, factor = self.pilot.state, self.pilot.real_time_factor
+            record["mode"] = state.mode
+            record["armed"] = state.armed
+            record["real_time_factor"] = None if factor is None else round(factor, 4)
+            if state.position is not None:
+                record["altitude_m"] = round(state.position.relative_alt_m, 1)
+            if state.garbage:
+                record["garbage"] = state.garbage
+            if state.log_error is not None:
+                record["telemetry_log_error"] = state.log_error
+            if state.texts:
+                record["last_text"] = state.texts[-1]
+        return record
+
+    def _ended(self, process: Program) -> VehicleFailedError:
+        return VehicleFailedError(
+            f"vehicle {self.vehicle_id} ({self.kind.name}) ended by itself with {process.end}{self._last_words()}"
+        )
+
+    def _last_words(self) -> str:
+        try:
+            lines = self._output.read_text(encoding="utf-8", errors="replace").splitlines()[-LAST_WORDS:]
+        except OSError:
+            lines = []
+        said = " / ".join(line.strip() for line in lines if line.strip())
+        where = f"vehicles/{self._directory.name}/{self._output.name}"
+        return f"; its last words ({where}): {said}" if said else f"; it said nothing ({where})"

@@ -1,0 +1,115 @@
+"""What a run shows while it runs: elapsed mission time, chain lengths, who is reconciling.
+
+On a terminal a live table; elsewhere (CI logs) a line every few seconds.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from harness.play.control import Status
+
+LINE_EVERY_S = 10.0
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The swarm at one moment: mission seconds, and each agent's last status (None before its first)."""
+
+    stage: str
+    mission_s: float
+    duration_s: float
+    network: str
+    statuses: Mapping[int, Status | None]
+
+
+class Progress(Protocol):
+    def show(self, snapshot: Snapshot) -> None: ...
+    def close(self) -> None: ...
+
+
+class Silent:
+    """For programs."""
+
+    def show(self, snapshot: Snapshot) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class Lines:
+    """One line when the stage changes, and every few seconds."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._stage = ""
+        self._last = 0.0
+
+    def show(self, snapshot: Snapshot) -> None:
+        now = time.monotonic()
+        if snapshot.stage == self._stage and now - self._last < LINE_EVERY_S:
+            return
+        self._stage, self._last = snapshot.stage, now
+        line = f"{_minutes(snapshot.mission_s)} {snapshot.stage}"
+        if any(snapshot.statuses.values()):
+            known = {agent: status for agent, status in snapshot.statuses.items() if status}
+            chains = " ".join(f"{agent}:{status.chain}" for agent, status in known.items())
+            reconciling = [agent for agent, status in known.items() if status.reconcile_in_progress]
+            line += f"; chain lengths {chains}; {_reconciling(reconciling)}; {snapshot.network}"
+        self._console.print(line, highlight=False, soft_wrap=True)
+
+    def close(self) -> None:
+        pass
+
+
+class Dashboard:
+    """A live table; gone when it is closed."""
+
+    def __init__(self, console: Console) -> None:
+        self._live = Live(console=console, transient=True, auto_refresh=False)
+        self._live.start()
+
+    def show(self, snapshot: Snapshot) -> None:
+        self._live.update(_render(snapshot), refresh=True)
+
+    def close(self) -> None:
+        self._live.stop()
+
+
+def for_console(console: Console) -> Progress:
+    return Dashboard(console) if console.is_terminal else Lines(console)
+
+
+def _render(snapshot: Snapshot) -> RenderableType:
+    table = Table.grid(padding=(0, 2))
+    for _ in range(6):
+        table.add_column(justify="right")
+    table.add_row("agent", "chain", "waiting", "completed", "reconciles", "", style="dim")
+    for agent, status in snapshot.statuses.items():
+        if status is None:
+            table.add_row(str(agent))
+            continue
+        doing = "reconciling" if status.reconcile_in_progress else "" if status.idle else "voting"
+        numbers = (status.chain, status.deque, status.completed, status.reconciles)
+        table.add_row(str(agent), *map(str, numbers), Text(doing, style="yellow" if doing == "reconciling" else ""))
+    elapsed_s, over_s = min(snapshot.mission_s, snapshot.duration_s), snapshot.mission_s - snapshot.duration_s
+    times = f"{_minutes(elapsed_s)} of {_minutes(snapshot.duration_s)}{f' + {_minutes(over_s)}' if over_s >= 1 else ''}"
+    head = Table.grid(padding=(0, 2))
+    head.add_row(ProgressBar(total=snapshot.duration_s, completed=elapsed_s, width=30), times, snapshot.stage)
+    return Group(head, Text(snapshot.network, style="dim"), table)
+
+
+def _minutes(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02}"
+
+
+def _reconciling(agents: list[int]) -> str:
+    return f"reconciling {' '.join(map(str, agents))}" if agents else "nobody reconciles"

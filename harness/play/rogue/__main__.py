@@ -1,0 +1,138 @@
+"""The rogue node as a process on the air: `python -m harness.play.rogue`, spawned in its own place in the lab.
+
+It hears UCP's broadcasts on a UDP socket, and sends whole Ethernet frames (packet(7)) under MAC and IP addresses of the
+agents that it imitates. In its working directory it has `rogue.control`, which takes `start` and `inject`, and writes
+`rogue.jsonl`. SIGTERM ends it.
+"""
+
+import asyncio
+import contextlib
+import json
+import signal
+import socket
+import sys
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from harness.archive.directory import ROGUE_CONTROL, ROGUE_FILE
+from harness.play.rogue.journal import Journal
+from harness.play.rogue.rogue import Rogue
+from harness.scenario.injection import MODELS
+from netem.frames import udp_broadcast
+from ucp.clock import MissionClock
+from ucp.control import CommandError, ControlServer
+from ucp.messages import PORT
+
+LINK = "eth0"
+DATAGRAMS_PER_TURN = 64
+MAX_READ_BYTES = 65536
+
+
+class RogueNode:
+    """Works in `directory`. Raises OSError if a socket or a file cannot be had."""
+
+    def __init__(self, directory: Path) -> None:
+        self._rogue: Rogue | None = None
+        self._clock = MissionClock(1.0)
+        self._timer: asyncio.TimerHandle | None = None
+        self._ended = asyncio.Event()
+        self._ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._ear.setblocking(False)
+        self._ear.bind(("", PORT))
+        self._mouth = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # protocol 0 receives nothing
+        self._mouth.bind((LINK, 0))
+        self._file = (directory / ROGUE_FILE).open("a", encoding="utf-8", buffering=1)
+        self._journal = Journal(self._write)
+        self._control = ControlServer(
+            directory / ROGUE_CONTROL, {"start": self._start, "inject": self._inject, "status": self._status}
+        )
+
+    async def run(self) -> None:
+        """Serve until SIGTERM or SIGINT."""
+        loop = asyncio.get_running_loop()
+        for signal_number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(signal_number, self._ended.set)
+        loop.add_reader(self._ear, self._hear)
+        await self._control.start()
+        await self._ended.wait()
+        self._journal.close()
+        self._file.close()
+        self._control.close()
+
+    def _hear(self) -> None:
+        for _ in range(DATAGRAMS_PER_TURN):
+            try:
+                data = self._ear.recv(MAX_READ_BYTES)
+            except BlockingIOError:
+                return
+            if self._rogue is not None:
+                self._rogue.hears(data, self._clock.now())
+                self._send()
+
+    def _due(self) -> None:
+        assert self._rogue is not None, "a timer runs after the start"
+        self._timer = None
+        self._rogue.handle_timer(self._clock.now())
+        self._send()
+
+    def _send(self) -> None:
+        """Send what there is to send, and wait for what is due next."""
+        assert self._rogue is not None, "there is nothing to send before the start"
+        for one in self._rogue.to_send():
+            now = self._clock.now()
+            self._mouth.send(udp_broadcast(one.source, PORT, one.datagram))
+            self._journal.add(one, now)
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        soonest = self._rogue.next_timer()
+        if soonest is not None:
+            delay_s = self._clock.wall_s(soonest - self._clock.now())
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, delay_s), self._due)
+
+    def _write(self, record: dict[str, Any]) -> None:
+        self._file.write(json.dumps(record, separators=(",", ":")) + "\n")
+
+    # Commands of the control socket, which the orchestrator alone gives
+
+    def _start(self, request: dict[str, Any]) -> dict[str, Any]:
+        epoch_us = request["epoch_us"]
+        self._clock = MissionClock(request["speedup"])
+        self._clock.start(epoch_us)
+        self._rogue = Rogue(request["roster"], request["seed"], epoch_us)
+        return {}
+
+    def _inject(self, request: dict[str, Any]) -> dict[str, Any]:
+        if self._rogue is None:
+            raise CommandError("the mission has not started")
+        try:
+            injection = MODELS[request["what"]].model_validate(request["injection"])
+        except (KeyError, ValidationError) as error:
+            raise CommandError(f"no injection: {error}") from None
+        self._rogue.begin(request["number"], injection, self._clock.now())
+        self._send()
+        return {}
+
+    def _status(self, request: dict[str, Any]) -> dict[str, Any]:
+        return {"sent": dict(self._rogue.sent) if self._rogue is not None else {}}
+
+
+def main() -> int:
+    """Exit status 0; 1 if it cannot be on the air."""
+
+    async def run() -> None:
+        await RogueNode(Path.cwd()).run()
+
+    try:
+        asyncio.run(run())
+    except OSError as error:
+        sys.stderr.write(f"the rogue node: {error.strerror}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(KeyboardInterrupt):
+        sys.exit(main())

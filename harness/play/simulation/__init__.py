@@ -1,0 +1,1 @@
+"""The very same agents on a simulated air, in virtual time."""

@@ -1,0 +1,313 @@
+"""What is on its way, in virtual time: messages, events, and the ends of timers, in the order in which they come.
+
+Everything is broadcast, so N agents hear N times what each says, and nearly all of it changes nothing (`ucp.interest`).
+Unless every handler run is to be traced, the air does not deliver what cannot matter: a question goes to all but those
+who will still reconcile when it arrives; an answer only to those who have asked, or will have when it arrives. What
+becomes of the agents is the same to the last bit either way: lots are drawn for a broadcast as a whole, and everything
+has its place in the order, (time, rank, receiver), whether or not anything else is delivered.
+
+Most answers are only tallied. They are not delivered one by one: the agent is told of those that have come, in order,
+before it looks at its tally (`hear`), and nobody works out when an answer reaches whom until then.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+
+from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
+from netem.medium import Lots, Medium
+from ucp.agent import Agent
+from ucp.interest import ANSWERED, ASKED, MATTERS, ONLY_COUNTED, STILL_ASKED, Question
+from ucp.messages import BlockAddResponse, Message
+from ucp.settings import Settings
+
+NEVER = float("inf")
+SWEEP_EVERY = 1000
+"""Broadcasts between two looks for answers that have arrived everywhere."""
+
+
+@dataclass(slots=True, eq=False)
+class Flight:
+    """One broadcast on its way."""
+
+    sender: int
+    sequence: int
+    message: Message
+    matters: Callable[[Agent, int, Message], bool]
+    sent_at: float
+    rank: int
+    lots: Lots
+
+    def __lt__(self, other: object) -> bool:
+        return False  # of two copies that arrive at one agent in one instant either is the first
+
+
+@dataclass(slots=True, eq=False)
+class _Topic:
+    """What anybody says to one question, by sender in the order in which it was sent, and who asks."""
+
+    answers: dict[int, list[Flight]] = field(default_factory=dict)
+    askers: dict[int, "_Asked"] = field(default_factory=dict)
+    said: int = 0
+    """How many answers there are."""
+    quiet_at: float = 0.0
+    """None of the answers arrives later."""
+
+
+@dataclass(slots=True, eq=False)
+class _Asked:
+    """What an agent waits to hear, since when, and from whom it has heard it."""
+
+    question: Question
+    topic: _Topic
+    since: "Place"
+    heard: set[int] = field(default_factory=set)
+    heard_of: int = 0
+    """How many answers there were when it was last told of them."""
+    next_at: float = 0.0
+    """When the next of these comes."""
+    first: tuple[float, int] = (NEVER, 0)
+    """When the first answer of all arrives, and its rank, where no other is wanted."""
+
+
+Place = tuple[float, int, int]
+"""(mission seconds, rank, number of the agent): where something stands in the order."""
+
+Logged = tuple[int, int, bytes]
+"""An event that an agent is about to log: in which of its lives (0: whichever it is), event ID, data."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stray:
+    """A datagram that no agent has sent, under the address of vehicle `source`."""
+
+    source: int
+    datagram: bytes
+
+
+Happening = tuple[float, int, int, Flight | Logged | Stray | None]
+"""(mission seconds, rank, number of the agent, what): a message, an event, or None for the end of a timer.
+
+The number after the last agent's is the rogue node's.
+
+Of two in the same instant the one with the lower rank comes first."""
+
+
+class VirtualAir:
+    """The air between `roster`, whose agents are numbered in its order. `deliver_all`: even what cannot matter."""
+
+    def __init__(
+        self, roster: tuple[int, ...], settings: Settings, medium: Medium, script: FateScript, *, deliver_all: bool
+    ) -> None:
+        self.busy_until = [0.0] * len(roster)
+        """Until when, at least, the agent with this number reconciles, and so answers nobody."""
+        self.born_at = [0.0] * len(roster)
+        """When the agent with this number was started; it does not hear what was sent before."""
+        self.paused_at: dict[int, float] = {}
+        """Since when the agents are paused that are; what has come since waits for them."""
+        self.quiet_at = 0.0
+        """Nothing that was broadcast so far arrives later."""
+        self.place: Place = (0.0, 0, 0)
+        """Where in the order the world stands."""
+        self._roster = roster
+        self._settings = settings
+        self._medium = medium
+        self._script = script
+        self._deliver_all = deliver_all
+        self._coming: list[Happening] = []
+        self._rank = 0
+        self._topics: dict[Question, _Topic] = defaultdict(_Topic)
+        self._asked_by: list[dict[bool, _Asked]] = [{} for _ in roster]
+        self._swept_at = 0
+        self._waiting: dict[str, list[tuple[Flight, int]]] = defaultdict(list)
+        self._named: dict[str, float] = {}
+
+    def until(self, mission_s: float) -> Iterator[Happening]:
+        """What comes up to and at `mission_s`, in order, with whatever comes of it meanwhile."""
+        coming = self._coming
+        while coming and coming[0][0] <= mission_s:
+            happening = heappop(coming)
+            self.place = happening[:3]
+            yield happening
+        self._rank += 1
+        self.place = (mission_s, self._rank, 0)
+
+    def expect(self, at: float, number: int, what: Logged | None) -> None:
+        """The agent's timer ends, or it logs an event, at `at`."""
+        self._rank += 1
+        heappush(self._coming, (at, self._rank, number, what))
+
+    def inject(self, at: float, stray: Stray, numbers: Iterable[int]) -> None:
+        """`stray` reaches the agents with these numbers at `at`."""
+        self._rank += 1
+        self.quiet_at = max(self.quiet_at, at)
+        for number in numbers:
+            heappush(self._coming, (at, self._rank, number, stray))
+
+    def broadcast(self, now: float, number: int, sequence: int, message: Message, data_bytes: int) -> None:
+        """The agent with this number sends `message`, in a datagram with so many bytes of data."""
+        self._rank += 1
+        lots = self._medium.draw(number, now, data_bytes)
+        kind = type(message)
+        flight = Flight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots)
+        if kind in ASKED and not self._deliver_all:
+            self._ask(number, ASKED[kind](message, self._settings))
+        if now + lots.latest > self.quiet_at:
+            self.quiet_at = now + lots.latest
+        if self._script.listens and self._scripted(now, number, flight):
+            return
+        if self._deliver_all or kind not in ANSWERED:
+            self._deliver(flight)
+        else:
+            self._answer(ANSWERED[kind](message), flight, number)
+
+    def _deliver(self, flight: Flight) -> None:
+        """Let it arrive at everybody but those who will certainly not answer."""
+        coming, busy_until, deliver_all = self._coming, self.busy_until, self._deliver_all
+        now, rank = flight.sent_at, flight.rank
+        for receiver, delay in flight.lots.to_all():
+            at = now + delay
+            if deliver_all or at >= busy_until[receiver]:
+                heappush(coming, (at, rank, receiver, flight))
+
+    # Answers, to whom they matter
+
+    def hear(self, number: int) -> list[tuple[float, int, Flight]]:
+        """(mission seconds, rank, answer) of the answers that the agent tallies and has not been told of, in order.
+
+        Those that have come since it asked: of each agent the first.
+        """
+        heard = []
+        now, rank, _ = self.place
+        for asked in self._asked_by[number].values():
+            topic = asked.topic
+            if asked.question[0] not in ONLY_COUNTED or (topic.said == asked.heard_of and now < asked.next_at):
+                continue
+            asked.heard_of, asked.next_at = topic.said, NEVER
+            for sender, flights in topic.answers.items():
+                if sender in asked.heard:
+                    continue
+                first = self._first(flights, number, asked.since)
+                if first is None:
+                    continue
+                if first[0] < now or (first[0] == now and first[1] < rank):
+                    asked.heard.add(sender)
+                    heard.append(first)
+                elif first[0] < asked.next_at:
+                    asked.next_at = first[0]
+        heard.sort()
+        return heard
+
+    def no_longer_asked(self, number: int, agent: Agent) -> None:
+        """A timer of the agent has ended, and with it a question."""
+        asked_by = self._asked_by[number]
+        for of_vote, asked in list(asked_by.items()):
+            if not STILL_ASKED[asked.question[0]](agent):
+                del asked_by[of_vote], asked.topic.askers[number]
+
+    def is_gone(self, number: int) -> None:
+        """The agent has been killed."""
+        for asked in self._asked_by[number].values():
+            del asked.topic.askers[number]
+        self._asked_by[number].clear()
+        self.paused_at.pop(number, None)
+        self.busy_until[number] = 0.0
+
+    def _ask(self, number: int, question: Question) -> None:
+        """From now on the agent waits for answers: also for those to others that have not arrived yet."""
+        asked_by = self._asked_by[number]
+        of_vote = question[0] is BlockAddResponse
+        before = asked_by.get(of_vote)
+        if before is not None:
+            del before.topic.askers[number]
+        topic = self._topics[question]
+        asked = asked_by[of_vote] = topic.askers[number] = _Asked(question, topic, self.place)
+        if question[0] not in ONLY_COUNTED:
+            for flights in topic.answers.values():
+                self._arrive_first(flights, number, asked)
+
+    def _answer(self, question: Question, flight: Flight, sender: int) -> None:
+        """Keep an answer for those who ask, or will before it arrives."""
+        topic = self._topics[question]
+        topic.said += 1
+        topic.quiet_at = self.quiet_at
+        flights = topic.answers.get(sender)
+        if flights is None:
+            topic.answers[sender] = [flight]
+        else:
+            flights.append(flight)
+        if question[0] not in ONLY_COUNTED:
+            for receiver, asked in topic.askers.items():
+                self._arrive_first((flight,), receiver, asked)
+        if flight.rank - self._swept_at > SWEEP_EVERY:
+            self._sweep(flight)
+
+    def _arrive_first(self, flights: Iterable[Flight], receiver: int, asked: _Asked) -> None:
+        """Let that answer arrive that comes first, unless another comes before it."""
+        first = self._first(flights, receiver, asked.since)
+        if first is not None and first[:2] < asked.first:
+            at, rank, flight = first
+            asked.first = at, rank
+            heappush(self._coming, (at, rank, receiver, flight))
+
+    def _first(self, flights: Iterable[Flight], receiver: int, since: Place) -> tuple[float, int, Flight] | None:
+        """(mission seconds, rank, flight) of the flight that arrives first after `since`."""
+        since_s, since_rank, _ = since
+        born_at = self.born_at[receiver]
+        soonest, latest = self._medium.soonest, self._medium.latest
+        first_at, first = NEVER, None
+        for flight in flights:
+            sent_at = flight.sent_at
+            if sent_at + soonest >= first_at:
+                break
+            if sent_at + latest < since_s or sent_at < born_at:
+                continue
+            for delay in flight.lots.copies_to(receiver):
+                at = sent_at + delay
+                if at < first_at and (at > since_s or (at == since_s and flight.rank > since_rank)):
+                    first_at, first = at, flight
+        return None if first is None else (first_at, first.rank, first)
+
+    def _sweep(self, latest: Flight) -> None:
+        """Forget the answers that have arrived everywhere and that nobody waits for."""
+        self._swept_at = latest.rank
+        heard_before = min([latest.sent_at, *self.paused_at.values()])
+        self._topics = defaultdict(
+            _Topic,
+            {
+                question: topic
+                for question, topic in self._topics.items()
+                if topic.askers or topic.quiet_at >= heard_before
+            },
+        )
+
+    # Scripted fates
+
+    def _scripted(self, now: float, number: int, flight: Flight) -> bool:
+        """Send `flight` as the script says, to everybody; False if the script says nothing of it."""
+        decided = self._script.decide(
+            now, flight.sender, flight.message, flight.lots, lambda receiver: self._medium.hears(number, receiver)
+        )
+        if decided is None:
+            return False
+        for receiver, at in decided.arrivals:
+            self._arrive(flight, receiver, at)
+        for receiver, name in decided.waiting:
+            if name in self._named:
+                self._arrive(flight, receiver, max(now, self._named[name]) + RIGHT_AFTER_S)
+            else:
+                self._waiting[name].append((flight, receiver))
+        for name, at in decided.named:
+            self._named[name] = at
+            for waiting, receiver in self._waiting.pop(name, ()):
+                self._arrive(waiting, receiver, at + RIGHT_AFTER_S)
+        return True
+
+    def _arrive(self, flight: Flight, receiver: int, at: float) -> None:
+        self.quiet_at = max(self.quiet_at, at)
+        heappush(self._coming, (at, flight.rank, receiver, flight))
+
+    def unmatched_fates(self) -> list[str]:
+        """A sentence for each scripted fate that came to nothing."""
+        return self._script.unmatched(self._waiting)

@@ -1,0 +1,495 @@
+"""The simulation backend: a scenario played in virtual time, by the very agents that `ucp.node` runs.
+
+Nothing here waits, and nothing depends on the machine: the same scenario and seed give the same run, to the last bit.
+Each agent's events, the lots of each sender, and each agent's quirks have random streams of their own, so that adding
+one fault leaves the others as they are. Vehicles are tracks, without telemetry, so events are those of Algorithm 21.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import TYPE_CHECKING, Any, Protocol
+
+from harness.collector import uncollected
+from harness.errors import ScenarioError
+from harness.play.mission import Played
+from harness.play.radio_range import TRACK_S, Reach, tracks_of
+from harness.play.seeds import agent_seed
+from harness.play.simulation.air import NEVER, Flight, Happening, Logged, Stray, VirtualAir
+from harness.play.simulation.fate_script import FateScript, NameOf
+from harness.scenario import Scenario
+from harness.scenario.changes import AgentFault, Change, Injected, NetworkChange, disconnected_until, injected_nothing
+from harness.scenario.fates import Fate
+from harness.scenario.scenario import Clock
+from netem.medium import Medium
+from netem.radio import Place
+from ucp.agent import Agent
+from ucp.clock import MICROSECONDS
+from ucp.events import LoggableEvent, RandomEvents
+from ucp.interest import ONLY_COUNTED
+from ucp.messages import datagram_bytes
+from ucp.store import Holdings
+from ucp.trace import HandlerRun
+
+if TYPE_CHECKING:
+    from harness.play.simulation.rogue import VirtualRogue
+
+ENGINE = "virtual time"
+SCRIPTED_EVENT_ID = 1
+ANY_LIFE = 0
+BREATH_S = 20.0
+"""Mission seconds between two looks at whoever watches."""
+
+
+def refuse_what_needs_processes(scenario: Scenario) -> None:
+    """Raises ScenarioError naming the keys that virtual time cannot give."""
+    asked = {
+        "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
+        "vehicles.binary": scenario.vehicles.binary is not None,
+        "agent_command": scenario.agent_command is not None,
+    }
+    keys = [f"`{key}`" for key, needed in asked.items() if needed]
+    if keys:
+        verb = "need" if len(keys) > 1 else "needs"
+        raise ScenarioError(f"{', '.join(keys)} {verb} real processes: use --backend process, or leave it out")
+
+
+class Recorder(Protocol):
+    """Takes down what cannot be asked for at the end."""
+
+    tracing: bool
+    """Whether handler runs are wanted; if not, `write` is not called."""
+
+    def begin(self, life: "Life") -> None:
+        """An agent starts, or starts anew."""
+
+    def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
+        """An agent is about to log an event with so much data."""
+
+    def write(self, agent_id: int, runs: list[HandlerRun]) -> None: ...
+
+    def changed(self, record: dict[str, Any]) -> None:
+        """A change of the network, or a fault of agents, was made."""
+
+    def injected(self, record: dict[str, Any]) -> None:
+        """The rogue node has sent something; see `harness.play.rogue.journal`."""
+
+    def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
+        """Here are the vehicles now, if any fly."""
+
+    def keep_chains(self, simulation: "Simulation") -> None:
+        """A final reconcile is about to put the chains in order."""
+
+    def export(self, simulation: "Simulation") -> None:
+        """Somebody wants to see the chains as they are now. Raises OSError."""
+
+
+@dataclass(slots=True)
+class Life:
+    """An agent from its start, restart or reboot on."""
+
+    agent: Agent
+    source: RandomEvents
+    clock: Clock | None
+    """None shows mission time."""
+    born_at: float
+    found: Holdings | None = None
+    """What was on its disk, if it came back from a brown-out with it."""
+    deadline: float | None = None
+    """When its next timer ends, in mission seconds."""
+    waiting: list[Happening] | None = None
+    """What has reached the agent while it is paused; None if it is not."""
+    resumed_at: float = 0.0
+    """Whatever came before is handled then."""
+    bytes_sent: int = 0
+
+
+class Simulation:
+    """A swarm in virtual time; see `harness.play.mission.Swarm`. Agents are numbered in the roster's order.
+
+    `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. `breathe` is
+    awaited every few mission seconds. `fate_script` makes what plays the scenario's fates, and `air` what carries
+    messages.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        recorder: Recorder,
+        *,
+        deliver_all: bool = False,
+        breathe: Callable[["Simulation"], Awaitable[None]] | None = None,
+        fate_script: Callable[[Sequence[Fate], Sequence[int], NameOf], FateScript] = FateScript,
+        air: Callable[..., VirtualAir] = VirtualAir,
+    ) -> None:
+        self.scenario = scenario
+        self.roster = scenario.roster
+        self.seed = seed
+        self.played = Played(engine=ENGINE)
+        self.stage = "mission"
+        self.network = ""
+        self._initial_data = f"{scenario.name}, seed {seed}".encode()
+        self._recorder = recorder
+        self._tracing = recorder.tracing
+        self._deliver_all = deliver_all
+        self._breathe = breathe
+        self._now = 0.0
+        self._generating = True
+        self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
+        self._lives: list[list[Life]] = [[] for _ in self.roster]
+        self._alive: list[Life | None] = [None] * (len(self.roster) + 1)
+        """By number; the last is the rogue node's, which is no agent and has no life."""
+        self._disks: dict[int, Holdings] = {}
+        """What is on the disk of the agents that reboot with it."""
+        self._reach = Reach(scenario)
+        self._tracks = tracks_of(scenario)
+        self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
+        self._moves_at = NEVER
+        self._medium = Medium(self.roster, seed)
+        self._block_names: dict[bytes, str] = {}
+        self._script = fate_script(scenario.fates, self.roster, self._block_name)
+        self._air = air(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
+        self._rogue = self._rogue_node() if scenario.rogue else None
+
+    def _rogue_node(self) -> "VirtualRogue":
+        from harness.play.simulation.rogue import VirtualRogue  # scapy takes long to import
+
+        return VirtualRogue(self.roster, self.seed, self._air, len(self.roster), self._recorder.injected)
+
+    # The swarm, as harness.play.mission drives it
+
+    def now(self) -> float:
+        return self._now
+
+    def enter(self, stage: str) -> None:
+        self.stage = stage
+
+    async def begin(self, first: Change) -> None:
+        await self.apply(first)
+        self._move()
+        for number in range(len(self.roster)):
+            self._start(number)
+        for event in self.scenario.events.script:
+            self._air.expect(event.at_s, self._number[event.agent], (ANY_LIFE, SCRIPTED_EVENT_ID, bytes(event.bytes)))
+
+    async def until(self, mission_s: float) -> None:
+        if self._breathe is None and not self._tracks:
+            self._run(mission_s)
+            return
+        while self._now < mission_s:
+            self._run(min(mission_s, self._now + BREATH_S, self._moves_at))
+            if self._now == self._moves_at:
+                self._move()
+            if self._breathe is not None:
+                await self._breathe(self)
+
+    async def apply(self, change: Change) -> None:
+        if isinstance(change, NetworkChange):
+            self._put_into_force(self._reach.ask(change), asked=change.conditions.to_json())
+            return
+        record = change.to_json(round(self._now, 3))
+        self.played.record(record)
+        if isinstance(change, Injected):
+            assert self._rogue is not None, "a scenario that injects has one"
+            self._rogue.begin(change, self._now)
+            return
+        for agent_id in change.agents:
+            self._fault(change, self._number[agent_id])
+        self._recorder.changed(record)
+
+    def _put_into_force(self, change: NetworkChange, **more: Any) -> None:
+        self._medium.apply(change.conditions)
+        self.network = change.detail
+        record = change.to_json(round(self._now, 3))
+        self.played.record(record)
+        self._recorder.changed({**record, **more})
+
+    def _move(self) -> None:
+        """The vehicles are somewhere else by now."""
+        if not self._tracks:
+            return
+        places = {vehicle: Place(*track.in_field(self._now)) for vehicle, track in self._tracks.items()}
+        self._recorder.moved(self._now, places)
+        if change := self._reach.move(self._now, places):
+            self._put_into_force(change)
+        self._moves_at = self._now + self._move_every_s
+
+    async def stop_events(self) -> None:
+        self._generating = False
+
+    async def until_idle(self, limit_s: float) -> bool:
+        limit = self._now + limit_s
+        while self._now < limit:
+            awake = (life for life in self.living() if life.waiting is None)
+            last = max([self._air.quiet_at, *(life.deadline or 0.0 for life in awake)])
+            if last <= self._now:
+                return all(life.waiting is None and life.agent.idle for life in self.living())
+            await self.until(min(limit, last))
+        return False
+
+    async def keep_chains(self) -> None:
+        self._recorder.keep_chains(self)
+
+    async def reconcile(self, agent_id: int) -> None:
+        number = self._number[agent_id]
+        life = self._alive[number]
+        if life is not None and life.waiting is None:
+            self._hear(number, life)
+            life.agent.begin_reconcile(self._local(life))
+            self._after(number, life)
+
+    async def top_chain_hashes(self) -> dict[int, str]:
+        return {life.agent.agent_id: life.agent.chain.top_chain_hash.hex() for life in self.living()}
+
+    async def completed(self) -> dict[int, int]:
+        return {life.agent.agent_id: len(life.agent.completed) for life in self.living() if life.waiting is None}
+
+    async def take_stock(self) -> Played:
+        played = self._played_by_now()
+        self._recorder.export(self)
+        return played
+
+    def end(self) -> None:
+        """Take down what there is at the end."""
+        if self._rogue is not None:
+            self._rogue.close()
+        self.played = self._played_by_now()
+
+    def _played_by_now(self) -> Played:
+        for number, life in enumerate(self._alive):
+            if life is not None:
+                self._hear(number, life)
+        last_s, network = self._script.last_s, self.played.network
+        return dataclasses.replace(
+            self.played,
+            mission_s=round(self._now, 3),
+            network=network if last_s is None else disconnected_until(last_s, network),
+            unmatched_fates=[*self._air.unmatched_fates(), *self._injected_nothing()],
+            agents={str(agent_id): self._agent_to_json(number) for agent_id, number in self._number.items()},
+        )
+
+    def _injected_nothing(self) -> list[str]:
+        return injected_nothing(self.scenario, self._rogue.sent) if self._rogue is not None else []
+
+    # What is there
+
+    def living(self) -> Iterator[Life]:
+        return (life for life in self._alive if life is not None)
+
+    def timestamp_us(self, life: Life) -> int:
+        """What the agent's clock shows, in microseconds; never less than 0."""
+        return max(0, round(self._local(life) * MICROSECONDS))
+
+    def _agent_to_json(self, number: int) -> dict[str, Any]:
+        lives = self._lives[number]
+        life = self._alive[number]
+        completed = dict.fromkeys(block.hex() for one in lives for block in one.agent.completed)
+        for block in life.agent.completed if life else ():
+            del completed[block.hex()]
+        reboots = sum(one.found is not None for one in lives)
+        dropped = sum((one.agent.dropped for one in lives), Counter())
+        return {
+            "outcome": "exported" if life else "rebooting" if number in self._disks else "killed",
+            "restarts": len(lives) - 1 - reboots,
+            "reboots": reboots,
+            "completed_before": list(completed),
+            "idle": life.agent.idle if life else None,
+            "bytes_sent": sum(life.bytes_sent for life in lives),
+            **({"dropped": dict(dropped)} if self._rogue is not None else {}),
+            "messages_sent": sum(life.agent.sent.total() for life in lives),
+            "reconciles": sum(life.agent.reconciles for life in lives),
+            "chain_changed_at_s": round(_mission_time(life, life.agent.chain_changed_at), 3) if life else None,
+        }
+
+    def _block_name(self, block_hash: bytes) -> str | None:
+        """`<agent>.<ordinal>` of a block that an agent has completed."""
+        if block_hash not in self._block_names:
+            for agent_id, lives in zip(self.roster, self._lives, strict=True):
+                completed = dict.fromkeys(block for life in lives for block in life.agent.completed)
+                self._block_names.update((block, f"{agent_id}.{count}") for count, block in enumerate(completed, 1))
+        return self._block_names.get(block_hash)
+
+    # What happens
+
+    def _run(self, until: float) -> None:
+        """All that happens up to `until`."""
+        with uncollected():
+            self._play(until)
+        self._now = until
+
+    def _play(self, until: float) -> None:
+        alive = self._alive
+        for happening in self._air.until(until):
+            self._now, _, number, what = happening
+            life = alive[number]
+            if life is None:
+                if self._rogue is not None and number == len(self.roster):
+                    self._rogue.wake(self._now)
+                continue
+            if life.waiting is None:
+                self._happen(number, life, what)
+            elif what is not None:
+                life.waiting.append(happening)
+
+    def _happen(self, number: int, life: Life, what: Flight | Logged | Stray | None) -> None:
+        if self._tracing or (isinstance(what, Flight) and type(what.message) in ONLY_COUNTED):
+            self._hear(number, life)
+        if isinstance(what, Flight):
+            agent, sender, message = life.agent, what.sender, what.message
+            if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent, sender, message)):
+                agent.receive_message(sender, what.sequence, message, self._local(life))
+                if self._tracing or agent.reconcile_in_progress:
+                    self._after(number, life)
+                else:
+                    self._say(number, life)  # of the handlers of messages only a reconcile's touch timers
+        elif what is None:
+            self._timer_ends(number, life)
+        elif isinstance(what, Stray):
+            self._hear(number, life)
+            life.agent.receive_datagram(what.datagram, self._local(life))
+            self._after(number, life)
+        elif self._generating and what[0] in (ANY_LIFE, len(self._lives[number])):
+            _, event_id, data = what
+            self._recorder.logged(self._now, life.agent.agent_id, len(data))
+            life.agent.add_event(LoggableEvent(self.timestamp_us(life), event_id, data), self._local(life))
+            self._expect_event(number, life)
+            self._after(number, life)
+
+    def _timer_ends(self, number: int, life: Life) -> None:
+        soonest = life.agent.next_timer()
+        if soonest is None or life.deadline is None or life.deadline > self._now:
+            return  # it was stopped, or started anew, since it was expected to end now
+        self._hear(number, life)
+        life.agent.handle_timer(max(soonest, self._local(life)))
+        self._air.no_longer_asked(number, life.agent)
+        self._after(number, life)
+
+    def _hear(self, number: int, life: Life) -> None:
+        """Tell the agent of the answers that have come and that it only tallies: before anybody looks at the tally."""
+        if life.waiting is not None:
+            return
+        agent = life.agent
+        for at, _, answer in self._air.hear(number):
+            if answer.matters(agent, answer.sender, answer.message):
+                at = max(at, life.resumed_at)
+                local = max(agent.now, self._local(life, at))
+                agent.receive_message(answer.sender, answer.sequence, answer.message, local)
+                if self._tracing:
+                    self._take_down(agent, at)
+
+    def _after(self, number: int, life: Life) -> None:
+        """Do what the agent says after an input: send, trace, and wait for its next timer."""
+        agent = life.agent
+        self._say(number, life)
+        if self._tracing:
+            self._take_down(agent, self._now)
+        soonest = agent.next_timer()
+        deadline = None if soonest is None else max(self._now, _mission_time(life, soonest))
+        if deadline != life.deadline:
+            life.deadline = deadline
+            if deadline is not None:
+                self._air.expect(deadline, number, None)
+        busy_until = agent.answers_nobody_until()
+        self._air.busy_until[number] = 0.0 if busy_until is None else _mission_time(life, busy_until)
+
+    def _say(self, number: int, life: Life) -> None:
+        """Send what the agent has to say."""
+        for sequence, message in life.agent.messages_to_send():
+            data_bytes = datagram_bytes(message)
+            life.bytes_sent += data_bytes
+            self._air.broadcast(self._now, number, sequence, message, data_bytes)
+            if self._rogue is not None:
+                self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
+
+    def _take_down(self, agent: Agent, mission_s: float) -> None:
+        runs = agent.trace()
+        for run in runs:
+            run.t = mission_s
+        self._recorder.write(agent.agent_id, runs)
+
+    # An agent's life
+
+    def _start(self, number: int, found: Holdings | None = None) -> None:
+        agent_id = self.roster[number]
+        scenario = self.scenario
+        seed = agent_seed(self.seed, agent_id, len(self._lives[number]) + 1)
+        agent = Agent(
+            agent_id,
+            self.roster,
+            self._initial_data,
+            scenario.settings,
+            seed=seed,
+            tracing=self._tracing,
+        )
+        agent.quirks = dataclasses.replace(scenario.quirks)
+        source = RandomEvents(Random(seed), scenario.events.mean_s)
+        life = Life(agent, source, scenario.clocks.get(agent_id), self._now, found)
+        self._lives[number].append(life)
+        self._alive[number] = life
+        self._air.born_at[number] = self._now
+        self._recorder.begin(life)
+        if found is not None:
+            agent.boot(found, self._local(life))
+            self._after(number, life)
+        self._expect_event(number, life)
+
+    def _expect_event(self, number: int, life: Life) -> None:
+        if self.scenario.events.source != "scripted":
+            due, event_id, data = life.source.next()
+            this_life = len(self._lives[number])
+            self._air.expect(max(self._now, life.born_at + due), number, (this_life, event_id, data))
+
+    def _fault(self, fault: AgentFault, number: int) -> None:
+        life = self._alive[number]
+        match fault.what:
+            case "kill" | "crash" | "reboot":
+                if life is not None:
+                    self._hear(number, life)
+                    if fault.disk == "kept":
+                        self._disks[number] = Holdings.of(life.agent)
+                self._alive[number] = None
+                self._air.is_gone(number)
+            case "restart" | "boot":
+                self._start(number, self._disks.pop(number, None))
+            case "pause" if life is not None:
+                self._hear(number, life)
+                life.waiting = []
+                self._air.paused_at[number] = self._now
+            case "resume" if life is not None and life.waiting is not None:
+                self._resume(number, life, life.waiting)
+
+    def _resume(self, number: int, life: Life, waiting: list[Happening]) -> None:
+        """What has waited is handled as a process does it: what the socket holds, then timers, then events.
+
+        What an agent asks while there is more in the socket may be answered by what came since.
+        """
+        life.waiting, life.resumed_at = None, self._now
+        place = self._air.place
+        for happening in waiting:
+            if isinstance(happening[3], Flight | Stray):
+                self._air.place = happening[:3]
+                self._happen(number, life, happening[3])
+        self._air.place = place
+        del self._air.paused_at[number]
+        self._hear(number, life)
+        self._timer_ends(number, life)
+        for happening in waiting:
+            if not isinstance(happening[3], Flight | Stray):
+                self._happen(number, life, happening[3])
+
+    # An agent's clock
+
+    def _local(self, life: Life, mission_s: float | None = None) -> float:
+        """What the agent takes for mission time: now, or at `mission_s`."""
+        clock = life.clock
+        now = self._now if mission_s is None else mission_s
+        return now if clock is None else clock.offset_s + (1 + clock.drift) * now
+
+
+def _mission_time(life: Life, local: float) -> float:
+    """When the agent's clock shows `local`."""
+    clock = life.clock
+    return local if clock is None else (local - clock.offset_s) / (1 + clock.drift)

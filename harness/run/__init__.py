@@ -1,0 +1,1 @@
+"""From a scenario to a verdict: one run in a directory, one in memory, and many on all cores."""

@@ -1,0 +1,43 @@
+"""Nothing is overwritten: a directory of results is new or empty."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.archive.directory import RunDirectory, claim
+from harness.errors import RunDirectoryError
+
+
+def test_a_directory_that_holds_anything_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "kept").touch()
+    with pytest.raises(RunDirectoryError, match="is not empty: choose another --out"):
+        claim(tmp_path)
+    with pytest.raises(RunDirectoryError, match="is not a directory"):
+        claim(tmp_path / "kept")
+    claim(tmp_path / "new" / "one", tmp_path / "new" / "one" / "inner")
+    assert (tmp_path / "new" / "one" / "inner").is_dir()
+
+
+def test_the_trace_of_a_later_life_follows_the_whole_lines_of_the_earlier(tmp_path: Path) -> None:
+    rundir = RunDirectory(tmp_path / "run")
+    first, second = rundir.agent(7), rundir.agent(7, life=2)
+    assert (first.name, second.name) == ("agents", "7-2")
+    (first / "7.trace.jsonl").write_text("one\ntw")
+    (second / "7.trace.jsonl").write_text("three\n")
+    rundir.bring_trace(7, second)
+    assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"
+    assert (second / "7.trace.jsonl").read_text() == "three\n"
+    rundir.bring_trace(7, rundir.agent(7, life=3))  # it was killed before it said anything
+    assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"
+
+
+def test_the_trace_of_a_life_that_goes_on_is_brought_piece_by_piece(tmp_path: Path) -> None:
+    rundir = RunDirectory(tmp_path / "run")
+    first, second = rundir.agent(7), rundir.agent(7, life=2)
+    (first / "7.trace.jsonl").write_text("one\n")
+    (second / "7.trace.jsonl").write_text("two\nthr")
+    brought = rundir.bring_trace(7, second)
+    (second / "7.trace.jsonl").write_text("two\nthree\n")
+    brought += rundir.bring_trace(7, second, brought)
+    assert (first / "7.trace.jsonl").read_text() == "one\ntwo\nthree\n"
+    assert rundir.bring_trace(7, second, brought) == 0

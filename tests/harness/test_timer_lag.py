@@ -1,0 +1,50 @@
+"""How late the agents' vote timers fired, from traces made by hand."""
+
+import pytest
+
+from harness.archive.traces import Header, Trace
+from harness.checker.timer_lag import ENOUGH, lateness
+from ucp.trace import HandlerRun, State
+
+
+def _run(t: float, handler: str, branch: str, reconciling: bool = False) -> HandlerRun:
+    state = State(chain=0, deque=0, stack=0, reconciling=reconciling, idle=False, top="")
+    return HandlerRun(t, handler, 1, {}, branch, [], [], state)
+
+
+def _votes(*late_s: float, reconciling: bool = False) -> Trace:
+    """An agent whose votes, set to 10 s, ended so late."""
+    header = Header(agent_id=1, roster=[1], settings={"vote_timeout_s": 10.0}, clock={})
+    runs = [
+        run
+        for number, late in enumerate(late_s)
+        for run in (
+            _run(100.0 * number, "process_next_deque_block", "proposed"),
+            _run(100.0 * number + 1, "receive_vote", "counted", reconciling),
+            _run(100.0 * number + 10 + late, "vote_timer_expiration", "committed"),
+        )
+    ]
+    return Trace(header, runs)
+
+
+@pytest.mark.parametrize(("late_s", "tolerable"), [(0.2, True), (0.6, False)])
+def test_lateness_is_that_of_the_latest_twentieth(late_s: float, tolerable: bool) -> None:
+    found = lateness([_votes(*[0.01] * 36), _votes(*[late_s] * 4)])
+    assert found is not None
+    assert found.late_s == pytest.approx(late_s)
+    assert found.asked_s == 10.0
+    assert found.tolerable is tolerable
+
+
+def test_one_late_timer_of_many_is_nothing_to_speak_of() -> None:
+    found = lateness([_votes(*[0.01] * 99, 5.0)])
+    assert found is not None
+    assert found.tolerable
+
+
+def test_too_few_votes_tell_nothing() -> None:
+    assert lateness([_votes(*[5.0] * (ENOUGH - 1))]) is None
+
+
+def test_a_vote_that_a_reconcile_paused_does_not_count() -> None:
+    assert lateness([_votes(*[50.0] * 100, reconciling=True)]) is None
