@@ -120,7 +120,7 @@ class _Network:
         return tuple(sorted(found, key=lambda group: (-len(group), min(group))))
 
 
-def read_connectivity(path: Path, vehicles: Collection[int]) -> Connectivity:
+def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectivity:
     """The network among `vehicles`. A line that means nothing, or comes before the first conditions, is left out."""
     lines = JsonLines(path, _Line)
     network = _Network(vehicles)

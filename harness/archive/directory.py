@@ -20,13 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive import traces
+from harness.archive.connectivity import NETWORK_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
 from harness.archive.record import RunRecord
+from harness.archive.tracks import TRACKS_FILE
 from harness.errors import MachineError, RunDirectoryError
 from netem.radio import Place
 from ucp.files import write_json_atomically
 
-TRACKS_FILE = "tracks.jsonl"
 ROGUE_FILE = "rogue.jsonl"
 ROGUE_CONTROL = "rogue.control"
 
@@ -96,7 +97,7 @@ class RunDirectory:
             shutil.copyfile(path, kept / path.name)
 
     def append_network(self, record: Mapping[str, Any]) -> None:
-        self._append("network.jsonl", record)
+        self._append(NETWORK_FILE, record)
 
     def append_injected(self, record: Mapping[str, Any]) -> None:
         self._append(ROGUE_FILE, record)

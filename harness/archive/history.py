@@ -6,21 +6,17 @@ Everything comes from the traces. A vote or reconcile that an agent's loss or th
 import math
 from bisect import bisect_right
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
-from pathlib import Path
 from typing import Literal
 
 from harness.archive.record import Fault
-from harness.archive.traces import SUFFIX, Trace, read_trace
+from harness.archive.traces import Trace
 from ucp.trace import HandlerRun
 
 LATEST_S = 1e7
 """No mission is as long; a handler run with a later time, or with none that can be, is left out."""
-MESSAGES_UP_TO_BYTES = 16 * 1024 * 1024
-"""Of traces that are larger together, handlers that only took a message in are left out, and so are messages."""
-
 TAKES_DOWN = ("kill", "crash", "reboot")
 """Faults that end a life of an agent."""
 
@@ -123,39 +119,14 @@ class Course:
     messages: list[Message] | None
 
 
-def read_traces(directory: Path, agents: Collection[int]) -> tuple[dict[int, Trace], bool, list[str]]:
-    """The traces of `agents`, whether they are whole, and a sentence for each that is not, or is left out."""
-    paths = sorted(directory.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
-    whole = sum(path.stat().st_size for path in paths if path.is_file()) <= MESSAGES_UP_TO_BYTES
-    traces: dict[int, Trace] = {}
-    problems = []
-    for path in paths:
-        trace = read_trace(path) if whole else read_trace(path, unread=_only_takes_in)
-        if trace is None:
-            problems.append(f"{path.name}: not a trace; it is left out")
-        elif trace.header.agent_id not in agents or trace.header.agent_id in traces:
-            problems.append(f"{path.name}: of an agent that is not of this run, or has a trace already; it is left out")
-        else:
-            traces[trace.header.agent_id] = trace
-            if trace.problem:
-                problems.append(f"{path.name}: {trace.problem}; what is before it is shown")
-            if not all(_in_time(run) for run in trace.runs):
-                problems.append(f"{path.name}: handler runs without a possible time are left out")
-    return traces, whole, problems
-
-
-def _only_takes_in(line: bytes) -> bool:
-    """Whether a handler took a message in without any change; false as well if the line does not look like ours."""
-    return b'"changes":[],' in line and b'"handler":"receive_' in line
-
-
-def _in_time(run: HandlerRun) -> bool:
+def in_time(run: HandlerRun) -> bool:
+    """Whether the handler ran when it can have run."""
     return 0 <= run.t <= LATEST_S
 
 
 def lives(trace: Trace) -> list[list[HandlerRun]]:
     """The handler runs of each life of an agent that have a possible time."""
-    return [[run for _, run in life if _in_time(run)] for life in trace.lives()]
+    return [[run for _, run in life if in_time(run)] for life in trace.lives()]
 
 
 def course(traces: Mapping[int, Trace], faults: Iterable[Fault], end_s: float, *, whole: bool = True) -> Course:
@@ -247,13 +218,13 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
     sent: dict[tuple[object, object], list[Message]] = defaultdict(list)
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
-            if _in_time(run):
+            if in_time(run):
                 for one in run.sent:
                     sent[agent, one.seq].append(Message(agent, run.t, one.message, one.block))
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
             of_this_number = sent.get((run.trigger.get("from"), run.trigger.get("seq")))
-            if of_this_number and _in_time(run):
+            if of_this_number and in_time(run):
                 by_then = bisect_right([message.at_s for message in of_this_number], run.t)
                 of_this_number[max(by_then - 1, 0)].receipts.append((agent, run.t))
     return sorted(
@@ -264,7 +235,7 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
 
 def ends_at(traces: Mapping[int, Trace]) -> float:
     """When the last handler ran, in mission seconds; 0 if none did."""
-    return max((run.t for trace in traces.values() for run in trace.runs if _in_time(run)), default=0.0)
+    return max((run.t for trace in traces.values() for run in trace.runs if in_time(run)), default=0.0)
 
 
 def possible(faults: Iterable[Fault]) -> list[Fault]:

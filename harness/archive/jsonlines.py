@@ -12,19 +12,19 @@ MAX_BYTES = 32 * 1024 * 1024
 """Tracks of 50 vehicles take 1.6 MB for 20 minutes."""
 MAX_LINE_BYTES = 4 * 1024 * 1024
 
-Line = TypeVar("Line", bound=BaseModel)
+Record = TypeVar("Record", bound=BaseModel)
 
 
-class JsonLines(Generic[Line]):
-    """The lines of a file that are what `model` says. A file that is not there has none."""
+class JsonLines(Generic[Record]):
+    """The lines of a file that are what `model` says. A file that is not there, or nowhere (None), has none."""
 
-    def __init__(self, path: Path, model: type[Line]) -> None:
+    def __init__(self, path: Path | None, model: type[Record]) -> None:
         self._path, self._model = path, model
         self._left_out = 0
         self._trouble = ""
 
-    def __iter__(self) -> Iterator[Line]:
-        if not self._path.is_file():
+    def __iter__(self) -> Iterator[Record]:
+        if self._path is None or not self._path.is_file():
             return
         try:
             with self._path.open("rb") as file:
@@ -62,4 +62,4 @@ class JsonLines(Generic[Line]):
             said.append(f"{lines} left out, damaged or of no meaning")
         if self._trouble:
             said.append(self._trouble)
-        return [f"{self._path.name}: {trouble}" for trouble in said]
+        return [f"{self._path.name if self._path else ''}: {trouble}" for trouble in said]

@@ -12,6 +12,7 @@ from typing import Any
 from harness.errors import RunDirectoryError
 
 SCHEMA = "ucp-run/1"
+MAX_BYTES = 256 * 1024 * 1024
 
 
 class DamagedResultError(RunDirectoryError):
@@ -21,6 +22,8 @@ class DamagedResultError(RunDirectoryError):
 def read_result(path: Path) -> dict[str, Any]:
     """Raises DamagedResultError, or RunDirectoryError for another version: a sentence that names file and trouble."""
     try:
+        if path.stat().st_size > MAX_BYTES:
+            raise DamagedResultError(f"{path}: larger than {MAX_BYTES} bytes, which no run's record is")
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DamagedResultError(f"{path}: cannot be read: {error.strerror}; is this a run directory?") from None
@@ -53,6 +56,15 @@ def number(document: Any, *keys: str) -> float | None:
         return float(found) if math.isfinite(found) else None
     except OverflowError:
         return None
+
+
+def roster_of(result: dict[str, Any]) -> list[int]:
+    """The agents that the run is known to have had, whether or not they left anything."""
+    agents = mapping(result, "scenario").get("agents")
+    if type(agents) is int and 0 < agents <= 1000:
+        agents = range(1, agents + 1)
+    named = [*(agents if isinstance(agents, list | range) else []), *listing(result, "scenario", "vehicles")]
+    return agent_ids([*listing(result, "roster"), *named, *mapping(result, "agents"), *mapping(result, "vehicles")])
 
 
 def agent_ids(names: Any) -> list[int]:

@@ -4,10 +4,11 @@ A trace that ends in half a line is that of a killed agent, and is read up to th
 is told in `problem`, and what came before it still counts.
 """
 
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from itertools import islice, pairwise
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import accumulate, islice, pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,6 +34,17 @@ class _VersionedHeader(Header):
     schema_: Literal["ucp-trace/1"] = Field(alias="schema")
 
 
+_ONLY_TAKES_IN = re.compile(
+    rb"""
+    \{"t":(?!0\d)\d{1,6}(?:\.\d+)?,"handler":"receive_\w+","algorithm":(?!0)\d{1,2},
+    "trigger":\{"message":"[\w ]+","from":(?!0)\d{1,5},"seq":(?!0\d)\d{1,9}\},"branch":"[\w ]*","changes":\[\],
+    "sent":\[(?:\{"message":"[\w ]+","seq":(?!0\d)\d{1,9},"block":(?:null|"[0-9a-f]*")\}(?:,(?!\]))?)*\],
+    "state":\{"chain":(?!0\d)\d{1,9},"deque":(?!0\d)\d{1,9},"stack":(?!0\d)\d{1,9},
+    "reconciling":(?:true|false),"idle":(?:true|false),"top":"[0-9a-f]*"\}\}\n""",
+    re.VERBOSE,
+)
+"""A line as agents write it whose handler took a message in, and nothing changed. Whatever else fits is as sound."""
+
 HEADER = TypeAdapter(_VersionedHeader)
 HANDLER_RUN = TypeAdapter(HandlerRun)
 
@@ -45,12 +57,24 @@ class Trace:
     runs: list[HandlerRun] = field(default_factory=list)
     starts: list[int] = field(default_factory=list)
     problem: str | None = None
+    cut_off: bool = False
+    """Whether it ends in half a line, which is not read."""
 
     def lives(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
         """Each life of the agent: its runs, with their lines, which count from 1. A life begins with a header line."""
         bounds = [0, *self.starts, len(self.runs)]
         for life, (start, end) in enumerate(pairwise(bounds), 1):
             yield enumerate(islice(self.runs, start, end), start + life + 1)
+
+    def skimmed(self) -> "Trace":
+        """The trace without the handler runs that only took a message in; lines are then not counted by `lives`."""
+        kept = [not only_takes_in(run) for run in self.runs]
+        before = [0, *accumulate(kept)]
+        return replace(
+            self,
+            runs=[run for run, keep in zip(self.runs, kept, strict=True) if keep],
+            starts=[before[start] for start in self.starts],
+        )
 
     def completed(self) -> list[str]:
         """Hashes of the blocks that the agent completed, in order."""
@@ -112,10 +136,15 @@ class Held:
                     self.not_in_chain.add(block)
 
 
-def read_trace(path: Path, unread: Callable[[bytes], bool] = lambda line: False) -> Trace | None:
+def only_takes_in(run: HandlerRun) -> bool:
+    """Whether the handler took a message in, and nothing changed."""
+    return not run.changes and run.handler.startswith("receive_")
+
+
+def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
     """The trace in `path`; None if there is none, or it does not even begin as one.
 
-    Handler runs whose lines are to stay `unread` are left out unseen, and lines are then not counted by `lives`.
+    With `skim`, handler runs that only took a message in are left out unseen; lines are then not counted by `lives`.
     """
     trace: Trace | None = None
     try:
@@ -126,8 +155,10 @@ def read_trace(path: Path, unread: Callable[[bytes], bool] = lambda line: False)
                 if not line.endswith(b"\n"):
                     if trace is not None and len(line) == MAX_LINE_BYTES:
                         trace.problem = f"line {number} is too long"
+                    elif trace is not None:
+                        trace.cut_off = True
                     break
-                if trace is not None and unread(line):
+                if skim and trace is not None and _ONLY_TAKES_IN.fullmatch(line):
                     continue
                 try:
                     if trace is None:

@@ -11,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.archive.jsonlines import JsonLines
 
+TRACKS_FILE = "tracks.jsonl"
+
 MissionSeconds = Annotated[float, Field(ge=0, le=1e9)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
 """Nothing flies a thousand kilometres from the field."""
@@ -56,7 +58,7 @@ class _Line(BaseModel):
     places: dict[int, tuple[Metres, Metres, Metres]]
 
 
-def read_tracks(path: Path, vehicles: Collection[int]) -> Tracks:
+def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
     """The tracks of those of `vehicles` that have any. A line that names another vehicle means nothing."""
     lines = JsonLines(path, _Line)
     found: dict[int, list[Fix]] = {}

@@ -1,24 +1,12 @@
 """What the checker looks at: exports, traces where there are any, and what the run's record says of the network."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 
-from harness.archive import traces
+from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
-from harness.archive.exports import (
-    BEFORE_FINAL_RECONCILE,
-    RUN_FILE,
-    Export,
-    agents_directory,
-    export_files,
-    export_paths,
-    read_exports,
-)
+from harness.archive.exports import Export
 from harness.archive.record import AgentRecord, JudgedRecord
 from harness.archive.traces import Trace
-
-MAX_RECORD_BYTES = 64 * 1024 * 1024
 
 
 @dataclass
@@ -112,51 +100,9 @@ class Evidence:
         return owners
 
 
-def gather(paths: Iterable[Path]) -> Evidence:
-    """The evidence in a run directory, or in exports from anywhere with the traces that lie beside them.
-
-    Raises RunDirectoryError if a path does not exist or nothing at all is there.
-    """
-    paths = list(paths)
-    files = export_files(paths)
-    record: JudgedRecord | None = None
-    errors: list[str] = []
-    directories = [path.parent for path in files]
-    for path in paths:
-        if path.is_dir():
-            record = record or _record(path / RUN_FILE, errors)
-            directories.append(agents_directory(path))  # which has no exports if the run was killed
-    exports = read_exports(files)
-    evidence_traces: dict[int, Trace] = {}
-    for directory in dict.fromkeys(directories):
-        for path in sorted(directory.glob(f"*{traces.SUFFIX}")):
-            trace = traces.read_trace(path)
-            if trace is None:
-                errors.append(f"{path}: not a trace; it is left out")
-                continue
-            agent = record.agents.get(str(trace.header.agent_id)) if record else None
-            if agent is not None and agent.trace_problem:
-                trace.problem = f"it ends early: {agent.trace_problem}"
-            if trace.problem:
-                errors.append(f"{path}: {trace.problem}; what is there is read")
-            evidence_traces.setdefault(trace.header.agent_id, trace)
-    return Evidence(exports.by_agent, evidence_traces, record, errors + exports.errors, _before(files))
-
-
-def _before(export_files: list[Path]) -> dict[int, Export]:
-    """The exports that a final reconcile found, if that is what the files come from."""
-    runs = dict.fromkeys(path.parent.parent for path in export_files)
-    kept = [path for run in runs for path in export_paths(run / BEFORE_FINAL_RECONCILE)]
-    return read_exports(kept).by_agent
-
-
-def _record(path: Path, errors: list[str]) -> JudgedRecord | None:
-    try:
-        if path.stat().st_size > MAX_RECORD_BYTES:
-            raise ValueError("too large")
-        return JudgedRecord.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError):
-        errors.append(f"{path}: damaged, or not a run's record; the exports are checked without it")
-        return None
+def gather(archive: RunArchive) -> Evidence:
+    """All that an archive has of it."""
+    problems = list(archive.problems)
+    if archive.record_error is not None:
+        problems[0] += "; the exports are checked without it"
+    return Evidence(archive.exports.by_agent, archive.traces, archive.record, problems, archive.before_final_reconcile)

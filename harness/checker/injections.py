@@ -8,13 +8,11 @@ were sent before them.
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from harness.archive.directory import ROGUE_FILE
-from harness.archive.jsonlines import JsonLines
+from harness.archive.archive import RunArchive
 from harness.archive.record import InjectedMessages, RogueInjection
 from harness.archive.traces import Trace
 from harness.play.rogue.sequences import injection_of
@@ -61,17 +59,17 @@ class _Tally:
     """The messages that some agent has handled."""
 
 
-def account(scenario: Scenario, run_dir: Path, traces: Mapping[int, Trace]) -> list[RogueInjection]:
+def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
     """Of each injection of the scenario, in order; what no trace tells is not known."""
     injections = injections_of(scenario)
     if not injections:
         return []
     tallies = {one.number: _Tally() for one in injections}
     copies: dict[_Key, list[tuple[float, int]]] = defaultdict(list)
-    for line in JsonLines(run_dir / ROGUE_FILE, _Line):
+    for line in archive.injected(_Line):
         if line.injection in tallies:
             _take_down(line, tallies[line.injection], copies)
-    for trace in traces.values():
+    for trace in archive.traces.values():
         for key, runs in _triggered_by(trace, copies).items():
             for number, copy, run in _paired(copies.get(key), key, runs):
                 if number in tallies:

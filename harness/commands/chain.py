@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from harness import logbook
+from harness.archive.archive import RunArchive
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST, ExportError, MachineError, RunDirectoryError
 from harness.logbook.geojson import geojson
@@ -27,7 +28,7 @@ def chain_command(
     kml_file: Annotated[Path | None, typer.Option("--kml", help="The same for Google Earth; must be new.")] = None,
 ) -> None:
     """Print each agent's chain, block by block; or put what the vehicles logged on a map."""
-    whole = logbook.read(paths)
+    whole = logbook.read(RunArchive(*paths))
     shown = whole if agent is None else whole.only(agent)
     if geojson_file is not None or kml_file is not None:
         _write_maps(tracks(shown), shown.telemetry, geojson_file, kml_file)

@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 
 from harness import checker
+from harness.archive.archive import RunArchive
 from harness.checker.survival import survival
 from harness.commands.terminal import complain, print_json, show_result, show_survival
 from harness.errors import VIOLATED, WRONG_REQUEST
@@ -17,7 +18,7 @@ def check_command(
     as_json: Annotated[bool, typer.Option("--json", help="The verdict as JSON on standard output.")] = False,
 ) -> None:
     """Decide the six characteristics from exported chains, and from traces beside them."""
-    evidence = checker.gather(paths)
+    evidence = checker.gather(RunArchive(*paths))
     result, survived = checker.check(evidence), survival(evidence)
     if as_json:
         print_json({**result.to_json(), "survival": survived.model_dump()})

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from harness import report
+from harness.archive.archive import RunArchive
 from harness.archive.result import mapping
 from harness.commands.terminal import complain
 from harness.errors import MachineError, RunDirectoryError
@@ -15,7 +16,7 @@ from harness.errors import MachineError, RunDirectoryError
 
 def report_command(run: Annotated[Path, typer.Argument(help="A run directory.")]) -> None:
     """Write report.html, report.md, junit.xml and chains.svg again, also of a run that was killed half-way."""
-    left = report.read_remains(run)
+    left = report.read_remains(RunArchive(run, skim=True))
     try:
         page = report.write(left)
     except RunDirectoryError as error:

@@ -6,11 +6,11 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from harness.archive import traces
-from harness.archive.exports import RUN_FILE, export_paths, read_exports
-from harness.archive.result import agent_ids, listing, mapping, read_result
+from harness.archive.archive import RunArchive
+from harness.archive.exports import RUN_FILE
+from harness.archive.result import agent_ids, listing, mapping
 from harness.difference.keys import KeyDifference, differing_keys
-from harness.difference.steps import Step, completed_blocks, name, read_lines
+from harness.difference.steps import Step, completed_blocks, name
 from harness.errors import RunDirectoryError
 from harness.report.chain_tree import ranges
 
@@ -107,17 +107,18 @@ class _Run:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.result = read_result(path / RUN_FILE)
+        self.archive = RunArchive(path)
+        self.result = self.archive.result
+        if not self.result:
+            missing = RunDirectoryError(f"{path}: there is no {RUN_FILE}; is this a run directory?")
+            raise self.archive.record_error or missing
         self.roster: Sequence[int] = agent_ids(listing(self.result, "roster"))
-        self.exports = read_exports(export_paths(path))
+        self.exports = self.archive.exports
         self.names: Mapping[str, str] = {
             block: known
             for agent_id in self.roster
-            for block, known in completed_blocks(self.trace(agent_id), agent_id).items()
+            for block, known in completed_blocks(self.archive.trace_lines(agent_id), agent_id).items()
         }
-
-    def trace(self, agent_id: int) -> Path:
-        return self.path / "agents" / f"{agent_id}{traces.SUFFIX}"
 
     def chain(self, agent_id: int) -> list[str]:
         export = self.exports.by_agent.get(agent_id)
@@ -126,6 +127,8 @@ class _Run:
     def problems(self) -> Iterator[str]:
         if self.result.get("outcome") in (None, "running"):
             yield f"{self.path}: the run has not recorded its end, and is compared up to there"
+        if self.archive.record_error is not None:
+            yield str(self.archive.record_error)
         yield from self.exports.errors
 
     def asked(self) -> dict[str, Any]:
@@ -149,7 +152,7 @@ def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
 def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, Parting | None]:
     """How many handler runs are the same, whether to the last byte, and where the traces part."""
     same, exact = 0, True
-    for one, other in zip_longest(read_lines(a.trace(agent_id)), read_lines(b.trace(agent_id))):
+    for one, other in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):
         if one is None or other is None or (one.life, one.text) != (other.life, other.text):
             exact = False
             step, other_step = one and Step.of(one, a.names), other and Step.of(other, b.names)

@@ -1,46 +1,13 @@
 """Gathers exports, and what is known of where their events come from."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict
-
+from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
-from harness.archive.exports import RUN_FILE, SUFFIX, Export, export_files, read_exports
-from harness.archive.record import AgentRecord
-from harness.checker.evidence import MAX_RECORD_BYTES
+from harness.archive.exports import SUFFIX, Export
+from harness.archive.result import agent_ids, listing, mapping
 from harness.errors import ExportError, RunDirectoryError
-
-
-class _Events(BaseModel):
-    source: str
-
-
-class _Vehicles(BaseModel):
-    kind: str | None
-
-
-class _Scenario(BaseModel):
-    events: _Events
-    vehicles: _Vehicles
-
-
-class _Run(BaseModel):
-    """The part of run.json that says who flew, and what was logged."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    backend: str
-    roster: list[int]
-    scenario: _Scenario
-    agents: dict[str, AgentRecord] = {}
-
-    @property
-    def logged_telemetry(self) -> bool:
-        """Events are random where no vehicle flies."""
-        scenario = self.scenario
-        return self.backend != "sim" and scenario.events.source == "mavlink" and scenario.vehicles.kind != "none"
 
 
 @dataclass
@@ -70,37 +37,30 @@ class Logbook:
         raise ExportError(f"{self.absent.get(agent_id, f'there is no export of agent {agent_id}')}; {known}")
 
 
-def read(paths: Iterable[Path]) -> Logbook:
-    """The logbook in run directories, in directories of exports, or in exports from anywhere.
-
-    Raises RunDirectoryError if a path does not exist, or nothing at all is there.
-    """
-    paths = list(paths)
-    files = export_files(paths)
-    if not files:
-        raise RunDirectoryError(f"{paths[0]}: holds no exports (*{SUFFIX}): no agent of this run left its chain")
-    exports = read_exports(files)
-    logbook = Logbook(exports.by_agent, name_blocks(exports.by_agent), errors=exports.errors)
-    records = dict.fromkeys(directory / RUN_FILE for path in files for directory in (path.parent.parent, path.parent))
-    run = next((run for path in records if (run := _run(path)) is not None), None)
-    if run is not None:
-        logbook.telemetry = run.logged_telemetry
-        logbook.absent = {
-            agent_id: _absent(agent_id, run.agents.get(str(agent_id)))
-            for agent_id in run.roster
-            if agent_id not in exports.by_agent
-        }
-    return logbook
+def read(archive: RunArchive) -> Logbook:
+    """The logbook of an archive. Raises RunDirectoryError if it has no exports at all."""
+    exports = archive.exports
+    if not exports.by_agent and not exports.errors:
+        why = f"holds no exports (*{SUFFIX}): no agent of this run left its chain"
+        raise RunDirectoryError(f"{archive.directory}: {why}")
+    run = archive.origin
+    absent = [agent_id for agent_id in agent_ids(listing(run, "roster")) if agent_id not in exports.by_agent]
+    return Logbook(
+        exports.by_agent,
+        name_blocks(exports.by_agent),
+        telemetry=_logged_telemetry(run),
+        absent={agent_id: _absent(agent_id, mapping(run, "agents", str(agent_id))) for agent_id in absent},
+        errors=[*([str(archive.record_error)] if archive.record_error else []), *exports.errors],
+    )
 
 
-def _run(path: Path) -> _Run | None:
-    """None if there is no record, or none that tells."""
-    try:
-        return _Run.model_validate_json(path.read_bytes()) if path.stat().st_size <= MAX_RECORD_BYTES else None
-    except (OSError, ValueError):
-        return None
+def _logged_telemetry(run: dict[str, Any]) -> bool:
+    """Events are random where no vehicle flies; those of exports that came without a run are taken for telemetry."""
+    source, kind = mapping(run, "scenario", "events").get("source"), mapping(run, "scenario", "vehicles").get("kind")
+    return source is None or (run.get("backend") != "sim" and source == "mavlink" and kind != "none")
 
 
-def _absent(agent_id: int, record: AgentRecord | None) -> str:
-    why = f" ({record.outcome})" if record is not None and record.outcome != "exported" else ""
+def _absent(agent_id: int, agent: dict[str, Any]) -> str:
+    outcome = agent.get("outcome")
+    why = f" ({outcome})" if isinstance(outcome, str) and outcome != "exported" else ""
     return f"agent {agent_id} has no export here{why}"

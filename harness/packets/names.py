@@ -7,9 +7,9 @@ agent from its first datagram on: it proposes its blocks in the order in which i
 from collections.abc import Iterable
 from pathlib import Path
 
+from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
-from harness.archive.exports import export_paths, read_exports
-from harness.errors import CaptureError
+from harness.errors import CaptureError, RunDirectoryError
 from harness.packets.files import DIRECTORY
 from harness.packets.transmissions import Transmission
 from ucp.messages import BlockAddRequest, CommitBlock
@@ -61,7 +61,10 @@ class Names:
         )
 
     def _learn_from_exports(self, run: Path) -> None:
-        exports = read_exports(export_paths(run)).by_agent
+        try:
+            exports = RunArchive(run).exports.by_agent
+        except RunDirectoryError:  # captures from the field
+            return
         self._blocks |= {bytes.fromhex(block_hash): name for block_hash, name in name_blocks(exports).items()}
         for export in exports.values():
             self._top_of[bytes.fromhex(export.inception.chain_hash)] = None

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
-from harness.archive.exports import export_paths, read_exports
 from harness.checker import Result
 from harness.checker.characteristic import Characteristic, Finding, Verdict
 from harness.errors import ScenarioError
@@ -71,7 +71,7 @@ class Findings:
         Raises ScenarioError if the agent has left no chain.
         """
         __tracebackhide__ = True
-        exports = read_exports(export_paths(self.directory)).by_agent
+        exports = RunArchive(self.directory).exports.by_agent
         if agent not in exports:
             raise ScenarioError(f"there is no chain of agent {agent!r}: there are those of {sorted(exports)}")
         names = name_blocks(exports)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import checker
+from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, ScenarioError
 from harness.play import mission
 from harness.play.mission import Played
@@ -181,7 +182,7 @@ class Swarm:
 
     def _judge_by_now(self, played: Played) -> Findings:
         self._recording.take_down(played)
-        return Findings(self.directory, checker.check(checker.gather([self.directory])))
+        return Findings(self.directory, checker.check(checker.gather(RunArchive(self.directory))))
 
     # Between the test and the run
 

@@ -3,9 +3,8 @@
 from typing import Any
 
 from harness.archive.exports import Exports
-from harness.archive.result import mapping, number
+from harness.archive.result import mapping, number, roster_of
 from harness.present import words
-from harness.report import swarm
 
 FIGURES = {
     "blocks": "blocks completed",
@@ -29,7 +28,7 @@ def title(result: dict[str, Any]) -> str:
 def summary(result: dict[str, Any], exports: Exports) -> list[str]:
     scenario = mapping(result, "scenario")
     parts = [words.value(result["outcome"])] if result.get("outcome") else []
-    agents = len({*swarm.roster(result), *exports.by_agent})
+    agents = len({*roster_of(result), *exports.by_agent})
     parts.append("1 agent" if agents == 1 else f"{agents} agents")
     duration_s, speedup = number(scenario, "duration_s"), number(scenario, "speedup")
     loss, wall_s = number(scenario, "network", "loss"), number(result, "wall_s")

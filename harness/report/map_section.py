@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from markupsafe import Markup
 
-from harness.archive.connectivity import NETWORK_FILE, Connectivity, read_connectivity
-from harness.archive.directory import TRACKS_FILE
-from harness.archive.tracks import Tracks, read_tracks
+from harness.archive.connectivity import Connectivity
+from harness.archive.tracks import Tracks
 from harness.present import words
 from harness.present.colours import Ink
 from harness.report import map_svg
@@ -42,12 +40,10 @@ class Section:
     notes: list[str]
 
 
-def section(run_dir: Path, ink: Mapping[int, Ink]) -> Section | None:
+def section(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink]) -> Section | None:
     """None if no vehicle of the run is known to have moved, and nothing was wrong with what was read."""
-    tracks = read_tracks(run_dir / TRACKS_FILE, ink)
     if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
         return Section(None, [], [], tracks.problems) if tracks.problems else None
-    network = read_connectivity(run_dir / NETWORK_FILE, ink)
     return _drawn(tracks, network, ink)
 
 

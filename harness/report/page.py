@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.block_names import name_blocks
-from harness.archive.exports import BEFORE_FINAL_RECONCILE, Export, Exports, export_paths, read_exports
+from harness.archive.exports import Export
 from harness.archive.result import mapping
 from harness.present.colours import Ink
 from harness.report import facts, html, map_section, network, rogue, survival, swarm, timeline, verdicts
@@ -46,37 +46,38 @@ def draw(left: Remains) -> str:
         verdicts=judged,
         figures=facts.figures(result),
         survival=survival.section(result, ink),
-        pictures=_pictures(exports, ink, left.run_dir),
+        pictures=_pictures(exports.by_agent, left.archive.before_final_reconcile, ink),
         blocks=swarm.block_rows(exports.by_agent, ink),
         timeline=told,
         strip=network.strip(result),
         network=network.start(result),
         faults=network.faults(result),
         rogue=rogue.section(result),
-        flight=map_section.section(left.run_dir, ink),
-        agents=swarm.agents_table(result, exports.by_agent, ink),
+        flight=map_section.section(left.archive.tracks(ink), left.network, ink),
+        agents=swarm.agents_table(left.archive, ink),
         versions=mapping(result, "versions"),
         evidence_shown=EVIDENCE_SHOWN,
         long_text=LONG_TEXT,
     )
 
 
-def _pictures(exports: Exports, ink: Mapping[int, Ink], run_dir: Path) -> list[dict[str, Any]]:
+def _pictures(
+    exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, Ink]
+) -> list[dict[str, Any]]:
     """The chains at the end of the run, and how the mission had left them where a final reconcile changed them."""
-    if not exports.by_agent:
+    if not exports:
         return []
-    before = read_exports(export_paths(run_dir / BEFORE_FINAL_RECONCILE)).by_agent
     if not before:
-        return [_picture("", exports.by_agent, ink, "chains")]
+        return [_picture("", exports, ink, "chains")]
     changed = any(
-        agent_id in exports.by_agent and export.top_chain_hash != exports.by_agent[agent_id].top_chain_hash
+        agent_id in exports and export.top_chain_hash != exports[agent_id].top_chain_hash
         for agent_id, export in before.items()
     )
     if not changed:
         return [_picture("As the mission left them; the final reconcile changed nothing", before, ink, "chains")]
     return [
         _picture("As the mission left them", before, ink, "before"),
-        _picture("After the final reconcile", exports.by_agent, ink, "chains"),
+        _picture("After the final reconcile", exports, ink, "chains"),
     ]
 
 

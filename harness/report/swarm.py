@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
-from harness.archive.exports import Export, Exports
-from harness.archive.result import agent_ids, listing, mapping
+from harness.archive.exports import Export
+from harness.archive.result import listing, mapping
 from harness.present import words
 from harness.present.colours import Ink, inks
 from harness.report.chain_tree import holders, ranges
@@ -21,26 +22,18 @@ class BlockRow:
     held_by: str
 
 
-def roster(result: dict[str, Any]) -> list[int]:
-    """The agents that the run is known to have had, whether or not they left an export."""
-    agents = mapping(result, "scenario").get("agents")
-    if type(agents) is int and 0 < agents <= 1000:
-        agents = range(1, agents + 1)
-    named = [*(agents if isinstance(agents, list | range) else []), *listing(result, "scenario", "vehicles")]
-    return agent_ids([*listing(result, "roster"), *named, *mapping(result, "agents"), *mapping(result, "vehicles")])
-
-
-def agent_inks(result: dict[str, Any], exports: Mapping[int, Export]) -> dict[int, Ink]:
+def agent_inks(archive: RunArchive) -> dict[int, Ink]:
+    exports = archive.exports.by_agent
     makers = {block.agent_id for export in exports.values() for block in export.blocks()}
-    return inks({*roster(result), *exports, *makers})
+    return inks({*archive.roster, *exports, *makers})
 
 
-def missing(result: dict[str, Any], exports: Exports) -> list[str]:
+def missing(archive: RunArchive) -> list[str]:
     """A sentence for all agents of the run without a usable export for the same reason."""
     alike: dict[str, list[int]] = {}
-    for agent_id in roster(result):
-        if agent_id not in exports.by_agent:
-            alike.setdefault(_fate(mapping(result, "agents", str(agent_id))), []).append(agent_id)
+    for agent_id in archive.roster:
+        if agent_id not in archive.exports.by_agent:
+            alike.setdefault(_fate(mapping(archive.result, "agents", str(agent_id))), []).append(agent_id)
     return [f"{'agent' if len(ids) == 1 else 'agents'} {', '.join(ranges(ids))}{fate}" for fate, ids in alike.items()]
 
 
@@ -51,11 +44,12 @@ def _fate(agent: dict[str, Any]) -> str:
     return ": no usable export" + (f" ({why})" if why else "")
 
 
-def agents_table(result: dict[str, Any], exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> dict[str, Any]:
+def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
     """Column labels, and a row (agent ID, ink, cells by column) for each agent and its vehicle."""
+    result, exports = archive.result, archive.exports.by_agent
     rows = []
     columns: dict[str, None] = {}
-    for agent_id in sorted({*roster(result), *exports}):
+    for agent_id in sorted({*archive.roster, *exports}):
         cells: dict[str, Any] = {}
         agent, vehicle = (mapping(result, owner, str(agent_id)) for owner in ("agents", "vehicles"))
         cells |= {words.label(key): value for key, value in agent.items() if key not in ("detail", "dropped")}

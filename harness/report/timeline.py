@@ -75,7 +75,7 @@ def section(left: Remains, names: Mapping[str, str]) -> Section | None:
     notes = []
     faults = _faults(left.result)
     end_s = max(ends_at(traces), *(fault.at_s for fault in faults), _planned_s(left.result), 1.0)
-    told = course(traces, faults, end_s, whole=left.whole_traces)
+    told = course(traces, faults, end_s, whole=not left.archive.large)
     shades, shades_left_out = _shades(left.network, end_s)
     if shades_left_out:
         notes.append(f"{shades_left_out} shorter stretches of a parted network are not shaded")

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from harness.archive.archive import RunArchive
 from harness.collector import uncollected
 from harness.errors import RunDirectoryError
 from harness.report.chain_tree_svg import ChainTreePicture
@@ -12,18 +13,18 @@ from harness.report.remains import Remains, read_remains
 from ucp.files import write_atomically
 
 
-def write_report(run_dir: Path) -> Path:
+@uncollected()
+def write_report(archive: RunArchive) -> Path:
     """Write `report.html`, `chains.svg`, `report.md` and `junit.xml` into the run directory; the path of the page.
 
     Raises RunDirectoryError if there is nothing of a run in the directory, or if the disk refuses the report. What is
     missing or damaged is said on the page.
     """
-    return write(read_remains(run_dir))
+    return write(read_remains(archive))
 
 
-@uncollected()
 def write(left: Remains) -> Path:
-    """As `write_report` does."""
+    """As `write_report` does, of what was read."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))
     _write(left.run_dir / "junit.xml", to_junit(left.result))

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import checker, report
+from harness.archive.archive import RunArchive
 from harness.archive.directory import RunDirectory
 from harness.archive.record import RogueInjection, RunRecord, Survival
 from harness.checker.injections import account
@@ -121,13 +122,15 @@ class Recording:
         """Judge what was played, and write record and report. Raises MachineError if the disk refuses them."""
         self._record = _updated(self._record, outcome=played.outcome, outcome_detail=played.outcome_detail)
         self.take_down(played)
-        evidence = checker.gather([self.directory.path])
+        archive = RunArchive(self.directory.path)
+        evidence = checker.gather(archive)
         result, survived = checker.check(evidence), survival(evidence)
         wall_s = time.monotonic() - self._started
-        rogue = account(self._record.scenario, self.directory.path, evidence.traces)
+        rogue = account(self._record.scenario, archive)
         self._update(**result.to_json(), survival=survived, rogue=rogue, wall_s=round(wall_s, 1))
+        archive.forget_record()
         try:
-            page = report.write_report(self.directory.path)
+            page = report.write_report(archive)
         except RunDirectoryError as error:
             raise MachineError(f"{error}; run.json has the verdict") from None
         status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
 from harness import logbook
+from harness.archive.archive import RunArchive
 from harness.archive.exports import ExportedBlock, ExportMaker
 from harness.logbook import Logbook
 from harness.logbook.geojson import geojson
@@ -132,9 +133,9 @@ def test_events_that_no_vehicle_made_are_shown_as_bytes(tmp_path: Path) -> None:
     ],
 )
 def test_a_run_s_record_says_whether_vehicles_logged(flown: Air, tmp_path: Path, change: dict[str, Any]) -> None:
-    assert logbook.read([write_run(flown, tmp_path / "flown", CONNECTED, **FLOWN)]).telemetry
-    assert not logbook.read([write_run(flown, tmp_path / "not", CONNECTED, **{**FLOWN, **change})]).telemetry
-    assert not logbook.read([tmp_path / "not" / "agents" / "2.chain.json"]).telemetry
+    assert logbook.read(RunArchive(write_run(flown, tmp_path / "flown", CONNECTED, **FLOWN))).telemetry
+    assert not logbook.read(RunArchive(write_run(flown, tmp_path / "not", CONNECTED, **{**FLOWN, **change}))).telemetry
+    assert not logbook.read(RunArchive(tmp_path / "not" / "agents" / "2.chain.json")).telemetry
 
 
 def test_a_simulated_run_is_shown_from_end_to_end(tmp_path: Path) -> None:
@@ -224,7 +225,7 @@ def test_nothing_to_show_is_status_2(tmp_path: Path) -> None:
 @pytest.mark.parametrize("record", ["", "[]", '{"roster": 7}', "[" * 100_000])
 def test_a_damaged_record_is_no_hindrance(run_dir: Path, record: str) -> None:
     (run_dir / "run.json").write_text(record)
-    assert list(logbook.read([run_dir]).exports) == [1, 2, 3]
+    assert list(logbook.read(RunArchive(run_dir)).exports) == [1, 2, 3]
 
 
 @pytest.mark.parametrize("option", ["--decode", "--json"])

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from harness.archive.archive import RunArchive
 from harness.checker import Result, check, gather
 from tests.harness.mission import CONNECTED, LOSSY, edit, edit_lines, fly, reconcile_all, write_exports, write_run
 from tests.ucp.air import Air
@@ -32,7 +33,7 @@ def run_dir(perfect: Air, tmp_path: Path) -> Path:
 
 
 def test_a_perfect_run_holds_in_all_six(run_dir: Path) -> None:
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert verdicts(result) == "hhhhhh"
     assert result.figures["distinct_chains"] == 1
     assert result.figures["mutual_chain"] == result.figures["blocks"] == result.figures["longest_chain"]
@@ -43,7 +44,7 @@ def test_a_perfect_run_holds_in_all_six(run_dir: Path) -> None:
 
 def test_exports_alone_say_nothing_of_what_triggered_handlers(perfect: Air, tmp_path: Path) -> None:
     paths = write_exports(perfect, tmp_path, traces=False)
-    result = check(gather(paths))
+    result = check(gather(RunArchive(*paths)))
     assert verdicts(result) == "nhhhhh"
     assert result.figures["messages"] is None
 
@@ -51,14 +52,14 @@ def test_exports_alone_say_nothing_of_what_triggered_handlers(perfect: Air, tmp_
 def test_after_loss_equal_chains_hold_and_different_ones_do_not_apply(tmp_path: Path) -> None:
     air = fly(loss=0.3, seed=3)
     assert len(set(air.chains())) > 1
-    result = check(gather([write_run(air, tmp_path / "before", LOSSY)]))
+    result = check(gather(RunArchive(write_run(air, tmp_path / "before", LOSSY))))
     assert verdicts(result) == "hhhhnn"
     assert "loss 15 %" in reason(result, "6")
     assert result.figures["distinct_chains"] == len(set(air.chains()))
     began = air.now
     reconcile_all(air)
     healed = [*LOSSY, {"at_s": began, "what": "final reconcile", "detail": "loss 0 %", "fully_connected": True}]
-    result = check(gather([write_run(air, tmp_path / "after", healed)]))
+    result = check(gather(RunArchive(write_run(air, tmp_path / "after", healed))))
     assert verdicts(result) == "hhhhhh"
 
 
@@ -79,7 +80,7 @@ def missed_last_block(reconcile_before: bool = False) -> Air:
 
 @pytest.mark.parametrize("reconcile_before", [False, True])
 def test_a_difference_that_no_vote_could_find_does_not_apply(tmp_path: Path, reconcile_before: bool) -> None:
-    result = check(gather([write_run(missed_last_block(reconcile_before), tmp_path / "run", CONNECTED)]))
+    result = check(gather(RunArchive(write_run(missed_last_block(reconcile_before), tmp_path / "run", CONNECTED))))
     assert verdicts(result) == "hhhhnn"
     assert "agent 2 differs by blocks after which neither a vote nor a reconcile took place" in reason(result, "6")
 
@@ -91,7 +92,7 @@ def test_a_difference_that_outlives_a_reconcile_violates_5_and_6(tmp_path: Path)
     agent.messages_to_send()  # a radio that is on record as perfect, and says nothing
     air.flush(2)
     air.settle()
-    result = check(gather([write_run(air, tmp_path / "run", CONNECTED)]))
+    result = check(gather(RunArchive(write_run(air, tmp_path / "run", CONNECTED))))
     assert verdicts(result)[4:] == "vv"
     (finding,) = result.characteristics["5"].evidence
     assert (finding.agent_id, finding.block) == (2, "3.1")
@@ -99,7 +100,7 @@ def test_a_difference_that_outlives_a_reconcile_violates_5_and_6(tmp_path: Path)
 
 def test_exports_alone_that_differ_do_not_tell_whether_the_system_was_connected(tmp_path: Path) -> None:
     paths = write_exports(missed_last_block(), tmp_path, traces=False)
-    result = check(gather(paths))
+    result = check(gather(RunArchive(*paths)))
     assert verdicts(result)[4:] == "nn"
     assert "exports alone" in reason(result, "6")
 
@@ -107,14 +108,14 @@ def test_exports_alone_that_differ_do_not_tell_whether_the_system_was_connected(
 def test_an_agent_that_never_became_idle_is_not_judged(tmp_path: Path) -> None:
     air = Air([1, 2])
     air.fill_block(1)
-    result = check(gather([write_run(air, tmp_path / "run", CONNECTED)]))
+    result = check(gather(RunArchive(write_run(air, tmp_path / "run", CONNECTED))))
     assert verdicts(result) == "hnhhnn"
     assert "agent 1 never became idle" in reason(result, "2")
 
 
 def test_an_agent_whose_export_is_missing_is_never_taken_for_agreeing(run_dir: Path) -> None:
     (run_dir / "agents" / "4.chain.json").unlink()
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert verdicts(result) == "hnnhnn"
     assert "no export of agent 4" in reason(result, "6")
 
@@ -124,7 +125,7 @@ def test_an_idle_agent_with_an_uncommitted_block_violates_2(run_dir: Path) -> No
         export["blocks_to_be_committed"].append({**export["chain"].pop(), "chain_hash": None})
 
     edit(run_dir / "agents" / "2.chain.json", hide)
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["2"].verdict == "violated"
     assert result.characteristics["2"].evidence[0].agent_id == 2
 
@@ -135,7 +136,7 @@ def test_a_trace_that_was_idle_with_a_full_deque_violates_2(run_dir: Path) -> No
         voting["state"]["idle"] = True
 
     edit_lines(run_dir / "agents" / "1.trace.jsonl", claim_idle)
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["2"].verdict == "violated"
     assert "trace line" in result.characteristics["2"].evidence[0].detail
 
@@ -145,7 +146,7 @@ def test_a_second_copy_in_an_export_violates_3(run_dir: Path) -> None:
         export["reconcile_stack"].append({**export["chain"][0], "chain_hash": None})
 
     edit(run_dir / "agents" / "3.chain.json", copy)
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["3"].verdict == "violated"
     (finding,) = result.characteristics["3"].evidence
     assert finding.agent_id == 3
@@ -158,20 +159,20 @@ def test_a_second_copy_at_one_step_of_a_trace_violates_3(run_dir: Path) -> None:
         commit["changes"].append(["stack+", commit["changes"][0][1]])
 
     edit_lines(run_dir / "agents" / "5.trace.jsonl", copy)
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["3"].verdict == "violated"
 
 
 def test_an_edited_block_violates_4(run_dir: Path) -> None:
     edit(run_dir / "agents" / "1.chain.json", lambda export: export["chain"][2].update(timestamp_us=1))
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["4"].verdict == "violated"
     assert "does not hash to its block hash" in result.characteristics["4"].evidence[0].detail
 
 
 def test_a_reordered_chain_violates_4(run_dir: Path) -> None:
     edit(run_dir / "agents" / "1.chain.json", lambda export: export["chain"].insert(0, export["chain"].pop(1)))
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert "the chain hash at block" in result.characteristics["4"].evidence[0].detail
 
 
@@ -183,20 +184,20 @@ def test_a_block_that_its_agent_never_completed_violates_4(run_dir: Path) -> Non
 
     edit(run_dir / "agents" / "2.chain.json", disown)
     (run_dir / "agents" / "2.trace.jsonl").unlink()
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["4"].verdict == "violated"
     assert {finding.block_hash for finding in result.characteristics["4"].evidence} == set(block)
 
 
 def test_a_block_of_a_stranger_violates_4(run_dir: Path) -> None:
     edit(run_dir / "run.json", lambda record: record.update(roster=[1, 2, 3, 4]))
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert "agent 5, which is not on the roster" in result.characteristics["4"].evidence[0].detail
 
 
 def test_blocks_of_an_agent_that_left_nothing_are_not_taken_for_genuine(perfect: Air, tmp_path: Path) -> None:
     paths = write_exports(perfect, tmp_path, traces=False)
-    result = check(gather(path for path in paths if path.name != "3.chain.json"))
+    result = check(gather(RunArchive(*(path for path in paths if path.name != "3.chain.json"))))
     assert result.characteristics["4"].verdict == "not applicable"
     assert "agent 3" in reason(result, "4")
 
@@ -217,7 +218,7 @@ def test_a_handler_without_a_trigger_of_its_own_violates_1(run_dir: Path, trigge
         next(line for line in lines[1:] if line["handler"] == "receive_commit_block")["trigger"] = trigger
 
     edit_lines(run_dir / "agents" / "2.trace.jsonl", forge)
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["1"].verdict == "violated"
     assert detail in result.characteristics["1"].evidence[0].detail
 
@@ -229,28 +230,28 @@ def hang(lines: list[dict]) -> None:
 
 def test_a_vote_that_never_ends_violates_1(run_dir: Path) -> None:
     edit_lines(run_dir / "agents" / "2.trace.jsonl", hang)
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert any("a vote began and did not end" in one.detail for one in result.characteristics["1"].evidence)
 
 
 def test_a_killed_run_without_exports_is_judged_by_its_traces(run_dir: Path) -> None:
     for export in (run_dir / "agents").glob("*.chain.json"):
         export.unlink()
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert verdicts(result) == "hnnnnn"
     edit_lines(run_dir / "agents" / "2.trace.jsonl", hang)
-    assert check(gather([run_dir])).characteristics["1"].verdict == "violated"
+    assert check(gather(RunArchive(run_dir))).characteristics["1"].verdict == "violated"
 
 
 def test_a_missing_or_damaged_trace_is_never_taken_for_a_good_one(run_dir: Path) -> None:
     trace = run_dir / "agents" / "2.trace.jsonl"
     lines = trace.read_text().splitlines(keepends=True)
     trace.write_text("".join(lines[:-1]) + "{]\n")
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert "2.trace.jsonl: line" in result.errors[0]
     assert result.characteristics["1"].verdict != "holds"
     trace.unlink()
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["1"].verdict == "not applicable"
     assert "no trace of agent 2" in reason(result, "1")
 
@@ -258,15 +259,15 @@ def test_a_missing_or_damaged_trace_is_never_taken_for_a_good_one(run_dir: Path)
 def test_half_a_last_line_is_that_of_a_killed_agent_and_no_damage(run_dir: Path) -> None:
     trace = run_dir / "agents" / "2.trace.jsonl"
     trace.write_text(trace.read_text() + '{"t": 1')
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert verdicts(result) == "hhhhhh"
     assert not result.errors
 
 
 def test_a_damaged_record_is_told_and_the_exports_are_checked_without_it(run_dir: Path) -> None:
     (run_dir / "run.json").write_text('{"schema": "ucp-run/1", "roster": "all", "network": [7]}')
-    result = check(gather([run_dir]))
-    assert "run.json: damaged" in result.errors[0]
+    result = check(gather(RunArchive(run_dir)))
+    assert "run.json: `roster` is wrong" in result.errors[0]
     assert verdicts(result)[1:4] == "hhh"
 
 
@@ -289,7 +290,7 @@ def test_whatever_a_run_directory_holds_there_is_a_verdict(run_dir: Path, data: 
     try:
         edit_lines(trace, lambda lines: spoil(lines[data.draw(st.integers(0, len(lines) - 1))]))
         edit(record, spoil)
-        result = check(gather([run_dir]))
+        result = check(gather(RunArchive(run_dir)))
         assert set(verdicts(result)) <= set("hvn")
     finally:
         trace.write_text(kept[0])
@@ -299,6 +300,6 @@ def test_whatever_a_run_directory_holds_there_is_a_verdict(run_dir: Path, data: 
 def test_a_trace_that_a_full_disk_ended_is_never_taken_for_a_whole_one(run_dir: Path) -> None:
     full = {"outcome": "exported", "trace_problem": "No space left on device"}
     edit(run_dir / "run.json", lambda record: record.update(agents={"3": full}))
-    result = check(gather([run_dir]))
+    result = check(gather(RunArchive(run_dir)))
     assert "3.trace.jsonl: it ends early: No space left on device" in result.errors[0]
     assert result.characteristics["1"].verdict == "not applicable"

@@ -5,8 +5,10 @@ from typing import Any
 
 import pytest
 
+from harness.archive import archive
 from harness.archive import history as told
-from harness.archive.history import Message, Phase, Reconcile, Tie, Vote, course, ends_at, read_traces
+from harness.archive.archive import RunArchive
+from harness.archive.history import Message, Phase, Reconcile, Tie, Vote, course, ends_at
 from harness.archive.record import Fault
 from harness.archive.replication import Spread, spread
 from harness.archive.traces import Header, Trace
@@ -212,12 +214,15 @@ def test_what_is_on_a_lost_disk_is_no_copy_any_more(disk: Any, copies: list[int]
 
 def test_large_traces_tell_the_same_without_the_messages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran = run(scenario(**ROUGH), 5, tmp_path / "run", Silent(), backend="sim")
-    whole, all_of_it, _ = read_traces(ran.directory / "agents", range(1, 6))
-    monkeypatch.setattr(told, "MESSAGES_UP_TO_BYTES", 1000)
-    part, not_all_of_it, problems = read_traces(ran.directory / "agents", range(1, 6))
-    assert all_of_it
-    assert not not_all_of_it
-    assert problems == []
+    all_of_it = RunArchive(ran.directory)
+    whole = all_of_it.traces
+    assert not all_of_it.large
+    monkeypatch.setattr(archive, "LARGE_BYTES", 1000)
+    skimmed = RunArchive(ran.directory, skim=True)
+    part = skimmed.traces
+    assert skimmed.large
+    assert skimmed.problems == []
+    assert part == {agent_id: trace.skimmed() for agent_id, trace in whole.items()}
     assert sum(len(trace.runs) for trace in part.values()) < sum(len(trace.runs) for trace in whole.values())
     one, other = course(whole, [], 900.0), course(part, [], 900.0, whole=False)
     assert (one.votes, one.commits, one.ties) == (other.votes, other.commits, other.ties)
@@ -234,7 +239,8 @@ def test_a_trace_that_is_none_or_not_of_this_run_is_left_out_in_one_sentence(tmp
     (agents / "9.trace.jsonl").write_bytes((agents / "1.trace.jsonl").read_bytes())
     with (agents / "2.trace.jsonl").open("a") as file:
         file.write('{"t": "never"}\n')
-    traces, _, problems = read_traces(agents, [1, 2, 3])
-    assert sorted(traces) == [1, 2, 3]
-    assert [problem.split(":")[0] for problem in problems] == ["2.trace.jsonl", "8.trace.jsonl", "9.trace.jsonl"]
-    assert [len(problem.splitlines()) for problem in problems] == [1, 1, 1]
+    run_archive = RunArchive(ran.directory)
+    assert sorted(run_archive.traces) == [1, 2, 3]
+    named = [Path(problem.split(":")[0]).name for problem in run_archive.problems]
+    assert named == ["2.trace.jsonl", "8.trace.jsonl", "9.trace.jsonl"]
+    assert [len(problem.splitlines()) for problem in run_archive.problems] == [1, 1, 1]

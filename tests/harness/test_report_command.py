@@ -64,20 +64,23 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
 
 
-NO_RECORD = [
-    "there is no verdict: `ucp-harness check {run}` judges what there is",
-    "run.json is missing or damaged: scenario, verdict and figures are not known",
-]
+NO_VERDICT = "there is no verdict: `ucp-harness check {run}` judges what there is"
 
 
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda run: (run / "run.json").unlink(), NO_RECORD),
-        (lambda run: cut(run / "run.json"), NO_RECORD),
+        (
+            lambda run: (run / "run.json").unlink(),
+            [NO_VERDICT, "run.json is missing: scenario, verdict and figures are not known"],
+        ),
+        (
+            lambda run: cut(run / "run.json"),
+            [NO_VERDICT, "run.json: truncated or damaged: not a JSON document"],
+        ),
         (
             lambda run: cut(run / "agents" / "2.trace.jsonl"),
-            ["2.trace.jsonl: cut off in mid-line; what is before it is shown"],
+            ["agents/2.trace.jsonl: cut off in mid-line; what is before that is read"],
         ),
         (
             lambda run: (run / "agents" / "2.trace.jsonl").unlink(),
@@ -129,7 +132,12 @@ def test_what_is_no_run_directory_is_status_2(run_dir: Path, what: str) -> None:
     done = harness("report", run_dir)
     assert (done.returncode, done.stdout) == (2, "")
     (said,) = sentences(done.stderr)
-    assert "run.json: " in said
+    expected = {
+        "nowhere": "does not exist",
+        "no run": "neither a run directory",
+        "another record": "run.json: its schema",
+    }
+    assert expected[what] in said
 
 
 def test_a_report_that_cannot_be_written_is_status_3(run_dir: Path) -> None:

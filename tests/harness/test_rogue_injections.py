@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from harness.archive.archive import RunArchive
 from harness.archive.record import RogueInjection
 from harness.archive.traces import Header, Trace
 from harness.checker.injections import account, in_words
@@ -44,7 +45,10 @@ def copy(at_s: float, injection: int) -> dict[str, Any]:
 
 def told(directory: Path, one: Any, lines: list[dict[str, Any]], *traces: Trace) -> list[RogueInjection]:
     (directory / "rogue.jsonl").write_text("".join(json.dumps(it) + "\n" for it in lines) + "{half a li")
-    return account(one, directory, {trace.header.agent_id: trace for trace in traces})
+    (directory / "run.json").touch()
+    archive = RunArchive(directory)
+    archive.traces = {trace.header.agent_id: trace for trace in traces}
+    return account(one, archive)
 
 
 def test_of_runs_in_common_the_last_are_the_copies(tmp_path: Path) -> None:

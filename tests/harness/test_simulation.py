@@ -11,6 +11,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from harness import checker
+from harness.archive.archive import RunArchive
 from harness.archive.exports import read_export
 from harness.errors import MachineError, ScenarioError
 from harness.play.progress import Silent
@@ -226,7 +227,7 @@ def test_a_run_directory_says_what_a_simulation_in_memory_says(tmp_path: Path) -
     assert finished.result.to_json() == in_memory.result.to_json()
     for agent_id, export in in_memory.evidence.exports.items():
         assert read_export(tmp_path / "run" / "agents" / f"{agent_id}.chain.json") == export
-    again = checker.check(checker.gather([tmp_path / "run"]))
+    again = checker.check(checker.gather(RunArchive(tmp_path / "run")))
     assert again.to_json() == finished.result.to_json()
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (record["backend"], record["outcome"], record["settled"]) == ("sim", "completed", True)

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from harness.archive.archive import RunArchive
 from harness.archive.record import Loss, Survival
 from harness.checker import Evidence, gather
 from harness.checker.survival import in_words, survival
@@ -134,5 +135,5 @@ def test_the_scenario_of_attrition_answers_the_thesis_s_question_from_its_direct
     ]
     assert all(loss.blocks for loss in finished.survival.losses)
     assert finished.survival == survival(simulate(one, 2, tracing=True).evidence)
-    assert finished.survival == survival(gather([tmp_path / "run"]))
+    assert finished.survival == survival(gather(RunArchive(tmp_path / "run")))
     assert "Survival" in finished.report.read_text(encoding="utf-8")

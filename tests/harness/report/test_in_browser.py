@@ -5,6 +5,7 @@ from typing import Literal
 
 import pytest
 
+from harness.archive.archive import RunArchive
 from harness.report import write_report
 from harness.scenario import Scenario
 from tests.harness.report.browser import Browser, chromium_or_skip
@@ -35,7 +36,7 @@ TAGS_THAT_DO_NOT_FIT = """
 @pytest.fixture(scope="module", params=["disconnected", "twenty"])
 def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     chains = {"disconnected": DISCONNECTED, "twenty": TWENTY}[request.param]
-    return write_report(write_run(tmp_path_factory.mktemp("run") / "run", chains))
+    return write_report(RunArchive(write_run(tmp_path_factory.mktemp("run") / "run", chains)))
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -52,7 +53,7 @@ def test_it_fits_the_screen_and_the_console_is_silent(
 
 
 def test_large_figures_stay_on_one_line(browser: Browser, tmp_path: Path) -> None:
-    page = write_report(write_run(tmp_path / "run", {1: "1.1"}, {"figures": {"bytes": 129_526_143}}))
+    page = write_report(RunArchive(write_run(tmp_path / "run", {1: "1.1"}, {"figures": {"bytes": 129_526_143}})))
     lines = """(() => { const range = document.createRange();
       range.selectNodeContents(document.querySelector('.tiles dd'));
       return range.getClientRects().length; })()"""
@@ -94,7 +95,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     timeline = [{"at_s": 500, "kill": [5]}]
     scenario = Scenario.model_validate({"name": "x", "agents": 5, "network": network, "timeline": timeline})
     write_flight(run_dir, scenario, {agent: split_and_rejoin(agent) for agent in range(1, 6)}, 600)
-    return write_report(run_dir)
+    return write_report(RunArchive(run_dir))
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

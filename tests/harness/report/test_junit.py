@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from harness.archive.archive import RunArchive
 from harness.report import write_report
 from harness.report.junit import to_junit
 from tests.harness.report.runs import result_of, write_run
@@ -38,7 +39,7 @@ def judged(number: str, **keys: Any) -> dict[str, Any]:
 
 
 def test_it_lies_beside_the_page_with_a_test_case_for_each_characteristic(tmp_path: Path) -> None:
-    write_report(write_run(tmp_path / "run", {1: "1.1"}))
+    write_report(RunArchive(write_run(tmp_path / "run", {1: "1.1"})))
     suites = ElementTree.parse(tmp_path / "run" / "junit.xml").getroot()  # noqa: S314 - ours
     (suite,) = suites
     counts = {"tests": "6", "failures": "0", "errors": "0", "time": "61.2"}

@@ -8,8 +8,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from harness.archive.connectivity import State
-from harness.archive.directory import TRACKS_FILE
+from harness.archive.archive import RunArchive
+from harness.archive.connectivity import NETWORK_FILE, State, read_connectivity
+from harness.archive.tracks import TRACKS_FILE, read_tracks
 from harness.present.colours import Ink, inks
 from harness.report import map_section, write_report
 from harness.report.map_parts import divisions, letter, longest
@@ -31,9 +32,14 @@ def scenario(range_m: float = 250.0, **more: Any) -> Scenario:
 def drawn(run_dir: Path, seconds: int = 600, ways: dict[int, Way] | None = None, **more: Any) -> Section:
     ways = ways or {vehicle: split_and_rejoin(vehicle) for vehicle in FIVE}
     write_flight(run_dir, scenario(agents=len(ways), **more), ways, seconds)
-    section = map_section.section(run_dir, inks(ways))
+    section = section_of(run_dir, inks(ways))
     assert section is not None
     return section
+
+
+def section_of(run_dir: Path, ink: dict[int, Ink]) -> Section | None:
+    network = read_connectivity(run_dir / NETWORK_FILE, ink)
+    return map_section.section(read_tracks(run_dir / TRACKS_FILE, ink), network, ink)
 
 
 def paths(section: Section) -> list[tuple[str, str, list[tuple[float, float]]]]:
@@ -218,14 +224,14 @@ def ink() -> dict[int, Ink]:
 
 
 def test_where_nobody_moves_or_nobody_looked_there_is_no_map(tmp_path: Path, ink: dict[int, Ink]) -> None:
-    assert map_section.section(tmp_path, ink) is None
+    assert section_of(tmp_path, ink) is None
     write_flight(tmp_path, scenario(agents=5), {vehicle: still(vehicle, 0) for vehicle in FIVE}, 5)
-    assert map_section.section(tmp_path, ink) is None
+    assert section_of(tmp_path, ink) is None
 
 
 def test_tracks_without_a_record_of_the_network_are_drawn_and_it_is_said(tmp_path: Path, ink: dict[int, Ink]) -> None:
     write_lines(tmp_path / TRACKS_FILE, [{"at_s": at, "places": {"3": [at * 9, 0, 0]}} for at in range(3)])
-    section = map_section.section(tmp_path, ink)
+    section = section_of(tmp_path, ink)
     assert section is not None
     assert [which for which, _, _ in paths(section)] == ["unknown"]
     assert section.notes == ["network.jsonl: who could reach whom is not on record"]
@@ -235,7 +241,7 @@ def test_tracks_without_a_record_of_the_network_are_drawn_and_it_is_said(tmp_pat
 def test_damaged_tracks_leave_a_sentence_on_the_page(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", {1: "1.1", 2: "1.1"})
     (run_dir / TRACKS_FILE).write_text('{\n{"at_s": 1, "places": {"<script>": [0, 0, 0]}}\n')
-    page = Reader(write_report(run_dir).read_text(encoding="utf-8"))
+    page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
     assert "tracks.jsonl: 2 lines are left out, damaged or of no meaning." in page.text
     assert "map" not in {attributes.get("class") for tag, attributes in page.elements if tag == "svg"}
 
@@ -247,7 +253,7 @@ def test_texts_from_the_record_stay_text(tmp_path: Path) -> None:
     asked = {"at_s": 10.0, "what": "<script>alert(1)</script>", "asked": {"partition": [[1]]}}
     write_lines(tmp_path / "more", [asked])
     record.write_text(record.read_text() + (tmp_path / "more").read_text())
-    page = write_report(run_dir).read_text(encoding="utf-8")
+    page = write_report(RunArchive(run_dir)).read_text(encoding="utf-8")
     assert "<script" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     identifiers = re.findall(r' id="([^"]+)"', page)

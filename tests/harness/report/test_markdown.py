@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from harness.archive.archive import RunArchive
 from harness.report import write_report
 from tests.harness.report.runs import write_run
 
@@ -12,7 +13,7 @@ def lines_of(tmp_path: Path, result: dict[str, Any] | None = None) -> list[str]:
     run_dir = write_run(tmp_path / "run", {1: "1.1 2.1", 2: "1.1"}, result)
     for name in ("network.jsonl", "tracks.jsonl", "agents/1.trace.jsonl", "agents/2.trace.jsonl"):
         (run_dir / name).touch()
-    write_report(run_dir)
+    write_report(RunArchive(run_dir))
     return (run_dir / "report.md").read_text().splitlines()
 
 

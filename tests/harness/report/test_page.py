@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from harness.archive.archive import RunArchive
 from harness.archive.exports import BEFORE_FINAL_RECONCILE
 from harness.errors import RunDirectoryError
 from harness.report import write_report
@@ -48,7 +49,7 @@ class Reader(HTMLParser):
 
 
 def report(run_dir: Path, result: dict[str, Any] | None = None) -> Reader:
-    return Reader(write_report(write_run(run_dir, CHAINS, result)).read_text(encoding="utf-8"))
+    return Reader(write_report(RunArchive(write_run(run_dir, CHAINS, result))).read_text(encoding="utf-8"))
 
 
 def test_the_page_says_how_the_run_went_in_its_order(tmp_path: Path) -> None:
@@ -112,7 +113,7 @@ def test_a_violation_leads_and_its_evidence_is_complete(tmp_path: Path) -> None:
 def test_the_page_is_one_file_that_refers_to_no_other(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", CHAINS)
     before = {path.name for path in run_dir.iterdir()}
-    html = write_report(run_dir).read_text(encoding="utf-8")
+    html = write_report(RunArchive(run_dir)).read_text(encoding="utf-8")
     assert {path.name for path in run_dir.iterdir()} - before == {"report.html", "report.md", "junit.xml", "chains.svg"}
     page = Reader(html)
     references = {
@@ -178,7 +179,7 @@ def test_a_run_that_did_not_complete_says_so_and_why(tmp_path: Path, outcome: st
 def test_a_run_file_with_nothing_but_its_schema_is_shown(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", CHAINS)
     (run_dir / "run.json").write_text('{"schema": "ucp-run/1"}')
-    page = Reader(write_report(run_dir).read_text(encoding="utf-8"))
+    page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
     assert "This run has not recorded its end" in page.text
     assert "Not judged" in page.text
     assert "inception block" in page.text
@@ -188,7 +189,7 @@ def test_agents_without_a_usable_export_are_said_and_the_rest_is_drawn(tmp_path:
     agents = {"2": {"outcome": "crashed", "detail": "exit status 1"}, "4": {"outcome": "hung"}}
     run_dir = write_run(tmp_path / "run", CHAINS, {"agents": agents})
     (run_dir / "agents" / "2.chain.json").write_text('{"schema": "ucp-chain-')
-    page = Reader(write_report(run_dir).read_text(encoding="utf-8"))
+    page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
     assert "agent 2: no usable export (crashed, exit status 1)" in page.text
     assert "agent 4: no usable export (hung)" in page.text
     assert "agents/2.chain.json: truncated or damaged" in page.text
@@ -198,7 +199,7 @@ def test_agents_without_a_usable_export_are_said_and_the_rest_is_drawn(tmp_path:
 
 def test_a_run_without_any_export_is_still_reported(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", {}, {"scenario": {"name": "all lost", "agents": 2}})
-    page = Reader(write_report(run_dir).read_text(encoding="utf-8"))
+    page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
     assert "No chain to draw" in page.text
     assert "agents 1, 2: no usable export" in page.text
 
@@ -212,14 +213,14 @@ def test_a_chain_that_was_not_abridged_has_nothing_to_unfold(tmp_path: Path) -> 
 def test_a_directory_without_a_readable_result_is_refused_in_one_sentence(tmp_path: Path, content: str | None) -> None:
     if content is not None:
         (tmp_path / "run.json").write_text(content, encoding="utf-8", errors="surrogateescape")
-    with pytest.raises(RunDirectoryError, match=r"run\.json: [^\n]*$"):
-        write_report(tmp_path)
+    with pytest.raises(RunDirectoryError, match=r"^[^\n]*(run\.json: |neither a run directory)[^\n]*$"):
+        write_report(RunArchive(tmp_path))
 
 
 def test_the_cycle_collector_runs_again_afterwards(tmp_path: Path) -> None:
     report(tmp_path / "run")
     with pytest.raises(RunDirectoryError):
-        write_report(tmp_path)
+        write_report(RunArchive(tmp_path))
     assert gc.isenabled()
 
 
@@ -227,7 +228,7 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> N
     run_dir = write_run(tmp_path / "run", CHAINS)
     (run_dir / "report.html").mkdir()
     with pytest.raises(RunDirectoryError, match=r"report\.html: cannot be written"):
-        write_report(run_dir)
+        write_report(RunArchive(run_dir))
     assert not list(run_dir.glob("*.tmp")) + list(run_dir.glob(".*.tmp"))
 
 
@@ -246,7 +247,7 @@ def test_whatever_the_result_holds_there_is_a_report(
     tmp_path: Path, result: dict[str, Any], scenario: dict[str, Any]
 ) -> None:
     (tmp_path / "run.json").write_text(json.dumps({"scenario": scenario, **result, "schema": "ucp-run/1"}))
-    assert write_report(tmp_path).stat().st_size > 0
+    assert write_report(RunArchive(tmp_path)).stat().st_size > 0
 
 
 def test_template_and_styles_are_in_the_package() -> None:
@@ -257,7 +258,7 @@ def test_template_and_styles_are_in_the_package() -> None:
 def test_what_the_mission_left_is_drawn_beside_what_the_final_reconcile_made_of_it(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path, {1: ["1.1", "2.1"], 2: ["1.1", "2.1"]}, result_of([1, 2]))
     write_exports(run_dir / BEFORE_FINAL_RECONCILE, {1: ["1.1", "2.1"], 2: ["1.1"]})
-    page = write_report(run_dir).read_text()
+    page = write_report(RunArchive(run_dir)).read_text()
     assert "As the mission left them" in page
     assert "After the final reconcile" in page
     identifiers = re.findall(r' id="([^"]+)"', page)
@@ -267,6 +268,6 @@ def test_what_the_mission_left_is_drawn_beside_what_the_final_reconcile_made_of_
 def test_a_final_reconcile_that_changed_nothing_is_said_and_drawn_once(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path, {1: ["1.1"], 2: ["1.1"]}, result_of([1, 2]))
     write_exports(run_dir / BEFORE_FINAL_RECONCILE, {1: ["1.1"], 2: ["1.1"]})
-    page = write_report(run_dir).read_text()
+    page = write_report(RunArchive(run_dir)).read_text()
     assert "the final reconcile changed nothing" in page
     assert page.count('class="chains"') == 1

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from harness.archive import history as told
+from harness.archive import archive
+from harness.archive.archive import RunArchive
 from harness.archive.history import Commit, Course, Phase, Reconcile, Tie, Vote
 from harness.archive.replication import Spread
 from harness.play.progress import Silent
@@ -45,7 +46,7 @@ def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def html_of(run_dir: Path) -> str:
-    return write_report(run_dir).read_text(encoding="utf-8")
+    return write_report(RunArchive(run_dir)).read_text(encoding="utf-8")
 
 
 def run_with(tmp_path: Path, *lines: Mapping[str, Any], result: Mapping[str, Any] | None = None) -> Path:
@@ -160,7 +161,7 @@ def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> No
 
 @pytest.mark.parametrize(
     ("module", "limit", "said"),
-    [(told, "MESSAGES_UP_TO_BYTES", "traces are too large"), (timeline, "MAX_ARROWS", "too many for a page")],
+    [(archive, "LARGE_BYTES", "traces are too large"), (timeline, "MAX_ARROWS", "too many for a page")],
 )
 def test_messages_above_a_limit_are_left_out_and_that_is_said(
     troubled: Path, monkeypatch: pytest.MonkeyPatch, module: Any, limit: str, said: str

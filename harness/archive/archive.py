@@ -1,0 +1,217 @@
+"""The archive of a run: what it left in its directory, or what came home from the field, whatever has become of it.
+
+Everything after a run stands on this one reader. A file is read when it is first asked for, and once. What cannot be
+used is left out and told in a sentence, the same for all who ask: `problems` are of files that are damaged or not what
+they should be, `gaps` of what a run that came to its end leaves, and this one has not.
+"""
+
+import os
+from collections.abc import Collection, Iterable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from harness.archive.connectivity import NETWORK_FILE, Connectivity, read_connectivity
+from harness.archive.directory import ROGUE_FILE
+from harness.archive.exports import (
+    BEFORE_FINAL_RECONCILE,
+    RUN_FILE,
+    Export,
+    Exports,
+    agents_directory,
+    export_files,
+    export_paths,
+    read_exports,
+)
+from harness.archive.history import in_time
+from harness.archive.jsonlines import JsonLines, Record
+from harness.archive.record import JudgedRecord
+from harness.archive.result import DamagedResultError, agent_ids, listing, mapping, read_result, roster_of
+from harness.archive.trace_lines import Line, read_lines
+from harness.archive.traces import SUFFIX, Trace, read_trace
+from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
+from harness.errors import RunDirectoryError
+
+LARGE_BYTES = 16 * 1024 * 1024
+"""Traces that are larger together are read without what only took a message in, if that is enough."""
+
+
+class RunArchive:
+    """What is in run directories, in directories of exports, or in exports from anywhere, with the traces beside them.
+
+    `directory` is the first that was named, which has the run's record if there is one; None if files were named.
+    With `skim`, handler runs that only took a message in are left out of traces that are `large`. Raises
+    RunDirectoryError if a path does not exist, or is a directory of other things.
+    """
+
+    def __init__(self, *paths: Path, skim: bool = False) -> None:
+        self._export_files = export_files(paths)
+        self._skim = skim
+        directories = [path for path in paths if path.is_dir()]
+        self.directory = directories[0] if directories else None
+        beside = [path.parent for path in self._export_files]
+        # A directory may have traces and no exports: the run was killed.
+        self._agents = list(dict.fromkeys([*beside, *map(agents_directory, directories)]))
+
+    # What the run says of itself
+
+    @cached_property
+    def result(self) -> dict[str, Any]:
+        """run.json as it stands, empty if it cannot be read; ask by `harness.archive.result`, for it may be edited."""
+        return self._run[0]
+
+    @cached_property
+    def record(self) -> JudgedRecord | None:
+        """What a judgement needs of run.json; None if that is not there, or damaged."""
+        return self._run[1]
+
+    @cached_property
+    def record_error(self) -> RunDirectoryError | None:
+        """What is wrong with run.json, if it is there and not what it should be."""
+        return self._run[2]
+
+    @cached_property
+    def origin(self) -> dict[str, Any]:
+        """The same of the run that the exports come from, even if not its directory was named but files in it."""
+        if self.directory is not None:
+            return self.result
+        beside = dict.fromkeys(path.parent for file in self._export_files for path in (file.parent, file))
+        return next((RunArchive(path).result for path in beside if (path / RUN_FILE).is_file()), {})
+
+    @cached_property
+    def _run(self) -> tuple[dict[str, Any], JudgedRecord | None, RunDirectoryError | None]:
+        path = self._in_directory(RUN_FILE)
+        if path is None or not path.exists():
+            return {}, None, None
+        try:
+            result = read_result(path)
+        except RunDirectoryError as error:
+            return {}, None, error
+        try:
+            return result, JudgedRecord.model_validate(result), None
+        except ValidationError as error:
+            problem = error.errors()[0]
+            where, what = ".".join(map(str, problem["loc"])), problem["msg"].lower()
+            return result, None, DamagedResultError(f"{path}: `{where}` is wrong: {what}; it was edited or damaged")
+
+    @cached_property
+    def roster(self) -> list[int]:
+        """The agents that the run is known to have had: by its record, else by the files that they left."""
+        files = [path for directory in self._agents for path in directory.glob("*.*.json*")]
+        return roster_of(self.result) or agent_ids(path.name.partition(".")[0] for path in files)
+
+    def forget_record(self) -> None:
+        """The record has been written anew: it is read once more when it is asked for."""
+        for name in ("_run", "result", "record", "record_error", "origin", "roster"):
+            self.__dict__.pop(name, None)
+
+    # What the agents left
+
+    @cached_property
+    def exports(self) -> Exports:
+        return read_exports(self._export_files)
+
+    @cached_property
+    def before_final_reconcile(self) -> dict[int, Export]:
+        """The exports that a final reconcile found, by agent; none if there was no such thing."""
+        runs = dict.fromkeys(path.parent.parent for path in self._export_files)
+        return read_exports(path for run in runs for path in export_paths(run / BEFORE_FINAL_RECONCILE)).by_agent
+
+    @cached_property
+    def traces(self) -> dict[int, Trace]:
+        """The trace of each agent, the lowest ID first."""
+        return self._read_traces[0]
+
+    def trace_lines(self, agent_id: int) -> Iterator[Line]:
+        """The handler runs of an agent's trace as they stand in it. Raises RunDirectoryError, where it is damaged."""
+        assert self.directory is not None
+        return read_lines(agents_directory(self.directory) / f"{agent_id}{SUFFIX}")
+
+    @cached_property
+    def large(self) -> bool:
+        """Whether the traces are so large together that nobody looks at all of them at once."""
+        return sum(path.stat().st_size for path in self._trace_files if path.is_file()) > LARGE_BYTES
+
+    @cached_property
+    def _trace_files(self) -> list[Path]:
+        paths = [path for directory in self._agents for path in directory.glob(f"*{SUFFIX}")]
+        return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+    @cached_property
+    def _read_traces(self) -> tuple[dict[int, Trace], list[str], list[str]]:
+        """The traces, and their problems and gaps."""
+        traces: dict[int, Trace] = {}
+        problems, gaps = [], []
+        skim = self._skim and self.large
+        for path in self._trace_files:
+            trace = read_trace(path, skim=skim)
+            if trace is None:
+                problems.append(f"{path}: not a trace; it is left out")
+                continue
+            agent_id = trace.header.agent_id
+            if agent_id in traces or (self.directory is not None and self.roster and agent_id not in self.roster):
+                problems.append(f"{path}: of an agent that is not of this run, or has a trace already; it is left out")
+                continue
+            recorded = self.record.agents.get(str(agent_id)) if self.record else None
+            if recorded is not None and recorded.trace_problem:
+                trace.problem = f"it ends early: {recorded.trace_problem}"
+            if trace.problem:
+                problems.append(f"{path}: {trace.problem}; what is before that is read")
+            elif trace.cut_off:
+                gaps.append(f"{path}: cut off in mid-line; what is before that is read")
+            if not all(map(in_time, trace.runs)):
+                gaps.append(f"{path}: handler runs without a possible time are left out of the timeline")
+            traces[agent_id] = trace
+        return dict(sorted(traces.items())), problems, gaps
+
+    # What was going on around them
+
+    def network(self, vehicles: Collection[int]) -> Connectivity:
+        """Who could reach whom among `vehicles`; nothing is known of exports that came without a run."""
+        return read_connectivity(self._in_directory(NETWORK_FILE), vehicles)
+
+    def tracks(self, vehicles: Collection[int]) -> Tracks:
+        """Where the vehicles were."""
+        return read_tracks(self._in_directory(TRACKS_FILE), vehicles)
+
+    def injected(self, model: type[Record]) -> Iterable[Record]:
+        """What a rogue node sent, each datagram as `model`."""
+        return JsonLines(self._in_directory(ROGUE_FILE), model)
+
+    # What is wrong
+
+    @property
+    def problems(self) -> list[str]:
+        """A sentence that names the file for each that cannot be used, or not wholly."""
+        record = [str(self.record_error)] if self.record_error else []
+        return [*record, *self._read_traces[1], *self.exports.errors]
+
+    @property
+    def gaps(self) -> list[str]:
+        """A sentence for each thing that a whole run leaves and that is not here, or cut off."""
+        return [*self._read_traces[2], *self._missing()]
+
+    def _missing(self) -> Iterator[str]:
+        if self.directory is None:
+            return
+        if not (self.directory / RUN_FILE).exists():
+            yield f"{RUN_FILE} is missing: scenario, verdict and figures are not known"
+        without = [agent_id for agent_id in self.roster if agent_id not in self.traces]
+        if without and not self.traces:
+            yield "no agent has left a trace: there is no timeline"
+        else:
+            yield from (f"agent {agent_id}: no trace, and so no lane in the timeline" for agent_id in without)
+        if not (self.directory / NETWORK_FILE).is_file():
+            yield f"{NETWORK_FILE} is missing: who could reach whom is not known"
+        flew = mapping(self.result, "vehicles") or listing(self.result, "scenario", "flight")
+        if flew and not (self.directory / TRACKS_FILE).is_file():
+            yield f"{TRACKS_FILE} is missing: where the vehicles were is not known"
+
+    def within(self, sentence: str) -> str:
+        """A sentence as it is said in the run directory: files by their names there."""
+        return sentence if self.directory is None else sentence.replace(f"{self.directory}{os.sep}", "")
+
+    def _in_directory(self, name: str) -> Path | None:
+        return None if self.directory is None else self.directory / name
