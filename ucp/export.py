@@ -1,35 +1,33 @@
 """The chain export, schema `ucp-chain-export/1`: everything that an agent holds, as a JSON document."""
 
 import base64
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ucp.block import Block
-
-if TYPE_CHECKING:
-    from ucp.agent import Agent
+from ucp.state import AgentState
 
 SCHEMA = "ucp-chain-export/1"
 
 
-def export_chain(agent: "Agent", exported_at_us: int) -> dict[str, Any]:
-    """The export of `agent`. Blocks of the chain are oldest first, of the deque front first, of the stack top last."""
-    inception = agent.chain.inception
+def export_chain(state: AgentState, exported_at_us: int) -> dict[str, Any]:
+    """An agent's export. Blocks of the chain are oldest first, of the deque front first, of the stack top last."""
+    inception = state.chain.inception
     return {
         "schema": SCHEMA,
-        "agent_id": agent.agent_id,
+        "agent_id": state.agent_id,
         "exported_at_us": exported_at_us,
         "inception": {
             "block_data": _base64(inception.block_data),
             "block_hash": inception.block_hash.hex(),
             "chain_hash": inception.chain_hash.hex(),
         },
-        "chain": [_block(block, chain_hash) for block, chain_hash in agent.chain.with_chain_hashes()],
-        "blocks_to_be_committed": [_block(block, None) for block in agent.blocks_to_be_committed],
-        "reconcile_stack": [_block(block, None) for block in agent.reconcile_stack],
-        "current_block": {"event_data": _base64(bytes(agent.current_block))},
-        "reconcile_in_progress": agent.reconcile_in_progress,
-        "idle": agent.idle,
-        "completed": [block_hash.hex() for block_hash in agent.completed],
+        "chain": [_block(block, chain_hash) for block, chain_hash in state.chain.with_chain_hashes()],
+        "blocks_to_be_committed": [_block(block, None) for block in state.blocks_to_be_committed],
+        "reconcile_stack": [_block(block, None) for block in state.reconcile_stack],
+        "current_block": {"event_data": _base64(bytes(state.current_block))},
+        "reconcile_in_progress": state.reconcile_in_progress,
+        "idle": state.idle,
+        "completed": [block_hash.hex() for block_hash in state.completed],
     }
 
 

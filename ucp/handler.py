@@ -1,31 +1,75 @@
-"""What an event handler is: one of Algorithms 1-20, and the branches that it can take."""
+"""What an event handler is: one of Algorithms 1-20, and all that it declares.
 
+A handler declares the branches that it can take, the messages that it may send, the timers that it may start and the
+local events that it may trigger. `ucp.core` holds it to that, and `ucp.diagram` draws the protocol from it.
+"""
+
+import re
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Concatenate, Generic, ParamSpec
+from dataclasses import dataclass, replace
+from typing import Generic, Literal, ParamSpec
 
-if TYPE_CHECKING:
-    from ucp.agent import Agent
+from ucp.messages import Message
 
 P = ParamSpec("P")
+
+LocalEvent = Literal[
+    "Build Data Block",
+    "Process Next Deque Block",
+    "Reconcile Begin",
+    "Reconcile Phase 1",
+    "Reconcile Phase 2",
+    "Reconcile Phase 3",
+    "Reconcile Finalize",
+]
+"""What happens inside an agent (Figure 3.3: the parallelograms), by its name in the thesis."""
 
 
 @dataclass(frozen=True, eq=False)
 class EventHandler(Generic[P]):
-    """A handler changes the agent, tells it what to send and trigger, and returns the branch that it took."""
+    """`run` is given the agent's core, then its input; it returns the branch that it took."""
 
     name: str
-    run: "Callable[Concatenate[Agent, P], str]"
+    run: Callable[P, str]
     algorithm: int
     branches: tuple[str, ...]
+    sends: tuple[type[Message], ...]
+    starts: tuple[str, ...]
+    triggers: tuple[LocalEvent, ...]
+
+    @property
+    def title(self) -> str:
+        """Number and name of the algorithm, as a good handler's docstring begins."""
+        algorithm = re.match(rf"Algorithm ({self.algorithm}), (\w[\w ]+\w)", self.run.__doc__ or "")
+        assert algorithm, f"{self.name} says which algorithm it is"
+        return " ".join(algorithm.groups())
 
 
 def event_handler(
-    algorithm: int, *branches: str
-) -> "Callable[[Callable[Concatenate[Agent, P], str]], EventHandler[P]]":
-    """Declare a function to be the handler of Algorithm `algorithm`, and the only branches that it returns."""
+    algorithm: int,
+    *branches: str,
+    sends: tuple[type[Message], ...] = (),
+    starts: tuple[str, ...] = (),
+    triggers: tuple[LocalEvent, ...] = (),
+) -> Callable[[Callable[P, str]], EventHandler[P]]:
+    """Declare a function to be the handler of Algorithm `algorithm`, and the most that it does.
 
-    def declare(run: "Callable[Concatenate[Agent, P], str]") -> EventHandler[P]:
-        return EventHandler(run.__name__, run, algorithm, branches)
+    `branches` are those that it returns; `starts` names timers.
+    """
+
+    def declare(run: Callable[P, str]) -> EventHandler[P]:
+        return EventHandler(run.__name__, run, algorithm, branches, sends, starts, triggers)
+
+    return declare
+
+
+def in_place_of(good: EventHandler[P], *branches: str) -> Callable[[Callable[P, str]], EventHandler[P]]:
+    """Declare a function to be a wrong handler that an agent can be given in the place of the `good` one.
+
+    It may do what that may, and returns `branches` besides.
+    """
+
+    def declare(run: Callable[P, str]) -> EventHandler[P]:
+        return replace(good, run=run, branches=good.branches + branches)
 
     return declare

@@ -7,7 +7,7 @@ the handlers then do nothing, as Algorithms 1-20 say.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ucp.messages import (
     BlockAddRequest,
@@ -22,10 +22,7 @@ from ucp.messages import (
     RequestForBlock,
 )
 from ucp.settings import Settings
-
-if TYPE_CHECKING:
-    from ucp.agent import Agent
-
+from ucp.state import AgentState
 
 Question = tuple[type[Message], bytes]
 """What an agent wants to hear: answers of this type about this block or chain, or both.
@@ -57,41 +54,41 @@ ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
 }
 """Message -> the question that it answers, so that it is nothing to those who have not asked it."""
 
-STILL_ASKED: dict[type[Message], Callable[["Agent"], bool]] = {
-    BlockAddResponse: lambda agent: agent.voting_timer.active,
-    ChainContainResponse: lambda agent: agent.phase_one_timer.active,
-    NextInSequenceResponse: lambda agent: agent.phase_two_timer.active,
-    BlockResponse: lambda agent: agent.phase_three_timer.active,
+STILL_ASKED: dict[type[Message], Callable[[AgentState], bool]] = {
+    BlockAddResponse: lambda state: state.voting_timer.active,
+    ChainContainResponse: lambda state: state.phase_one_timer.active,
+    NextInSequenceResponse: lambda state: state.phase_two_timer.active,
+    BlockResponse: lambda state: state.phase_three_timer.active,
 }
 """Answer -> whether the agent still waits for any of its type."""
 
-MATTERS: dict[type[Message], Callable[["Agent", int, Any], bool]] = {
-    BlockAddRequest: lambda agent, sender, message: not agent.reconcile_in_progress,
-    BlockAddResponse: lambda agent, sender, message: (
-        agent.voting_timer.active
-        and sender not in agent.voters
-        and agent.candidate_block is not None
-        and agent.candidate_block.block_hash == message.block_hash
-        and (not agent.settings.vote_names_chain or agent.top_chain_hash_at_initiation == message.chain_hash)
+MATTERS: dict[type[Message], Callable[[AgentState, int, Any], bool]] = {
+    BlockAddRequest: lambda state, sender, message: not state.reconcile_in_progress,
+    BlockAddResponse: lambda state, sender, message: (
+        state.voting_timer.active
+        and sender not in state.voters
+        and state.candidate_block is not None
+        and state.candidate_block.block_hash == message.block_hash
+        and (not state.settings.vote_names_chain or state.top_chain_hash_at_initiation == message.chain_hash)
     ),
-    CommitBlock: lambda agent, sender, message: not agent.reconcile_in_progress,
-    ChainContainQuery: lambda agent, sender, message: not agent.reconcile_in_progress,
-    ChainContainResponse: lambda agent, sender, message: (
-        agent.phase_one_timer.active
-        and sender not in agent.reconcile_responders
-        and message.chain_hash == agent.chain.top_chain_hash
+    CommitBlock: lambda state, sender, message: not state.reconcile_in_progress,
+    ChainContainQuery: lambda state, sender, message: not state.reconcile_in_progress,
+    ChainContainResponse: lambda state, sender, message: (
+        state.phase_one_timer.active
+        and sender not in state.reconcile_responders
+        and message.chain_hash == state.chain.top_chain_hash
     ),
-    ChainHashSuccessorQuery: lambda agent, sender, message: not agent.reconcile_in_progress,
-    NextInSequenceResponse: lambda agent, sender, message: (
-        agent.phase_two_timer.active
-        and sender not in agent.reconcile_responders
-        and message.chain_hash == agent.chain.top_chain_hash
+    ChainHashSuccessorQuery: lambda state, sender, message: not state.reconcile_in_progress,
+    NextInSequenceResponse: lambda state, sender, message: (
+        state.phase_two_timer.active
+        and sender not in state.reconcile_responders
+        and message.chain_hash == state.chain.top_chain_hash
     ),
-    RequestForBlock: lambda agent, sender, message: (
-        not agent.reconcile_in_progress and message.block_hash in agent.chain
+    RequestForBlock: lambda state, sender, message: (
+        not state.reconcile_in_progress and message.block_hash in state.chain
     ),
-    BlockResponse: lambda agent, sender, message: (
-        agent.phase_three_timer.active and message.block.block_hash == agent.majority_response_block_hash
+    BlockResponse: lambda state, sender, message: (
+        state.phase_three_timer.active and message.block.block_hash == state.majority_response_block_hash
     ),
 }
-"""(agent, sender, message) -> whether the handler could change the agent, or make it send anything."""
+"""(state of an agent, sender, message) -> whether the handler could change the agent, or make it send anything."""

@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 from ucp.block import MAX_AGENT_ID
 from ucp.events import MEAN_TIME_BETWEEN_EVENTS_S
-from ucp.settings import Quirks, Settings
+from ucp.quirks import Quirks
+from ucp.settings import Settings
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
 SCHEMA = "ucp-mission/1"

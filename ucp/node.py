@@ -43,8 +43,14 @@ class Node:
     def __init__(self, mission: Mission, directory: Path) -> None:
         self.mission = mission
         self.clock = MissionClock(mission.speedup)
-        self.agent = Agent(mission.agent_id, mission.roster, mission.initial_data, mission.settings, seed=mission.seed)
-        self.agent.quirks = mission.quirks
+        self._lots = Random(mission.seed)  # of what is random about its quirks
+        self.agent = Agent(
+            mission.agent_id,
+            mission.roster,
+            mission.initial_data,
+            mission.settings,
+            handlers=mission.quirks.handlers(self._lots),
+        )
         self.generating = False
         self.handled = 0
         self.bytes_sent = 0
@@ -52,7 +58,7 @@ class Node:
         self._born_s = 0.0  # mission seconds at which the agent joined a mission that was under way
         self._directory = directory
         self._trace = TraceFile(directory / f"{mission.agent_id}.trace.jsonl")
-        self._store = Store(directory / mission.store, self.agent) if mission.store else None
+        self._store = Store(directory / mission.store, self.agent.state) if mission.store else None
         self._socket = _broadcast_socket(mission)
         self._timer: asyncio.TimerHandle | None = None
         self._source: asyncio.Task[None] | None = None
@@ -100,7 +106,7 @@ class Node:
         """Write the chain export whole or not at all. Raises OSError."""
         path = self._directory / f"{self.mission.agent_id}.chain.json"
         now = self.clock.now()
-        write_json_atomically(path, export_chain(self.agent, self.clock.timestamp_us(now)))
+        write_json_atomically(path, export_chain(self.agent.state, self.clock.timestamp_us(now)))
         return path
 
     # Inputs of the agent
@@ -178,7 +184,7 @@ class Node:
         )
         if self._store is not None and self._store.found is not None:
             self._drive(partial(self.agent.boot, self._store.found))
-            log.info("went on from a store of %d blocks", len(self.agent.chain))
+            log.info("went on from a store of %d blocks", len(self.agent.state.chain))
         if self.mission.events.source != "none":
             self.generating = True
             source = self._random_events if self.mission.events.source == "random" else self._vehicle_events
@@ -216,22 +222,22 @@ class Node:
     # Commands of the control socket
 
     def _status(self, request: dict[str, Any]) -> dict[str, Any]:
-        agent = self.agent
+        agent, state = self.agent, self.agent.state
         return {
             "agent_id": agent.agent_id,
             "started": self.clock.running,
             "mission_s": round(self.clock.now(), 3),
             "generating": self.generating,
-            "idle": agent.idle,
-            "reconcile_in_progress": agent.reconcile_in_progress,
-            "chain": len(agent.chain),
-            "deque": len(agent.blocks_to_be_committed),
-            "stack": len(agent.reconcile_stack),
-            "top_chain_hash": agent.chain.top_chain_hash.hex(),
-            "completed": len(agent.completed),
-            "reconciles": agent.reconciles,
+            "idle": state.idle,
+            "reconcile_in_progress": state.reconcile_in_progress,
+            "chain": len(state.chain),
+            "deque": len(state.blocks_to_be_committed),
+            "stack": len(state.reconcile_stack),
+            "top_chain_hash": state.chain.top_chain_hash.hex(),
+            "completed": len(state.completed),
+            "reconciles": state.reconciles,
             "handled": self.handled,
-            "sent": dict(agent.sent),
+            "sent": dict(state.sent),
             "received": dict(agent.received),
             "dropped": dict(agent.dropped),
             "bytes_sent": self.bytes_sent,
@@ -261,10 +267,11 @@ class Node:
 
     def _quirk(self, request: dict[str, Any]) -> dict[str, Any]:
         try:
-            self.agent.quirks.set(str(request.get("name")), request.get("value"))
+            self.mission.quirks.set(str(request.get("name")), request.get("value"))
         except ValueError as error:
             raise CommandError(str(error)) from None
-        return dataclasses.asdict(self.agent.quirks)
+        self.agent.replace_handlers(self.mission.quirks.handlers(self._lots))
+        return dataclasses.asdict(self.mission.quirks)
 
     def _reconcile(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.clock.running:

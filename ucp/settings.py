@@ -1,8 +1,7 @@
-"""What an agent can be told: timers, sizes, the readings of an ambiguous thesis, and the field test's bugs."""
+"""What an agent can be told: timers, sizes, and the readings of an ambiguous thesis."""
 
-import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Literal, get_args, get_type_hints
 
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MAX_EVENT_BYTES
@@ -45,29 +44,3 @@ class Settings:
             allowed = get_args(get_type_hints(Settings)[name])
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {getattr(self, name)!r}")
-
-
-@dataclass(slots=True)
-class Quirks:
-    """Faults that an agent can be told to have while it runs."""
-
-    ignore_commit: float = 0.0
-    """Probability 0..1 that Algorithm 6 ignores a Commit Block (Section 4.2's second stage of testing)."""
-    crash_on_tie: bool = False
-    """Algorithm 15 dies on a tied vote and the reconcile never ends (Section 4.3, second field test)."""
-    early_phase3_expiry: bool = False
-    """The phase 3 timer ends as it starts, so no block ever comes in time (Section 4.3, agents 118 and 120)."""
-    stale_chain_hash: bool = False
-    """Algorithm 18 commits the block without computing the chain hash anew (Section 4.2, the field tests' last bug)."""
-
-    def set(self, name: str, value: Any) -> None:
-        """Set one quirk by name. ValueError says which names there are and what the value may be."""
-        known = [field.name for field in dataclasses.fields(self)]
-        if name not in known:
-            raise ValueError(f"unknown quirk {name!r}: there are {', '.join(known)}")
-        if name == "ignore_commit":
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
-                raise ValueError(f"ignore_commit is a probability 0..1, not {value!r}")
-        elif not isinstance(value, bool):
-            raise ValueError(f"{name} is true or false, not {value!r}")
-        setattr(self, name, value)

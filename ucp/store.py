@@ -18,12 +18,10 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 from ucp.block import Block
-
-if TYPE_CHECKING:
-    from ucp.agent import Agent
+from ucp.state import AgentState
 
 SCHEMA = "ucp-store/1"
 
@@ -48,9 +46,9 @@ class Holdings:
     stack: list[Block] = field(default_factory=list)
 
     @classmethod
-    def of(cls, agent: "Agent") -> "Holdings":
+    def of(cls, state: AgentState) -> "Holdings":
         return cls(
-            list(agent.completed), list(agent.chain), list(agent.blocks_to_be_committed), list(agent.reconcile_stack)
+            list(state.completed), list(state.chain), list(state.blocks_to_be_committed), list(state.reconcile_stack)
         )
 
     def blocks(self) -> Iterator[Block]:
@@ -86,20 +84,20 @@ class Holdings:
 
 
 class Store:
-    """The store of `agent` in the file `path`. Raises OSError, or StoreError for a file that is not this agent's store.
+    """An agent's store in the file `path`. Raises OSError, or StoreError for a file that is not this agent's store.
 
-    `found` is what an earlier life left; None if there was none.
+    `state` is the agent's, now and as it goes on. `found` is what an earlier life left; None if there was none.
     """
 
-    def __init__(self, path: Path, agent: "Agent") -> None:
+    def __init__(self, path: Path, state: AgentState) -> None:
         self.problem: str | None = None
         """Why the store ends early, once the disk refuses it."""
         self._path = path
-        self._agent = agent
+        self._state = state
         self._header = {
             "schema": SCHEMA,
-            "agent_id": agent.agent_id,
-            "inception": agent.chain.inception.block_hash.hex(),
+            "agent_id": state.agent_id,
+            "inception": state.chain.inception.block_hash.hex(),
         }
         self._written: set[str] = set()
         self._file: BinaryIO | None = None
@@ -156,11 +154,11 @@ class Store:
         return file
 
     def _block(self, block_hash: str) -> Block:
-        agent = self._agent
-        held = agent.chain.get(bytes.fromhex(block_hash))
+        state = self._state
+        held = state.chain.get(bytes.fromhex(block_hash))
         if held is not None:
             return held
-        aside = (*agent.blocks_to_be_committed, *agent.reconcile_stack)
+        aside = (*state.blocks_to_be_committed, *state.reconcile_stack)
         return next(block for block in aside if block.block_hash.hex() == block_hash)
 
     def close(self) -> None:

@@ -16,9 +16,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from harness.errors import ExportError, RunDirectoryError
-from ucp.agent import Agent
 from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
 from ucp.export import SCHEMA
+from ucp.state import AgentState
 
 RUN_FILE = "run.json"
 SUFFIX = ".chain.json"
@@ -120,25 +120,25 @@ class ExportMaker:
         self._blocks: dict[tuple[bytes, bytes | None], ExportedBlock] = {}
         self._event_data: dict[bytes, str] = {}
 
-    def export(self, agent: Agent, exported_at_us: int) -> Export:
-        """What `read_export` would read of a file with `ucp.export.export_chain(agent, exported_at_us)`."""
-        inception = agent.chain.inception
+    def export(self, state: AgentState, exported_at_us: int) -> Export:
+        """What `read_export` would read of a file with `ucp.export.export_chain(state, exported_at_us)`."""
+        inception = state.chain.inception
         return Export.model_construct(
             schema_=SCHEMA,
-            agent_id=agent.agent_id,
+            agent_id=state.agent_id,
             exported_at_us=exported_at_us,
             inception=ExportedInception.model_construct(
                 block_data=_base64(inception.block_data),
                 block_hash=inception.block_hash.hex(),
                 chain_hash=inception.chain_hash.hex(),
             ),
-            chain=[self._block(block, chain_hash) for block, chain_hash in agent.chain.with_chain_hashes()],
-            blocks_to_be_committed=[self._block(block, None) for block in agent.blocks_to_be_committed],
-            reconcile_stack=[self._block(block, None) for block in agent.reconcile_stack],
-            current_block=CurrentBlock.model_construct(event_data=_base64(bytes(agent.current_block))),
-            reconcile_in_progress=agent.reconcile_in_progress,
-            idle=agent.idle,
-            completed=[block_hash.hex() for block_hash in agent.completed],
+            chain=[self._block(block, chain_hash) for block, chain_hash in state.chain.with_chain_hashes()],
+            blocks_to_be_committed=[self._block(block, None) for block in state.blocks_to_be_committed],
+            reconcile_stack=[self._block(block, None) for block in state.reconcile_stack],
+            current_block=CurrentBlock.model_construct(event_data=_base64(bytes(state.current_block))),
+            reconcile_in_progress=state.reconcile_in_progress,
+            idle=state.idle,
+            completed=[block_hash.hex() for block_hash in state.completed],
         )
 
     def _block(self, block: Block, chain_hash: bytes | None) -> ExportedBlock:

@@ -7,14 +7,14 @@ when its own timer does. Only traces can tell.
 from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
 from harness.checker.waiting import waited_too_long
-from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER, TRIGGERED_LOCALLY
+from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
 from ucp.trace import HandlerRun
 
 NAME = "distributed"
 
 _OF_MESSAGE = {message.NAME: handler.name for message, handler in ON_MESSAGE.items()}
 _OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
-_LOCAL = {handler.name for handler in TRIGGERED_LOCALLY}
+_LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 
 
 def check(evidence: Evidence) -> Characteristic:

@@ -106,14 +106,14 @@ def _snapshot(simulation: Simulation) -> Snapshot:
 
 
 def _status(life: Life) -> Status:
-    agent = life.agent
+    state = life.agent.state
     return Status.model_construct(
-        idle=agent.idle,
-        reconcile_in_progress=agent.reconcile_in_progress,
-        chain=len(agent.chain),
-        deque=len(agent.blocks_to_be_committed),
-        completed=len(agent.completed),
-        reconciles=agent.reconciles,
+        idle=state.idle,
+        reconcile_in_progress=state.reconcile_in_progress,
+        chain=len(state.chain),
+        deque=len(state.blocks_to_be_committed),
+        completed=len(state.completed),
+        reconciles=state.reconciles,
     )
 
 
@@ -180,7 +180,7 @@ class InMemory:
 
     def _exports(self, simulation: Simulation) -> dict[int, Export]:
         return {
-            life.agent.agent_id: self._maker.export(life.agent, simulation.timestamp_us(life))
+            life.agent.agent_id: self._maker.export(life.agent.state, simulation.timestamp_us(life))
             for life in simulation.living()
         }
 
@@ -223,7 +223,7 @@ class OnDisk:
         """Raises OSError."""
         for life in simulation.living():
             path = self._rundir.agents / f"{life.agent.agent_id}.chain.json"
-            write_json_atomically(path, export_chain(life.agent, simulation.timestamp_us(life)))
+            write_json_atomically(path, export_chain(life.agent.state, simulation.timestamp_us(life)))
 
     def problems(self) -> dict[int, str]:
         """Why the trace of which agent ends early."""
@@ -241,6 +241,6 @@ def _header(life: Life) -> dict[str, Any]:
     return {
         "agent_id": agent.agent_id,
         "roster": sorted(agent.roster),
-        "settings": dataclasses.asdict(agent.settings),
+        "settings": dataclasses.asdict(agent.state.settings),
         "clock": clock,
     }

@@ -20,7 +20,8 @@ from harness.scenario.vehicles import Vehicles
 from netem.errors import ConditionsError
 from sitl.plan import PlanError
 from ucp.block import MAX_AGENT_ID
-from ucp.settings import Quirks, Settings
+from ucp.quirks import Quirks
+from ucp.settings import Settings
 
 
 class Settle(Model):

@@ -31,7 +31,7 @@ def write_exports(air: Air, directory: Path, traces: bool = True) -> list[Path]:
     paths = []
     for agent_id, agent in air.agents.items():
         paths.append(directory / f"{agent_id}.chain.json")
-        paths[-1].write_text(json.dumps(export_chain(agent, round(air.now * 1e6))))
+        paths[-1].write_text(json.dumps(export_chain(agent.state, round(air.now * 1e6))))
         if traces:
             header = header_line(
                 agent_id, sorted(agent.roster), {"vote_timeout_s": 10.0}, {"epoch_us": 0, "speedup": 1.0}

@@ -67,7 +67,7 @@ def run_dir(flown: Air, tmp_path: Path) -> Path:
 
 
 def first_position(air: Air, agent_id: int) -> Position:
-    ours = next(block for block in air.agents[1].chain if block.agent_id == agent_id)
+    ours = next(block for block in air.agents[1].state.chain if block.agent_id == agent_id)
     return Position.unpack(next(e.data for e in decode_events(ours.event_data) if e.event_id == POSITION))
 
 
@@ -78,7 +78,7 @@ def test_each_agent_s_chain_is_printed_block_by_block(flown: Air, run_dir: Path)
     done = harness("chain", run_dir)
     assert (done.returncode, done.stderr) == (0, "")
     printed = done.stdout.splitlines()
-    chain = flown.agents[1].chain
+    chain = flown.agents[1].state.chain
     heads = [line for line in printed if not line.startswith(" ")]
     assert heads == [
         f"agent {agent_id}: a chain of {len(chain)} blocks, top {chain.top_chain_hash.hex()[:12]}"
@@ -98,8 +98,8 @@ def test_decoded_each_event_is_a_line_in_words(flown: Air, run_dir: Path) -> Non
     done = harness("chain", run_dir, "--decode", "--agent", "2")
     assert done.returncode == 0
     assert "agent 1:" not in done.stdout
-    events = sum(len(decode_events(block.event_data)) for block in flown.agents[2].chain)
-    assert len(done.stdout.splitlines()) == 1 + len(flown.agents[2].chain) + events
+    events = sum(len(decode_events(block.event_data)) for block in flown.agents[2].state.chain)
+    assert len(done.stdout.splitlines()) == 1 + len(flown.agents[2].state.chain) + events
     assert "    2026-11-21 10:51:48.000 UTC  [30.0 s] reached mission item 0\n" in done.stdout
     assert "] info: <EKF> & ?[31mGPS\n" in done.stdout
     assert "\x1b" not in done.stdout
@@ -179,8 +179,8 @@ def test_as_json_the_chains_are_whole(flown: Air, run_dir: Path) -> None:
     assert plain["source"] == "mavlink"
     assert plain["errors"] == []
     told = plain["agents"]["3"]["chain"]
-    assert [block["block_hash"] for block in told] == [block.block_hash.hex() for block in flown.agents[3].chain]
-    for block, ours in zip(told, flown.agents[3].chain, strict=True):
+    assert [block["block_hash"] for block in told] == [block.block_hash.hex() for block in flown.agents[3].state.chain]
+    for block, ours in zip(told, flown.agents[3].state.chain, strict=True):
         events = [LoggableEvent(e["timestamp_us"], e["event_id"], bytes.fromhex(e["data"])) for e in block["events"]]
         assert events == decode_events(ours.event_data)
     assert "words" not in told[0]["events"][0]
@@ -298,7 +298,7 @@ def fixes(book: Logbook) -> list[list[tuple[int, bytes]]]:
 
 def logbook_of(air: Air) -> Logbook:
     maker = ExportMaker()
-    exports = {agent_id: maker.export(agent, 0) for agent_id, agent in air.agents.items()}
+    exports = {agent_id: maker.export(agent.state, 0) for agent_id, agent in air.agents.items()}
     return Logbook(exports, {})
 
 
@@ -342,7 +342,7 @@ def test_geojson_has_a_line_for_each_vehicle_and_a_point_for_each_event(
     assert at[1] == pytest.approx(50.0)  # longitude comes first
     positions = sum(len(one["geometry"]["coordinates"]) for one in tracks_drawn)
     assert done.stdout == f"{positions} positions of 3 vehicles: {file}\n"
-    blocks = flown.agents[1].chain
+    blocks = flown.agents[1].state.chain
     assert len(features) - 3 == sum(len(decode_events(block.event_data)) for block in blocks)
 
 

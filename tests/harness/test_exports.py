@@ -30,8 +30,8 @@ def test_what_an_agent_exports_is_read_back(air: Air, paths: list[Path]) -> None
     assert list(exports.by_agent) == [1, 2, 3]
     for agent_id, export in exports.by_agent.items():
         agent = air.agents[agent_id]
-        assert export.top_chain_hash == agent.chain.top_chain_hash.hex()
-        assert [block.event_bytes for block in export.chain] == [block.event_data for block in agent.chain]
+        assert export.top_chain_hash == agent.state.chain.top_chain_hash.hex()
+        assert [block.event_bytes for block in export.chain] == [block.event_data for block in agent.state.chain]
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_fields_that_this_version_does_not_know_are_ignored(paths: list[Path]) -
 
 def test_an_export_of_another_mission_is_left_out(paths: list[Path], tmp_path: Path) -> None:
     other = Air([1, 2, 3, 4])
-    other.agents[4].chain.__init__(type(other.agents[4].chain.inception)(b"another mission"))
+    other.agents[4].state.chain.__init__(type(other.agents[4].state.chain.inception)(b"another mission"))
     stranger = write_exports(other, tmp_path / "other", traces=False)[3]
     exports = read_exports([stranger, *paths])
     assert list(exports.by_agent) == [1, 2, 3]

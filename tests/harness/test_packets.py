@@ -324,7 +324,7 @@ def test_the_story_of_a_block_has_all_that_is_about_it(flown: tuple[Air, Capture
     air, _ = flown
     found = join(read(run_dir))
     names = Names(found, runs_of([run_dir]))
-    block_hash = air.agents[3].completed[1]
+    block_hash = air.agents[3].state.completed[1]
     assert names.find("3.2") == names.find(block_hash.hex()[:10]) == block_hash
     chapters = list(story(block_hash, found, Exchanges(found)))
     told = [one.number for chapter in chapters for one in (chapter.begins, *chapter.answers)]

@@ -43,10 +43,10 @@ class Air:
     def fill_block(self, agent_id: int) -> bytes:
         """Log events until a block is complete; its hash."""
         agent = self.agents[agent_id]
-        count = len(agent.completed)
-        while len(agent.completed) == count:
+        count = len(agent.state.completed)
+        while len(agent.state.completed) == count:
             self.log(agent_id)
-        return agent.completed[-1]
+        return agent.state.completed[-1]
 
     def reconcile(self, agent_id: int) -> None:
         """Have the agent reconcile, and wait until all are done."""
@@ -108,7 +108,7 @@ class Air:
             assert self.now < limit, "the agents did not become idle"
 
     def chains(self) -> list[tuple[bytes, ...]]:
-        return [tuple(block.block_hash for block in agent.chain) for agent in self.agents.values()]
+        return [tuple(block.block_hash for block in agent.state.chain) for agent in self.agents.values()]
 
     def branches(self, agent_id: int, handler: str) -> list[str]:
         return [run.branch for run in self.runs[agent_id] if run.handler == handler]
@@ -123,11 +123,11 @@ def uniform_latency(rng: Random, low_s: float = 0.002, high_s: float = 0.05, los
 
 def assert_characteristics_2_to_4(agent: Agent, completed_by: dict[int, set[bytes]]) -> None:
     """Characteristics 2, 3 and 4 of one agent, from its state."""
-    chain = [block.block_hash for block in agent.chain]
-    aside = [block.block_hash for block in (*agent.blocks_to_be_committed, *agent.reconcile_stack)]
-    if agent.idle:
+    chain = [block.block_hash for block in agent.state.chain]
+    aside = [block.block_hash for block in (*agent.state.blocks_to_be_committed, *agent.state.reconcile_stack)]
+    if agent.state.idle:
         assert not aside, "idle with blocks that are not committed"
-        assert set(agent.completed) <= set(chain), "idle, and a completed block is not in the chain"
+        assert set(agent.state.completed) <= set(chain), "idle, and a completed block is not in the chain"
     assert len(set(chain + aside)) == len(chain + aside), "two copies of a block"
-    for block in (*agent.chain, *agent.blocks_to_be_committed, *agent.reconcile_stack):
+    for block in (*agent.state.chain, *agent.state.blocks_to_be_committed, *agent.state.reconcile_stack):
         assert block.block_hash in completed_by[block.agent_id], "a block that its agent never completed"

@@ -4,12 +4,12 @@ A test names the branches that it is about, `@takes("vote_timer_expiration", "ap
 if no agent takes them while it runs (`conftest.py`). `test_branches.py` fails while a branch has no such test.
 """
 
-import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
+from random import Random
 from types import ModuleType
 from typing import Any
 
@@ -18,6 +18,7 @@ import pytest
 import ucp
 from ucp.agent import HANDLERS
 from ucp.handler import EventHandler
+from ucp.quirks import Quirks
 
 Branch = tuple[str, str]
 """(handler, branch)"""
@@ -33,8 +34,18 @@ A test that does not take its branches fails, and a branch without a test fails 
 
 This page is written by `python -m tests.ucp.branches`.
 
+"""
+
+TABLE = """\
 | Algorithm | handler | branch | when | tests |
 |---|---|---|---|---|
+"""
+
+OF_WRONG_AGENTS = """
+## Of wrong agents
+
+An agent with [quirks](quirks.py) has wrong handlers in the place of some of these, which take branches of their own.
+
 """
 
 WHEN: dict[str, dict[str, str]] = {
@@ -69,7 +80,6 @@ WHEN: dict[str, dict[str, str]] = {
     },
     "receive_commit_block": {
         "reconcile in progress": "the agent reconciles",
-        "ignored by quirk": "the quirk `ignore_commit` strikes",
         "does not succeed": "the block does not go on top of the agent's chain",
         "held already": "it does, but the agent holds it already",
         "committed": "it goes on top of the agent's chain",
@@ -117,7 +127,6 @@ WHEN: dict[str, dict[str, str]] = {
         "block": "most name one and the same block",
         "tie: top of chain": "a tie, and the oldest answer is that the chain ends here",
         "tie: block": "a tie, and the oldest answer is a block (`phase2_tie: block`: some answer is)",
-        "tie: crashed by quirk": "a tie, and the quirk `crash_on_tie` is on",
     },
     "reconcile_phase_3": {
         "from the stack": "the block is on the reconcile stack",
@@ -140,6 +149,15 @@ WHEN: dict[str, dict[str, str]] = {
         "done": "the stack is empty",
     },
 }
+
+
+WHEN_WRONG: dict[str, dict[str, str]] = {
+    "receive_commit_block": {"ignored by quirk": "the quirk `ignore_commit` strikes"},
+    "reconcile_phase_2_timer_expiration": {"tie: crashed by quirk": "a tie, and the quirk `crash_on_tie` is on"},
+}
+"""When the handlers of wrong agents take their branches that the good ones do not have."""
+
+WRONG = list(Quirks(1.0, True, True, True).handlers(Random(0)))
 
 
 def takes(handler: str, *branches: str) -> pytest.MarkDecorator:
@@ -170,7 +188,8 @@ def recorded() -> Iterator[set[Branch]]:
         return record
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EventHandler, "run", property(recording), raising=False)  # goes before the instance's `run`
+        run = property(recording, lambda handler, run: vars(handler).update(run=run))
+        patch.setattr(EventHandler, "run", run, raising=False)  # goes before the instance's `run`
         yield taken
 
 
@@ -202,19 +221,22 @@ def _marks_of(test: object) -> Iterator[pytest.Mark | pytest.MarkDecorator]:
                 yield from getattr(case, "marks", ())
 
 
+def branches_of(handlers: Iterable[EventHandler[Any]]) -> list[Branch]:
+    return [(handler.name, branch) for handler in handlers for branch in handler.branches]
+
+
 def page() -> str:
     tests = taken_by()
-    rows = []
-    for handler in HANDLERS.values():
-        algorithm = re.match(r"Algorithm (\d+), (\w[\w ]+\w)", handler.run.__doc__ or "")
-        assert algorithm, f"{handler.name} says which algorithm it is"
-        title, name = " ".join(algorithm.groups()), f"`{handler.name}`"
-        for branch in handler.branches:
-            when = WHEN[handler.name][branch]
-            named = "<br>".join(f"`{test}`" for test in tests.get((handler.name, branch), ()))
-            rows.append(f"| {title} | {name} | {branch} | {when} | {named} |\n")
-            title = name = ""
-    return INTRODUCTION + "".join(rows)
+
+    def rows(when: dict[str, dict[str, str]]) -> Iterator[str]:
+        for name, branches in when.items():
+            cells = f"{HANDLERS[name].title} | `{name}`"
+            for branch, reason in branches.items():
+                named = "<br>".join(f"`{test}`" for test in tests.get((name, branch), ()))
+                yield f"| {cells} | {branch} | {reason} | {named} |\n"
+                cells = " | "
+
+    return INTRODUCTION + TABLE + "".join(rows(WHEN)) + OF_WRONG_AGENTS + TABLE + "".join(rows(WHEN_WRONG))
 
 
 if __name__ == "__main__":

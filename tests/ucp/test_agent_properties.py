@@ -11,13 +11,14 @@ from tests.ucp.test_messages import messages
 from ucp.agent import HANDLERS, Agent
 from ucp.block import Block, next_chain_hash
 from ucp.messages import CommitBlock, Message, decode, encode
+from ucp.quirks import Quirks
+from ucp.store import Holdings
 
 
 def state_of(agent: Agent) -> bytes:
     """Everything but the counters of what was received and dropped."""
-    state = {name: value for name, value in vars(agent).items() if name not in ("dropped", "received", "now")}
-    state = {name: value.__dict__ if name == "chain" else value for name, value in state.items()}
-    return pickle.dumps({name: value for name, value in state.items() if name != "_timers"})
+    state = {name: value for name, value in vars(agent.state).items() if name not in ("now", "running")}
+    return pickle.dumps({**state, "chain": vars(agent.state.chain), "trace": vars(agent)["_trace"]})
 
 
 hostile = st.one_of(
@@ -58,10 +59,10 @@ def test_hostile_input_is_counted_and_dropped_and_changes_nothing(datagrams: lis
 def test_a_block_of_an_agent_that_is_not_on_the_roster_is_dropped() -> None:
     agent = Agent(1, [1, 2], b"")
     block = Block(3, 1, b"x")
-    commit = CommitBlock(block, next_chain_hash(agent.chain.top_chain_hash, block.block_hash))
+    commit = CommitBlock(block, next_chain_hash(agent.state.chain.top_chain_hash, block.block_hash))
     agent.receive_datagram(encode(2, 0, commit), 0.0)
     assert agent.dropped == {"block not of the roster": 1}
-    assert len(agent.chain) == 0
+    assert len(agent.state.chain) == 0
 
 
 @given(st.lists(messages, max_size=30), st.integers(0, 3))
@@ -73,9 +74,9 @@ def test_well_formed_messages_of_a_liar_never_break_characteristics_2_and_3(lies
         agent = air.agents[1]
         agent.receive_message(2 + number % 60, number, lie, air.now)
         air.run_until(air.now + 3)
-        held = [block.block_hash for block in (*agent.chain, *agent.blocks_to_be_committed, *agent.reconcile_stack)]
+        held = [block.block_hash for block in Holdings.of(agent.state).blocks()]
         assert len(held) == len(set(held))
-        assert not agent.idle or set(agent.completed) <= {block.block_hash for block in agent.chain}
+        assert not agent.state.idle or set(agent.state.completed) <= {block.block_hash for block in agent.state.chain}
 
 
 @settings(max_examples=120)
@@ -99,14 +100,14 @@ def test_characteristics_2_to_4_hold_after_every_step(
 
     air = Air(range(1, agents + 1), fate)
     for agent in air.agents.values():
-        agent.quirks.set("ignore_commit", quirk)
+        agent.replace_handlers(Quirks(ignore_commit=quirk).handlers(Random(0)))
     air.generate_events(seed, mean_s)
     for _ in range(400):
         if air.now > 150:
             air.stop_events()
         if not air.step():
             break
-        completed_by = {agent_id: set(agent.completed) for agent_id, agent in air.agents.items()}
+        completed_by = {agent_id: set(agent.state.completed) for agent_id, agent in air.agents.items()}
         for agent in air.agents.values():
             assert_characteristics_2_to_4(agent, completed_by)
 
@@ -136,4 +137,4 @@ def test_equal_inputs_give_equal_outputs_and_traces_replay_to_the_state(loss: fl
             assert {name: len(hashes) for name, hashes in held.items()} == {
                 name: getattr(handler_run.state, name) for name in held
             }
-        assert held["chain"] == [block.block_hash.hex() for block in agent.chain]
+        assert held["chain"] == [block.block_hash.hex() for block in agent.state.chain]

@@ -9,6 +9,7 @@ from tests.ucp.branches import takes
 from ucp.block import Block, next_chain_hash
 from ucp.events import LoggableEvent, decode_events
 from ucp.messages import BlockAddRequest, BlockAddResponse, CommitBlock, Message
+from ucp.quirks import Quirks, ignores_commits
 from ucp.settings import Settings
 
 
@@ -23,13 +24,13 @@ def test_a_block_is_full_when_the_largest_event_might_not_fit_any_more() -> None
     agent = air.agents[1]
     for _ in range(2):
         air.log(1, bytes(256))
-    assert not agent.completed  # 2 * 267 + 267 < 1024
+    assert not agent.state.completed  # 2 * 267 + 267 < 1024
     air.now = 3.5
     air.log(1, bytes(256))  # 3 * 267 + 267 >= 1024
-    (block,) = agent.blocks_to_be_committed
+    (block,) = agent.state.blocks_to_be_committed
     assert [len(event.data) for event in decode_events(block.event_data)] == [256] * 3
     assert block.timestamp_us == 3_500_000  # the newest event's
-    assert agent.current_block == b""
+    assert agent.state.current_block == b""
 
 
 def test_blocks_completed_in_the_same_microsecond_still_differ() -> None:
@@ -49,18 +50,18 @@ def test_a_full_block_is_proposed_to_go_on_top_of_the_own_chain() -> None:
     air.fill_block(2)
     air.settle()
     agent = air.agents[1]
-    while not agent.completed:
+    while not agent.state.completed:
         agent.add_event(LoggableEvent(0, 7, bytes(256)), air.now)
-    proposal = BlockAddRequest(agent.completed[0], agent.chain.top_chain_hash)
+    proposal = BlockAddRequest(agent.state.completed[0], agent.state.chain.top_chain_hash)
     assert agent.messages_to_send() == [(1, proposal)]  # 0 was its approval of 2's
-    assert agent.vote_count == {"yes": 1, "no": 0}  # its own
+    assert agent.state.vote_count == {"yes": 1, "no": 0}  # its own
     assert agent.next_timer() == air.now + 10.0
 
 
 @takes("receive_request_add_block", "approve", "disapprove")
 def test_an_agent_approves_what_goes_on_top_of_its_own_chain() -> None:
     agent = Air([1, 2]).agents[1]
-    for chain_hash in (agent.chain.top_chain_hash, bytes(32)):
+    for chain_hash in (agent.state.chain.top_chain_hash, bytes(32)):
         agent.receive_message(2, 0, BlockAddRequest(b"\1" * 32, chain_hash), 0.0)
     approval, disapproval = (message for _, message in agent.messages_to_send())
     assert approval == BlockAddResponse(b"\1" * 32, approve=True)
@@ -72,11 +73,11 @@ def test_an_agent_alone_commits_its_own_blocks_after_the_vote() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     block_hash = air.fill_block(1)
     air.run_until(9.99)
-    assert block_hash not in air.agents[1].chain
+    assert block_hash not in air.agents[1].state.chain
     air.run_until(10.0)
-    assert block_hash in air.agents[1].chain
-    assert air.agents[1].idle
-    assert air.agents[1].sent["Block Add Request"] == 1
+    assert block_hash in air.agents[1].state.chain
+    assert air.agents[1].state.idle
+    assert air.agents[1].state.sent["Block Add Request"] == 1
 
 
 @takes("receive_vote_add_block", "yes")
@@ -87,7 +88,7 @@ def test_an_approved_block_is_committed_by_everybody() -> None:
     block_hash = air.fill_block(3)
     air.settle()
     assert air.chains() == [(block_hash,)] * 5
-    assert all(agent.reconciles == 0 for agent in air.agents.values())
+    assert all(agent.state.reconciles == 0 for agent in air.agents.values())
 
 
 @takes("process_next_deque_block", "vote running")
@@ -98,9 +99,9 @@ def test_blocks_wait_their_turn_while_a_vote_runs() -> None:
     second = air.fill_block(1)
     assert air.branches(1, "process_next_deque_block") == ["proposed", "vote running"]
     air.run_until(10.0)
-    assert [block.block_hash for block in air.agents[1].chain] == [first]
+    assert [block.block_hash for block in air.agents[1].state.chain] == [first]
     air.run_until(20.0)
-    assert [block.block_hash for block in air.agents[1].chain] == [first, second]
+    assert [block.block_hash for block in air.agents[1].state.chain] == [first, second]
 
 
 @takes("receive_vote_add_block", "no", "counted already", "another block")
@@ -111,7 +112,7 @@ def test_a_responder_counts_once_per_round() -> None:
     for _ in range(3):
         agent.receive_message(2, 0, BlockAddResponse(block_hash, approve=False), 1.0)
     agent.receive_message(3, 0, BlockAddResponse(bytes(32), approve=False), 1.0)
-    assert agent.vote_count == {"yes": 1, "no": 1}
+    assert agent.state.vote_count == {"yes": 1, "no": 1}
     air.flush(1)
     assert air.branches(1, "receive_vote_add_block") == ["no", "counted already", "counted already", "another block"]
 
@@ -124,7 +125,7 @@ def test_a_vote_after_the_timer_does_not_count() -> None:
     air.agents[1].receive_message(2, 0, BlockAddResponse(block_hash, approve=True), air.now)
     air.flush(1)
     assert air.branches(1, "receive_vote_add_block") == ["no vote running"]
-    assert air.agents[1].vote_count == {"yes": 1, "no": 0}
+    assert air.agents[1].state.vote_count == {"yes": 1, "no": 0}
 
 
 @takes("vote_timer_expiration", "not approved")
@@ -134,7 +135,7 @@ def test_a_tied_vote_is_not_approved() -> None:
     air.agents[1].receive_message(2, 0, BlockAddResponse(block_hash, approve=False), 1.0)
     air.run_until(10.0)
     assert air.branches(1, "vote_timer_expiration") == ["not approved"]
-    assert air.agents[1].reconcile_in_progress
+    assert air.agents[1].state.reconcile_in_progress
 
 
 @takes("vote_timer_expiration", "reconcile in progress")
@@ -145,8 +146,8 @@ def test_a_vote_that_ends_during_a_reconcile_decides_nothing_and_is_repeated_aft
     agent.begin_reconcile(7.0)  # phase 1 ends at 12, the vote at 10
     air.run_until(11.0)
     assert air.branches(1, "vote_timer_expiration") == ["reconcile in progress"]
-    assert [block.block_hash for block in agent.blocks_to_be_committed] == [block_hash]
-    assert agent.sent["Commit Block"] == 0
+    assert [block.block_hash for block in agent.state.blocks_to_be_committed] == [block_hash]
+    assert agent.state.sent["Commit Block"] == 0
     air.settle()
     assert air.now == 22.0
     assert air.chains()[0] == (block_hash,)
@@ -162,7 +163,7 @@ def test_an_approved_vote_is_repeated_when_the_chain_changed_meanwhile() -> None
     air.settle()
     assert air.branches(2, "vote_timer_expiration") == ["chain changed", "approved"]
     assert air.chains() == [(first, second)] * 3
-    assert air.agents[2].reconciles == 0
+    assert air.agents[2].state.reconciles == 0
 
 
 @pytest.mark.parametrize(
@@ -181,8 +182,8 @@ def test_the_order_of_algorithm_5_s_tests_is_a_setting(changed_before_tally: boo
     other = Air([1, 2])
     other.fill_block(2)
     other.settle()
-    (committed,) = other.agents[2].chain
-    agent.receive_message(2, 1, CommitBlock(committed, other.agents[2].chain.top_chain_hash), 2.0)
+    (committed,) = other.agents[2].state.chain
+    agent.receive_message(2, 1, CommitBlock(committed, other.agents[2].state.chain.top_chain_hash), 2.0)
     air.run_until(10.0)
     assert air.branches(1, "vote_timer_expiration") == [expected]
 
@@ -199,7 +200,7 @@ def test_a_late_vote_of_an_earlier_round_counts_unless_votes_name_the_chain(name
     block_hash = air.fill_block(1)
     earlier_round = BlockAddResponse(block_hash, True, b"\1" * 32)
     air.agents[1].receive_message(2, 0, earlier_round, 1.0)
-    assert air.agents[1].vote_count["yes"] == yes
+    assert air.agents[1].state.vote_count["yes"] == yes
 
 
 @takes("receive_request_add_block", "disapprove")
@@ -214,7 +215,7 @@ def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:
     air.fill_block(1)
     air.run_until(air.now + 11)
     assert air.branches(3, "receive_commit_block") == ["does not succeed"]
-    assert len(air.agents[3].chain) == 0
+    assert len(air.agents[3].state.chain) == 0
 
 
 @takes("receive_commit_block", "held already")
@@ -224,18 +225,18 @@ def test_a_second_copy_of_a_block_is_never_committed() -> None:
     air.fill_block(2)
     air.settle()
     agent = air.agents[1]
-    (block,) = agent.chain
-    again = CommitBlock(block, next_chain_hash(agent.chain.top_chain_hash, block.block_hash))
+    (block,) = agent.state.chain
+    again = CommitBlock(block, next_chain_hash(agent.state.chain.top_chain_hash, block.block_hash))
     agent.receive_message(2, 9, again, air.now)
     air.flush(1)
     assert air.branches(1, "receive_commit_block") == ["committed", "held already"]
-    assert len(agent.chain) == 1
+    assert len(agent.state.chain) == 1
 
 
 @takes("receive_commit_block", "ignored by quirk")
 def test_the_ignore_commit_quirk_misses_commits() -> None:
     air = Air([1, 2])
-    air.agents[2].quirks.set("ignore_commit", 1.0)
+    air.agents[2].replace_handlers([ignores_commits(1.0, Random(0))])
     air.fill_block(1)
     air.settle()
     assert air.branches(2, "receive_commit_block") == ["ignored by quirk"]
@@ -250,12 +251,12 @@ def test_a_reconciling_agent_neither_votes_nor_commits_nor_proposes() -> None:
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
     air.fill_block(1)
-    top, block = agent.chain.top_chain_hash, Block(2, 1, b"x")
+    top, block = agent.state.chain.top_chain_hash, Block(2, 1, b"x")
     agent.receive_message(2, 0, BlockAddRequest(block.block_hash, top), 1.0)
     agent.receive_message(2, 1, CommitBlock(block, next_chain_hash(top, block.block_hash)), 1.0)
-    assert agent.sent == {"Chain Contain Query": 1}
-    assert not agent.voting_timer.active
-    assert len(agent.chain) == 0
+    assert agent.state.sent == {"Chain Contain Query": 1}
+    assert not agent.state.voting_timer.active
+    assert len(agent.state.chain) == 0
 
 
 @pytest.mark.parametrize(
@@ -263,7 +264,7 @@ def test_a_reconciling_agent_neither_votes_nor_commits_nor_proposes() -> None:
 )
 def test_an_impossible_quirk_is_refused(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=name):
-        Air([1]).agents[1].quirks.set(name, value)
+        Quirks().set(name, value)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def mission(loss: float, seed: int) -> Air:
 @pytest.mark.parametrize("seed", range(5))
 def test_without_loss_one_uniform_chain_emerges(seed: int) -> None:
     air = mission(0.0, seed)
-    completed = {block_hash for agent in air.agents.values() for block_hash in agent.completed}
+    completed = {block_hash for agent in air.agents.values() for block_hash in agent.state.completed}
     assert len(completed) > 20
     assert len(set(air.chains())) == 1
     assert set(air.chains()[0]) == completed
@@ -30,14 +30,14 @@ def test_without_loss_one_uniform_chain_emerges(seed: int) -> None:
 def test_disconnected_agents_hold_their_own_blocks_only(seed: int) -> None:
     air = mission(1.0, seed)
     for agent in air.agents.values():
-        assert [block.block_hash for block in agent.chain] == agent.completed
-        assert agent.reconciles == 0
+        assert [block.block_hash for block in agent.state.chain] == agent.state.completed
+        assert agent.state.reconciles == 0
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_at_15_percent_loss_no_block_is_lost_and_a_final_reconcile_makes_one_chain(seed: int) -> None:
     air = mission(0.15, seed)
-    completed = {block_hash for agent in air.agents.values() for block_hash in agent.completed}
+    completed = {block_hash for agent in air.agents.values() for block_hash in agent.state.completed}
     assert completed <= {block_hash for chain in air.chains() for block_hash in chain}
     air.fate = uniform_latency(Random(seed))
     for _ in range(3):
@@ -52,7 +52,7 @@ def mutual_share(loss: float, seeds: range = range(5)) -> float:
     shares = []
     for seed in seeds:
         air = mission(loss, seed)
-        blocks = sum(len(agent.completed) for agent in air.agents.values())
+        blocks = sum(len(agent.state.completed) for agent in air.agents.values())
         shares.append(common_prefix(air.chains()) / blocks)
     return sum(shares) / len(shares)
 

@@ -14,10 +14,12 @@ from ucp.messages import (
     ChainContainQuery,
     ChainContainResponse,
     ChainHashSuccessorQuery,
+    CommitBlock,
     Message,
     NextInSequenceResponse,
     RequestForBlock,
 )
+from ucp.quirks import crashes_on_a_tie, keeps_a_stale_chain_hash, lets_phase_3_expire_early
 from ucp.settings import Settings
 
 
@@ -50,7 +52,7 @@ def with_blocks(count: int) -> Agent:
 
 
 def answers(agent: Agent, message: Message) -> list[Message]:
-    agent.receive_message(2, 0, message, agent.now)
+    agent.receive_message(2, 0, message, agent.state.now)
     return [answer for _, answer in agent.messages_to_send()]
 
 
@@ -63,7 +65,7 @@ A, B = b"\xaa" * 32, b"\xbb" * 32
 @takes("reconcile_phase_3", "asked")
 def test_each_phase_asks_its_question_and_waits_for_answers() -> None:
     agent = Air([1, 2]).agents[1]
-    top = agent.chain.top_chain_hash
+    top = agent.state.chain.top_chain_hash
     agent.begin_reconcile(0.0)
     assert agent.messages_to_send() == [(0, ChainContainQuery(top))]
     assert agent.next_timer() == 5.0
@@ -80,7 +82,7 @@ def test_each_phase_asks_its_question_and_waits_for_answers() -> None:
 @takes("receive_request_chain_contain", "yes", "no")
 def test_an_agent_says_whether_its_chain_contains_another() -> None:
     agent = with_blocks(2)
-    (_, below), (_, top) = agent.chain.with_chain_hashes()
+    (_, below), (_, top) = agent.state.chain.with_chain_hashes()
     for chain_hash, contained in ((below, True), (top, True), (bytes(32), False)):
         assert answers(agent, ChainContainQuery(chain_hash)) == [ChainContainResponse(chain_hash, contained)]
 
@@ -88,7 +90,7 @@ def test_an_agent_says_whether_its_chain_contains_another() -> None:
 @takes("receive_request_next_in_sequence", "successor", "top of chain")
 def test_an_agent_names_its_next_block_or_the_top_of_its_chain_and_the_timestamp() -> None:
     agent = with_blocks(2)
-    (_, below), (block, top) = agent.chain.with_chain_hashes()
+    (_, below), (block, top) = agent.state.chain.with_chain_hashes()
     successor = NextInSequenceResponse(below, block.block_hash, block.timestamp_us)
     assert answers(agent, ChainHashSuccessorQuery(below)) == [successor]
     assert answers(agent, ChainHashSuccessorQuery(top)) == [NextInSequenceResponse(top, None, block.timestamp_us)]
@@ -97,7 +99,7 @@ def test_an_agent_names_its_next_block_or_the_top_of_its_chain_and_the_timestamp
 @takes("receive_request_block_for_hash", "sent", "not held")
 def test_an_agent_sends_a_block_of_its_chain_and_says_nothing_of_others() -> None:
     agent = with_blocks(1)
-    (block,) = agent.chain
+    (block,) = agent.state.chain
     assert answers(agent, RequestForBlock(block.block_hash)) == [BlockResponse(block)]
     assert answers(agent, RequestForBlock(bytes(32))) == []
 
@@ -107,15 +109,15 @@ def test_an_agent_sends_a_block_of_its_chain_and_says_nothing_of_others() -> Non
 @takes("receive_response_block_for_hash", "not in phase 3")
 def test_an_answer_that_nobody_waits_for_changes_nothing() -> None:
     agent = with_blocks(1)
-    top = agent.chain.top_chain_hash
+    top = agent.state.chain.top_chain_hash
     late = Block(2, 1, b"late")
     assert answers(agent, ChainContainResponse(top, False)) == []
     assert answers(agent, NextInSequenceResponse(top, late.block_hash, 1)) == []
     assert answers(agent, BlockResponse(late)) == []
-    assert agent.reconcile_vote_count == {"yes": 0, "no": 0}
-    assert not agent.reconcile_response_dictionary
-    assert agent.chain.top_chain_hash == top
-    assert agent.idle
+    assert agent.state.reconcile_vote_count == {"yes": 0, "no": 0}
+    assert not agent.state.reconcile_response_dictionary
+    assert agent.state.chain.top_chain_hash == top
+    assert agent.state.idle
 
 
 @takes("reconcile_phase_1_timer_expiration", "not contained", "contained")
@@ -124,8 +126,8 @@ def test_an_answer_that_nobody_waits_for_changes_nothing() -> None:
 @takes("reconcile_finalize", "done")
 def test_an_outvoted_agent_rebuilds_on_the_majority_s_chain_and_gives_back_its_own_block() -> None:
     air = diverged(blocks_on_2=2)
-    (own,) = air.agents[1].completed
-    theirs = tuple(air.agents[2].completed)
+    (own,) = air.agents[1].state.completed
+    theirs = tuple(air.agents[2].state.completed)
     air.reconcile(1)
     assert air.chains() == [(*theirs, own)] * 3
     assert air.branches(1, "reconcile_phase_1_timer_expiration") == ["not contained", "contained"]
@@ -140,16 +142,17 @@ def test_a_vote_against_a_diverged_chain_starts_the_reconcile() -> None:
     air.settle()
     assert air.branches(1, "reconcile_begin") == ["begun"]
     assert len(set(air.chains())) == 1
-    assert len(air.agents[1].chain) == 3
+    assert len(air.agents[1].state.chain) == 3
 
 
 @takes("reconcile_phase_3", "from the stack")
 def test_blocks_popped_in_phase_1_are_taken_from_the_stack_and_not_asked_for() -> None:
     """2 and 3 hold 1's first block on top of theirs: phase 3 finds it on 1's stack."""
     air = diverged()
-    own = next(iter(air.agents[1].chain))
-    for agent_id in (2, 3):
-        air.agents[agent_id].commit(own)
+    own = next(iter(air.agents[1].state.chain))
+    for agent in (air.agents[2], air.agents[3]):
+        on_top = next_chain_hash(agent.state.chain.top_chain_hash, own.block_hash)
+        agent.receive_message(1, 99, CommitBlock(own, on_top), air.now)
     air.reconcile(1)
     assert air.branches(1, "reconcile_phase_3") == ["asked", "from the stack"]
     assert len(set(air.chains())) == 1
@@ -173,7 +176,7 @@ def test_nobody_answers_phase_1() -> None:
     air.reconcile(1)
     assert air.now == 5.0
     assert air.branches(1, "reconcile_phase_1_timer_expiration") == ["no response"]
-    assert air.agents[1].idle
+    assert air.agents[1].state.idle
 
 
 @takes("reconcile_phase_2_timer_expiration", "no response")
@@ -183,7 +186,7 @@ def test_nobody_answers_phase_2() -> None:
     air.fate = lambda s, r, m: [] if isinstance(m, NextInSequenceResponse) else latency(s, r, m)
     air.reconcile(1)
     assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["no response"]
-    assert len(air.agents[1].chain) == 1  # its own block went back on top
+    assert len(air.agents[1].state.chain) == 1  # its own block went back on top
 
 
 @takes("reconcile_phase_3_timer_expiration", "gave up")
@@ -193,8 +196,8 @@ def test_no_block_comes_in_phase_3_and_the_rest_of_the_stack_goes_back() -> None
     air.fate = lambda s, r, m: [] if isinstance(m, BlockResponse) else latency(s, r, m)
     air.reconcile(1)
     assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
-    assert len(air.agents[1].chain) == 1
-    assert air.agents[1].majority_response_block_hash is None
+    assert len(air.agents[1].state.chain) == 1
+    assert air.agents[1].state.majority_response_block_hash is None
 
 
 @takes("reconcile_phase_1_timer_expiration", "at inception")
@@ -202,11 +205,11 @@ def test_the_inception_block_is_never_popped() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
-    agent.receive_message(2, 0, ChainContainResponse(agent.chain.top_chain_hash, False), 1.0)
+    agent.receive_message(2, 0, ChainContainResponse(agent.state.chain.top_chain_hash, False), 1.0)
     air.flush(1)
     air.settle()
     assert air.branches(1, "reconcile_phase_1_timer_expiration") == ["at inception"]
-    assert agent.idle
+    assert agent.state.idle
 
 
 @takes("receive_phase_1_response", "yes", "no", "counted already", "another chain")
@@ -223,9 +226,9 @@ def test_a_tie_in_phase_1(phase1_tie: str, expected: str) -> None:
     air.settle()
     agent = air.agents[1]
     agent.begin_reconcile(air.now)
-    agent.receive_message(2, 0, ChainContainResponse(agent.chain.top_chain_hash, True), air.now)
-    agent.receive_message(3, 0, ChainContainResponse(agent.chain.top_chain_hash, False), air.now)
-    agent.receive_message(3, 1, ChainContainResponse(agent.chain.top_chain_hash, False), air.now)
+    agent.receive_message(2, 0, ChainContainResponse(agent.state.chain.top_chain_hash, True), air.now)
+    agent.receive_message(3, 0, ChainContainResponse(agent.state.chain.top_chain_hash, False), air.now)
+    agent.receive_message(3, 1, ChainContainResponse(agent.state.chain.top_chain_hash, False), air.now)
     agent.receive_message(3, 1, ChainContainResponse(bytes(32), False), air.now)
     air.run_until(air.now + 5)
     assert air.branches(1, "reconcile_phase_1_timer_expiration") == [expected]
@@ -237,7 +240,7 @@ def in_phase_2(agents: int, **settings: object) -> Air:
     air = Air(range(1, agents + 1), fate=lambda *_: [], settings=Settings(**settings))
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
-    agent.receive_message(2, 0, ChainContainResponse(agent.chain.top_chain_hash, True), 1.0)
+    agent.receive_message(2, 0, ChainContainResponse(agent.state.chain.top_chain_hash, True), 1.0)
     air.run_until(5.0)
     return air
 
@@ -247,7 +250,7 @@ def phase_2(answers: list[tuple[bytes | None, int]], **settings: object) -> tupl
     air = in_phase_2(len(answers) + 1, **settings)
     agent = air.agents[1]
     for sender, (block_hash, timestamp_us) in enumerate(answers, start=2):
-        response = NextInSequenceResponse(agent.chain.top_chain_hash, block_hash, timestamp_us)
+        response = NextInSequenceResponse(agent.state.chain.top_chain_hash, block_hash, timestamp_us)
         agent.receive_message(sender, 1, response, 6.0)
     air.run_until(10.0)
     (branch,) = air.branches(1, "reconcile_phase_2_timer_expiration")
@@ -259,7 +262,7 @@ def phase_2(answers: list[tuple[bytes | None, int]], **settings: object) -> tupl
 def test_phase_2_follows_the_plurality() -> None:
     air, branch = phase_2([(A, 9), (A, 9), (B, 1), (None, 0)])
     assert branch == "block"
-    assert air.agents[1].majority_response_block_hash == A
+    assert air.agents[1].state.majority_response_block_hash == A
     assert air.branches(1, "receive_response_next_in_sequence") == [
         "new candidate",
         "counted",
@@ -272,28 +275,28 @@ def test_phase_2_follows_the_plurality() -> None:
 def test_a_tie_in_phase_2_goes_to_the_oldest_block() -> None:
     air, branch = phase_2([(A, 9), (B, 1)])
     assert branch == "tie: block"
-    assert air.agents[1].majority_response_block_hash == B
+    assert air.agents[1].state.majority_response_block_hash == B
 
 
 @takes("reconcile_phase_2_timer_expiration", "tie: block")
 def test_a_tie_of_equal_timestamps_goes_to_the_lowest_hash() -> None:
     air, _ = phase_2([(B, 5), (A, 5)])
-    assert air.agents[1].majority_response_block_hash == A
+    assert air.agents[1].state.majority_response_block_hash == A
 
 
 @takes("reconcile_phase_2_timer_expiration", "tie: top of chain")
 def test_a_tie_with_top_of_chain_ends_the_search_as_the_mutual_block_is_older() -> None:
     air, branch = phase_2([(A, 5), (None, 0)])
     assert branch == "tie: top of chain"
-    assert air.agents[1].idle
-    assert air.agents[1].sent["Request for Block"] == 0
+    assert air.agents[1].state.idle
+    assert air.agents[1].state.sent["Request for Block"] == 0
 
 
 @takes("reconcile_phase_2_timer_expiration", "tie: block")
 def test_a_tie_never_ends_the_search_while_a_block_is_on_offer_if_so_set() -> None:
     air, branch = phase_2([(A, 5), (None, 0)], phase2_tie="block")
     assert branch == "tie: block"
-    assert air.agents[1].majority_response_block_hash == A
+    assert air.agents[1].state.majority_response_block_hash == A
 
 
 @takes("receive_response_next_in_sequence", "counted already", "another chain")
@@ -301,12 +304,12 @@ def test_a_responder_of_phase_2_counts_once_and_only_for_the_chain_asked_about()
     """One for A and one for B, who is older: not two or three for A."""
     air = in_phase_2(agents=4)
     agent = air.agents[1]
-    top = agent.chain.top_chain_hash
+    top = agent.state.chain.top_chain_hash
     for sender, chain_hash, block_hash, timestamp_us in ((2, top, A, 9), (2, top, A, 9), (3, B, A, 9), (3, top, B, 1)):
         agent.receive_message(sender, 1, NextInSequenceResponse(chain_hash, block_hash, timestamp_us), 6.0)
     air.run_until(10.0)
     assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["tie: block"]
-    assert agent.majority_response_block_hash == B
+    assert agent.state.majority_response_block_hash == B
 
 
 @takes("receive_response_block_for_hash", "another block")
@@ -322,41 +325,43 @@ def test_a_block_that_was_not_asked_for_does_not_delay_the_end_of_phase_3() -> N
 def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever() -> None:
     air = in_phase_2(agents=3)
     agent = air.agents[1]
-    agent.quirks.set("crash_on_tie", True)
-    top = agent.chain.top_chain_hash
+    agent.replace_handlers([crashes_on_a_tie])
+    top = agent.state.chain.top_chain_hash
     agent.receive_message(2, 1, NextInSequenceResponse(top, A, 5), 6.0)
     agent.receive_message(3, 1, NextInSequenceResponse(top, None, 0), 6.0)
     air.settle()
     assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["tie: crashed by quirk"]
-    assert agent.reconcile_in_progress
+    assert agent.state.reconcile_in_progress
     assert agent.next_timer() is None
 
 
 def test_the_field_test_s_early_phase_3_expiry_ends_every_reconcile_before_a_block_comes() -> None:
     air = diverged()
     agent = air.agents[1]
-    agent.quirks.set("early_phase3_expiry", True)
+    agent.replace_handlers([lets_phase_3_expire_early])
     air.reconcile(1)
     assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
     assert set(air.branches(1, "receive_response_block_for_hash")) == {"not in phase 3"}
-    assert len(agent.chain) == 1
-    assert agent.idle, "it goes on to take part"
-    agent.quirks.set("early_phase3_expiry", False)
+    assert len(agent.state.chain) == 1
+    assert agent.state.idle, "it goes on to take part"
+    agent.replace_handlers([])
     air.reconcile(1)
-    assert len(agent.chain) == 2
+    assert len(agent.state.chain) == 2
 
 
 def test_the_field_test_s_stale_chain_hash_makes_an_agent_ask_for_what_it_has_just_got() -> None:
     air = diverged(blocks_on_2=2)
     agent = air.agents[1]
-    agent.quirks.set("stale_chain_hash", True)
+    agent.replace_handlers([keeps_a_stale_chain_hash])
     air.reconcile(1)
     assert air.branches(1, "receive_response_block_for_hash")[0] == "committed"
     assert air.branches(1, "reconcile_phase_3") == ["asked", "held already"]
     right = accumulate(
-        (block.block_hash for block in agent.chain), next_chain_hash, initial=agent.chain.inception.chain_hash
+        (block.block_hash for block in agent.state.chain),
+        next_chain_hash,
+        initial=agent.state.chain.inception.chain_hash,
     )
-    assert [chain_hash for _, chain_hash in agent.chain.with_chain_hashes()] != list(right)[1:]
+    assert [chain_hash for _, chain_hash in agent.state.chain.with_chain_hashes()] != list(right)[1:]
 
 
 @takes("reconcile_phase_3", "held already")
@@ -365,15 +370,15 @@ def test_a_block_that_is_held_already_is_not_asked_for() -> None:
     air.fill_block(1)
     air.settle()
     agent = air.agents[1]
-    (own,) = agent.completed
+    (own,) = agent.state.completed
     agent.begin_reconcile(air.now)
-    agent.receive_message(2, 0, ChainContainResponse(agent.chain.top_chain_hash, True), air.now)
+    agent.receive_message(2, 0, ChainContainResponse(agent.state.chain.top_chain_hash, True), air.now)
     air.run_until(air.now + 5)
-    agent.receive_message(2, 1, NextInSequenceResponse(agent.chain.top_chain_hash, own, 1), air.now)
+    agent.receive_message(2, 1, NextInSequenceResponse(agent.state.chain.top_chain_hash, own, 1), air.now)
     air.settle()
     assert air.branches(1, "reconcile_phase_3") == ["held already"]
-    assert agent.sent["Request for Block"] == 0
-    assert agent.idle
+    assert agent.state.sent["Request for Block"] == 0
+    assert agent.state.idle
 
 
 @takes("reconcile_finalize", "recommitted, more to come", "done")
@@ -394,7 +399,7 @@ def test_finalize_pauses_between_commits_and_the_others_follow() -> None:
     ]
     assert [later - earlier for earlier, later in pairwise(recommits)] == pytest.approx([0.1, 0.1])
     assert len(set(air.chains())) == 1
-    assert len(air.agents[2].chain) == 4
+    assert len(air.agents[2].state.chain) == 4
 
 
 @takes("reconcile_finalize", "done")
@@ -410,15 +415,15 @@ def test_without_a_gap_finalize_commits_all_at_once() -> None:
 @takes("reconcile_begin", "already in progress")
 def test_a_reconciling_agent_answers_nobody_and_does_not_begin_again() -> None:
     agent = with_blocks(1)
-    (block,) = agent.chain
-    top = agent.chain.top_chain_hash
-    agent.begin_reconcile(agent.now)
+    (block,) = agent.state.chain
+    top = agent.state.chain.top_chain_hash
+    agent.begin_reconcile(agent.state.now)
     agent.messages_to_send()
     for question in (ChainContainQuery(top), ChainHashSuccessorQuery(top), RequestForBlock(block.block_hash)):
         assert answers(agent, question) == []
-    agent.begin_reconcile(agent.now + 1)
+    agent.begin_reconcile(agent.state.now + 1)
     assert not agent.messages_to_send()
-    assert agent.reconciles == 1
+    assert agent.state.reconciles == 1
 
 
 def test_a_divergence_of_50_blocks_is_reconciled() -> None:
@@ -430,4 +435,4 @@ def test_a_divergence_of_50_blocks_is_reconciled() -> None:
     air.fate = uniform_latency(Random(3))
     air.reconcile(1)
     assert len(set(air.chains())) == 1
-    assert len(air.agents[1].chain) == 100
+    assert len(air.agents[1].state.chain) == 100

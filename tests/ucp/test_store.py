@@ -11,6 +11,10 @@ import pytest
 from tests.ucp.air import INITIAL_DATA, Air, assert_characteristics_2_to_4, uniform_latency
 from ucp.agent import Agent
 from ucp.block import Block
+from ucp.core import Core
+from ucp.events import LoggableEvent
+from ucp.settings import Settings
+from ucp.state import AgentState
 from ucp.store import Holdings, Store, StoreError
 
 
@@ -19,7 +23,7 @@ class StoringAir(Air):
 
     def __init__(self, path: Path, loss: float) -> None:
         super().__init__([1, 2, 3], uniform_latency(Random(1), loss=loss))
-        self.store = Store(path, self.agents[1])
+        self.store = Store(path, self.agents[1].state)
 
     def flush(self, agent_id: int) -> None:
         before = len(self.runs[agent_id])
@@ -28,22 +32,22 @@ class StoringAir(Air):
             self.store.write([change for run in self.runs[1][before:] for change in run.changes])
 
 
-def a_store(path: Path, blocks: int = 5) -> Agent:
-    """The agent whose store it is: it has completed and committed so many blocks, and completed one more."""
-    agent = Agent(1, [1, 2], INITIAL_DATA)
-    store = Store(path, agent)
+def a_store(path: Path, blocks: int = 5) -> AgentState:
+    """Of the agent whose store it is: it has completed and committed so many blocks, and completed one more."""
+    core = Core(1, INITIAL_DATA, Settings())
+    store = Store(path, core)
     for number in range(blocks + 1):
-        agent.complete(Block(1, number, bytes([number])))
+        core.complete(Block(1, number, bytes([number])))
         if number < blocks:
-            agent.commit(agent.take_from_deque())
-        changes, agent._changes = agent._changes, []
+            core.commit(core.take_from_deque())
+        changes, core.changes = core.changes, []
         store.write(changes)
     store.close()
-    return agent
+    return core
 
 
 def found(path: Path) -> Holdings | None:
-    return Store(path, Agent(1, [1, 2], INITIAL_DATA)).found
+    return Store(path, Agent(1, [1, 2], INITIAL_DATA).state).found
 
 
 def test_at_every_moment_the_store_holds_what_the_agent_holds(tmp_path: Path) -> None:
@@ -53,9 +57,9 @@ def test_at_every_moment_the_store_holds_what_the_agent_holds(tmp_path: Path) ->
     for step in range(1, 3000):
         air.step()
         agent = air.agents[1]
-        if step % 40 == 0 and (agent.reconcile_stack or step % 400 == 0):
-            stored = Store(tmp_path / "store", Agent(1, [1, 2, 3], INITIAL_DATA)).found
-            assert stored == Holdings.of(agent)
+        if step % 40 == 0 and (agent.state.reconcile_stack or step % 400 == 0):
+            stored = Store(tmp_path / "store", Agent(1, [1, 2, 3], INITIAL_DATA).state).found
+            assert stored == Holdings.of(agent.state)
             kinds |= {kind for kind in ("chain", "deque", "stack") if getattr(stored, kind)}
     assert kinds == {"chain", "deque", "stack"}
 
@@ -69,22 +73,22 @@ def test_an_agent_that_boots_has_what_it_held_and_commits_what_it_had_completed(
     for _ in range(40):
         for _ in range(rng.randrange(1, 80)):
             air.step()
-        before = Holdings.of(air.agents[1])
+        before = Holdings.of(air.agents[1].state)
         aside += len(before.stack) + len(before.deque)
         air.agents[1] = Agent(1, [1, 2, 3], INITIAL_DATA)
         air.agents[1].boot(before, air.now)
         air.flush(1)
-        assert not air.agents[1].idle or not (before.stack or before.deque)
-        assert {block.block_hash for block in Holdings.of(air.agents[1]).blocks()} == {
+        assert not air.agents[1].state.idle or not (before.stack or before.deque)
+        assert {block.block_hash for block in Holdings.of(air.agents[1].state).blocks()} == {
             block.block_hash for block in before.blocks()
         }
-        completed_by = {agent_id: set(agent.completed) for agent_id, agent in air.agents.items()}
+        completed_by = {agent_id: set(agent.state.completed) for agent_id, agent in air.agents.items()}
         assert_characteristics_2_to_4(air.agents[1], completed_by)
     assert aside > 20
     air.stop_events()
     air.settle()
     assert_characteristics_2_to_4(
-        air.agents[1], {agent_id: set(agent.completed) for agent_id, agent in air.agents.items()}
+        air.agents[1], {agent_id: set(agent.state.completed) for agent_id, agent in air.agents.items()}
     )
 
 
@@ -106,14 +110,14 @@ def test_the_first_run_after_a_boot_names_all_that_was_found() -> None:
         ("chain+", hashes["popped"]),
     ]
     assert (second.handler, second.branch) == ("process_next_deque_block", "proposed")
-    assert agent.newest_block_timestamp_us == 3
+    assert agent.state.newest_block_timestamp_us == 3
 
 
 def test_wherever_the_last_write_is_torn_the_blocks_before_it_are_found(tmp_path: Path) -> None:
     path = tmp_path / "store"
-    agent = a_store(path)
+    state = a_store(path)
     whole = path.read_bytes()
-    assert found(path) == Holdings.of(agent)
+    assert found(path) == Holdings.of(state)
     last = whole.rfind(b"\n", 0, -1) + 1
     for end in range(last, len(whole) - 1):
         path.write_bytes(whole[:end])
@@ -141,12 +145,13 @@ def test_a_store_that_lost_its_end_is_good_again_from_the_first_thing_that_is_wr
     a_store(path)
     path.write_bytes(path.read_bytes()[:-10])
     agent = Agent(1, [1, 2], INITIAL_DATA)
-    store = Store(path, agent)
+    store = Store(path, agent.state)
     assert store.found is not None
     agent.boot(store.found, 1.0)
-    agent.complete(Block(1, 100, b"later"))
-    store.write([*(change for run in agent.trace() for change in run.changes), *agent._changes])
-    assert found(path) == Holdings.of(agent)
+    while agent.state.completed == store.found.completed:
+        agent.add_event(LoggableEvent(0, 7, bytes(256)), 1.0)
+    store.write([change for run in agent.trace() for change in run.changes])
+    assert found(path) == Holdings.of(agent.state)
     assert not list(tmp_path.glob(".*"))
 
 
@@ -155,7 +160,7 @@ def test_another_agent_s_store_or_another_mission_s_is_refused(tmp_path: Path) -
     a_store(path)
     for other in (Agent(2, [1, 2], INITIAL_DATA), Agent(1, [1, 2], b"another mission")):
         with pytest.raises(StoreError, match=r"is the store of agent 1 in another mission.*name another file"):
-            Store(path, other)
+            Store(path, other.state)
 
 
 def test_a_file_that_is_no_store_is_left_alone(tmp_path: Path) -> None:
@@ -172,14 +177,14 @@ def test_a_full_disk_ends_the_store_and_leaves_what_was_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "store"
-    agent = a_store(path)
+    state = a_store(path)
     before = path.read_bytes()
 
     def refuse(_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     again = Agent(1, [1, 2], INITIAL_DATA)
-    store = Store(path, again)
+    store = Store(path, again.state)
     assert store.found is not None
     monkeypatch.setattr(os, "fdatasync", refuse)
     again.boot(store.found, 1.0)
@@ -187,4 +192,4 @@ def test_a_full_disk_ends_the_store_and_leaves_what_was_written(
     assert store.problem == "No space left on device"
     assert path.read_bytes() == before
     assert not list(tmp_path.glob(".*"))
-    assert found(path) == Holdings.of(agent)
+    assert found(path) == Holdings.of(state)

@@ -17,10 +17,10 @@ from heapq import heappop, heappush
 
 from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
 from netem.medium import Lots, Medium
-from ucp.agent import Agent
 from ucp.interest import ANSWERED, ASKED, MATTERS, ONLY_COUNTED, STILL_ASKED, Question
 from ucp.messages import BlockAddResponse, Message
 from ucp.settings import Settings
+from ucp.state import AgentState
 
 NEVER = float("inf")
 SWEEP_EVERY = 1000
@@ -34,7 +34,7 @@ class Flight:
     sender: int
     sequence: int
     message: Message
-    matters: Callable[[Agent, int, Message], bool]
+    matters: Callable[[AgentState, int, Message], bool]
     sent_at: float
     rank: int
     lots: Lots
@@ -199,11 +199,11 @@ class VirtualAir:
         heard.sort()
         return heard
 
-    def no_longer_asked(self, number: int, agent: Agent) -> None:
+    def no_longer_asked(self, number: int, state: AgentState) -> None:
         """A timer of the agent has ended, and with it a question."""
         asked_by = self._asked_by[number]
         for of_vote, asked in list(asked_by.items()):
-            if not STILL_ASKED[asked.question[0]](agent):
+            if not STILL_ASKED[asked.question[0]](state):
                 del asked_by[of_vote], asked.topic.askers[number]
 
     def is_gone(self, number: int) -> None:

@@ -226,7 +226,7 @@ class Simulation:
             awake = (life for life in self.living() if life.waiting is None)
             last = max([self._air.quiet_at, *(life.deadline or 0.0 for life in awake)])
             if last <= self._now:
-                return all(life.waiting is None and life.agent.idle for life in self.living())
+                return all(life.waiting is None and life.agent.state.idle for life in self.living())
             await self.until(min(limit, last))
         return False
 
@@ -242,10 +242,10 @@ class Simulation:
             self._after(number, life)
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        return {life.agent.agent_id: life.agent.chain.top_chain_hash.hex() for life in self.living()}
+        return {life.agent.agent_id: life.agent.state.chain.top_chain_hash.hex() for life in self.living()}
 
     async def completed(self) -> dict[int, int]:
-        return {life.agent.agent_id: len(life.agent.completed) for life in self.living() if life.waiting is None}
+        return {life.agent.agent_id: len(life.agent.state.completed) for life in self.living() if life.waiting is None}
 
     async def take_stock(self) -> Played:
         played = self._played_by_now()
@@ -286,8 +286,8 @@ class Simulation:
     def _agent_to_json(self, number: int) -> dict[str, Any]:
         lives = self._lives[number]
         life = self._alive[number]
-        completed = dict.fromkeys(block.hex() for one in lives for block in one.agent.completed)
-        for block in life.agent.completed if life else ():
+        completed = dict.fromkeys(block.hex() for one in lives for block in one.agent.state.completed)
+        for block in life.agent.state.completed if life else ():
             del completed[block.hex()]
         reboots = sum(one.found is not None for one in lives)
         dropped = sum((one.agent.dropped for one in lives), Counter())
@@ -296,19 +296,19 @@ class Simulation:
             "restarts": len(lives) - 1 - reboots,
             "reboots": reboots,
             "completed_before": list(completed),
-            "idle": life.agent.idle if life else None,
+            "idle": life.agent.state.idle if life else None,
             "bytes_sent": sum(life.bytes_sent for life in lives),
             **({"dropped": dict(dropped)} if self._rogue is not None else {}),
-            "messages_sent": sum(life.agent.sent.total() for life in lives),
-            "reconciles": sum(life.agent.reconciles for life in lives),
-            "chain_changed_at_s": round(_mission_time(life, life.agent.chain_changed_at), 3) if life else None,
+            "messages_sent": sum(life.agent.state.sent.total() for life in lives),
+            "reconciles": sum(life.agent.state.reconciles for life in lives),
+            "chain_changed_at_s": round(_mission_time(life, life.agent.state.chain_changed_at), 3) if life else None,
         }
 
     def _block_name(self, block_hash: bytes) -> str | None:
         """`<agent>.<ordinal>` of a block that an agent has completed."""
         if block_hash not in self._block_names:
             for agent_id, lives in zip(self.roster, self._lives, strict=True):
-                completed = dict.fromkeys(block for life in lives for block in life.agent.completed)
+                completed = dict.fromkeys(block for life in lives for block in life.agent.state.completed)
                 self._block_names.update((block, f"{agent_id}.{count}") for count, block in enumerate(completed, 1))
         return self._block_names.get(block_hash)
 
@@ -339,9 +339,9 @@ class Simulation:
             self._hear(number, life)
         if isinstance(what, Flight):
             agent, sender, message = life.agent, what.sender, what.message
-            if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent, sender, message)):
+            if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent.state, sender, message)):
                 agent.receive_message(sender, what.sequence, message, self._local(life))
-                if self._tracing or agent.reconcile_in_progress:
+                if self._tracing or agent.state.reconcile_in_progress:
                     self._after(number, life)
                 else:
                     self._say(number, life)  # of the handlers of messages only a reconcile's touch timers
@@ -364,7 +364,7 @@ class Simulation:
             return  # it was stopped, or started anew, since it was expected to end now
         self._hear(number, life)
         life.agent.handle_timer(max(soonest, self._local(life)))
-        self._air.no_longer_asked(number, life.agent)
+        self._air.no_longer_asked(number, life.agent.state)
         self._after(number, life)
 
     def _hear(self, number: int, life: Life) -> None:
@@ -373,9 +373,9 @@ class Simulation:
             return
         agent = life.agent
         for at, _, answer in self._air.hear(number):
-            if answer.matters(agent, answer.sender, answer.message):
+            if answer.matters(agent.state, answer.sender, answer.message):
                 at = max(at, life.resumed_at)
-                local = max(agent.now, self._local(life, at))
+                local = max(agent.state.now, self._local(life, at))
                 agent.receive_message(answer.sender, answer.sequence, answer.message, local)
                 if self._tracing:
                     self._take_down(agent, at)
@@ -421,10 +421,9 @@ class Simulation:
             self.roster,
             self._initial_data,
             scenario.settings,
-            seed=seed,
+            handlers=scenario.quirks.handlers(Random(seed)),
             tracing=self._tracing,
         )
-        agent.quirks = dataclasses.replace(scenario.quirks)
         source = RandomEvents(Random(seed), scenario.events.mean_s)
         life = Life(agent, source, scenario.clocks.get(agent_id), self._now, found)
         self._lives[number].append(life)
@@ -449,7 +448,7 @@ class Simulation:
                 if life is not None:
                     self._hear(number, life)
                     if fault.disk == "kept":
-                        self._disks[number] = Holdings.of(life.agent)
+                        self._disks[number] = Holdings.of(life.agent.state)
                 self._alive[number] = None
                 self._air.is_gone(number)
             case "restart" | "boot":

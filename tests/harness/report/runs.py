@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.exports import Export
-from ucp.agent import Agent
 from ucp.block import Block
+from ucp.core import Core
 from ucp.export import export_chain
+from ucp.settings import Settings
 
 Chains = Mapping[int, str | Sequence[str]]
 
@@ -24,14 +25,14 @@ def documents(chains: Chains) -> dict[int, dict[str, Any]]:
     everywhere = {name for chain in named.values() for name in chain}
     exported = {}
     for agent_id, chain in named.items():
-        agent = Agent(agent_id, {*named, *(int(name.split(".")[0]) for name in everywhere)}, b"mission")
+        core = Core(agent_id, b"mission", Settings())
         own = [int(name.split(".")[1]) for name in everywhere if name.startswith(f"{agent_id}.")]
         for ordinal in range(1, max(own, default=0) + 1):
-            agent.complete(block(f"{agent_id}.{ordinal}"))
-            agent.take_from_deque()
+            core.complete(block(f"{agent_id}.{ordinal}"))
+            core.take_from_deque()
         for name in chain:
-            agent.commit(block(name))
-        exported[agent_id] = export_chain(agent, 1_200_000_000)
+            core.commit(block(name))
+        exported[agent_id] = export_chain(core, 1_200_000_000)
     return exported
 
 

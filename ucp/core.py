@@ -1,0 +1,110 @@
+"""What event handlers may do to the protocol state of their vehicle.
+
+An agent has two faces. `ucp.agent` is the one that whoever drives it sees; this is the one that its handlers see. A
+handler is held to what it has declared: to send, start or trigger anything else is an error of the handler.
+"""
+
+from typing import Any
+
+from ucp.block import Block
+from ucp.handler import EventHandler, LocalEvent
+from ucp.messages import Message, block_named
+from ucp.settings import Settings
+from ucp.state import AgentState
+from ucp.timers import Timer
+from ucp.trace import Sent
+
+
+class Core(AgentState):
+    """The state, what handlers do to it, and what has come of that since the agent last took it away.
+
+    `outbox` has (sequence, message) to broadcast; `changes` and `announced`, kept only while `tracing`, are the parts
+    of a trace line of the same meaning.
+    """
+
+    running: EventHandler[Any]
+    """The handler that runs."""
+
+    def __init__(self, agent_id: int, initial_data: bytes, settings: Settings, *, tracing: bool = True) -> None:
+        super().__init__(agent_id, initial_data, settings)
+        self.outbox: list[tuple[int, Message]] = []
+        self.changes: list[tuple[str, str]] = []
+        self.announced: list[Sent] = []
+        self._tracing = tracing
+        self._sequence = 0
+
+    def trigger(self, event: LocalEvent) -> None:
+        """Trigger a local event: its handler runs after the current one has ended."""
+        assert event in self.running.triggers, f"{self.running.name} does not declare that it triggers {event}"
+        self.triggered.append((event, self.running.name))
+
+    def send(self, message: Message) -> None:
+        """Broadcast `message` to the local UVS."""
+        assert type(message) in self.running.sends, f"{self.running.name} does not declare that it sends {message.NAME}"
+        self.outbox.append((self._sequence, message))
+        self.sent[message.NAME] += 1
+        if self._tracing:
+            block_hash = block_named(message)
+            self.announced.append(Sent(message.NAME, self._sequence, block_hash.hex() if block_hash else None))
+        self._sequence += 1
+
+    def start(self, timer: Timer, duration_s: float) -> None:
+        """Let `timer` count down from now, in mission seconds."""
+        assert timer.name in self.running.starts, f"{self.running.name} does not declare that it starts {timer.name}"
+        timer.start(self.now, duration_s)
+
+    def complete(self, block: Block) -> None:
+        """A block of our own is full: push it onto the back of the deque."""
+        self.completed.append(block.block_hash)
+        self.newest_block_timestamp_us = block.timestamp_us
+        self._changed("complete", block)
+        self.push_onto_deque(block)
+
+    def push_onto_deque(self, block: Block) -> None:
+        self.blocks_to_be_committed.append(block)
+        self._held_aside.add(block.block_hash)
+        self._changed("deque+", block)
+
+    def take_from_deque(self) -> Block:
+        block = self.blocks_to_be_committed.popleft()
+        self._held_aside.remove(block.block_hash)
+        self._changed("deque-", block)
+        return block
+
+    def commit(self, block: Block) -> None:
+        """Append `block` to the chain, computing its chain hash (eq. 3.2)."""
+        self.chain.append(block)
+        self.chain_changed_at = self.now
+        self._changed("chain+", block)
+
+    def pop_to_stack(self) -> None:
+        """Move the chain's top block onto the reconcile stack."""
+        block = self.chain.pop()
+        self.chain_changed_at = self.now
+        self._changed("chain-", block)
+        self.push_onto_stack(block)
+
+    def push_onto_stack(self, block: Block) -> None:
+        self.reconcile_stack.append(block)
+        self._held_aside.add(block.block_hash)
+        self._changed("stack+", block)
+
+    def pop_from_stack(self) -> Block:
+        block = self.reconcile_stack.pop()
+        self._held_aside.remove(block.block_hash)
+        self._changed("stack-", block)
+        return block
+
+    def remove_from_stack(self, block_hash: bytes) -> Block | None:
+        """Take the block out of the reconcile stack, wherever in it; None if it is not there."""
+        for position in range(len(self.reconcile_stack) - 1, -1, -1):  # the mutual successor is mostly on top
+            if self.reconcile_stack[position].block_hash == block_hash:
+                block = self.reconcile_stack.pop(position)
+                self._held_aside.remove(block_hash)
+                self._changed("stack-", block)
+                return block
+        return None
+
+    def _changed(self, operation: str, block: Block) -> None:
+        if self._tracing:
+            self.changes.append((operation, block.block_hash.hex()))
