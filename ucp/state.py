@@ -66,6 +66,7 @@ class AgentState:
     @property
     def idle(self) -> bool:
         """No timer armed, no reconcile, nothing triggered and not yet run."""
-        if self.reconcile_in_progress or self.triggered:
-            return False
-        return all(timer.deadline is None for timer in self.timers)
+        for timer in self.timers:
+            if timer.deadline is not None:
+                return False
+        return not (self.reconcile_in_progress or self.triggered)

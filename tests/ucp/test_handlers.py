@@ -1,0 +1,191 @@
+"""Handlers do what they declare, and the diagram shows what they declare."""
+
+import ast
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import ucp
+from harness.simulate import simulate
+from harness.traces import Trace
+from tests.harness.virtual import scenario
+from tests.ucp.branches import WRONG
+from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, Agent
+from ucp.core import Core
+from ucp.diagram import PAGE, page
+from ucp.events import LoggableEvent
+from ucp.handler import EventHandler, LocalEvent, in_place_of
+from ucp.messages import Message, RequestForBlock
+from ucp.settings import Settings
+from ucp.state import AgentState
+
+OF_MESSAGE = {message.NAME: handler.name for message, handler in ON_MESSAGE.items()}
+OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
+OF_LOCAL_EVENT = {event: handler.name for event, handler in ON_LOCAL_EVENT.items()}
+
+PARTITION = [{"at_s": 200, "partition": [[1, 2], [3, 4, 5]]}, {"at_s": 500, "heal": True}]
+RESTARTS = [
+    {"at_s": 150, "reboot": [2], "down_s": 30, "disk": "kept"},
+    {"at_s": 200, "kill": [3]},
+    {"at_s": 400, "restart": [3]},
+    {"at_s": 450, "pause": [4]},
+    {"at_s": 500, "resume": [4]},
+]
+RUNS = {
+    "loss": {"network": {"loss": 0.25}, "final_reconcile": True},
+    "partition": {"timeline": PARTITION, "final_reconcile": True},
+    "restarts": {"timeline": RESTARTS, "network": {"loss": 0.1}},
+    "readings": {"network": {"loss": 0.25}, "settings": {"phase1_tie": "pop", "phase2_tie": "block"}},
+}
+HELD_ALREADY = ("reconcile_phase_3", "Reconcile Finalize")
+"""What no chain in good faith leads to: the mutual successor is in the chain already."""
+QUIRKS = {"ignore_commit": 0.2, "crash_on_tie": True, "early_phase3_expiry": True, "stale_chain_hash": True}
+
+
+def traces(**keys: Any) -> Iterator[Trace]:
+    played = scenario(agents=5, duration_s=900, **keys)
+    for seed in (1, 2):
+        simulated = simulate(played, seed, tracing=True)
+        yield from simulated.evidence.traces.values()
+
+
+def done(trace: Trace, handlers: dict[str, EventHandler[Any]]) -> Iterator[tuple[str, str]]:
+    """(handler, what it sent, started or triggered) of a trace; fails at the first line that is not as declared."""
+    for life in trace.lives():
+        ran: set[str] = set()
+        for number, run in life:
+            where = f"line {number}: {run.handler}"
+            declared = handlers[run.handler]
+            assert run.algorithm == declared.algorithm, where
+            assert run.branch in declared.branches, where
+            for sent in run.sent:
+                assert sent.message in {message.NAME for message in declared.sends}, where
+                yield run.handler, sent.message
+            match run.trigger:
+                case {"message": message}:
+                    assert OF_MESSAGE[message] == run.handler, where
+                case {"timer": timer}:
+                    assert OF_TIMER[timer] == run.handler, where
+                    (starter,) = (handler for handler in HANDLERS.values() if timer in handler.starts)
+                    assert starter.name in ran, where
+                    yield starter.name, timer
+                case {"local": by}:
+                    (event,) = (event for event, name in OF_LOCAL_EVENT.items() if name == run.handler)
+                    assert event in handlers[by].triggers, where
+                    assert by in ran, where
+                    yield by, event
+                case {"event": _}:
+                    assert run.handler == OF_LOCAL_EVENT["Build Data Block"], where
+                case {"operator": _}:
+                    assert run.handler == OF_LOCAL_EVENT["Reconcile Begin"], where
+                case {"boot": _}:
+                    assert run.handler == OF_LOCAL_EVENT["Reconcile Finalize"], where
+                case other:
+                    pytest.fail(f"{where} has the trigger {other}")
+            ran.add(run.handler)
+
+
+def test_every_line_of_a_trace_is_as_declared_and_all_that_is_declared_is_done() -> None:
+    seen = {deed for keys in RUNS.values() for trace in traces(**keys) for deed in done(trace, HANDLERS)}
+    declared = {
+        (handler.name, what)
+        for handler in HANDLERS.values()
+        for what in (*(message.NAME for message in handler.sends), *handler.starts, *handler.triggers)
+    }
+    assert seen == declared - {HELD_ALREADY}
+
+
+def test_wrong_agents_too_do_only_what_they_declare() -> None:
+    handlers = HANDLERS | {handler.name: handler for handler in WRONG}
+    seen, branches = set(), set()
+    for quirk, value in QUIRKS.items():
+        for trace in traces(network={"loss": 0.3}, quirks={quirk: value}):
+            seen |= set(done(trace, handlers))
+            branches |= {run.branch for run in trace.runs}
+    assert HELD_ALREADY in seen
+    assert branches >= {"ignored by quirk", "tie: crashed by quirk"}
+
+
+def test_what_a_handler_does_not_declare_is_refused() -> None:
+    core = Core(1, b"", Settings())
+    core.running = HANDLERS["build_data_block"]
+    with pytest.raises(AssertionError, match="build_data_block does not declare that it sends Request for Block"):
+        core.send(RequestForBlock(bytes(32)))
+    with pytest.raises(AssertionError, match="build_data_block does not declare that it starts voting"):
+        core.start(core.voting_timer, 1.0)
+    with pytest.raises(AssertionError, match="build_data_block does not declare that it triggers Reconcile Begin"):
+        core.trigger("Reconcile Begin")
+    assert not core.outbox and not core.triggered and not core.voting_timer.active
+
+
+def test_a_handler_in_the_place_of_another_may_do_what_that_may_and_takes_branches_of_its_own() -> None:
+    good = HANDLERS["build_data_block"]
+
+    @in_place_of(good, "forgotten")
+    def forgets(core: Core, event: LoggableEvent) -> str:
+        return "forgotten"
+
+    assert (forgets.name, forgets.algorithm, forgets.triggers) == (good.name, good.algorithm, good.triggers)
+    assert forgets.branches == ("building", "full", "forgotten")
+
+
+def test_each_algorithm_has_one_handler_and_each_handler_one_table_but_reconcile_finalize() -> None:
+    """The pause of Section 4.2 between two commits of Algorithm 20 ends with a timer."""
+    assert [handler.algorithm for handler in HANDLERS.values()] == list(range(1, 21))
+    tabled = [handler.name for table in (ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT) for handler in table.values()]
+    assert sorted(tabled) == sorted([*HANDLERS, "reconcile_finalize"])
+
+
+@pytest.mark.parametrize(
+    ("event", "by"),
+    [
+        ("Process Next Deque Block", {1, 5, 20}),  # Section 3.6.2, before Algorithm 2
+        ("Reconcile Begin", {5, 13}),  # Figure 3.10
+        ("Reconcile Phase 1", {7, 11}),  # Figure 3.11
+        ("Reconcile Phase 2", {11, 16, 18}),  # Figure 3.15, and step 4 of Reconcile Phase 3 (Section 3.5.3)
+        ("Reconcile Phase 3", {15}),  # Figure 3.19
+        ("Reconcile Finalize", {11, 15, 16, 19}),  # Figure 3.23; 16 where the block is held already
+    ],
+)
+def test_local_events_are_triggered_by_whom_the_thesis_says(event: LocalEvent, by: set[int]) -> None:
+    assert {handler.algorithm for handler in HANDLERS.values() if event in handler.triggers} == by
+
+
+def test_each_message_and_timer_has_a_handler_and_somebody_who_sends_or_starts_it() -> None:
+    sent: set[type[Message]] = {message for handler in HANDLERS.values() for message in handler.sends}
+    assert sent == set(ON_MESSAGE)
+    assert [timer for handler in HANDLERS.values() for timer in handler.starts] == list(ON_TIMER)
+
+
+def test_the_diagram_is_of_the_handlers_that_there_are() -> None:
+    assert PAGE.read_text() == page(), "write it again: python -m ucp.diagram"
+
+
+def test_what_handlers_do_to_the_state_no_driver_is_offered() -> None:
+    offered = {name for face in (Agent, AgentState) for name in dir(face)}
+    verbs = {name for name in vars(Core) if not name.startswith("_")}
+    assert {"commit", "pop_to_stack", "send", "trigger"} <= verbs
+    assert not verbs & offered
+
+
+def test_no_module_of_ucp_imports_in_a_circle() -> None:
+    """Not even for types alone. Raises CycleError naming the circle."""
+    folder = Path(ucp.__path__[0])
+    modules = {path.stem: imported(path) for path in folder.glob("*.py")}
+    order = list(TopologicalSorter(modules).static_order())
+    assert order.index("handler") < order.index("state") < order.index("core") < order.index("commit")
+    assert "agent" not in modules["commit"] | modules["reconcile"] | modules["store"]
+
+
+def imported(path: Path) -> set[str]:
+    """The modules of the package `ucp` that the file names in an import."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == "ucp":
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("ucp."):
+            names.add((node.module or "").split(".")[1])
+    return names
