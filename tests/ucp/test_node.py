@@ -20,8 +20,8 @@ import pytest
 from harness.archive.exports import read_export
 from harness.archive.traces import read_trace
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError
-from ucp.block import Block
-from ucp.messages import BlockAddRequest, RequestForBlock, decode, encode
+from ucp.block import Block, InceptionBlock, next_chain_hash
+from ucp.messages import BlockAddRequest, CommitBlock, RequestForBlock, decode, encode
 from ucp.mission import parse_mission
 from ucp.node import Node
 from ucp.store import Store
@@ -153,6 +153,25 @@ def test_quirks_are_set_and_reconciles_begun_on_command(agent: AgentUnderTest) -
     agent.ask("reconcile")
     agent.wait_for(lambda: agent.ask("status")["reconciles"] == 1)
     agent.wait_for(lambda: agent.ask("status")["idle"])
+
+
+def test_an_agent_has_the_quirks_of_its_mission_until_it_is_told_others(directory: Path) -> None:
+    agent = AgentUnderTest(directory, mission(quirks={"ignore_commit": 1}))
+    try:
+        agent.start()
+        inception, block = InceptionBlock(b"test"), Block(9, 1, b"x")
+        commit = CommitBlock(block, next_chain_hash(inception.chain_hash, block.block_hash))
+        for sequence, probability in enumerate((None, 0, 1)):
+            if probability is not None:
+                agent.ask("quirk", name="ignore_commit", value=probability)
+            agent.send(encode(9, sequence, commit))
+            agent.wait_for(lambda handled=sequence + 1: agent.ask("status")["handled"] == handled)
+        trace = read_trace(directory / "7.trace.jsonl")
+        assert trace is not None
+        assert [run.branch for run in trace.runs] == ["ignored by quirk", "committed", "ignored by quirk"]
+    finally:
+        agent.process.kill()
+        agent.process.communicate()
 
 
 @pytest.mark.parametrize(
