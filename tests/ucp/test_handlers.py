@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import ucp
-from harness.simulate import simulate
-from harness.traces import Trace
+from harness.archive.traces import Trace
+from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
 from tests.ucp.branches import WRONG
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, Agent
