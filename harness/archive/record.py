@@ -5,7 +5,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.scenario import Scenario
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 
 SCHEMA = "ucp-run/1"
 
@@ -189,7 +189,7 @@ class RunRecord(JudgedRecord):
 
     scenario: Scenario
     seed: int
-    backend: Backend
+    backend: BackendName
     engine: str | None = None
     versions: dict[str, str]
     started_at: str

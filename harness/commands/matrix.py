@@ -13,12 +13,14 @@ from harness.matrix import outputs, results, table
 from harness.matrix.baseline import load_baseline
 from harness.matrix.run import compared, on_cluster, on_cores
 from harness.run.sweep import cores
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 
 
 def matrix_command(
     file: Annotated[Path, typer.Argument(metavar="MATRIX", help="Matrix file (YAML).")],
-    backend: Annotated[Backend | None, typer.Option(help="What plays the runs, instead of the file's word.")] = None,
+    backend: Annotated[
+        BackendName | None, typer.Option(help="What plays the runs, instead of the file's word.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Directory of the results: new or empty, or of this matrix, which then goes on.")
     ] = None,

@@ -18,7 +18,7 @@ from harness.play.process.vehicle import system_ids
 from harness.report.capture import gaps
 from harness.run.run import Run, choose_vehicles, run
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 from harness.scenario.load import explain
 
 
@@ -36,7 +36,7 @@ def run_command(
     speedup: Annotated[float | None, typer.Option(help="Mission seconds per second of wall time.")] = None,
     vehicles: Annotated[Vehicles | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
     backend: Annotated[
-        Backend, typer.Option(help="Real processes in a private network, the same in containers, or virtual time.")
+        BackendName, typer.Option(help="Real processes in a private network, the same in containers, or virtual time.")
     ] = "process",
     capture: Annotated[
         bool, typer.Option("--capture", help="Keep each frame that a vehicle sent or got, in capture/<ID>.pcapng.")

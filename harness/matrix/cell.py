@@ -10,7 +10,7 @@ from harness.checker.verdict import CHECKS
 from harness.matrix.estimate import Estimate
 from harness.matrix.metrics import BEFORE_FINAL_RECONCILE, METRICS
 from harness.matrix.model import Point, Task
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 
 
 class Placed(BaseModel):
@@ -20,7 +20,7 @@ class Placed(BaseModel):
 
     loss: float
     agents: int
-    backend: Backend
+    backend: BackendName
 
     @property
     def point(self) -> Point:

@@ -8,7 +8,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Probability
 
 MAX_SEEDS = 10_000
@@ -20,7 +20,7 @@ class Point(NamedTuple):
 
     loss: float
     agents: int
-    backend: Backend
+    backend: BackendName
 
     @property
     def file_name(self) -> str:
@@ -56,7 +56,7 @@ class Matrix(Model):
         | None
     ) = None
     """One number or several; the scenario's if not given."""
-    backend: Annotated[list[Backend], Field(min_length=1, default_factory=lambda: ["sim"])]
+    backend: Annotated[list[BackendName], Field(min_length=1, default_factory=lambda: ["sim"])]
     """One or several."""
     keep: Literal["violated", "all"] = "violated"
     """Of which runs as processes the directories are kept: those that violated a characteristic or failed, or all."""
@@ -150,7 +150,7 @@ class Matrix(Model):
         return _each_once(seeds)
 
 
-def load_matrix(path: Path, backend: Backend | None = None) -> Matrix:
+def load_matrix(path: Path, backend: BackendName | None = None) -> Matrix:
     """`backend` comes before the file's word.
 
     Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed.

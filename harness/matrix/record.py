@@ -8,7 +8,7 @@ from harness.errors import INTERRUPTED, VIOLATED
 from harness.matrix.cell import Cell, Placed
 from harness.matrix.comparison import Comparison
 from harness.matrix.model import Matrix
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 
 SCHEMA = "ucp-matrix/1"
 
@@ -31,7 +31,7 @@ class MatrixRecord(BaseModel):
 
     schema_: Literal["ucp-matrix/1"] = Field(default="ucp-matrix/1", alias="schema")
     matrix: Matrix
-    backend: Backend | Literal["several"]
+    backend: BackendName | Literal["several"]
     versions: dict[str, str]
     started_at: str
     wall_s: float

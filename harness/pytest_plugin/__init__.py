@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from harness.scenario.backend import BACKENDS
+from harness.scenario.backend import BACKEND_NAMES
 
 if TYPE_CHECKING:
     from harness.pytest_plugin.findings import Findings
@@ -29,7 +29,9 @@ MARKERS = (
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("ucp", "UCP harness")
-    group.addoption("--ucp-backend", choices=BACKENDS, help="Play on this backend, whatever tests and scenarios say.")
+    group.addoption(
+        "--ucp-backend", choices=BACKEND_NAMES, help="Play on this backend, whatever tests and scenarios say."
+    )
     group.addoption("--ucp-seed", type=int, metavar="N", help="Play with this seed, whatever tests and scenarios say.")
     group.addoption("--ucp-speedup", type=float, metavar="X", help="Mission seconds per second, of processes.")
     group.addoption(

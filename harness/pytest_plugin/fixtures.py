@@ -16,7 +16,7 @@ from harness.pytest_plugin.swarm_in_test import Swarm
 from harness.pytest_plugin.trial import Trial, one_sentence
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.backend import BACKENDS, Backend
+from harness.scenario.backend import BACKEND_NAMES, BackendName
 from harness.scenario.load import parse
 
 DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
@@ -57,7 +57,7 @@ def scenario_for(node: pytest.Item) -> Iterator[Findings]:
         discard(directory, options)
 
 
-def play(scenario: Scenario, seed: int, backend: Backend, directory: Path) -> Run:
+def play(scenario: Scenario, seed: int, backend: BackendName, directory: Path) -> Run:
     """Play and judge a scenario. Raises HarnessError, and KeyboardInterrupt if the run was interrupted."""
     finished = run(scenario, seed, directory, Silent(), backend)
     if finished.played.outcome == "interrupted":
@@ -75,10 +75,10 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
     return node.path.parent / marker.args[0], {**DEFAULTS, **marker.kwargs}
 
 
-def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[Backend, int]:
+def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[BackendName, int]:
     """What a marker says of them, unless the command line says something else. Raises ScenarioError."""
-    if backend not in BACKENDS:
-        *others, last = map(repr, BACKENDS)
+    if backend not in BACKEND_NAMES:
+        *others, last = map(repr, BACKEND_NAMES)
         raise ScenarioError(f"`backend` is {backend!r}: it should be {', '.join(others)} or {last}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ScenarioError(f"`seed` is {seed!r}: it should be a number, 0 or more")

@@ -14,7 +14,7 @@ from harness.pytest_plugin.fixtures import play
 from harness.pytest_plugin.options import Options
 from harness.pytest_plugin.trial import Trial, one_sentence
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 from harness.scenario.expect import Expect
 
 
@@ -36,7 +36,7 @@ class ScenarioFile(pytest.File):
 class ScenarioItem(pytest.Item):
     """One run; whether it is as expected is judged where that of every test is (`pytest_runtest_call`)."""
 
-    def __init__(self, *, scenario: Scenario, backend: Backend, seed: int, **node: Any) -> None:
+    def __init__(self, *, scenario: Scenario, backend: BackendName, seed: int, **node: Any) -> None:
         super().__init__(**node)
         self._scenario = scenario
         self._backend = backend

@@ -7,7 +7,7 @@ import pytest
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 from harness.scenario.load import parse
 
 
@@ -15,7 +15,7 @@ from harness.scenario.load import parse
 class Options:
     """None where the command line says nothing."""
 
-    backend: Backend | None
+    backend: BackendName | None
     seed: int | None
     speedup: float | None
     keep: Path | None

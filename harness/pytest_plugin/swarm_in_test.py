@@ -17,7 +17,7 @@ from harness.pytest_plugin.findings import Findings, Judgement
 from harness.pytest_plugin.told import Sentence, Told
 from harness.run.run import Play, Recording, Run, prepare
 from harness.scenario import Scenario
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 
 
 class RunEndedError(Exception):
@@ -32,7 +32,7 @@ class Swarm:
     and leaves everything as it is. Raises HarnessError if it cannot begin.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, backend: Backend, out: Path) -> None:
+    def __init__(self, scenario: Scenario, seed: int, backend: BackendName, out: Path) -> None:
         self._told = Told(scenario)
         play = prepare(scenario, seed, backend, self._told.story)
         self._recording = Recording(scenario, seed, out, backend)

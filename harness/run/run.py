@@ -32,7 +32,7 @@ from harness.play.progress import Progress
 from harness.play.simulation.backend import refuse_what_needs_processes
 from harness.run.simulate import simulate_into
 from harness.scenario import Scenario
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 from netem import uml
 from sitl.ardupilot import ArduPilot
 from sitl.embedded import Embedded
@@ -60,7 +60,7 @@ class Run:
     lateness: Lateness | None
 
 
-def run(scenario: Scenario, seed: int, out: Path, progress: Progress, backend: Backend = "process") -> Run:
+def run(scenario: Scenario, seed: int, out: Path, progress: Progress, backend: BackendName = "process") -> Run:
     """Play `scenario` and judge it, into the new or empty directory `out`. Raises HarnessError if it cannot even begin.
 
     Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
@@ -81,7 +81,7 @@ class Recording:
     Raises RunDirectoryError if `out` is neither new nor empty, MachineError if the disk refuses the record.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, out: Path, backend: Backend) -> None:
+    def __init__(self, scenario: Scenario, seed: int, out: Path, backend: BackendName) -> None:
         self.directory = RunDirectory(out)
         self._started = time.monotonic()
         self._record = RunRecord(
@@ -150,7 +150,7 @@ Play = Callable[[RunDirectory, Progress, asyncio.Event], Coroutine[Any, Any, Pla
 """Plays one mission into a run directory, until it is over or the event is set."""
 
 
-def prepare(scenario: Scenario, seed: int, backend: Backend, story: Story | None = None) -> Play:
+def prepare(scenario: Scenario, seed: int, backend: BackendName, story: Story | None = None) -> Play:
     """What plays `scenario`, or `story` with its swarm. Raises HarnessError if backend or machine cannot."""
     told = story or mission.play
     if backend == "sim":

@@ -1,8 +1,8 @@
-"""The backends by name: what plays a scenario."""
+"""The backends by name, as scenarios, records and the command line say it: what they are is in `harness.play`."""
 
 from typing import Literal, get_args
 
-Backend = Literal["process", "docker", "sim"]
+BackendName = Literal["process", "docker", "sim"]
 """Real processes in a private network, the same in containers, or virtual time."""
 
-BACKENDS: tuple[Backend, ...] = get_args(Backend)
+BACKEND_NAMES: tuple[BackendName, ...] = get_args(BackendName)

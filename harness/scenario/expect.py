@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from harness.scenario.backend import Backend
+from harness.scenario.backend import BackendName
 from harness.scenario.model import BOUNDED, Model
 
 Verdict = Literal["holds", "violated", "not applicable"]
@@ -90,7 +90,7 @@ class Expect(Model):
 
     characteristics: dict[int, Verdict] = {}
     figures: dict[FigureName, Annotated[Range, BeforeValidator(_exactly)]] = {}
-    backends: Annotated[list[Backend], Field(min_length=1)] = ["sim"]
+    backends: Annotated[list[BackendName], Field(min_length=1)] = ["sim"]
     seeds: Annotated[list[Annotated[int, Field(ge=0, strict=True)]], Field(min_length=1, max_length=10_000)] = [1]
 
     @field_validator("characteristics", mode="before")
