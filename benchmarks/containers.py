@@ -18,10 +18,11 @@ from typing import Any
 from benchmarks.rounds import Spread, show
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
-from harness.play.containers import backend
-from harness.play.process import backend as process
+from harness.play.containers.backend import Containers
+from harness.play.containers.preflight import require_root
 from harness.play.process.agent import AgentProcess, agent_command
 from harness.play.process.lab import OpenLab
+from harness.play.process.processes import Processes
 from harness.scenario.load import parse
 from netem.errors import NetemError
 
@@ -52,7 +53,7 @@ async def once(agents: int, open_lab: OpenLab, directory: Path) -> tuple[float, 
 def up_and_down(agents: int, rounds: int, folder: Path) -> _Row:
     found: dict[str, list[tuple[float, float]]] = {"docker": [], "process": []}
     for number in range(rounds):
-        for name, open_lab in (("docker", backend.open_lab), ("process", process.open_lab)):
+        for name, open_lab in (("docker", Containers().open_lab), ("process", Processes().open_lab)):
             found[name].append(asyncio.run(once(agents, open_lab, folder / f"{name}-{agents}-{number}")))
     row: _Row = {"agents": agents}
     for place, key in enumerate(("up", "down")):
@@ -69,7 +70,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
-        backend.require_root()
+        require_root()
         with tempfile.TemporaryDirectory() as folder:
             rows = [up_and_down(agents, options.rounds, Path(folder)) for agents in options.agents or [5, 20]]
     except (HarnessError, NetemError) as error:

@@ -16,8 +16,8 @@ from typing import NoReturn
 
 import pytest
 
-from harness.play.containers.backend import require_root
 from harness.play.containers.engine import DockerError, Engine
+from harness.play.containers.preflight import require_root
 from netem import uml
 from netem.errors import UmlError
 from netem.lab import Lab, LabUnavailable

@@ -14,9 +14,11 @@ from harness.commands.terminal import complain, show_result, show_rogue, show_su
 from harness.errors import HarnessError, ScenarioError
 from harness.machine.kernel import Kernel, run_inside
 from harness.play import progress
+from harness.play.backends import BACKENDS
 from harness.play.process.vehicle import system_ids
+from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.report.capture import gaps
-from harness.run.run import Run, choose_vehicles, run
+from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.backend import BackendName
 from harness.scenario.load import explain
@@ -61,20 +63,16 @@ def run_command(
         _emit_compose(console, request, chosen_seed, emit_compose)
         return
     if kernel is Kernel.uml:
-        if backend == "sim":
-            raise HarnessError("--kernel uml is for real processes: virtual time, --backend sim, needs no kernel")
-        if backend == "docker":
-            raise HarnessError(
-                "there is no Docker engine in User Mode Linux: leave out --kernel uml, or --backend docker"
-            )
+        if why := BACKENDS[backend].not_in_uml:
+            raise HarnessError(why)
         options = {"--seed": chosen_seed, "--out": directory, "--speedup": speedup, "--vehicles": vehicles}
         given = [f"{option}={value}" for option, value in options.items() if value is not None]
         given += ["--capture"] if capture else []
         console.print("Booting User Mode Linux.", style="dim")
         raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
-    if backend == "sim" and request.events.source == "mavlink":
-        console.print("Virtual time has no telemetry: events are random (Algorithm 21).", style="dim")
+    if remark := BACKENDS[backend].remark(request):
+        console.print(remark, style="dim")
     shown = progress.for_console(console)
     try:
         finished = run(request, chosen_seed, directory, shown, backend)

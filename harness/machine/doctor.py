@@ -47,15 +47,15 @@ def _user_mode_linux() -> Finding:
 
 
 def _docker() -> Finding:
-    from harness.play.containers import backend
     from harness.play.containers.engine import DockerError, Engine
+    from harness.play.containers.preflight import require_root
 
     use = "--backend docker: vehicles and agents in containers"
     try:
         engine = Engine.connect()
         version = engine.api.version()["Version"]
         engine.close()
-        backend.require_root()
+        require_root()
     except DockerError as error:
         return Finding("Docker", False, False, str(error), f"with it there is {use}")
     return Finding("Docker", True, False, f"{version}, for {use}")

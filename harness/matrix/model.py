@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from harness.errors import ScenarioError
+from harness.play.backends import BACKENDS
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
 from harness.scenario.backend import BackendName
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Probability
@@ -64,7 +65,7 @@ class Matrix(Model):
     @property
     def needs_processes(self) -> bool:
         """Whether any run is for real, in containers or without."""
-        return any(backend != "sim" for backend in self.backend)
+        return any(not BACKENDS[backend].plays_in_memory for backend in self.backend)
 
     @property
     def seed_list(self) -> list[int]:

@@ -16,6 +16,7 @@ from harness.matrix.estimate import Estimate
 from harness.matrix.metrics import BY_NAME
 from harness.matrix.record import MatrixRecord
 from harness.matrix.table import say, series, series_name
+from harness.play.backends import in_virtual_time
 from harness.present import svg, words
 from harness.present.svg import Area, Axis, n
 
@@ -101,7 +102,7 @@ def description(record: MatrixRecord) -> str:
 
 def _about(record: MatrixRecord) -> str:
     agents = sorted({point.agents for point in record.matrix.points})
-    simulated = "simulated " if record.backend == "sim" else ""
+    simulated = "simulated " if in_virtual_time(record.backend) else ""
     parts = [
         f"{', '.join(map(str, agents))} agents, {words.duration(record.matrix.scenario.duration_s)}",
         f"{words.value(record.runs)} {simulated}runs",

@@ -9,8 +9,9 @@ from harness.checker import Result
 from harness.errors import VIOLATED, HarnessError, InterruptedRunError
 from harness.matrix.cell import Run
 from harness.matrix.model import Matrix, Point, Task
+from harness.play.backends import BACKENDS
 from harness.play.progress import Silent
-from harness.run.run import prepare, run
+from harness.run.run import run
 from harness.scenario import Scenario
 
 Judge = Callable[[Scenario, int], Result]
@@ -40,15 +41,15 @@ class Player:
 
     def __call__(self, task: Task) -> Run:
         scenario = self.matrix.scenario_at(task.point)
-        simulated = task.point.backend == "sim"
-        result = self.judge(scenario, task.seed) if simulated else self._for_real(scenario, task)
+        in_memory = BACKENDS[task.point.backend].plays_in_memory
+        result = self.judge(scenario, task.seed) if in_memory else self._for_real(scenario, task)
         verdicts = {number: one.verdict for number, one in result.characteristics.items()}
         return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts)
 
     def refuse(self, points: Iterable[Point]) -> None:
         """Raises HarnessError if a backend, or this machine, cannot play these: before hours of others have gone by."""
         for point in points:
-            prepare(self.matrix.scenario_at(point), 0, point.backend)
+            BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
     def _for_real(self, scenario: Scenario, task: Task) -> Result:
         """Raises RunFailedError, which names the run directory."""

@@ -4,6 +4,7 @@ Play the timeline, stop the events, let the agents settle, and reconcile finally
 """
 
 from collections.abc import Awaitable, Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -109,6 +110,13 @@ async def play(swarm: Swarm, scenario: Scenario) -> None:
         await swarm.apply(change)
     await swarm.until(scenario.duration_s)
     await settle(swarm, scenario)
+
+
+async def play_on(opening: AbstractAsyncContextManager[Swarm], scenario: Scenario, story: Story = play) -> Played:
+    """Lead the swarm that opens through the story; what became of it."""
+    async with opening as swarm:
+        await story(swarm, scenario)
+    return swarm.played
 
 
 async def settle(swarm: Swarm, scenario: Scenario) -> None:

@@ -11,11 +11,13 @@ from harness import checker
 from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, ScenarioError
 from harness.play import mission
+from harness.play.backend import Backend
+from harness.play.backends import BACKENDS
 from harness.play.mission import Played
 from harness.play.progress import Silent
 from harness.pytest_plugin.findings import Findings, Judgement
 from harness.pytest_plugin.told import Sentence, Told
-from harness.run.run import Play, Recording, Run, prepare
+from harness.run.run import Recording, Run
 from harness.scenario import Scenario
 from harness.scenario.backend import BackendName
 
@@ -34,7 +36,8 @@ class Swarm:
 
     def __init__(self, scenario: Scenario, seed: int, backend: BackendName, out: Path) -> None:
         self._told = Told(scenario)
-        play = prepare(scenario, seed, backend, self._told.story)
+        chosen = BACKENDS[backend]
+        chosen.refuse(scenario)
         self._recording = Recording(scenario, seed, out, backend)
         self._judged = False
         self._seen: Findings | None = None
@@ -42,7 +45,7 @@ class Swarm:
         self._runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
         self._loop = self._runner.get_loop()
         self._thread = ThreadPoolExecutor(1, "ucp-swarm")
-        self._playing: Future[Any] = self._thread.submit(self._play, play)
+        self._playing: Future[Any] = self._thread.submit(self._play, chosen, seed)
         try:
             wait((self._told.begun, self._playing), return_when=FIRST_COMPLETED)
             if self._playing.done():
@@ -54,10 +57,12 @@ class Swarm:
     def __repr__(self) -> str:
         return f"<swarm, run in {self.directory}>"
 
-    def _play(self, play: Play) -> Played:
+    def _play(self, backend: Backend, seed: int) -> Played:
+        scenario, directory = self._told.scenario, self._recording.directory
         with self._runner:
             try:
-                return self._runner.run(play(self._recording.directory, Silent(), self._interrupted))
+                opening = backend.open(scenario, seed, directory, Silent(), self._interrupted, keeps_disks=True)
+                return self._runner.run(mission.play_on(opening, scenario, self._told.story))
             except HarnessError as error:
                 self._recording.fail(error)
                 raise

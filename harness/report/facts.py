@@ -4,6 +4,7 @@ from typing import Any
 
 from harness.archive.exports import Exports
 from harness.archive.result import mapping, number, roster_of
+from harness.play.backends import in_virtual_time
 from harness.present import words
 
 FIGURES = {
@@ -36,7 +37,7 @@ def summary(result: dict[str, Any], exports: Exports) -> list[str]:
         parts.append(f"{words.duration(duration_s)} mission")
     if loss is not None:
         parts.append(f"{words.percent(loss)} loss")
-    if speedup is not None and result.get("backend") != "sim":
+    if speedup is not None and not in_virtual_time(result.get("backend")):
         parts.append(f"speedup {words.value(speedup)}")
     parts += [
         f"{key} {words.value(result[key])}" for key in ("seed", "backend", "engine") if result.get(key) is not None

@@ -17,7 +17,7 @@ import pytest
 import requests
 import yaml
 
-from harness.play.containers import backend, engine, images, ownership
+from harness.play.containers import engine, images, ownership, preflight
 from harness.play.containers.container import STDERR, STDOUT, Output
 from harness.play.containers.images import Image
 from tests.harness.command import harness, sentences, write_scenario
@@ -127,7 +127,7 @@ def test_an_image_that_cannot_be_built_is_one_sentence() -> None:
 def test_only_root_can_lay_cables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with pytest.raises(engine.DockerError, match="use sudo"):
-        backend.require_root()
+        preflight.require_root()
 
 
 def test_user_mode_linux_has_no_engine(tmp_path: Path) -> None:

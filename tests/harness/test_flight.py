@@ -12,7 +12,7 @@ import yaml
 
 from harness.errors import MachineError, ScenarioError
 from harness.play.process.vehicle import system_ids
-from harness.run.run import choose_vehicles
+from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario, load_scenario
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
 from tests.harness.command import harness, processes, write_scenario

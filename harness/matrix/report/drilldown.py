@@ -78,10 +78,9 @@ def _count(runs: Sequence[Run]) -> str:
 
 def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:
     kept = f"runs/{directory_name(run.task)}/report.html"
-    is_kept = run.backend != "sim" and (directory / kept).exists()
     return Row(
         run.seed,
-        kept if is_kept else None,
+        kept if (directory / kept).exists() else None,
         [] if run.failed is not None else [ICONS[run.verdicts[number]] for number in CHECKS],
         [] if run.failed is not None else [words.value(run.figures.get(name)) for name in figures],
         run.failed,

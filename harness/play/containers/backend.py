@@ -1,41 +1,34 @@
-"""The Docker backend as `harness.run.run` sees it."""
+"""The backend of containers: as that of processes, but every vehicle and every agent is in a container of its own.
 
-import os
+The docker SDK takes its time to import, which who plays no containers need not wait for.
+"""
+
 from collections.abc import Callable
+from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
-from harness.play.containers import images
-from harness.play.containers.engine import DockerError, Engine
-from harness.play.containers.lab import ContainerLab
-from harness.play.process import agent
 from harness.play.process.lab import Lab
+from harness.play.process.processes import Processes
 from harness.scenario import Scenario
+from harness.scenario.backend import BackendName
 
 
-def refuse_what_docker_cannot(scenario: Scenario) -> None:
-    """Raises DockerError if there is no engine here that we may use, or not the image that is asked for."""
-    engine = Engine.connect()
-    try:
-        require_root()
-        if scenario.docker.image is not None:
-            images.named(engine, scenario.docker.image)
-    finally:
-        engine.close()
+class Containers(Processes):
+    name: ClassVar[BackendName] = "docker"
+    not_in_uml = "there is no Docker engine in User Mode Linux: leave out --kernel uml, or --backend docker"
 
+    def refuse(self, scenario: Scenario) -> None:
+        from harness.play.containers.preflight import refuse_what_docker_cannot
 
-def require_root() -> None:
-    """Raises DockerError."""
-    if os.geteuid() != 0:
-        raise DockerError("the Docker backend puts network cables into containers, for which it must be root: use sudo")
+        super().refuse(scenario)
+        refuse_what_docker_cannot(scenario)
 
+    def agent_command(self, scenario: Scenario) -> list[str]:
+        if scenario.docker.image is not None and scenario.agent_command is not None:
+            return list(scenario.agent_command)  # a program in the image
+        return super().agent_command(scenario)
 
-def agent_command(scenario: Scenario) -> list[str]:
-    """What starts an agent in its container, but for the mission file. Raises ScenarioError."""
-    if scenario.docker.image is not None and scenario.agent_command is not None:
-        return list(scenario.agent_command)  # a program in the image
-    return agent.agent_command(scenario)
+    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> Lab:
+        from harness.play.containers.lab import ContainerLab
 
-
-async def open_lab(scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> Lab:
-    """The lab of containers. Raises DockerError, or as netem.lab.Lab.open does."""
-    return await ContainerLab.open(scenario, rundir, say)
+        return await ContainerLab.open(scenario, rundir, say)

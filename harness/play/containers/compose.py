@@ -13,7 +13,7 @@ import yaml
 
 from harness.errors import RunDirectoryError
 from harness.play.containers import images, ownership
-from harness.play.containers.backend import agent_command
+from harness.play.containers.backend import Containers
 from harness.play.containers.images import Image
 from harness.play.process.mission_file import mission_file
 from harness.scenario import Scenario
@@ -101,7 +101,7 @@ def _services(
             services[name] = _service(scenario, ours, launch.argv, f"vehicles/{vehicle}", beside) | build | network
             services[name] |= {"environment": dict(launch.env)} if launch.env else {}
             network = {"network_mode": f"service:{name}", "depends_on": [name]}
-        argv = [*agent_command(scenario), mission]
+        argv = [*Containers().agent_command(scenario), mission]
         services[f"agent-{vehicle}"] = _service(scenario, agents, argv, "agents", beside) | network
         services[f"agent-{vehicle}"] |= build if asked is None else {}
     waits = {"network_mode": "none", "depends_on": [f"agent-{vehicle}" for vehicle in scenario.roster]}

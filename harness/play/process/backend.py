@@ -1,4 +1,4 @@
-"""The process and Docker backends: a scenario played by real programs in a real, private network.
+"""A scenario played by real programs in a real, private network: as processes, or in containers.
 
 Build the lab, start vehicles and agents and the mission's clock, play the mission while watching everybody, export,
 stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and still exports what there is.
@@ -6,17 +6,18 @@ stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and s
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.play.control import Status
-from harness.play.mission import Played, Story
+from harness.play.mission import Played
 from harness.play.process.agent import AgentProcess, reboots_with_disk
 from harness.play.process.lab import Lab, OpenLab
-from harness.play.process.preflight import network_needs, on_the_air
+from harness.play.process.preflight import on_the_air
 from harness.play.process.rogue import RogueProcess
 from harness.play.process.vehicle import VehicleProcess, system_ids
 from harness.play.process.watchers import Watchers, unless_interrupted
@@ -28,7 +29,6 @@ from netem.capture import Capture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import CaptureError, LabUnavailable, NetemError
-from netem.lab import Lab as ProcessLab
 from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
 from ucp.clock import MICROSECONDS, MissionClock
 
@@ -39,13 +39,8 @@ FOLLOW_S = 0.1
 """Wall time between two looks at where the vehicles are, at least."""
 
 
-async def open_lab(scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> Lab:
-    """The lab of processes. Raises NetemError."""
-    return await ProcessLab.open(scenario.on_the_air, needs=network_needs(scenario), log=rundir.lab_log)
-
-
 class ProcessRun:
-    """One run; `play` it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early.
+    """One run; open it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early.
 
     `open_lab` says what vehicles and agents are made of, `agent_command` what starts an agent there.
     With `keeps_disks` every agent has a disk that it can be rebooted with, else those that the scenario reboots so.
@@ -62,8 +57,8 @@ class ProcessRun:
         interrupted: asyncio.Event,
         *,
         agent_command: Sequence[str],
-        open_lab: OpenLab = open_lab,
-        keeps_disks: bool = False,
+        open_lab: OpenLab,
+        keeps_disks: bool,
     ) -> None:
         self.scenario = scenario
         self.seed = seed
@@ -93,10 +88,11 @@ class ProcessRun:
         kind = self._kinds[self.scenario.vehicles.type_of(vehicle_id)]
         return VehicleProcess(vehicle_id, self._system_ids[vehicle_id], kind, self.rundir, life)
 
-    async def play(self, story: Story) -> Played:
-        """Raises HarnessError if there is no lab, MachineError if this machine cannot build it.
+    @asynccontextmanager
+    async def opened(self) -> AsyncIterator[Self]:
+        """The mission is inside. Raises HarnessError if there is no lab, MachineError if this machine cannot build it.
 
-        All else that goes wrong is in the answer.
+        All else that goes wrong is in `played`.
         """
         try:
             lab = await unless_interrupted(self._open_lab(self.scenario, self.rundir, self._show), self.interrupted)
@@ -110,8 +106,8 @@ class ProcessRun:
             self._lab = lab
             self.played.engine = lab.engine
             try:
-                mission = story(self, self.scenario)
-                await self._watchers.guard(mission, self._watch_for_interruption(), lab.watch())
+                async with self._watchers.guard(self._watch_for_interruption(), lab.watch()):
+                    yield self
             except HarnessError as error:
                 self._ended_early(error)
             except CaptureError as error:
@@ -121,7 +117,6 @@ class ProcessRun:
             except OSError as error:
                 self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
             await self._wind_up(lab)
-        return self.played
 
     async def _watch_for_interruption(self) -> None:
         await self.interrupted.wait()

@@ -2,7 +2,8 @@
 
 import asyncio
 from collections import defaultdict
-from collections.abc import Awaitable, Coroutine
+from collections.abc import AsyncIterator, Awaitable, Coroutine
+from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
 from harness.errors import HarnessError, InterruptedRunError
@@ -19,13 +20,14 @@ class Watchers:
         self._tasks: dict[str, list[asyncio.Task[None]]] = defaultdict(list)
         """Of what -> the tasks that watch it, or fly it."""
 
-    async def guard(self, mission: Awaitable[None], *watched: Coroutine[Any, Any, None]) -> None:
-        """Run the mission beside what is watched all along; raises the first failure of anything."""
+    @asynccontextmanager
+    async def guard(self, *watched: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+        """The mission is inside, beside what is watched all along; raises the first failure of anything."""
         try:
             async with self._group:
                 for coroutine in watched:
                     self.start(coroutine)
-                await mission
+                yield
                 for what in list(self._tasks):
                     self.stop(what)
         except BaseExceptionGroup as errors:

@@ -13,7 +13,6 @@ from random import Random
 from typing import TYPE_CHECKING, Any, Protocol
 
 from harness.collector import uncollected
-from harness.errors import ScenarioError
 from harness.play.mission import Played
 from harness.play.radio_range import TRACK_S, Reach, tracks_of
 from harness.play.seeds import agent_seed
@@ -41,19 +40,6 @@ SCRIPTED_EVENT_ID = 1
 ANY_LIFE = 0
 BREATH_S = 20.0
 """Mission seconds between two looks at whoever watches."""
-
-
-def refuse_what_needs_processes(scenario: Scenario) -> None:
-    """Raises ScenarioError naming the keys that virtual time cannot give."""
-    asked = {
-        "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
-        "vehicles.binary": scenario.vehicles.binary is not None,
-        "agent_command": scenario.agent_command is not None,
-    }
-    keys = [f"`{key}`" for key, needed in asked.items() if needed]
-    if keys:
-        verb = "need" if len(keys) > 1 else "needs"
-        raise ScenarioError(f"{', '.join(keys)} {verb} real processes: use --backend process, or leave it out")
 
 
 class Recorder(Protocol):

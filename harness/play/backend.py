@@ -1,0 +1,56 @@
+"""What a backend is: it says its name, refuses what it cannot play, and opens the swarm that a story is played on.
+
+Whoever treats backends differently asks one of these properties, and never which backend it is. A new one is a room of
+its own here, its name in `harness.scenario.backend`, and its place in the table `harness.play.backends`.
+"""
+
+import asyncio
+from abc import ABC, abstractmethod
+from contextlib import AbstractAsyncContextManager
+from typing import ClassVar
+
+from harness.archive.directory import RunDirectory
+from harness.play.mission import Swarm
+from harness.play.progress import Progress
+from harness.scenario import Scenario
+from harness.scenario.backend import BackendName
+
+
+class Backend(ABC):
+    """Plays scenarios, any number of them."""
+
+    name: ClassVar[BackendName]
+    virtual_time: ClassVar[bool] = False
+    """Whether mission time is computed: no machine is late for it, a speedup means nothing, there is no telemetry."""
+    plays_in_memory: ClassVar[bool] = False
+    """Whether `harness.run.simulate` plays the same without a run directory, for sweeps over thousands of runs."""
+
+    not_in_uml: ClassVar[str | None] = None
+    """Why it does not play inside User Mode Linux, and the way out; None if it does."""
+
+    @abstractmethod
+    def refuse(self, scenario: Scenario) -> None:
+        """Raises HarnessError, a sentence with the way out, if the scenario cannot be played so, or not here."""
+
+    def remark(self, scenario: Scenario) -> str | None:
+        """What it plays otherwise than the scenario says, in a sentence, if anything."""
+        return None
+
+    @abstractmethod
+    def open(
+        self,
+        scenario: Scenario,
+        seed: int,
+        rundir: RunDirectory,
+        progress: Progress,
+        interrupted: asyncio.Event,
+        *,
+        keeps_disks: bool = False,
+    ) -> AbstractAsyncContextManager[Swarm]:
+        """A swarm, opened, for a scenario that has not been refused; it leaves its files in `rundir`.
+
+        Whatever ends the mission early, `interrupted` too, raises inside the block, leaves it, and is on record in
+        `played` then, as is everything else. With `keeps_disks` any agent can be rebooted with its disk, not only those
+        that the scenario reboots so: of a mission that is told while it is played. Raises HarnessError if there is no
+        swarm to be had.
+        """

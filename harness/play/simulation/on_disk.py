@@ -1,0 +1,73 @@
+"""A simulated run on disk: the files of a run directory that agents as processes would write themselves."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from harness.archive.directory import RunDirectory
+from harness.play.simulation.backend import Life, Simulation
+from netem.radio import Place
+from ucp.export import export_chain
+from ucp.files import TraceFile, write_json_atomically
+from ucp.trace import HandlerRun, header_line
+
+
+class OnDisk:
+    """The simulation's `Recorder` that writes them."""
+
+    tracing = True
+
+    def __init__(self, rundir: RunDirectory) -> None:
+        self._rundir = rundir
+        self._traces: dict[int, TraceFile] = {}
+
+    def begin(self, life: Life) -> None:
+        agent_id = life.agent.agent_id
+        if agent_id not in self._traces:
+            self._traces[agent_id] = TraceFile(self._rundir.agents / f"{agent_id}.trace.jsonl")
+        self._traces[agent_id].write(header_line(**header(life)))
+
+    def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
+        """The block that it becomes part of has it."""
+
+    def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
+        self._traces[agent_id].write("".join([run.to_line() for run in runs]))
+
+    def changed(self, record: dict[str, Any]) -> None:
+        self._rundir.append_network(record)
+
+    def injected(self, record: dict[str, Any]) -> None:
+        self._rundir.append_injected(record)
+
+    def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
+        self._rundir.append_tracks(at_s, places)
+
+    def keep_chains(self, simulation: Simulation) -> None:
+        self.export(simulation)
+        self._rundir.keep_exports_before_final_reconcile()
+
+    def export(self, simulation: Simulation) -> None:
+        """Raises OSError."""
+        for life in simulation.living():
+            path = self._rundir.agents / f"{life.agent.agent_id}.chain.json"
+            write_json_atomically(path, export_chain(life.agent.state, simulation.timestamp_us(life)))
+
+    def problems(self) -> dict[int, str]:
+        """Why the trace of which agent ends early."""
+        return {agent_id: trace.problem for agent_id, trace in self._traces.items() if trace.problem}
+
+    def close(self) -> None:
+        for trace in self._traces.values():
+            trace.close()
+
+
+def header(life: Life) -> dict[str, Any]:
+    """The first line of a trace, as keywords of `ucp.trace.header_line`."""
+    agent = life.agent
+    clock = {"epoch_us": 0, "speedup": 1, **(life.clock.model_dump() if life.clock else {})}
+    return {
+        "agent_id": agent.agent_id,
+        "roster": sorted(agent.roster),
+        "settings": dataclasses.asdict(agent.state.settings),
+        "clock": clock,
+    }

@@ -1,0 +1,105 @@
+"""The backend of virtual time: the very same agents on a simulated air, into a run directory as any other run."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, closing
+from functools import partial
+
+from harness.archive.directory import RunDirectory
+from harness.errors import InterruptedRunError, MachineError, ScenarioError
+from harness.play.backend import Backend
+from harness.play.control import Status
+from harness.play.progress import Progress, Snapshot
+from harness.play.simulation.air import VirtualAir
+from harness.play.simulation.backend import Life, Simulation
+from harness.play.simulation.captured_air import CapturedAir, VirtualCapture
+from harness.play.simulation.on_disk import OnDisk
+from harness.scenario import Scenario
+
+
+class VirtualTime(Backend):
+    name = "sim"
+    virtual_time = True
+    plays_in_memory = True
+    not_in_uml = "--kernel uml is for real processes: virtual time, --backend sim, needs no kernel"
+
+    def refuse(self, scenario: Scenario) -> None:
+        asked = {
+            "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
+            "vehicles.binary": scenario.vehicles.binary is not None,
+            "agent_command": scenario.agent_command is not None,
+        }
+        keys = [f"`{key}`" for key, needed in asked.items() if needed]
+        if keys:
+            verb = "need" if len(keys) > 1 else "needs"
+            raise ScenarioError(f"{', '.join(keys)} {verb} real processes: use --backend process, or leave it out")
+
+    def remark(self, scenario: Scenario) -> str | None:
+        if scenario.events.source != "mavlink":
+            return None
+        return "Virtual time has no telemetry: events are random (Algorithm 21)."
+
+    @asynccontextmanager
+    async def open(
+        self,
+        scenario: Scenario,
+        seed: int,
+        rundir: RunDirectory,
+        progress: Progress,
+        interrupted: asyncio.Event,
+        *,
+        keeps_disks: bool = False,
+    ) -> AsyncIterator[Simulation]:
+        async def breathe(simulation: Simulation) -> None:
+            progress.show(_snapshot(simulation))
+            await asyncio.sleep(0)  # lets the loop hear of Ctrl-C
+            if interrupted.is_set():
+                raise InterruptedRunError(f"the run was interrupted at mission second {simulation.now():.0f}")
+
+        with closing(OnDisk(rundir)) as files:
+            capture = _captures(rundir, scenario) if scenario.capture else None
+            air = partial(CapturedAir, capture) if capture else VirtualAir
+            simulation = Simulation(scenario, seed, files, breathe=breathe, air=air)
+            try:
+                yield simulation
+            except InterruptedRunError as error:
+                simulation.played.end_early("interrupted", error)
+            except OSError as error:
+                simulation.played.end_early("failed", _failure(error, rundir))
+            simulation.end()
+            try:
+                if capture:
+                    simulation.played.capture = capture.end(simulation.now())
+                files.export(simulation)
+            except OSError as error:
+                simulation.played.end_early("failed", _failure(error, rundir))
+            for agent_id, problem in files.problems().items():
+                simulation.played.agents[str(agent_id)]["trace_problem"] = problem
+
+
+def _failure(error: OSError, rundir: RunDirectory) -> MachineError:
+    return MachineError(f"{error.strerror}: {error.filename or rundir.path}")
+
+
+def _captures(rundir: RunDirectory, scenario: Scenario) -> VirtualCapture:
+    try:
+        return VirtualCapture(rundir.capture(), scenario.roster)
+    except OSError as error:
+        raise MachineError(f"{error.strerror}: {error.filename}") from None
+
+
+def _snapshot(simulation: Simulation) -> Snapshot:
+    statuses = {life.agent.agent_id: _status(life) for life in simulation.living()}
+    return Snapshot(simulation.stage, simulation.now(), simulation.scenario.duration_s, simulation.network, statuses)
+
+
+def _status(life: Life) -> Status:
+    state = life.agent.state
+    return Status.model_construct(
+        idle=state.idle,
+        reconcile_in_progress=state.reconcile_in_progress,
+        chain=len(state.chain),
+        deque=len(state.blocks_to_be_committed),
+        completed=len(state.completed),
+        reconciles=state.reconciles,
+    )
