@@ -8,6 +8,7 @@ from harness.archive.block_names import name_blocks
 from harness.archive.exports import SUFFIX, Export
 from harness.archive.result import agent_ids, listing, mapping
 from harness.errors import ExportError, RunDirectoryError
+from harness.play.backends import in_virtual_time
 
 
 @dataclass
@@ -57,7 +58,8 @@ def read(archive: RunArchive) -> Logbook:
 def _logged_telemetry(run: dict[str, Any]) -> bool:
     """Events are random where no vehicle flies; those of exports that came without a run are taken for telemetry."""
     source, kind = mapping(run, "scenario", "events").get("source"), mapping(run, "scenario", "vehicles").get("kind")
-    return source is None or (run.get("backend") != "sim" and source == "mavlink" and kind != "none")
+    flown = source == "mavlink" and kind != "none"
+    return source is None or (flown and not in_virtual_time(run.get("backend")))
 
 
 def _absent(agent_id: int, agent: dict[str, Any]) -> str:
