@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.play.process.lab import Lab
+from harness.play.process.preflight import refuse_what_programs_cannot
 from harness.play.process.processes import Processes
 from harness.scenario import Scenario
 from harness.scenario.backend import BackendName
@@ -20,8 +21,9 @@ class Containers(Processes):
     def refuse(self, scenario: Scenario) -> None:
         from harness.play.containers.preflight import refuse_what_docker_cannot
 
-        super().refuse(scenario)
+        refuse_what_programs_cannot(scenario)
         refuse_what_docker_cannot(scenario)
+        self.agent_command(scenario)
 
     def agent_command(self, scenario: Scenario) -> list[str]:
         if scenario.docker.image is not None and scenario.agent_command is not None:

@@ -5,6 +5,7 @@ import tempfile
 from pathlib import Path
 
 from harness.errors import MachineError, ScenarioError
+from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario
 from harness.scenario.changes import NetworkChange, timeline_of
 from netem.conditions import NetworkConditions
@@ -12,6 +13,13 @@ from netem.errors import ConditionsError, EngineError, LabUnavailable, NetemErro
 from netem.lab import Lab
 from netem.radio import over_the_air
 from netem.tc import may_refuse
+
+
+def refuse_what_programs_cannot(scenario: Scenario) -> None:
+    """Raises HarnessError for what neither processes nor containers can play, or not on this machine."""
+    refuse_what_needs_virtual_time(scenario)
+    refuse_what_this_machine_cannot(scenario)
+    choose_vehicles(scenario)
 
 
 def refuse_what_needs_virtual_time(scenario: Scenario) -> None:

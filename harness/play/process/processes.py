@@ -12,11 +12,7 @@ from harness.play.mission import Swarm
 from harness.play.process import agent
 from harness.play.process.backend import ProcessRun
 from harness.play.process.lab import Lab
-from harness.play.process.preflight import (
-    network_needs,
-    refuse_what_needs_virtual_time,
-    refuse_what_this_machine_cannot,
-)
+from harness.play.process.preflight import network_needs, refuse_what_programs_cannot
 from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.play.progress import Progress
 from harness.scenario import Scenario
@@ -28,9 +24,7 @@ class Processes(Backend):
     name: ClassVar[BackendName] = "process"
 
     def refuse(self, scenario: Scenario) -> None:
-        refuse_what_needs_virtual_time(scenario)
-        refuse_what_this_machine_cannot(scenario)
-        choose_vehicles(scenario)
+        refuse_what_programs_cannot(scenario)
         self.agent_command(scenario)
 
     def agent_command(self, scenario: Scenario) -> list[str]:
