@@ -4,8 +4,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from harness.backend_names import BackendName
 from harness.scenario import Scenario
-from harness.scenario.backend import BackendName
 
 SCHEMA = "ucp-run/1"
 

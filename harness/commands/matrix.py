@@ -7,13 +7,13 @@ import typer
 
 from harness import matrix
 from harness.archive.directory import default_path
+from harness.backend_names import BackendName
 from harness.commands.terminal import complain, end_sweep
 from harness.matrix import nights as nights_of_matrix
 from harness.matrix import outputs, results, table
 from harness.matrix.baseline import load_baseline
 from harness.matrix.run import compared, on_cluster, on_cores
 from harness.run.sweep import cores
-from harness.scenario.backend import BackendName
 
 
 def matrix_command(

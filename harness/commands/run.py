@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from harness.archive.directory import default_path
+from harness.backend_names import BackendName
 from harness.commands.terminal import complain, show_result, show_rogue, show_survival
 from harness.errors import HarnessError, ScenarioError
 from harness.machine.kernel import Kernel, run_inside
@@ -20,7 +21,6 @@ from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.report.capture import gaps
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.backend import BackendName
 from harness.scenario.load import explain
 
 

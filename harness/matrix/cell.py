@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, ConfigDict
 
+from harness.backend_names import BackendName
 from harness.checker.characteristic import Verdict
 from harness.checker.verdict import CHECKS
 from harness.matrix.estimate import Estimate
 from harness.matrix.metrics import BEFORE_FINAL_RECONCILE, METRICS
 from harness.matrix.model import Point, Task
-from harness.scenario.backend import BackendName
 
 
 class Placed(BaseModel):

@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from harness.backend_names import BackendName
 from harness.errors import ScenarioError
 from harness.play.backends import BACKENDS
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
-from harness.scenario.backend import BackendName
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Probability
 
 MAX_SEEDS = 10_000

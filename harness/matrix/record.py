@@ -4,11 +4,11 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from harness.backend_names import BackendName
 from harness.errors import INTERRUPTED, VIOLATED
 from harness.matrix.cell import Cell, Placed
 from harness.matrix.comparison import Comparison
 from harness.matrix.model import Matrix
-from harness.scenario.backend import BackendName
 
 SCHEMA = "ucp-matrix/1"
 

@@ -1,7 +1,7 @@
 """What a backend is: it says its name, refuses what it cannot play, and opens the swarm that a story is played on.
 
 Whoever treats backends differently asks one of these properties, and never which backend it is. A new one is a room of
-its own here, its name in `harness.scenario.backend`, and its place in the table `harness.play.backends`.
+its own here, its name in `harness.backend_names`, and its place in the table `harness.play.backends`.
 """
 
 import asyncio
@@ -10,10 +10,10 @@ from contextlib import AbstractAsyncContextManager
 from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
+from harness.backend_names import BackendName
 from harness.play.mission import Swarm
 from harness.play.progress import Progress
 from harness.scenario import Scenario
-from harness.scenario.backend import BackendName
 
 
 class Backend(ABC):

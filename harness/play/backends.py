@@ -2,11 +2,11 @@
 
 from typing import Any
 
+from harness.backend_names import BackendName
 from harness.play.backend import Backend
 from harness.play.containers.backend import Containers
 from harness.play.process.processes import Processes
 from harness.play.simulation.virtual_time import VirtualTime
-from harness.scenario.backend import BackendName
 
 BACKENDS: dict[BackendName, Backend] = {one.name: one for one in (Processes(), Containers(), VirtualTime())}
 

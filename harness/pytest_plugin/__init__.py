@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from harness.scenario.backend import BACKEND_NAMES
+from harness.backend_names import BACKEND_NAMES
 
 if TYPE_CHECKING:
     from harness.pytest_plugin.findings import Findings

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from harness.backend_names import BACKEND_NAMES, BackendName
 from harness.errors import ScenarioError
 from harness.play.progress import Silent
 from harness.pytest_plugin import TRIAL
@@ -16,7 +17,6 @@ from harness.pytest_plugin.swarm_in_test import Swarm
 from harness.pytest_plugin.trial import Trial, one_sentence
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.backend import BACKEND_NAMES, BackendName
 from harness.scenario.load import parse
 
 DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}

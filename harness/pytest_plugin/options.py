@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from harness.backend_names import BackendName
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
-from harness.scenario.backend import BackendName
 from harness.scenario.load import parse
 
 

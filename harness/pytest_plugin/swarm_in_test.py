@@ -9,6 +9,7 @@ from typing import Any
 
 from harness import checker
 from harness.archive.archive import RunArchive
+from harness.backend_names import BackendName
 from harness.errors import HarnessError, ScenarioError
 from harness.play import mission
 from harness.play.backend import Backend
@@ -19,7 +20,6 @@ from harness.pytest_plugin.findings import Findings, Judgement
 from harness.pytest_plugin.told import Sentence, Told
 from harness.run.run import Recording, Run
 from harness.scenario import Scenario
-from harness.scenario.backend import BackendName
 
 
 class RunEndedError(Exception):

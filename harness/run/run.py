@@ -15,6 +15,7 @@ from harness import checker, report
 from harness.archive.archive import RunArchive
 from harness.archive.directory import RunDirectory
 from harness.archive.record import RogueInjection, RunRecord, Survival
+from harness.backend_names import BackendName
 from harness.checker.injections import account
 from harness.checker.survival import survival
 from harness.checker.timer_lag import Lateness, lateness
@@ -25,7 +26,6 @@ from harness.play.backends import BACKENDS, in_virtual_time
 from harness.play.mission import Played
 from harness.play.progress import Progress
 from harness.scenario import Scenario
-from harness.scenario.backend import BackendName
 from netem import uml
 
 PACKAGES = ("ucp-harness", "pymavlink", "pyroute2")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from harness.scenario.backend import BackendName
+from harness.backend_names import BackendName
 from harness.scenario.model import BOUNDED, Model
 
 Verdict = Literal["holds", "violated", "not applicable"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from harness.archive.directory import RunDirectory
+from harness.backend_names import BACKEND_NAMES
 from harness.errors import ScenarioError
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
@@ -15,7 +16,6 @@ from harness.play.mission import Played, Swarm
 from harness.play.progress import Progress, Silent
 from harness.run.run import run
 from harness.scenario import Scenario
-from harness.scenario.backend import BACKEND_NAMES
 from harness.scenario.changes import Change
 from tests.harness.matrix.stub import judge, matrix, played
 from tests.harness.mission import write_exports
@@ -61,10 +61,10 @@ class OnPerfectAir(Swarm):
         self.air.reconcile(agent_id)
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        return {number: agent.chain.top_chain_hash.hex() for number, agent in self.air.agents.items()}
+        return {number: agent.state.chain.top_chain_hash.hex() for number, agent in self.air.agents.items()}
 
     async def completed(self) -> dict[int, int]:
-        return {number: len(agent.completed) for number, agent in self.air.agents.items()}
+        return {number: len(agent.state.completed) for number, agent in self.air.agents.items()}
 
     async def take_stock(self) -> Played:
         write_exports(self.air, self._rundir.agents)

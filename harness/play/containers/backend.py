@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
+from harness.backend_names import BackendName
 from harness.play.process.lab import Lab
 from harness.play.process.preflight import refuse_what_programs_cannot
 from harness.play.process.processes import Processes
 from harness.scenario import Scenario
-from harness.scenario.backend import BackendName
 
 
 class Containers(Processes):

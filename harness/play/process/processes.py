@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
+from harness.backend_names import BackendName
 from harness.play.backend import Backend
 from harness.play.mission import Swarm
 from harness.play.process import agent
@@ -16,7 +17,6 @@ from harness.play.process.preflight import network_needs, refuse_what_programs_c
 from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.play.progress import Progress
 from harness.scenario import Scenario
-from harness.scenario.backend import BackendName
 from netem.lab import Lab as ProcessLab
 
 
