@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.archive.jsonlines import JsonLines
 from harness.archive.tracks import MissionSeconds
+from harness.scenario.faults import named
 from netem.conditions import NetworkConditions
 from netem.radio import components
 
@@ -24,9 +25,6 @@ NETWORK_FILE = "network.jsonl"
 Pair = tuple[int, int]
 """Two vehicles, the lower ID first."""
 Components = tuple[frozenset[int], ...]
-
-LOST_WITH: tuple[str, ...] = ("kill", "crash")
-"""What takes a vehicle out of the air, until it is restarted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +94,9 @@ class _Network:
             self._cut_off = {pair for pair in self._pairs.values() if len(components(conditions, pair)) > 1}
         self._out_of_range -= losses.keys()
         self._out_of_range |= {pair for pair, loss in losses.items() if loss == 1.0}
-        if line.what in LOST_WITH:
+        if (fault := named(line.what)).takes_the_vehicle:
             self.lost |= set(line.agents) & set(self.vehicles)
-        elif line.what == "restart":
+        elif fault.brings_a_vehicle:
             self.lost -= set(line.agents)
 
     def components(self) -> Components:
@@ -142,7 +140,7 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
         switched, fallen = cut_before ^ network.cut, lost_before ^ network.lost
         _switch(cut, switched, now_s)
         _switch(lost, fallen, now_s)
-        if line.what == "reboot":
+        if (fault := named(line.what)).ends_a_life and not fault.takes_the_vehicle:
             reboots += [(now_s, vehicle) for vehicle in line.agents if vehicle in network.vehicles]
         if switched or fallen or not states:
             _enter(states, State(now_s, line.what, network.components()))

@@ -17,8 +17,6 @@ from ucp.trace import HandlerRun
 
 LATEST_S = 1e7
 """No mission is as long; a handler run with a later time, or with none that can be, is left out."""
-TAKES_DOWN = ("kill", "crash", "reboot")
-"""Faults that end a life of an agent."""
 
 PhaseName = Literal["phase 1", "phase 2", "phase 3", "finalize"]
 PHASES: dict[str, PhaseName] = {
@@ -133,7 +131,7 @@ def course(traces: Mapping[int, Trace], faults: Iterable[Fault], end_s: float, *
     """`end_s` is when the run ended, in mission seconds; without `whole` traces there are no messages."""
     falls: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
-        if fault.what in TAKES_DOWN:
+        if fault.kind.ends_a_life:
             for agent in fault.agents or ():
                 falls[agent].append(fault.at_s)
     found = Course([], [], [], [], [] if whole else None)

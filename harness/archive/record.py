@@ -5,7 +5,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
-from harness.scenario import Scenario
+from harness.scenario import Scenario, faults
+from harness.scenario.faults import Disk
 
 SCHEMA = "ucp-run/1"
 
@@ -47,8 +48,18 @@ class Fault(_Model):
     detail: str
     fully_connected: bool | None = None
     agents: list[int] | None = None
-    disk: Literal["kept", "lost"] | None = None
+    disk: Disk | None = None
     """What a reboot left of it."""
+
+    @property
+    def kind(self) -> type[faults.Fault]:
+        """What is known of such faults."""
+        return faults.named(self.what)
+
+    @property
+    def loses_data(self) -> bool:
+        """Whether all that the agents held was gone."""
+        return self.kind.loses_data(self.disk)
 
 
 class FinalReconcile(_Model):

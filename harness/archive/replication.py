@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from harness.archive.connectivity import LOST_WITH
 from harness.archive.history import lives
 from harness.archive.record import Fault
 from harness.archive.traces import Trace
@@ -70,10 +69,10 @@ class _Chains:
         self._copies_of_completed = 0
 
     def suffer(self, agent: int, fault: Fault) -> None:
-        if fault.what in LOST_WITH or (fault.what == "reboot" and fault.disk == "lost"):
+        if fault.loses_data:
             self._empty(agent)
             self._paths.pop(agent, None)
-        elif fault.what in ("restart", "boot"):
+        elif fault.kind.begins_a_life:
             self._mutual = 0 if agent not in self._paths else self._mutual
             self._paths.setdefault(agent, [])
 

@@ -61,7 +61,7 @@ class Evidence:
         for fault in self.record.faults if self.record else ():
             if agent_id not in (fault.agents or ()):
                 continue
-            if fault.what == "pause":
+            if fault.kind.stands_still:
                 since = fault.at_s
             elif since is not None:
                 if since <= until_s and fault.at_s >= from_s:

@@ -15,14 +15,13 @@ from harness.archive.traces import Held, Trace
 from harness.checker.characteristic import agents
 from harness.checker.evidence import Evidence
 
-LOSSES = ("kill", "crash")
 LOSSES_TOLD = 5
 
 
 def survival(evidence: Evidence) -> Survival:
     """What became of the completed blocks with each loss of vehicles, and what the next loss could take."""
     at_end = _holders(evidence.exports)
-    lost = [fault for fault in (evidence.record.faults if evidence.record else ()) if _is_loss(fault)]
+    lost = [fault for fault in (evidence.record.faults if evidence.record else ()) if fault.loses_data]
     return Survival(
         losses=_losses(evidence, lost, at_end),
         completed=len(evidence.completed_blocks()),
@@ -30,10 +29,6 @@ def survival(evidence: Evidence) -> Survival:
         at_end=_least_held(evidence, evidence.exports),
         before_final_reconcile=_least_held(evidence, evidence.before_final_reconcile),
     )
-
-
-def _is_loss(fault: Fault) -> bool:
-    return fault.what in LOSSES or (fault.what == "reboot" and fault.disk == "lost")
 
 
 def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:

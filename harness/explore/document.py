@@ -9,8 +9,8 @@ from typing import Any
 
 from harness.explore.tape import Logged, Lost
 from harness.scenario import Scenario
+from harness.scenario.faults import ASKED_FOR
 from harness.scenario.injection import INJECTIONS
-from harness.scenario.timeline import FAULTS
 
 Document = dict[str, Any]
 
@@ -153,8 +153,9 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
         return {**entry, "partition": groups} if groups else None
     if not {sender for name in INJECTIONS if (sender := at(entry, f"{name}.sender")) is not None} <= {*kept}:
         return None
-    entry = _of(entry, FAULTS, kept)
-    return entry if all(entry.get(fault) != [] for fault in FAULTS) else None
+    faults = [kind.what for kind in ASKED_FOR]
+    entry = _of(entry, faults, kept)
+    return entry if all(entry.get(fault) != [] for fault in faults) else None
 
 
 def _of(entry: Document, keys: Collection[str], kept: Collection[int]) -> Document:

@@ -20,6 +20,9 @@ from harness.pytest_plugin.findings import Findings, Judgement
 from harness.pytest_plugin.told import Sentence, Told
 from harness.run.run import Recording, Run
 from harness.scenario import Scenario
+from harness.scenario.faults import ASKED_FOR
+
+_VERBS = [kind.what for kind in ASKED_FOR]
 
 
 class RunEndedError(Exception):
@@ -86,29 +89,21 @@ class Swarm:
 
     # The agents
 
-    def kill(self, *agents: int) -> None:
-        """They are gone with their vehicles, and all that they held with them (Section 3.3)."""
-        __tracebackhide__ = True
-        self._change(kill=list(agents))
+    def __getattr__(self, verb: str) -> Callable[..., None]:
+        """Each fault is a verb, with the further keys of its timeline entry: `kill(2, 4)`, `reboot(3, down_s=10)`."""
+        fault = next((kind for kind in ASKED_FOR if kind.what == verb), None)
+        if fault is None:
+            raise AttributeError(f"a swarm has no {verb!r}; what can happen to it: {', '.join(_VERBS)}")
 
-    def restart(self, *agents: int) -> None:
-        """Killed agents begin anew, with nothing but the inception block."""
-        __tracebackhide__ = True
-        self._change(restart=list(agents))
+        def happen(*agents: int, **further: Any) -> None:
+            __tracebackhide__ = True
+            self._change(**fault.told(*agents, **further))
 
-    def pause(self, *agents: int) -> None:
-        """They stand still, and what reaches them waits."""
-        __tracebackhide__ = True
-        self._change(pause=list(agents))
+        happen.__doc__ = fault.__doc__
+        return happen
 
-    def resume(self, *agents: int) -> None:
-        __tracebackhide__ = True
-        self._change(resume=list(agents))
-
-    def reboot(self, *agents: int, down_s: float = 30.0, disk: str = "kept") -> None:
-        """Their computers brown out; they are back after `down_s` with their `disk` "kept", or "lost"."""
-        __tracebackhide__ = True
-        self._change(reboot=list(agents), down_s=down_s, disk=disk)
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *_VERBS]
 
     def reconcile(self, agent: int) -> None:
         """The agent begins a reconcile."""

@@ -12,12 +12,15 @@ from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
 from typing import Any
 
+from pydantic import ValidationError
+
 from harness.errors import ScenarioError
 from harness.play import mission
 from harness.play.mission import Played
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of
-from harness.scenario.load import parse
+from harness.scenario.load import explain, parse
+from harness.scenario.timeline import TimelineEntry
 
 INSTANT_S = 0.001
 """Of two sentences in one instant the second comes a millisecond later."""
@@ -68,11 +71,10 @@ class Told:
         """Make this entry of a timeline happen now. Raises ScenarioError if it cannot."""
         now = max(swarm.now(), self._played_s + INSTANT_S)
         at_s = math.ceil(now * 1000) / 1000
-        last_s = at_s + entry.get("down_s", 0.0)
         document = self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
-        document["duration_s"] = max(self.scenario.duration_s, last_s)
         try:
+            document["duration_s"] = max(self.scenario.duration_s, _entry(at_s, entry).ends_at_s)
             self.scenario = parse(document)
         except ScenarioError as error:
             raise ScenarioError(re.sub(r"timeline\.\d+(\.|: )", "", str(error))) from None
@@ -126,3 +128,11 @@ class Told:
 
     def _set(self, **keys: Any) -> None:
         self.scenario = self.scenario.model_copy(update=keys)
+
+
+def _entry(at_s: float, keys: dict[str, Any]) -> TimelineEntry:
+    """Raises ScenarioError."""
+    try:
+        return TimelineEntry.model_validate({"at_s": at_s, **keys})
+    except ValidationError as error:
+        raise ScenarioError(explain(error, TimelineEntry)) from None

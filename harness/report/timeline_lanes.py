@@ -13,11 +13,11 @@ from typing import TypeVar
 
 from markupsafe import Markup
 
-from harness.archive.connectivity import LOST_WITH
 from harness.archive.history import CUT_SHORT, Commit, Course, Phase, Reconcile, Tie, Vote
 from harness.archive.record import Fault
 from harness.present.svg import n
 from harness.report.timeline_plot import Shade, pin, plot, seconds, shaded, short, told
+from harness.scenario.faults import KINDS
 
 OUTCOMES = {
     "approved": "approved",
@@ -30,16 +30,6 @@ OUTCOMES = {
 PHASE_HEIGHTS = {"phase 1": 4, "phase 2": 7, "phase 3": 10, "finalize": 2}
 BAR_HEIGHT = 7
 """Of a whole reconcile, where there is no room for phases."""
-FAULT_SHAPES = {
-    "kill": "M-5-5l10 10m0-10l-10 10",
-    "crash": "M-5-5l10 10m0-10l-10 10",
-    "restart": "M-4-5l9 5-9 5z",
-    "reboot": "M0-6l6 6-6 6-6-6z",
-    "boot": "M-4-5l9 5-9 5z",
-    "pause": "M-3-5v10M3-5v10",
-    "resume": "M-4-5l9 5-9 5z",
-}
-"""Around the origin."""
 
 MAX_BARS = 6000
 MAX_COMMITS = 4000
@@ -102,7 +92,7 @@ def draw(
         pin(fault.at_s, end_s, (agents.index(agent) + 0.5) * lane_height, _mark(fault))
         for fault in faults
         for agent in fault.agents or ()
-        if agent in agents and fault.what in FAULT_SHAPES
+        if agent in agents and fault.kind.mark
     ]
     view = [*grounds, shaded(shades, [fault for fault in faults if not fault.agents], height), *lanes]
     arrows = Markup('<svg class="arrows" width="100%" height="{}"></svg>').format(height)
@@ -136,17 +126,11 @@ def _legend(
     ]
     if course.ties:
         entries.append(('<path class="tie" d="M17 8h.01"/>', "tie"))
-    said = {"boot": "restart", "resume": "restart", "crash": "kill"}
-    shapes = {said.get(fault.what, fault.what) for fault in faults if fault.agents}
+    suffered = {fault.kind for fault in faults if fault.agents}
+    meanings = {kind.meaning: kind.mark for kind in KINDS if kind in suffered}
     entries += [
-        (f'<g transform="translate(17 8)"><path class="mark" d="{FAULT_SHAPES[what]}"/></g>', meaning)
-        for what, meaning in (
-            ("kill", "lost"),
-            ("pause", "paused"),
-            ("reboot", "reboots"),
-            ("restart", "goes on, or begins anew"),
-        )
-        if what in shapes
+        (f'<g transform="translate(17 8)"><path class="mark" d="{mark}"/></g>', meaning)
+        for meaning, mark in meanings.items()
     ]
     if shades:
         entries.append(('<rect class="shade" x="4" y="1" width="26" height="14"/>', "network parted"))
@@ -272,14 +256,14 @@ def _alive(agent: int, faults: Sequence[Fault], lane_height: int, end_s: float) 
     since_s: float | None = 0.0
     paused_s: float | None = None
     for fault in (fault for fault in faults if agent in (fault.agents or ())):
-        if fault.what in (*LOST_WITH, "reboot") and since_s is not None:
+        if fault.kind.ends_a_life and since_s is not None:
             ran.append((since_s, fault.at_s))
             since_s = None
-        elif fault.what in ("restart", "boot") and since_s is None:
+        elif fault.kind.begins_a_life and since_s is None:
             since_s = fault.at_s
-        elif fault.what == "pause" and paused_s is None:
+        elif fault.kind.stands_still and paused_s is None:
             paused_s = fault.at_s
-        if fault.what != "pause" and paused_s is not None:
+        if not fault.kind.stands_still and paused_s is not None:
             paused.append((paused_s, fault.at_s))
             paused_s = None
     ran += [(since_s, end_s)] if since_s is not None else []
@@ -303,4 +287,4 @@ def _alive(agent: int, faults: Sequence[Fault], lane_height: int, end_s: float) 
 
 
 def _mark(fault: Fault) -> Markup:
-    return Markup('<path class="mark" d="{}"><title>{}</title></path>').format(FAULT_SHAPES[fault.what], told(fault))
+    return Markup('<path class="mark" d="{}"><title>{}</title></path>').format(fault.kind.mark, told(fault))

@@ -10,10 +10,11 @@ from itertools import groupby, product
 from typing import Any
 
 from harness.scenario import Scenario
+from harness.scenario.faults import Fault
 from harness.scenario.injection import Injection, InjectionName
 from harness.scenario.network import NetworkModel
 from harness.scenario.schedule import UNTOUCHED, Layer
-from harness.scenario.timeline import Disk, FaultName, TimelineEntry
+from harness.scenario.timeline import TimelineEntry
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 RANGE = "range"
@@ -45,26 +46,6 @@ class NetworkChange:
 
 
 @dataclass(frozen=True)
-class AgentFault:
-    """At `at_s` mission seconds something happens to `agents`. `disk` is what a reboot leaves of it."""
-
-    at_s: float
-    what: FaultName
-    agents: tuple[int, ...]
-    disk: Disk | None = None
-
-    @property
-    def detail(self) -> str:
-        who = f"agent{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
-        return who if self.disk is None else f"{who}, disk {self.disk}"
-
-    def to_json(self, at_s: float) -> dict[str, Any]:
-        """The record of this fault, made at `at_s`."""
-        record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
-        return record if self.disk is None else {**record, "disk": self.disk}
-
-
-@dataclass(frozen=True)
 class Injected:
     """At `at_s` mission seconds a rogue node begins to send. Injections are numbered from 1, in order."""
 
@@ -82,18 +63,16 @@ class Injected:
         return {"at_s": at_s, "what": self.what, "detail": self.detail}
 
 
-Change = NetworkChange | AgentFault | Injected
+Change = NetworkChange | Fault | Injected
 
 
 def timeline_of(scenario: Scenario) -> list[Change]:
     """All that the scenario changes, in order; the first is the network's first state, at 0 s."""
-    faults: list[Change] = [
-        AgentFault(at_s, what, entry.fault[1], entry.disk)
-        for at_s, what, entry in scenario.faults_in_order()
-        if entry.fault is not None
-    ]
     first, *states = _network_states(scenario)
-    return [first, *sorted([*states, *faults, *injections_of(scenario)], key=lambda change: change.at_s)]
+    return [
+        first,
+        *sorted([*states, *scenario.faults_in_order(), *injections_of(scenario)], key=lambda change: change.at_s),
+    ]
 
 
 def injections_of(scenario: Scenario) -> list[Injected]:

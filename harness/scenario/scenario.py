@@ -11,11 +11,13 @@ from harness.scenario.docker import Docker
 from harness.scenario.events import Events
 from harness.scenario.expect import Expect
 from harness.scenario.fates import Fate
+from harness.scenario.faults import Fault
+from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.flight import Flight
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
 from harness.scenario.schedule import NEEDED, Schedule
-from harness.scenario.timeline import FAULT_LEADS_TO, FAULT_NEEDS, FaultName, TimelineEntry
+from harness.scenario.timeline import TimelineEntry
 from harness.scenario.vehicles import Vehicles
 from netem.errors import ConditionsError
 from sitl.plan import PlanError
@@ -90,10 +92,15 @@ class Scenario(Model):
     def timeline_in_order(self) -> list[TimelineEntry]:
         return sorted(self.timeline, key=lambda entry: entry.at_s)
 
-    def faults_in_order(self) -> list[tuple[float, FaultName, TimelineEntry]]:
-        """(mission seconds, what, entry) of all that happens to agents; of one instant what was begun first."""
-        faults = [(at_s, what, entry) for entry in self.timeline_in_order() for at_s, what in entry.course()]
-        return sorted(faults, key=lambda fault: fault[0])
+    def faults_in_order(self) -> list[Fault]:
+        """All that happens to agents; of one instant what was begun first."""
+        return [fault for _, fault in self._faults_with_their_keys()]
+
+    def _faults_with_their_keys(self) -> list[tuple[str, Fault]]:
+        begun = [(f"timeline.{index}", entry.fault) for index, entry in enumerate(self.timeline) if entry.fault]
+        begun.sort(key=lambda keyed: keyed[1].at_s)
+        course = [(f"{where}.{fault.what}", one) for where, fault in begun for one in fault.course()]
+        return sorted(course, key=lambda keyed: keyed[1].at_s)
 
     @field_validator("agents", mode="before")
     @classmethod
@@ -153,8 +160,7 @@ class Scenario(Model):
             yield from ((f"fates.{index}.block", int(name.split(".")[0])) for name in (fate.block,) if name)
         for index, entry in enumerate(self.timeline):
             if entry.fault is not None:
-                what, agents = entry.fault
-                yield from ((f"timeline.{index}.{what}", agent) for agent in agents)
+                yield from ((f"timeline.{index}.{entry.fault.what}", agent) for agent in entry.fault.agents)
             if entry.injection is not None:
                 injected, it = entry.injection
                 yield from ((f"timeline.{index}.{injected}.sender", agent) for agent in (it.sender,) if agent)
@@ -222,24 +228,20 @@ class Scenario(Model):
 
     @model_validator(mode="after")
     def _faults_can_be_played(self) -> "Scenario":
-        state = dict.fromkeys(self.roster, "running")
-        for at_s, what, entry in self.faults_in_order():
-            assert entry.fault is not None, "it is one"
-            key, agents = entry.fault
-            where = f"timeline.{self.timeline.index(entry)}.{key}"
-            if at_s > self.duration_s:
+        state = dict.fromkeys(self.roster, RUNNING)
+        for where, fault in self._faults_with_their_keys():
+            if fault.at_s > self.duration_s:
                 end = f"the mission's end at {self.duration_s:g} s"
-                raise ValueError(f"{where}: its agents would be back at {at_s:g} s, after {end}")
-            if what == "crash" and self.vehicles.kind == "none":
-                raise ValueError(
-                    f"{where} needs vehicles that can fall: `vehicles.kind` is none, where `kill` does the same"
-                )
-            for agent in agents:
-                if state[agent] not in FAULT_NEEDS[what]:
-                    needed = " or ".join(FAULT_NEEDS[what])
-                    raise ValueError(f"{where}: agent {agent} is {state[agent]} then, not {needed}")
-                state[agent] = FAULT_LEADS_TO[what]
-        if set(state.values()) == {"killed"}:
+                raise ValueError(f"{where}: its agents would be back at {fault.at_s:g} s, after {end}")
+            try:
+                fault.check(self.vehicles)
+            except ValueError as error:
+                raise ValueError(f"{where} {error}") from None
+            for agent in fault.agents:
+                if state[agent] not in fault.needs:
+                    raise ValueError(f"{where}: agent {agent} is {state[agent]} then, not {' or '.join(fault.needs)}")
+                state[agent] = fault.leads_to
+        if set(state.values()) == {KILLED}:
             raise ValueError("the timeline leaves nobody: at the end all agents are killed; spare or restart one")
         return self
 

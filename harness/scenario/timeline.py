@@ -1,9 +1,10 @@
 """What a scenario changes while it runs: the network, who is alive, and what a rogue node sends."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
-from pydantic import Field, model_validator
+from pydantic import create_model, model_validator
 
+from harness.scenario.faults import ASKED_FOR, Agents, Fault
 from harness.scenario.injection import (
     INJECTIONS,
     Corrupt,
@@ -15,58 +16,21 @@ from harness.scenario.injection import (
     InjectionName,
     Replay,
 )
-from harness.scenario.model import Instant, Model, Seconds, VehicleId
+from harness.scenario.model import Instant, Model, VehicleId
 from harness.scenario.network import Loss
 
-FaultName = Literal["kill", "crash", "restart", "pause", "resume", "reboot", "boot"]
-"""What can happen to agents; `boot` is the end of a `reboot`, and no key of its own."""
-FAULTS: tuple[FaultName, ...] = ("kill", "crash", "restart", "pause", "resume", "reboot")
-"""Those that are keys of a timeline entry."""
-FAULT_NEEDS: dict[FaultName, tuple[str, ...]] = {
-    "kill": ("running", "paused"),
-    "crash": ("running", "paused"),
-    "restart": ("killed",),
-    "pause": ("running",),
-    "resume": ("paused",),
-    "reboot": ("running", "paused"),
-    "boot": ("rebooting",),
-}
-FAULT_LEADS_TO: dict[FaultName, str] = {
-    "kill": "killed",
-    "crash": "killed",
-    "restart": "running",
-    "pause": "paused",
-    "resume": "running",
-    "reboot": "rebooting",
-    "boot": "running",
-}
 
-Disk = Literal["kept", "lost"]
-Agents = Annotated[list[VehicleId], Field(min_length=1)]
-
-
-class TimelineEntry(Model):
+class _Entry(Model):
     """At `at_s` mission seconds, one change: a new loss, a partition, heal; something happens to agents; an injection.
 
-    `kill`: they are gone with their vehicles, and all that they held with them (Section 3.3). `crash`: the same, after
-    their vehicles have fallen to the ground. `restart`: killed agents begin anew on vehicles at their homes, holding
-    nothing but the inception block. `pause`: they stand still, and what reaches them waits until `resume`. `reboot`:
-    their computers brown out and are back after `down_s` mission seconds, with what was on their `disk` or with
-    nothing; their vehicles fly on. Injections, from `replay` to `flood`: `harness.scenario.injection`.
+    What happens to agents, from `crash` to `resume`: `harness.scenario.faults`. Injections, from `replay` to `flood`:
+    `harness.scenario.injection`.
     """
 
     at_s: Instant
     loss: Loss | None = None
     partition: list[list[VehicleId]] | None = None
     heal: Literal[True] | None = None
-    kill: Agents | None = None
-    crash: Agents | None = None
-    restart: Agents | None = None
-    pause: Agents | None = None
-    resume: Agents | None = None
-    reboot: Agents | None = None
-    down_s: Seconds | None = None
-    disk: Disk | None = None
     replay: Replay | None = None
     duplicate: Duplicate | None = None
     delay: Delay | None = None
@@ -80,29 +44,45 @@ class TimelineEntry(Model):
         return next(((name, found) for name in INJECTIONS if (found := getattr(self, name)) is not None), None)
 
     @property
-    def fault(self) -> tuple[FaultName, tuple[int, ...]] | None:
-        """What happens to which agents, if anything does."""
-        for name in FAULTS:
-            agents = getattr(self, name)
-            if agents is not None:
-                return name, tuple(agents)
+    def fault(self) -> Fault | None:
+        """What happens to agents, if anything does."""
+        for kind in ASKED_FOR:
+            if (agents := getattr(self, kind.what)) is not None:
+                return kind(self.at_s, tuple(agents), **{key: getattr(self, key) for key in kind.further_keys()})
         return None
 
-    def course(self) -> list[tuple[float, FaultName]]:
-        """(mission seconds, what) of all that happens to the agents: a reboot is two things."""
-        if self.fault is None:
-            return []
-        what, _ = self.fault
-        return [(self.at_s, what), *([(self.at_s + self.down_s, "boot")] if self.down_s is not None else [])]  # type: ignore[list-item]
+    @property
+    def ends_at_s(self) -> float:
+        """When the last thing that it says happens."""
+        if self.fault is not None:
+            return self.fault.course()[-1].at_s
+        return self.at_s + (self.injection[1].lasts_s if self.injection else 0.0)
 
     @model_validator(mode="after")
     def _one_change(self) -> "TimelineEntry":
-        changes = ("loss", "partition", "heal", *FAULTS, *INJECTIONS)
+        changes = ("loss", "partition", "heal", *(kind.what for kind in ASKED_FOR), *INJECTIONS)
         if sum(getattr(self, change) is not None for change in changes) != 1:
             named = (f"`{change}{': true' if change == 'heal' else ''}`" for change in changes)
             raise ValueError(f"needs exactly one of {', '.join(named)}")
-        if self.reboot is None and (self.down_s is not None or self.disk is not None):
-            raise ValueError("`down_s` and `disk` belong to `reboot`")
-        if self.reboot is not None and (self.down_s is None or self.disk is None):
-            raise ValueError("a reboot needs `down_s`, in mission seconds, and `disk: kept` or `disk: lost`")
+        for kind in ASKED_FOR:
+            given = [key for key in kind.further_keys() if getattr(self, key) is not None]
+            if given and getattr(self, kind.what) is None:
+                raise ValueError(f"{' and '.join(f'`{key}`' for key in kind.further_keys())} belong to `{kind.what}`")
+            if len(given) < len(kind.further_keys()) and getattr(self, kind.what) is not None:
+                raise ValueError(f"a {kind.what} needs {kind.keys_in_words}")
         return self
+
+
+def _keys_of_faults() -> dict[str, Any]:
+    """The fields of an entry that faults bring along: the agents, by the fault's name, and its further keys."""
+    annotations: dict[str, Any] = {}
+    for kind in ASKED_FOR:
+        said = get_type_hints(kind, include_extras=True)
+        annotations |= {kind.what: Agents, **{key: said[key] for key in kind.further_keys()}}
+    return {key: (annotation | None, None) for key, annotation in annotations.items()}
+
+
+if TYPE_CHECKING:
+    TimelineEntry = _Entry
+else:
+    TimelineEntry = create_model("TimelineEntry", __base__=_Entry, __doc__=_Entry.__doc__, **_keys_of_faults())

@@ -320,4 +320,4 @@ class AgentProcess:
 
 def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:
     """Whether the scenario ever asks for what is on the agent's disk."""
-    return any(entry.disk == "kept" and agent_id in (entry.reboot or ()) for entry in scenario.timeline)
+    return any(fault.disk_left == "kept" and agent_id in fault.agents for fault in scenario.faults_in_order())

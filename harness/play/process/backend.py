@@ -24,7 +24,8 @@ from harness.play.process.watchers import Watchers, unless_interrupted
 from harness.play.progress import Progress, Snapshot
 from harness.play.radio_range import TRACK_S, Reach
 from harness.scenario import Scenario
-from harness.scenario.changes import AgentFault, Change, Injected, NetworkChange, describe, injected_nothing
+from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
+from harness.scenario.faults import Fault
 from netem.capture import Capture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
@@ -201,35 +202,40 @@ class ProcessRun:
             self.played.record(change.to_json(round(max(change.at_s, self.clock.now()), 3)))
             await self._rogue.inject(change)
             return
-        await asyncio.gather(*(self._fault(change, agent_id) for agent_id in change.agents))
+        await asyncio.gather(*(self._strike(change, agent_id) for agent_id in change.agents))
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
         self.played.record(record)
         self.rundir.append_network(record)
 
-    async def _fault(self, fault: AgentFault, agent_id: int) -> None:
-        """What the timeline does to an agent, and to its vehicle if it has one."""
+    async def _strike(self, fault: Fault, agent_id: int) -> None:
         if agent_id in self._starting:
             await self._starting.pop(agent_id)
-        number = self.scenario.roster.index(agent_id)
+        await fault.strike(self, agent_id)
+
+    # What faults do to an agent, and to its vehicle if it has one: harness.scenario.faults.Lives
+
+    async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
+        number = self._number(agent_id)
+        shot_down = [self._shoot_down(self.vehicles[number])] if with_vehicle and self.vehicles else []
+        await asyncio.gather(self._kill(self.agents[number], disk_kept=disk_kept), *shot_down)
+
+    async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
+        number = self._number(agent_id)
         agent = self.agents[number]
-        vehicle = self.vehicles[number] if self.vehicles else None
-        match fault.what:
-            case "pause":
-                await agent.pause()
-            case "resume":
-                await agent.resume()
-            case "reboot":
-                await self._kill(agent, disk_kept=fault.disk == "kept")
-            case "kill":
-                await asyncio.gather(self._kill(agent), *([self._shoot_down(vehicle)] if vehicle else []))
-            case "crash":
-                assert vehicle is not None, "without vehicles a crash is refused"
-                self._watchers.start(vehicle.fall(), of=f"flight {agent_id}")
-                await self._kill(agent)
-            case "boot":
-                self._starting[agent_id] = self._watchers.task(self._start_agent(agent, self._lab))
-            case "restart":
-                self._starting[agent_id] = self._watchers.task(self._start_again(agent, number))
+        start = self._start_again(agent, number) if new_vehicle else self._start_agent(agent, self._lab)
+        self._starting[agent_id] = self._watchers.task(start)
+
+    async def fall(self, agent_id: int) -> None:
+        self._watchers.start(self.vehicles[self._number(agent_id)].fall(), of=f"flight {agent_id}")
+
+    async def pause(self, agent_id: int) -> None:
+        await self.agents[self._number(agent_id)].pause()
+
+    async def resume(self, agent_id: int) -> None:
+        await self.agents[self._number(agent_id)].resume()
+
+    def _number(self, agent_id: int) -> int:
+        return self.scenario.roster.index(agent_id)
 
     async def _kill(self, agent: AgentProcess, *, disk_kept: bool = False) -> None:
         self._watchers.stop(f"agent {agent.agent_id}")

@@ -19,7 +19,7 @@ from harness.play.seeds import agent_seed
 from harness.play.simulation.air import NEVER, Flight, Happening, Logged, Stray, VirtualAir
 from harness.play.simulation.fate_script import FateScript, NameOf
 from harness.scenario import Scenario
-from harness.scenario.changes import AgentFault, Change, Injected, NetworkChange, disconnected_until, injected_nothing
+from harness.scenario.changes import Change, Injected, NetworkChange, disconnected_until, injected_nothing
 from harness.scenario.fates import Fate
 from harness.scenario.scenario import Clock
 from netem.medium import Medium
@@ -183,7 +183,7 @@ class Simulation:
             self._rogue.begin(change, self._now)
             return
         for agent_id in change.agents:
-            self._fault(change, self._number[agent_id])
+            await change.strike(self, agent_id)
         self._recorder.changed(record)
 
     def _put_into_force(self, change: NetworkChange, **more: Any) -> None:
@@ -427,24 +427,36 @@ class Simulation:
             this_life = len(self._lives[number])
             self._air.expect(max(self._now, life.born_at + due), number, (this_life, event_id, data))
 
-    def _fault(self, fault: AgentFault, number: int) -> None:
+    # What faults do to it: harness.scenario.faults.Lives
+
+    async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
+        number = self._number[agent_id]
+        if (life := self._alive[number]) is not None:
+            self._hear(number, life)
+            if disk_kept:
+                self._disks[number] = Holdings.of(life.agent.state)
+        self._alive[number] = None
+        self._air.is_gone(number)
+
+    async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
+        number = self._number[agent_id]
+        self._start(number, self._disks.pop(number, None))
+
+    async def fall(self, agent_id: int) -> None:
+        """A track knows nothing of that."""
+
+    async def pause(self, agent_id: int) -> None:
+        number = self._number[agent_id]
+        if (life := self._alive[number]) is not None:
+            self._hear(number, life)
+            life.waiting = []
+            self._air.paused_at[number] = self._now
+
+    async def resume(self, agent_id: int) -> None:
+        number = self._number[agent_id]
         life = self._alive[number]
-        match fault.what:
-            case "kill" | "crash" | "reboot":
-                if life is not None:
-                    self._hear(number, life)
-                    if fault.disk == "kept":
-                        self._disks[number] = Holdings.of(life.agent.state)
-                self._alive[number] = None
-                self._air.is_gone(number)
-            case "restart" | "boot":
-                self._start(number, self._disks.pop(number, None))
-            case "pause" if life is not None:
-                self._hear(number, life)
-                life.waiting = []
-                self._air.paused_at[number] = self._now
-            case "resume" if life is not None and life.waiting is not None:
-                self._resume(number, life, life.waiting)
+        if life is not None and life.waiting is not None:
+            self._resume(number, life, life.waiting)
 
     def _resume(self, number: int, life: Life, waiting: list[Happening]) -> None:
         """What has waited is handled as a process does it: what the socket holds, then timers, then events.

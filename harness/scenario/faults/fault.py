@@ -1,0 +1,124 @@
+"""A fault: what happens to agents and their vehicles at an instant, as a value.
+
+Everything that there is to know of one kind of fault is in its class: its word in YAML, in records and in pytest, what
+state it finds agents in and leaves them in, what becomes of their lives, vehicles and data, what a backend has to do,
+and how people are told. Whoever comes across a fault asks it, and compares no words. A class of its own in a file of
+its own in this directory is a new fault, which everything else then knows.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, ClassVar, Literal, Protocol
+
+from pydantic import Field
+
+from harness.scenario.model import VehicleId
+from harness.scenario.vehicles import Vehicles
+
+Agents = Annotated[list[VehicleId], Field(min_length=1)]
+Disk = Literal["kept", "lost"]
+
+RUNNING, PAUSED, KILLED, REBOOTING = "running", "paused", "killed", "rebooting"
+"""States of an agent. A fault may lead to another, with a word of its own."""
+
+CROSS = "M-5-5l10 10m0-10l-10 10"
+BARS = "M-3-5v10M3-5v10"
+ARROW = "M-4-5l9 5-9 5z"
+DIAMOND = "M0-6l6 6-6 6-6-6z"
+"""Marks: SVG paths around the origin."""
+
+
+class Lives(Protocol):
+    """What a backend can do to an agent and its vehicle. None of it waits for mission time to pass."""
+
+    async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
+        """Destroy the agent, and with it its vehicle if asked; `disk_kept`: what it had stored is there later on."""
+
+    async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
+        """Start the agent anew, with what is on its disk if that was kept, and on another vehicle if asked."""
+
+    async def fall(self, agent_id: int) -> None:
+        """Have the agent's vehicle fall to the ground, from now on."""
+
+    async def pause(self, agent_id: int) -> None:
+        """Have the agent stand still; what reaches it waits."""
+
+    async def resume(self, agent_id: int) -> None: ...
+
+
+@dataclass(frozen=True)
+class Fault:
+    """At `at_s` mission seconds something happens to `agents`.
+
+    Further fields of a subclass are keys of its timeline entry, each of which it needs; their annotations say what they
+    may be. Fault itself is one of which nothing is known: it does nothing, and ends, takes and loses nothing.
+    """
+
+    at_s: float
+    agents: tuple[int, ...]
+
+    what: ClassVar[str] = ""
+    """The key of a timeline entry, the word in records, and the verb in pytest."""
+    is_asked_for: ClassVar[bool] = True
+    """Whether it is a key of a timeline entry; otherwise it comes of another fault."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """The states that an agent may be in before."""
+    leads_to: ClassVar[str] = RUNNING
+    """The state that it is in afterwards."""
+    ends_a_life: ClassVar[bool] = False
+    """What the agent held in memory is gone."""
+    begins_a_life: ClassVar[bool] = False
+    takes_the_vehicle: ClassVar[bool] = False
+    """The vehicle is out of the air, with all that the agent held."""
+    brings_a_vehicle: ClassVar[bool] = False
+    """Another one, in the place of one that was taken."""
+    stands_still: ClassVar[bool] = False
+    """The agent lives and does nothing until the next fault."""
+    keys_in_words: ClassVar[str] = ""
+    """What its further keys have to be, for whoever has left one out."""
+    unless_told: ClassVar[Mapping[str, Any]] = {}
+    """What its further keys are in pytest, where a test leaves them out."""
+    mark: ClassVar[str] = ""
+    """How the report's timeline shows it, an SVG path around the origin; without one it does not."""
+    meaning: ClassVar[str] = ""
+    """What the mark means; faults that mean the same share a mark."""
+
+    async def strike(self, lives: Lives, agent_id: int) -> None:
+        """Do it to one of the agents."""
+
+    def course(self) -> "Sequence[Fault]":
+        """All that happens to the agents by this entry of the timeline, in order."""
+        return [self]
+
+    def check(self, vehicles: Vehicles) -> None:
+        """Raises ValueError, with what to do instead, if it cannot happen to such vehicles."""
+
+    @property
+    def disk_left(self) -> Disk | None:
+        """What it leaves of the agents' disks; None if that is no question."""
+        return None
+
+    @classmethod
+    def loses_data(cls, disk: Disk | None) -> bool:
+        """Whether all that the agents held is gone, by what it left of their disks."""
+        return cls.ends_a_life and disk != "kept"
+
+    @classmethod
+    def further_keys(cls) -> list[str]:
+        """Its keys in a timeline entry, beside `at_s` and the one that names it."""
+        return [field.name for field in fields(cls) if field.name not in Fault.__dataclass_fields__]
+
+    @classmethod
+    def told(cls, *agents: int, **further: Any) -> dict[str, Any]:
+        """The verb in pytest: what a test says, as the keys of a timeline entry."""
+        return {cls.what: list(agents), **cls.unless_told, **further}
+
+    @property
+    def detail(self) -> str:
+        who = f"agent{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
+        return who if self.disk_left is None else f"{who}, disk {self.disk_left}"
+
+    def to_json(self, at_s: float) -> dict[str, Any]:
+        """The record of this fault, made at `at_s`."""
+        record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
+        return record if self.disk_left is None else {**record, "disk": self.disk_left}
