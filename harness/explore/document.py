@@ -52,7 +52,7 @@ def scripted(document: Document, logged: list[Logged], drops: list[Document]) ->
     script = [event_of(event) for event in logged]
     document = _without_flight(document)
     network = _without_loss(document.get("network", {}))
-    entries = [{**entry, **_silent(entry)} for entry in document.get("timeline", [])]
+    entries = [_silent_change(entry) for entry in document.get("timeline", [])]
     document = with_key(with_key(document, "network", network), "timeline", [one for one in entries if len(one) > 1])
     document = with_key(document, "schedule", [_silent_schedule(one) for one in document.get("schedule", [])])
     document["events"] = {"source": "scripted", **({"script": script} if script else {})}
@@ -107,14 +107,23 @@ def _silent(layer: Document) -> Document:
     return {"loss": dict(NEVER_IN_BURSTS) if isinstance(layer["loss"], dict) else 0.0}
 
 
+def _silent_change(change: Document) -> Document:
+    """Of a timeline entry, or what a schedule repeats."""
+    silent = {**change, **_silent(change)}
+    return {**silent, "network": _without_loss(change["network"])} if "network" in change else silent
+
+
 def _silent_schedule(schedule: Document) -> Document:
-    if "ramp" in schedule and "loss" in schedule["ramp"]:
-        return {**schedule, "ramp": {**schedule["ramp"], "loss": [0.0, 0.0]}}
-    return (
-        {**schedule, "repeat": {**schedule["repeat"], **_silent(schedule["repeat"])}}
-        if "repeat" in schedule
-        else schedule
-    )
+    if "repeat" in schedule:
+        return {**schedule, "repeat": _silent_change(schedule["repeat"])}
+    if "ramp" not in schedule:
+        return schedule
+    ramp = {**schedule["ramp"], **({"loss": [0.0, 0.0]} if "loss" in schedule["ramp"] else {})}
+    return {**schedule, "ramp": _with_networks(ramp, _without_loss)}
+
+
+def _with_networks(ramp: Document, change: Callable[[Document], Document]) -> Document:
+    return {**ramp, "network": [change(one) for one in ramp["network"]]} if "network" in ramp else ramp
 
 
 def with_agents(document: Document, kept: Collection[int]) -> Document:
@@ -123,21 +132,41 @@ def with_agents(document: Document, kept: Collection[int]) -> Document:
     document = with_key(document, "events.script", [one for one in script(document) if one["agent"] in kept])
     document = with_key(document, "fates", [one for one in document.get("fates", []) if _named_in(one) <= {*kept}])
     document = with_key(document, "timeline", [*filter(None, (_entry(one, kept) for one in timeline(document)))])
-    document = with_key(document, "schedule", [_schedule(one, kept) for one in document.get("schedule", [])])
+    schedules = [_schedule(one, kept) for one in document.get("schedule", [])]
+    document = with_key(document, "schedule", [schedule for schedule in schedules if schedule])
     flights = [_of(flight, ("vehicles",), kept) for flight in document.get("flight", [])]
     document = with_key(document, "flight", [flight for flight in flights if flight["vehicles"]])
-    for key in ("clocks", "network.receivers", "vehicles.types"):
+    for key in ("clocks", "vehicles.types"):
         named = at(document, key) or {}
         document = with_key(document, key, {name: value for name, value in named.items() if int(name) in kept})
-    links = [_of(link, ("from", "to"), kept) for link in at(document, "network.links") or []]
-    return with_key(document, "network.links", [link for link in links if link["from"] and link["to"]])
+    return with_key(document, "network", _network(document.get("network", {}), kept))
 
 
-def _schedule(schedule: Document, kept: Collection[int]) -> Document:
-    if "partition" not in schedule.get("repeat", {}):
+def _network(network: Document, kept: Collection[int]) -> Document:
+    """What it says of all, and of these agents."""
+    receivers = {name: value for name, value in network.get("receivers", {}).items() if int(name) in kept}
+    links = [_of(link, ("from", "to"), kept) for link in network.get("links", [])]
+    network = with_key(network, "receivers", receivers)
+    return with_key(network, "links", [link for link in links if link["from"] and link["to"]])
+
+
+def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
+    """A schedule that speaks of these agents only; None if nothing is left of it."""
+    if "repeat" in schedule:
+        repeat = _disturbance(schedule["repeat"], kept)
+        return {**schedule, "repeat": repeat} if repeat else None
+    if "network" not in schedule.get("ramp", {}):
         return schedule
-    groups = [[agent for agent in group if agent in kept] for group in schedule["repeat"]["partition"]]
-    return {**schedule, "repeat": {**schedule["repeat"], "partition": [group for group in groups if group]}}
+    ramp = _with_networks(schedule["ramp"], lambda network: _network(network, kept))
+    ramp = with_key(ramp, "network", None) if {} in ramp["network"] else ramp
+    return {**schedule, "ramp": ramp} if ramp else None
+
+
+def _disturbance(change: Document, kept: Collection[int]) -> Document:
+    """What a timeline entry or a schedule makes of the network, among these agents."""
+    groups = [[agent for agent in group if agent in kept] for group in change.get("partition", [])]
+    change = with_key(change, "partition", [group for group in groups if group])
+    return with_key(change, "network", _network(change.get("network", {}), kept))
 
 
 def _named_in(fate: Document) -> set[int]:
@@ -147,10 +176,9 @@ def _named_in(fate: Document) -> set[int]:
 
 def _entry(entry: Document, kept: Collection[int]) -> Document | None:
     """A timeline entry that speaks of these agents only; None if nothing is left of it."""
-    if "partition" in entry:
-        groups = [[agent for agent in group if agent in kept] for group in entry["partition"]]
-        groups = [group for group in groups if group]
-        return {**entry, "partition": groups} if groups else None
+    if "partition" in entry or "network" in entry:
+        entry = _disturbance(entry, kept)
+        return entry if "partition" in entry or "network" in entry else None
     if not {sender for name in INJECTIONS if (sender := at(entry, f"{name}.sender")) is not None} <= {*kept}:
         return None
     faults = [kind.what for kind in ASKED_FOR]
@@ -174,22 +202,35 @@ def timeline(document: Document) -> list[Document]:
 
 
 def instants(document: Document) -> list[float]:
-    """When anything is logged or changed, in order."""
-    return sorted({one["at_s"] for one in (*script(document), *timeline(document))})
+    """When anything is logged or changed, or a change of the network passes, in order."""
+    passes = {one["at_s"] + one["for_s"] for one in timeline(document) if "for_s" in one}
+    return sorted({one["at_s"] for one in (*script(document), *timeline(document))} | passes)
 
 
 def cut_after(document: Document, last_s: float) -> Document:
     """Over at `last_s`, and without what would come later."""
     document = {**document, "duration_s": max(1.0, last_s)}
     for key in ("events.script", "timeline"):
-        document = with_key(document, key, [one for one in at(document, key) or [] if one["at_s"] <= last_s])
+        before = [one for one in at(document, key) or [] if one["at_s"] <= last_s]
+        document = with_key(document, key, [_over_by(one, last_s) for one in before])
     schedule = [one for one in document.get("schedule", []) if one.get("from_s", 0.0) < last_s]
     clipped = [{**one, "until_s": min(one["until_s"], last_s)} if "until_s" in one else one for one in schedule]
     return with_key(document, "schedule", clipped)
 
 
+def _over_by(entry: Document, last_s: float) -> Document:
+    """What would pass later stays to the end."""
+    lasts = "for_s" in entry and entry["at_s"] + entry["for_s"] > last_s
+    return with_key(entry, "for_s", None) if lasts else entry
+
+
 def moved(document: Document, to: Callable[[float], float]) -> Document:
     """Everything that happens happens at another time."""
     for key in ("events.script", "timeline"):
-        document = with_key(document, key, [{**one, "at_s": to(one["at_s"])} for one in at(document, key) or []])
+        document = with_key(document, key, [_moved(one, to) for one in at(document, key) or []])
     return {**document, "duration_s": max(1.0, to(document.get("duration_s", 1200.0)))}
+
+
+def _moved(one: Document, to: Callable[[float], float]) -> Document:
+    lasts = {"for_s": round(to(one["at_s"] + one["for_s"]) - to(one["at_s"]), 6)} if "for_s" in one else {}
+    return {**one, "at_s": to(one["at_s"]), **lasts}

@@ -72,20 +72,28 @@ class Swarm:
 
     # The network
 
-    def partition(self, *groups: list[int]) -> None:
+    def partition(self, *groups: list[int], for_s: float | None = None) -> None:
         """Cut the groups from each other; agents that none of them names form one more together."""
         __tracebackhide__ = True
-        self._change(partition=[list(group) for group in groups])
+        self._change(partition=[list(group) for group in groups], for_s=for_s)
 
     def heal(self) -> None:
         """Undo the partition."""
         __tracebackhide__ = True
         self._change(heal=True)
 
-    def loss(self, probability: float) -> None:
+    def loss(self, probability: float, for_s: float | None = None) -> None:
         """From now on every receiver loses each message with this probability."""
         __tracebackhide__ = True
-        self._change(loss=probability)
+        self._change(loss=probability, for_s=for_s)
+
+    def network(self, for_s: float | None = None, **keys: Any) -> None:
+        """From now on these keys of a scenario's `network` count: `network(links=[{"from": 1, "to": 2, "loss": 0.9}])`.
+
+        Here as above: for so many mission seconds, or for good.
+        """
+        __tracebackhide__ = True
+        self._change(network=keys, for_s=for_s)
 
     # The agents
 

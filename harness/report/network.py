@@ -1,5 +1,6 @@
 """What the network was set to and what happened to it, from the scenario and the recorded faults."""
 
+from operator import itemgetter
 from typing import Any
 
 from markupsafe import Markup
@@ -9,6 +10,9 @@ from harness.present import words
 from harness.report import network_strip
 from harness.report.chain_tree import ranges
 
+Change = tuple[float, float, tuple[str, float]]
+"""From when to when something is so, and what, in words and as a level."""
+
 
 def strip(result: dict[str, Any]) -> Markup | None:
     """The network along mission time, if the scenario says how long that was."""
@@ -17,21 +21,21 @@ def strip(result: dict[str, Any]) -> Markup | None:
     if not end_s or end_s <= 0:
         return None
     text, loss = _loss(mapping(scenario, "network")) or ("", 0.0)
-    losses, partitions = [(0.0, text, loss)], [(0.0, "", 0.0)]
-    for entry in listing(scenario, "timeline"):
-        at_s, loss_then = number(entry, "at_s"), _loss(mapping(entry))
-        if at_s is None:
-            continue
+    losses, partitions = [(0.0, end_s, (text, loss))], [(0.0, end_s, ("", 0.0))]
+    entries = [(at_s, entry) for entry in listing(scenario, "timeline") if (at_s := number(entry, "at_s")) is not None]
+    for at_s, entry in sorted(entries, key=itemgetter(0)):
+        until_s = end_s if (for_s := number(entry, "for_s")) is None else at_s + for_s
+        loss_then = _loss(mapping(entry)) or _loss(mapping(entry, "network"))
         if loss_then is not None:
-            losses.append((at_s, *loss_then))
+            losses.append((at_s, until_s, loss_then))
         elif groups := [group for group in listing(entry, "partition") if isinstance(group, list)]:
             text = " | ".join(", ".join(ranges(agent_ids(group))) for group in groups)
-            partitions.append((at_s, text, 1.0))
+            partitions.append((at_s, until_s, (text, 1.0)))
         elif mapping(entry).get("heal"):
-            partitions.append((at_s, "", 0.0))
+            partitions.append((at_s, until_s, ("", 0.0)))
     lanes = [
-        ("partition", network_strip.steps(partitions, end_s)),
-        ("loss", network_strip.steps(losses, end_s)),
+        ("partition", network_strip.steps(_one_after_another(partitions, end_s), end_s)),
+        ("loss", network_strip.steps(_one_after_another(losses, end_s), end_s)),
     ]
     ticks = [
         (at_s, f"{words.duration(at_s)}: {words.value(mapping(fault).get('what'))}")
@@ -39,6 +43,17 @@ def strip(result: dict[str, Any]) -> Markup | None:
         if (at_s := number(fault, "at_s")) is not None
     ]
     return network_strip.draw(lanes, ticks, end_s)
+
+
+def _one_after_another(changes: list[Change], end_s: float) -> list[tuple[float, str, float]]:
+    """When which of them stands; after one that passes the one that stood before."""
+    found = []
+    for place, (at_s, until_s, state) in enumerate(changes):
+        found.append((at_s, *state))
+        if until_s < end_s:
+            beneath = (one for _, other_until_s, one in reversed(changes[:place]) if other_until_s > until_s)
+            found.append((until_s, *next(beneath, ("", 0.0))))
+    return found
 
 
 def _loss(conditions: dict[str, Any]) -> tuple[str, float] | None:

@@ -3,18 +3,14 @@
 A timeline is computed before the run from the scenario alone, so every backend plays the same.
 """
 
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import groupby, product
+from itertools import groupby
 from typing import Any
 
 from harness.scenario import Scenario
 from harness.scenario.faults import Fault
 from harness.scenario.injection import Injection, InjectionName
-from harness.scenario.network import NetworkModel
-from harness.scenario.schedule import UNTOUCHED, Layer
-from harness.scenario.timeline import TimelineEntry
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 RANGE = "range"
@@ -90,58 +86,9 @@ def injected_nothing(scenario: Scenario, sent: Mapping[int, int]) -> list[str]:
     ]
 
 
-@dataclass
-class _Network:
-    """The network as it stands: what the scenario and its timeline say, and a layer for each schedule over it."""
-
-    model: NetworkModel
-    roster: tuple[int, ...]
-    layers: list[Layer]
-    partition: tuple[frozenset[int], ...] = ()
-
-    def conditions(self) -> NetworkConditions:
-        said: dict[str, Any] = {}
-        for layer in self.layers:
-            said |= {key: value for key in ("loss", "delay") if (value := getattr(layer, key)) is not None}
-        conditions = self.model.model_copy(update=said).conditions(self._cut_by_any())
-        cut = sorted(pair for layer in self.layers for pair in layer.cut)
-        severed = {pair: replace(conditions.link(*pair), loss=1.0) for pair in cut}
-        return replace(conditions, links={**conditions.links, **severed})
-
-    def _cut_by_any(self) -> tuple[frozenset[int], ...]:
-        """Groups whose members no partition keeps apart."""
-        partitions = [one for one in (self.partition, *(layer.partition for layer in self.layers)) if one]
-        if len(partitions) < 2:
-            return partitions[0] if partitions else ()
-        sides = [NetworkConditions(partition=one).groups(self.roster) for one in partitions]
-        together = (frozenset.intersection(*each) for each in product(*sides))
-        return tuple(group for group in together if group)
-
-    def play(self, entry: TimelineEntry) -> str:
-        """Make a change of the timeline; what it is, in a word."""
-        if entry.loss is not None:
-            self.model = self.model.model_copy(update={"loss": entry.loss})
-            return "loss"
-        self.partition = tuple(frozenset(group) for group in entry.partition or ())
-        return "heal" if entry.partition is None else "partition"
-
-
 def _network_states(scenario: Scenario) -> list[Change]:
     """Every state of the network; what begins in the same instant makes one state together."""
-    network = _Network(scenario.network, scenario.roster, [UNTOUCHED for _ in scenario.schedule])
-    entries = {entry.at_s: entry for entry in scenario.timeline if not (entry.fault or entry.injection)}
-    steps: dict[float, list[tuple[int, str, Layer]]] = defaultdict(list)
-    for number, schedule in enumerate(scenario.schedule):
-        for at_s, what, layer in schedule.steps(scenario.roster, scenario.duration_s):
-            steps[at_s].append((number, what, layer))
-    states: list[Change] = []
-    for at_s in sorted({0.0, *entries, *steps}):
-        said = [network.play(entries[at_s])] if at_s in entries else []
-        for number, what, layer in steps.get(at_s, ()):
-            network.layers[number] = layer
-            said.append(what)
-        states.append(_change(at_s, ", ".join(dict.fromkeys(said)) or "start", network.conditions()))
-    return states
+    return [_change(step.at_s, step.what, step.network.conditions()) for step in scenario.network_steps()]
 
 
 def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:

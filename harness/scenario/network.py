@@ -2,10 +2,10 @@
 
 Three layers: the network, receivers that differ from it, links that differ from their receiver. A layer changes
 the keys that it names. What the values mean, and which go together, `netem.conditions` says; here is how they are
-written.
+written, for the whole mission or, laid over that, from some time on: `NetworkLayer`.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import Annotated, Any, Literal
 
@@ -89,6 +89,13 @@ class Difference(Model):
     rate: Rate | None = None
     limit: Limit | None = None
 
+    def said(self) -> dict[str, Any]:
+        """The keys that are given."""
+        return {key: value for key in KEYS if (value := getattr(self, key)) is not None}
+
+
+KEYS = tuple(Difference.model_fields)
+
 
 class Receiver(Difference):
     """What one vehicle hears, where it differs from the network."""
@@ -111,6 +118,57 @@ class Link(Difference):
             yield sender, receiver
             if self.both:
                 yield receiver, sender
+
+
+Where = None | int | tuple[int, int]
+"""Of whom something is said: of all, of what one vehicle hears, or of a link, from sender to receiver."""
+Said = dict[Where, dict[str, Any]]
+"""A network, or what changes of it: whose keys have which values."""
+
+
+class NetworkLayer(Difference):
+    """What is laid over the network as it stands, key by key: for all, for receivers, for links."""
+
+    receivers: dict[VehicleKey, Receiver] = {}
+    links: Annotated[list[Link], Field(max_length=10_000)] = []
+
+    @model_validator(mode="after")
+    def _says_something(self) -> "NetworkLayer":
+        if self.whole() == {None: {}}:
+            raise ValueError(f"needs at least one of {', '.join(f'`{key}`' for key in type(self).model_fields)}")
+        return self
+
+    def whole(self) -> Said:
+        """Raises ConditionsError if it says something twice."""
+        return {None: self.said(), **_said_of(self.receivers, self.links)}
+
+    def named(self) -> Iterator[tuple[str, int]]:
+        """Every vehicle that is named, with the key that names it."""
+        return _named(self.receivers, self.links)
+
+
+class Disturbance(Model):
+    """The language of timeline and schedules: what becomes of the network. `loss` is short for a `network` of it."""
+
+    loss: Loss | None = None
+    partition: list[list[VehicleId]] | None = None
+    network: NetworkLayer | None = None
+
+    @model_validator(mode="after")
+    def _says_no_loss_twice(self) -> "Disturbance":
+        if self.loss is not None and self.network is not None and self.network.loss is not None:
+            raise ValueError("`loss` and `network.loss` are the same thing: leave one of them out")
+        return self
+
+    def said(self) -> Said:
+        """What it changes of the network, partitions apart."""
+        said: Said = self.network.whole() if self.network else {}
+        return said if self.loss is None else laid_over(said, {None: {"loss": self.loss}})
+
+    @property
+    def groups(self) -> tuple[frozenset[int], ...]:
+        """Those of its partition."""
+        return tuple(frozenset(group) for group in self.partition or ())
 
 
 class NetworkModel(Model):
@@ -142,46 +200,78 @@ class NetworkModel(Model):
 
     def named(self) -> Iterator[tuple[str, int]]:
         """Every vehicle that is named, with the key that names it."""
-        yield from (("receivers", vehicle) for vehicle in self.receivers)
-        for index, link in enumerate(self.links):
-            yield from ((f"links.{index}.from", vehicle) for vehicle in link.from_)
-            yield from ((f"links.{index}.to", vehicle) for vehicle in link.to)
+        return _named(self.receivers, self.links)
+
+    def whole(self) -> Said:
+        """Raises ConditionsError if it says something twice."""
+        return {None: {key: getattr(self, key) for key in KEYS}, **_said_of(self.receivers, self.links)}
 
     def conditions(self, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
         """The conditions that these words mean; raises ConditionsError if they contradict each other."""
-        links: dict[tuple[int, int], LinkConditions] = {}
-        for index, link in enumerate(self.links):
-            where = f"links.{index}: "
-            # One value per receiver, however many send to it.
-            values: dict[int, LinkConditions] = {}
-            for sender, receiver in link.pairs():
-                if sender == receiver:
-                    raise ConditionsError(f"{where}a link from vehicle {sender} to itself carries nothing")
-                if (sender, receiver) in links:
-                    raise ConditionsError(f"{where}from {sender} to {receiver} is named twice: which one counts?")
-                if receiver not in values:
-                    values[receiver] = _conditions(where, self, self.receivers.get(receiver), link)
-                links[sender, receiver] = values[receiver]
-        return NetworkConditions(
-            _conditions("", self),
-            {vehicle: _conditions(f"receivers.{vehicle}: ", self, it) for vehicle, it in self.receivers.items()},
-            links,
-            partition,
-        )
+        return conditions_of(self.whole(), partition)
 
 
-def _conditions(where: str, *layers: NetworkModel | Difference | None) -> LinkConditions:
-    """What the layers make together: of each key, the last word."""
-    last: dict[str, Any] = {}
-    for layer in layers:
-        for key in Difference.model_fields:
-            if (value := getattr(layer, key, None)) is not None:
-                last[key] = value
-    loss, delay = last["loss"], last["delay"]
-    last |= {key: None for key in ("rate", "limit") if last[key] == "none"}
-    last["loss"] = GilbertElliott(**loss.model_dump()) if isinstance(loss, Bursts) else loss
-    last["delay"] = Delay(**delay.model_dump()) if isinstance(delay, Jitter) else Delay(delay)
-    try:
-        return LinkConditions(**last)
-    except ConditionsError as error:
-        raise ConditionsError(f"{where}{error}") from None
+def _named(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Iterator[tuple[str, int]]:
+    yield from (("receivers", vehicle) for vehicle in receivers)
+    for index, link in enumerate(links):
+        yield from ((f"links.{index}.from", vehicle) for vehicle in link.from_)
+        yield from ((f"links.{index}.to", vehicle) for vehicle in link.to)
+
+
+def _said_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Said:
+    said: Said = {vehicle: receiver.said() for vehicle, receiver in receivers.items()}
+    for index, link in enumerate(links):
+        keys = link.said()
+        for sender, receiver in link.pairs():
+            if sender == receiver:
+                raise ConditionsError(f"links.{index}: a link from vehicle {sender} to itself carries nothing")
+            if (sender, receiver) in said:
+                raise ConditionsError(f"links.{index}: from {sender} to {receiver} is named twice: which one counts?")
+            said[sender, receiver] = keys
+    return said
+
+
+def laid_over(network: Said, layer: Said) -> Said:
+    """What the layer says counts, of whomever it says it; what it does not say stays."""
+    return {where: network.get(where, {}) | layer.get(where, {}) for where in (*network, *layer)}
+
+
+def of_whom(where: Where) -> str:
+    """In words, to put after a key: "loss from 1 to 2"."""
+    if where is None:
+        return ""
+    return f" from {where[0]} to {where[1]}" if isinstance(where, tuple) else f" to {where}"
+
+
+def conditions_of(network: Said, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
+    """The conditions that a whole network comes to; raises ConditionsError if its keys contradict each other."""
+    for_all = network[None]
+    found: dict[Where, LinkConditions] = {}
+    known: dict[tuple[Any, ...], LinkConditions] = {}  # of many links there are few kinds
+    for where, said in network.items():
+        receiver = where[1] if isinstance(where, tuple) else where
+        last = for_all | network.get(receiver, {}) | said
+        values = tuple(last[key] for key in KEYS)
+        if values not in known:
+            try:
+                known[values] = _conditions(last)
+            except ConditionsError as error:
+                raise ConditionsError(f"{_key(where)}{error}") from None
+        found[where] = known[values]
+    receivers = {where: link for where, link in found.items() if isinstance(where, int)}
+    links = {where: link for where, link in found.items() if isinstance(where, tuple)}
+    return NetworkConditions(found[None], receivers, links, partition)
+
+
+def _key(where: Where) -> str:
+    if where is None:
+        return ""
+    return f"links from {where[0]} to {where[1]}: " if isinstance(where, tuple) else f"receivers.{where}: "
+
+
+def _conditions(said: dict[str, Any]) -> LinkConditions:
+    loss, delay = said["loss"], said["delay"]
+    values = said | {key: None for key in ("rate", "limit") if said[key] == "none"}
+    values["loss"] = GilbertElliott(**loss.model_dump()) if isinstance(loss, Bursts) else loss
+    values["delay"] = Delay(**delay.model_dump()) if isinstance(delay, Jitter) else Delay(delay)
+    return LinkConditions(**values)

@@ -17,8 +17,10 @@ from harness.scenario.flight import Flight
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
 from harness.scenario.schedule import NEEDED, Schedule
+from harness.scenario.states import Step, refuse_ambiguity, steps
 from harness.scenario.timeline import TimelineEntry
 from harness.scenario.vehicles import Vehicles
+from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError
 from sitl.plan import PlanError
 from ucp.block import MAX_AGENT_ID
@@ -102,6 +104,10 @@ class Scenario(Model):
         course = [(f"{where}.{fault.what}", one) for where, fault in begun for one in fault.course()]
         return sorted(course, key=lambda keyed: keyed[1].at_s)
 
+    def network_steps(self) -> Iterator[Step]:
+        """Every change of the network, by the timeline and by schedules."""
+        return steps(self.network, self.roster, self.timeline, self.schedule, self.duration_s)
+
     @field_validator("agents", mode="before")
     @classmethod
     def _count_or_ids(cls, agents: Any) -> Any:
@@ -158,9 +164,13 @@ class Scenario(Model):
             yield from ((f"fates.{index}.sender", vehicle) for vehicle in (fate.sender,) if vehicle)
             yield from ((f"fates.{index}.receiver", vehicle) for vehicle in (fate.receiver,) if vehicle)
             yield from ((f"fates.{index}.block", int(name.split(".")[0])) for name in (fate.block,) if name)
+        for index, schedule in enumerate(self.schedule):
+            yield from ((f"schedule.{index}.{key}", vehicle) for key, vehicle in schedule.named())
         for index, entry in enumerate(self.timeline):
             if entry.fault is not None:
                 yield from ((f"timeline.{index}.{entry.fault.what}", agent) for agent in entry.fault.agents)
+            if entry.network is not None:
+                yield from ((f"timeline.{index}.network.{key}", vehicle) for key, vehicle in entry.network.named())
             if entry.injection is not None:
                 injected, it = entry.injection
                 yield from ((f"timeline.{index}.{injected}.sender", agent) for agent in (it.sender,) if agent)
@@ -198,8 +208,8 @@ class Scenario(Model):
             if schedule.nemesis is not None and len(self.roster) < NEEDED[schedule.nemesis]:
                 raise ValueError(f"{where}.nemesis {schedule.nemesis!r} needs {NEEDED[schedule.nemesis]} vehicles")
             try:
-                groups = tuple(frozenset(group) for group in (schedule.repeat and schedule.repeat.partition) or ())
-                self.network.conditions(groups).validate(self.roster)
+                if schedule.repeat is not None:
+                    NetworkConditions(partition=schedule.repeat.groups).validate(self.roster)
                 schedule.steps(self.roster, self.duration_s)
             except (ConditionsError, ValueError) as error:
                 raise ValueError(f"{where}: {error}") from None
@@ -212,18 +222,26 @@ class Scenario(Model):
             where = f"timeline.{index}"
             if entry.at_s > self.duration_s:
                 raise ValueError(f"{where}.at_s {entry.at_s:g} is after the mission's end at {self.duration_s:g} s")
-            if entry.injection is not None and entry.at_s + entry.injection[1].lasts_s > self.duration_s:
-                raise ValueError(
-                    f"{where}.{entry.injection[0]} would last until {entry.at_s + entry.injection[1].lasts_s:g} s, "
-                    f"after the mission's end at {self.duration_s:g} s"
-                )
+            if entry.fault is None and entry.ends_at_s > self.duration_s:
+                key = entry.injection[0] if entry.injection else entry.disturbs
+                end = f"the mission's end at {self.duration_s:g} s"
+                raise ValueError(f"{where}.{key} would last until {entry.ends_at_s:g} s, after {end}")
             if instants[entry.at_s] > 1:
                 raise ValueError(f"{where}.at_s {entry.at_s:g} has two entries: which comes first?")
             try:
-                partition = tuple(frozenset(group) for group in entry.partition or ())
-                self.network.conditions(partition).validate(self.roster)
+                NetworkConditions(partition=entry.groups).validate(self.roster)
             except ConditionsError as error:
                 raise ValueError(f"{where}: {error}") from None
+        refuse_ambiguity(self.timeline)
+        return self
+
+    @model_validator(mode="after")
+    def _network_means_something_all_along(self) -> "Scenario":
+        for step in self.network_steps():
+            try:
+                step.network.uncut()
+            except ConditionsError as error:
+                raise ValueError(f"{', '.join(step.keys)}, at {step.at_s:g} s: {error}") from None
         return self
 
     @model_validator(mode="after")

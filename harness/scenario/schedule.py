@@ -3,22 +3,24 @@
     schedule:
       - {ramp: {loss: [0, 0.5]}, from_s: 100, until_s: 400}
       - {repeat: {partition: [[1, 2]]}, every_s: 120, for_s: 30}
+      - {repeat: {network: {links: [{from: 1, to: 2, loss: 0.9}]}}, every_s: 120, for_s: 30}
       - {nemesis: halves, every_s: 60, for_s: 20, seed: 7}
 
 Each is a layer over the network of the scenario and its timeline, and is worked out before the run: every backend plays
-the same. Where layers meet, the later one's loss and delay count, partitions cut all that any of them cuts, and a pair
-that one of them cuts is cut.
+the same. Of the network they say what the timeline says: `loss`, `partition`, or `network` with any of its keys. Where
+layers meet, of each key the later one's value counts, partitions cut all that any of them cuts, and a pair that one of
+them cuts is cut.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from random import Random
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from harness.scenario.model import Instant, Model, Probability, Seconds, VehicleId
-from harness.scenario.network import DelaySeconds, Loss
+from harness.scenario.network import DelaySeconds, Disturbance, NetworkLayer, Said, Where, laid_over, of_whom
 
 MAX_STEPS = 10_000
 """More changes than this are a mistake, or another scenario."""
@@ -29,10 +31,9 @@ Pairs = frozenset[tuple[int, int]]
 
 @dataclass(frozen=True)
 class Layer:
-    """What a schedule makes of the network for a while; None and nothing: it leaves it alone."""
+    """What a schedule makes of the network for a while; nothing: it leaves it alone."""
 
-    loss: Loss | None = None
-    delay: DelaySeconds | None = None
+    said: Said = field(default_factory=dict)
     partition: tuple[frozenset[int], ...] = ()
     cut: Pairs = frozenset()
     """Directed pairs, sender and receiver, between which nothing passes."""
@@ -45,30 +46,65 @@ Step = tuple[float, str, Layer]
 
 
 class Ramp(Model):
-    """From the first value to the second, in equal steps."""
+    """From the first value to the second, in equal steps; `network`: of each number that both name."""
 
     loss: tuple[Probability, Probability] | None = None
     delay: tuple[DelaySeconds, DelaySeconds] | None = None
+    network: tuple[NetworkLayer, NetworkLayer] | None = None
 
     @model_validator(mode="after")
     def _of_something(self) -> "Ramp":
-        if self.loss is None and self.delay is None:
-            raise ValueError("needs `loss` or `delay`: [from, to]")
+        if self.loss is None and self.delay is None and self.network is None:
+            raise ValueError("needs `loss`, `delay` or `network`: [from, to]")
+        if self.network is not None:
+            first, last = ({(where, key): value for where, key, value in _values(end)} for end in self._ends())
+            for where, key in first.keys() ^ last.keys():
+                raise ValueError(f"{key}{of_whom(where)} is in one `network` of the two: from what, or to what?")
+            for (where, key), value in [*first.items(), *last.items()]:
+                if where is None and getattr(self, key, None) is not None:
+                    raise ValueError(f"`{key}` and `network.{key}` are the same thing: leave one of them out")
+                if not isinstance(value, float):
+                    raise ValueError(f"{key}{of_whom(where)} is {value!r}: a ramp goes from one number to another")
         return self
 
+    def _ends(self) -> tuple[Said, Said]:
+        """What `network` is at first, and in the end."""
+        return (self.network[0].whole(), self.network[1].whole()) if self.network else ({}, {})
 
-class Repeated(Model):
+    def at(self, share: float) -> Said:
+        """What it has come to after this share of it."""
+        short = {key: ends for key in ("loss", "delay") if (ends := getattr(self, key)) is not None}
+        first, last = (
+            laid_over({None: {key: ends[number] for key, ends in short.items()}}, end)
+            for number, end in enumerate(self._ends())
+        )
+        return {
+            where: {key: value + (last[where][key] - value) * share for key, value in said.items()}
+            for where, said in first.items()
+        }
+
+
+def _values(said: Said) -> Iterator[tuple[Where, str, Any]]:
+    return ((where, key, value) for where, keys in said.items() for key, value in keys.items())
+
+
+class Repeated(Disturbance):
     """What is done for a while, and undone."""
 
-    loss: Loss | None = None
-    delay: DelaySeconds | None = None
     partition: Groups | None = None
+    delay: DelaySeconds | None = None
 
     @model_validator(mode="after")
     def _of_something(self) -> "Repeated":
-        if self.loss is None and self.delay is None and self.partition is None:
-            raise ValueError("needs at least one of `loss`, `delay` or `partition`")
+        if all(said is None for said in (self.loss, self.delay, self.partition, self.network)):
+            raise ValueError("needs at least one of `loss`, `delay`, `partition` or `network`")
+        if self.delay is not None and self.network is not None and self.network.delay is not None:
+            raise ValueError("`delay` and `network.delay` are the same thing: leave one of them out")
         return self
+
+    def said(self) -> Said:
+        said = super().said()
+        return said if self.delay is None else laid_over(said, {None: {"delay": self.delay}})
 
 
 Nemesis = Literal["halves", "isolate", "majorities ring", "bridge", "flapping"]
@@ -110,10 +146,12 @@ class Schedule(Model):
             )
         return self
 
-    def vehicles(self) -> Iterator[int]:
-        """Every vehicle that is named."""
-        for group in (self.repeat.partition if self.repeat else None) or ():
-            yield from group
+    def named(self) -> Iterator[tuple[str, int]]:
+        """Every vehicle that is named outside of partitions, with the key that names it."""
+        if self.repeat is not None and self.repeat.network is not None:
+            yield from ((f"repeat.network.{key}", vehicle) for key, vehicle in self.repeat.network.named())
+        for number, end in enumerate((self.ramp.network if self.ramp else None) or ()):
+            yield from ((f"ramp.network.{number}.{key}", vehicle) for key, vehicle in end.named())
 
     def steps(self, roster: Sequence[int], end_s: float) -> list[Step]:
         """What happens when, in order. ValueError if it is more than anybody wants."""
@@ -134,23 +172,17 @@ class Schedule(Model):
 
     def _layer(self, roster: Sequence[int], rng: Random) -> Layer:
         if self.repeat is not None:
-            partition = tuple(frozenset(group) for group in self.repeat.partition or ())
-            return Layer(self.repeat.loss, self.repeat.delay, partition)
+            return Layer(self.repeat.said(), self.repeat.groups)
         assert self.nemesis is not None, "a schedule is one of three"
         return NEMESES[self.nemesis](rng.sample(list(roster), len(roster)))
 
 
 def _ramp(ramp: Ramp, from_s: float, until: float, every: float) -> list[Step]:
     count = max(1, round((until - from_s) / every))
-
-    def between(ends: tuple[float, float] | None, share: float) -> float | None:
-        return None if ends is None else ends[0] + (ends[1] - ends[0]) * share
-
     steps: list[Step] = []
     for number in range(count + 1):
         share = number / count
-        layer = Layer(between(ramp.loss, share), between(ramp.delay, share))
-        steps.append((from_s + (until - from_s) * share, "ramp", layer))
+        steps.append((from_s + (until - from_s) * share, "ramp", Layer(ramp.at(share))))
     return steps
 
 

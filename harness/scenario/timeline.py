@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
-from pydantic import create_model, model_validator
+from pydantic import ValidationInfo, create_model, field_validator, model_validator
 
 from harness.scenario.faults import ASKED_FOR, Agents, Fault
 from harness.scenario.injection import (
@@ -16,20 +16,26 @@ from harness.scenario.injection import (
     InjectionName,
     Replay,
 )
-from harness.scenario.model import Instant, Model, VehicleId
-from harness.scenario.network import Loss
+from harness.scenario.model import Instant, Seconds
+from harness.scenario.network import Disturbance
+
+NETWORK_KEYS = ("loss", "partition", "heal", "network")
+"""Keys of an entry that change the network."""
 
 
-class _Entry(Model):
-    """At `at_s` mission seconds, one change: a new loss, a partition, heal; something happens to agents; an injection.
+class _Entry(Disturbance):
+    """At `at_s` mission seconds, one change: of the network; something happens to agents; an injection.
+
+    `loss`, and all keys of `network`, change what they name and leave the rest of the network as it is; `partition`
+    stands until `heal` or another one. With `for_s` such a change passes: after so many mission seconds what it has
+    changed is as it would be without it.
 
     What happens to agents, from `crash` to `resume`: `harness.scenario.faults`. Injections, from `replay` to `flood`:
     `harness.scenario.injection`.
     """
 
     at_s: Instant
-    loss: Loss | None = None
-    partition: list[list[VehicleId]] | None = None
+    for_s: Seconds | None = None
     heal: Literal[True] | None = None
     replay: Replay | None = None
     duplicate: Duplicate | None = None
@@ -37,6 +43,14 @@ class _Entry(Model):
     corrupt: Corrupt | None = None
     forge: Forge | None = None
     flood: Flood | None = None
+
+    @field_validator("delay", "duplicate", "corrupt", mode="before")
+    @classmethod
+    def _an_injection(cls, value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, int | float):
+            of_the_network = f"`network: {{{info.field_name}: {value}}}`"
+            raise ValueError(f"it is what a rogue node does; {of_the_network} is the network's")
+        return value
 
     @property
     def injection(self) -> tuple[InjectionName, Injection] | None:
@@ -52,18 +66,26 @@ class _Entry(Model):
         return None
 
     @property
+    def disturbs(self) -> str | None:
+        """The key by which it changes the network, if it does."""
+        return next((key for key in NETWORK_KEYS if getattr(self, key) is not None), None)
+
+    @property
     def ends_at_s(self) -> float:
         """When the last thing that it says happens."""
         if self.fault is not None:
             return self.fault.course()[-1].at_s
-        return self.at_s + (self.injection[1].lasts_s if self.injection else 0.0)
+        lasts_s = self.injection[1].lasts_s if self.injection else self.for_s or 0.0
+        return round(self.at_s + lasts_s, 6)
 
     @model_validator(mode="after")
     def _one_change(self) -> "TimelineEntry":
-        changes = ("loss", "partition", "heal", *(kind.what for kind in ASKED_FOR), *INJECTIONS)
+        changes = (*NETWORK_KEYS, *(kind.what for kind in ASKED_FOR), *INJECTIONS)
         if sum(getattr(self, change) is not None for change in changes) != 1:
             named = (f"`{change}{': true' if change == 'heal' else ''}`" for change in changes)
             raise ValueError(f"needs exactly one of {', '.join(named)}")
+        if self.for_s is not None and (self.heal or not self.disturbs):
+            raise ValueError("`for_s` belongs to `loss`, `partition` and `network`")
         for kind in ASKED_FOR:
             given = [key for key in kind.further_keys() if getattr(self, key) is not None]
             if given and getattr(self, kind.what) is None:

@@ -123,7 +123,7 @@ def test_agents_survive_every_nemesis(nemesis: str) -> None:
         ({"nemesis": "halves"}, "needs `every_s` and `for_s`"),
         ({"nemesis": "halves", "every_s": 5, "for_s": 5}, "for_s 5 is not less than every_s 5"),
         ({"nemesis": "earthquake", "every_s": 5, "for_s": 1}, "'halves', 'isolate'"),
-        ({"ramp": {}}, "needs `loss` or `delay`"),
+        ({"ramp": {}}, "needs `loss`, `delay` or `network`"),
         ({"ramp": {"loss": [0, 2]}}, "less than or equal to 1"),
         ({"ramp": {"loss": [0, 1]}, "from_s": 5, "until_s": 5}, "until_s 5 is not after from_s 5"),
         ({"ramp": {"loss": [0, 1]}, "until_s": 500}, "schedule.0.until_s 500 is after the mission's end at 300 s"),

@@ -1,0 +1,148 @@
+"""The states of the network along a mission: what the scenario says, its timeline, and its schedules over that.
+
+A change of the timeline lasts, or passes after `for_s`. Of two that change the same thing (a key of all, of a receiver,
+of a link; the partition) one must be over before the other begins, or pass within it: then the inner one holds, and
+after it the outer one again. Any other overlap has two meanings, and is refused. What lasts never ends, so nothing that
+lasts may begin while what it changes is changed for a while.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+from harness.scenario.network import NetworkModel, Said, Where, conditions_of, laid_over, of_whom
+from harness.scenario.schedule import UNTOUCHED, Layer, Schedule
+from harness.scenario.timeline import TimelineEntry
+from netem.conditions import NetworkConditions
+
+Groups = tuple[frozenset[int], ...]
+PARTITION = "partition"
+
+
+@dataclass
+class Network:
+    """The network as it stands."""
+
+    roster: tuple[int, ...]
+    said: Said
+    """What lasts: of the scenario, and of its timeline up to now."""
+    layers: list[Layer]
+    """What each schedule makes of it."""
+    partition: Groups = ()
+    passing: list[TimelineEntry] = field(default_factory=list)
+    """The timeline's changes that will be over, in the order in which they began."""
+
+    def uncut(self) -> NetworkConditions:
+        """The conditions that there would be without partitions and cuts. Raises ConditionsError."""
+        said = self.said
+        for entry in self.passing:
+            said = laid_over(said, entry.said())
+        for layer in self.layers:
+            if layer.said:
+                said = laid_over(said, layer.said)
+        return conditions_of(said)
+
+    def conditions(self) -> NetworkConditions:
+        """Raises ConditionsError if they contradict each other."""
+        conditions = self.uncut().with_partition(self._cut_by_any())
+        cut = sorted(pair for layer in self.layers for pair in layer.cut)
+        severed = {pair: replace(conditions.link(*pair), loss=1.0) for pair in cut}
+        return replace(conditions, links={**conditions.links, **severed})
+
+    def _cut_by_any(self) -> Groups:
+        """Groups whose members no partition keeps apart."""
+        passing = [entry.groups for entry in self.passing if entry.disturbs == PARTITION]
+        standing = passing[-1] if passing else self.partition
+        partitions = [one for one in (standing, *(layer.partition for layer in self.layers)) if one]
+        if len(partitions) < 2:
+            return partitions[0] if partitions else ()
+        sides = [NetworkConditions(partition=one).groups(self.roster) for one in partitions]
+        together = (frozenset.intersection(*each) for each in product(*sides))
+        return tuple(group for group in together if group)
+
+    def play(self, entry: TimelineEntry) -> None:
+        """Make a change of the timeline."""
+        if entry.for_s is not None:
+            self.passing.append(entry)
+        elif entry.disturbs in (PARTITION, "heal"):
+            self.partition = entry.groups
+        else:
+            self.said = laid_over(self.said, entry.said())
+
+
+@dataclass(frozen=True)
+class Step:
+    """At an instant the network has changed. `what` in a word or two, `keys`: where the scenario says so."""
+
+    at_s: float
+    what: str
+    keys: list[str]
+    network: Network
+    """As it stands now: the next step changes it."""
+
+
+def steps(
+    model: NetworkModel,
+    roster: tuple[int, ...],
+    timeline: Sequence[TimelineEntry],
+    schedules: Sequence[Schedule],
+    end_s: float,
+) -> Iterator[Step]:
+    """Every change of the network, the first at 0 s; what happens in the same instant makes one step together."""
+    network = Network(roster, model.whole(), [UNTOUCHED for _ in schedules])
+    begins: dict[float, list[int]] = defaultdict(list)
+    ends: dict[float, list[int]] = defaultdict(list)
+    for number, entry in enumerate(timeline):
+        if entry.disturbs:
+            begins[entry.at_s].append(number)
+            if entry.for_s is not None:
+                ends[entry.ends_at_s].append(number)
+    scheduled: dict[float, list[tuple[int, str, Layer]]] = defaultdict(list)
+    for number, schedule in enumerate(schedules):
+        for at_s, what, layer in schedule.steps(roster, end_s):
+            scheduled[at_s].append((number, what, layer))
+    for at_s in sorted({0.0, *begins, *ends, *scheduled}):
+        said, keys = [], []
+        over = [timeline[number] for number in ends.get(at_s, ())]
+        network.passing = [entry for entry in network.passing if entry not in over]
+        for number in begins.get(at_s, ()):
+            network.play(timeline[number])
+            said.append(timeline[number].disturbs or "")
+            keys.append(f"timeline.{number}.{timeline[number].disturbs}")
+        if over:
+            said.append("undone")
+            keys += [f"the end of timeline.{number}" for number in ends[at_s]]
+        for number, what, layer in scheduled.get(at_s, ()):
+            network.layers[number] = layer
+            said.append(what)
+            keys.append(f"schedule.{number}")
+        yield Step(at_s, ", ".join(dict.fromkeys(said)) or "start", keys, network)
+
+
+def refuse_ambiguity(timeline: Sequence[TimelineEntry]) -> None:
+    """Raises ValueError if of two changes of the same thing nobody can say which holds when."""
+    under_way: dict[tuple[Where, str], list[tuple[float, int]]] = defaultdict(list)
+    for number, entry in sorted(enumerate(timeline), key=lambda numbered: numbered[1].at_s):
+        until_s = math.inf if entry.for_s is None else entry.ends_at_s
+        for where, key in _changed(entry):
+            others = under_way[where, key]
+            while others and others[-1][0] <= entry.at_s:
+                others.pop()
+            if others and until_s > others[-1][0]:
+                other_until_s, other = others[-1]
+                lasts = "for good" if entry.for_s is None else f"until {until_s:g} s"
+                raise ValueError(
+                    f"timeline.{number} changes {key}{of_whom(where)} {lasts}, and timeline.{other} until "
+                    f"{other_until_s:g} s: which holds when? Have timeline.{number} begin then, or be over by then"
+                )
+            others.append((until_s, number))
+
+
+def _changed(entry: TimelineEntry) -> Iterator[tuple[Where, str]]:
+    """Whose keys the entry changes; the partition counts as a key of all."""
+    if entry.disturbs in (PARTITION, "heal"):
+        yield None, "the partition"
+    elif entry.disturbs:
+        yield from ((where, key) for where, said in entry.said().items() for key in said)
