@@ -99,6 +99,7 @@ class Swarm:
 
     def __getattr__(self, verb: str) -> Callable[..., None]:
         """Each fault is a verb, with the further keys of its timeline entry: `kill(2, 4)`, `reboot(3, down_s=10)`."""
+        __tracebackhide__ = True
         fault = next((kind for kind in ASKED_FOR if kind.what == verb), None)
         if fault is None:
             raise AttributeError(f"a swarm has no {verb!r}; what can happen to it: {', '.join(_VERBS)}")

@@ -122,7 +122,8 @@ class Told:
             return
         if not self.scenario.schedule:  # which lasts as long as the mission was meant to
             last_s = max(change.at_s for change in timeline_of(self.scenario))
-            self._set(duration_s=max(swarm.now(), last_s, INSTANT_S))
+            await self.until(swarm, last_s)  # agents come back, and what is for a while passes
+            self._set(duration_s=max(swarm.now(), INSTANT_S))
         self._set(final_reconcile=reconcile_finally or self.scenario.final_reconcile)
         await mission.settle(swarm, self.scenario)
 

@@ -73,8 +73,8 @@ class _Entry(Disturbance):
     @property
     def ends_at_s(self) -> float:
         """When the last thing that it says happens."""
-        if self.fault is not None:
-            return self.fault.course()[-1].at_s
+        if (fault := self.fault) is not None:
+            return fault.course()[-1].at_s
         lasts_s = self.injection[1].lasts_s if self.injection else self.for_s or 0.0
         return round(self.at_s + lasts_s, 6)
 
@@ -87,10 +87,12 @@ class _Entry(Disturbance):
         if self.for_s is not None and (self.heal or not self.disturbs):
             raise ValueError("`for_s` belongs to `loss`, `partition` and `network`")
         for kind in ASKED_FOR:
-            given = [key for key in kind.further_keys() if getattr(self, key) is not None]
-            if given and getattr(self, kind.what) is None:
-                raise ValueError(f"{' and '.join(f'`{key}`' for key in kind.further_keys())} belong to `{kind.what}`")
-            if len(given) < len(kind.further_keys()) and getattr(self, kind.what) is not None:
+            keys, is_meant = kind.further_keys(), getattr(self, kind.what) is not None
+            given = [key for key in keys if getattr(self, key) is not None]
+            if given and not is_meant:
+                named = (f"`{key}`" for key in keys)
+                raise ValueError(f"{' and '.join(named)} belong{'s' if len(keys) == 1 else ''} to `{kind.what}`")
+            if is_meant and len(given) < len(keys):
                 raise ValueError(f"a {kind.what} needs {kind.keys_in_words}")
         return self
 
@@ -104,7 +106,7 @@ def _keys_of_faults() -> dict[str, Any]:
     return {key: (annotation | None, None) for key, annotation in annotations.items()}
 
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # a type checker does not run the code that makes the class
     TimelineEntry = _Entry
 else:
     TimelineEntry = create_model("TimelineEntry", __base__=_Entry, __doc__=_Entry.__doc__, **_keys_of_faults())

@@ -212,11 +212,36 @@ def test_a_failing_assert_shows_the_verdict_and_where_the_report_is(pytester: py
     report(result)
 
 
+def test_the_network_changes_for_a_while_and_a_test_that_ends_waits_for_that(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+    def test_network(swarm):
+        swarm.run_until(100)
+        swarm.network(links=[{"from": 1, "to": 2, "loss": 0.9}], for_s=50)
+        swarm.loss(0.3, for_s=10)
+        swarm.run_for(20)
+        swarm.partition([1], for_s=60)
+    """)
+    run(pytester, "--ucp-keep", "kept").assert_outcomes(passed=1)
+    (kept,) = run_directories(pytester)
+    record = json.loads((kept / "run.json").read_text())
+    assert [(fault["what"], fault["detail"]) for fault in record["faults"]] == [
+        ("network", "loss 0 %, loss 90 % from 1 to 2"),
+        ("loss", "loss 30 %, loss 90 % from 1 to 2"),
+        ("undone", "loss 0 %, loss 90 % from 1 to 2"),
+        ("partition", "loss 0 %, loss 90 % from 1 to 2, partition 1"),
+        ("undone", "loss 0 %, partition 1"),
+        ("undone", "loss 0 %"),
+    ]
+
+
 @pytest.mark.parametrize(
     ("told", "sentence"),
     [
         ("swarm.partition([1], [9])", "partition[[]1]: unknown vehicle 9; allowed is any of 1, 2, 3, 4, 5"),
         ("swarm.loss(2)", "`loss` is 2: *"),
+        ("swarm.network(lost=1)", "`network.lost` is unknown: there are loss, delay, *"),
+        ("swarm.loss(0.5, for_s=9); swarm.heel()", "a swarm has no 'heel'; what can happen to it: *kill, *"),
+        ("swarm.reboot(2, disk='half')", "`disk` is 'half': it should be 'kept' or 'lost'"),
         ("swarm.restart(2)", "restart: agent 2 is running then, not killed"),
         ("swarm.kill(1, 2, 3, 4, 5)", "the timeline leaves nobody: *"),
         ("swarm.characteristic(7)", "there is no characteristic 7: they are 1 to 6"),
