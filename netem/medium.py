@@ -9,7 +9,7 @@ one for corruption, then the limit, then the second copy on a way of its own, th
 stands before all of this.
 
 Every sender has a random stream of its own for each concern: loss, latency, duplication, and so on. A fault that is
-added, or another sender that says more, changes none of the others' lots. Lots are words of 32 bits, and what they are
+added, or another sender that says more, changes none of the others' draws. A draw is a word of 32 bits, and what it is
 compared with are whole numbers or tables of them, so that a seed means the same on every machine.
 
 With 200 agents on the air most lots are never looked at: an answer matters to one agent of the 200. So words are drawn
@@ -41,7 +41,7 @@ _BROADCASTS_AT_ONCE = 64
 _TABLE_SIZE = 4096
 
 
-class Lots(Protocol):
+class RandomDraws(Protocol):
     """The lots of one broadcast. Receivers are numbered in the order in which the medium was given its vehicles."""
 
     latest: float
@@ -88,7 +88,7 @@ class Medium:
         """Whether no partition stands between the two, by their numbers."""
         return self._group[sender] == self._group[receiver]
 
-    def draw(self, sender: int, now: float, data_bytes: int) -> Lots:
+    def draw(self, sender: int, now: float, data_bytes: int) -> RandomDraws:
         """The lots of a broadcast of the sender with this number: a UDP datagram that it sends at `now`, in seconds.
 
         `data_bytes` is the length of the datagram's data; no sender's `now` is before its last.
@@ -115,7 +115,7 @@ class _Air(Protocol):
     soonest_of_all: float
     latest: float
 
-    def draw(self, now: float, data_bytes: int) -> Lots: ...
+    def draw(self, now: float, data_bytes: int) -> RandomDraws: ...
 
 
 def _is_plain(link: LinkConditions) -> bool:
@@ -138,16 +138,16 @@ class _PlainAir:
         self.latest = max(delay.mean_s + delay.jitter_s for delay in delays)
         self._words = words
 
-    def draw(self, now: float, data_bytes: int) -> Lots:
+    def draw(self, now: float, data_bytes: int) -> RandomDraws:
         words = self._words
         at = words.next
         if at + self.receivers > len(words.loss):
             at = words.refill(self.receivers)
         words.next = at + self.receivers
-        return _PlainLots(self, words.loss, words.latency, at, self.latest)
+        return _PlainDraws(self, words.loss, words.latency, at, self.latest)
 
 
-class _PlainLots:
+class _PlainDraws:
     """Where the words of one broadcast stand among those of others."""
 
     __slots__ = ("_air", "_at", "_latency", "_loss", "latest")
@@ -222,9 +222,9 @@ class _AnyAir:
         self._words = words
         self._duplication, self._reordering, self._corruption = rare
 
-    def draw(self, now: float, data_bytes: int) -> Lots:
+    def draw(self, now: float, data_bytes: int) -> RandomDraws:
         bits = 8 * (data_bytes + _HEADERS)
-        return _DrawnLots([self._delays(receiver, now, bits) for receiver in range(len(self._links))])
+        return _RepeatedDraws([self._delays(receiver, now, bits) for receiver in range(len(self._links))])
 
     def _delays(self, receiver: int, now: float, bits: int) -> tuple[float, ...]:
         words = self._words
@@ -306,7 +306,7 @@ class _Link:
 
 
 @dataclass
-class _DrawnLots:
+class _RepeatedDraws:
     delays: list[tuple[float, ...]]
 
     def __post_init__(self) -> None:

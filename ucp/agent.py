@@ -65,7 +65,7 @@ from ucp.messages import (
 )
 from ucp.settings import Settings
 from ucp.state import AgentState
-from ucp.store import Holdings
+from ucp.store import StoredState
 from ucp.trace import HandlerRun, State
 
 Trigger = dict[str, int | str]
@@ -210,7 +210,7 @@ class Agent:
             timer.stop()
             self._handle(now, {"timer": timer.name}, self._on_timer[timer.name])
 
-    def boot(self, found: Holdings, now: float) -> None:
+    def boot(self, found: StoredState, now: float) -> None:
         """Go on from what a former life left on its vehicle's disk; before any other input.
 
         Timers, votes and the block being built are gone. A reconcile that was going on ends as if nobody had answered

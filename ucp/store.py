@@ -34,7 +34,7 @@ class StoreError(Exception):
 
 
 @dataclass(slots=True)
-class Holdings:
+class StoredState:
     """What an agent holds where, and the hashes of the blocks that it completed.
 
     Blocks of the chain are oldest first, of the deque front first, of the stack top last.
@@ -46,7 +46,7 @@ class Holdings:
     stack: list[Block] = field(default_factory=list)
 
     @classmethod
-    def of(cls, state: AgentState) -> "Holdings":
+    def of(cls, state: AgentState) -> "StoredState":
         return cls(
             list(state.completed), list(state.chain), list(state.blocks_to_be_committed), list(state.reconcile_stack)
         )
@@ -103,7 +103,7 @@ class Store:
         self._file: BinaryIO | None = None
         self.found = self._read()
 
-    def _read(self) -> Holdings | None:
+    def _read(self) -> StoredState | None:
         entries = _entries(self._path)
         header = next(entries, None)
         if header is None:
@@ -117,7 +117,7 @@ class Store:
                 f"{self._path} is the store of agent {header.get('agent_id')} in another mission, or of another "
                 "version: name another file as `store`"
             )
-        found, known = Holdings(), dict[str, Block]()
+        found, known = StoredState(), dict[str, Block]()
         for entry in entries:
             found.replay(entry, known)
         return found

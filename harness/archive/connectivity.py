@@ -28,7 +28,7 @@ Components = tuple[frozenset[int], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class Topology:
     """From `at_s` on the living vehicles fell into these components, the largest first; `what` changed them."""
 
     at_s: float
@@ -41,7 +41,7 @@ class Connectivity:
     """The states of the network, no two in a row alike; none if there is no record of it."""
 
     vehicles: tuple[int, ...]
-    states: list[State]
+    states: list[Topology]
     reboots: list[tuple[float, int]]
     """When an agent went down, while its vehicle flew on."""
     problems: list[str]
@@ -122,7 +122,7 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
     """The network among `vehicles`. A line that means nothing, or comes before the first conditions, is left out."""
     lines = JsonLines(path, _Line)
     network = _Network(vehicles)
-    states: list[State] = []
+    states: list[Topology] = []
     reboots: list[tuple[float, int]] = []
     cut: dict[Pair, list[float]] = {}
     lost: dict[int, list[float]] = {}
@@ -143,11 +143,11 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
         if (fault := named(line.what)).ends_a_life and not fault.takes_the_vehicle:
             reboots += [(now_s, vehicle) for vehicle in line.agents if vehicle in network.vehicles]
         if switched or fallen or not states:
-            _enter(states, State(now_s, line.what, network.components()))
+            _enter(states, Topology(now_s, line.what, network.components()))
     return Connectivity(network.vehicles, states, reboots, lines.problems(), cut, lost)
 
 
-def _enter(states: list[State], state: State) -> None:
+def _enter(states: list[Topology], state: Topology) -> None:
     """Add the state if it is another than the last; one that lasted no time was none."""
     if states and states[-1].at_s == state.at_s:
         states.pop()

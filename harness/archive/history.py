@@ -107,7 +107,7 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class History:
     """All in order of time, agent by agent. `messages` is None where they were left out."""
 
     votes: list[Vote]
@@ -127,26 +127,26 @@ def lives(trace: Trace) -> list[list[HandlerRun]]:
     return [[run for _, run in life if in_time(run)] for life in trace.lives()]
 
 
-def course(traces: Mapping[int, Trace], faults: Iterable[Fault], end_s: float, *, whole: bool = True) -> Course:
+def history_of(traces: Mapping[int, Trace], faults: Iterable[Fault], end_s: float, *, whole: bool = True) -> History:
     """`end_s` is when the run ended, in mission seconds; without `whole` traces there are no messages."""
     falls: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
         if fault.kind.ends_a_life:
             for agent in fault.agents or ():
                 falls[agent].append(fault.at_s)
-    found = Course([], [], [], [], [] if whole else None)
+    found = History([], [], [], [], [] if whole else None)
     for agent, trace in sorted(traces.items()):
         every = [runs for runs in lives(trace) if runs]
         for runs, later in zip_longest(every, every[1:]):
             known = [at_s for at_s in falls[agent] if at_s >= runs[-1].t]
-            _Life(agent, found).follow(runs, min([*known, later[0].t if later else end_s]))
+            _Incarnation(agent, found).follow(runs, min([*known, later[0].t if later else end_s]))
     return replace(found, messages=_messages(traces)) if whole else found
 
 
-class _Life:
+class _Incarnation:
     """An agent between its start and its end, while its trace is read."""
 
-    def __init__(self, agent: int, found: Course) -> None:
+    def __init__(self, agent: int, found: History) -> None:
         self._agent = agent
         self._found = found
         self._vote: tuple[str, float] | None = None

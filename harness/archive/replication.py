@@ -15,7 +15,7 @@ from ucp.trace import HandlerRun
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class Replication:
     """From `at_s` on: blocks in the mutual and in the longest chain, and distinct chains.
 
     Copies are None until a block is completed.
@@ -29,7 +29,7 @@ class Spread:
     copies_mean: float | None
 
 
-def spread(traces: Mapping[int, Trace], faults: Iterable[Fault]) -> list[Spread]:
+def replication_of(traces: Mapping[int, Trace], faults: Iterable[Fault]) -> list[Replication]:
     """How things stood from 0 s on, and after each moment that changed it."""
     steps: list[tuple[float, int, int, Fault | HandlerRun]] = []
     for fault in faults:
@@ -39,14 +39,14 @@ def spread(traces: Mapping[int, Trace], faults: Iterable[Fault]) -> list[Spread]
             steps += [(run.t, life, agent, run) for run in runs if run.changes]
     steps.sort(key=lambda step: step[:3])
     chains = _Chains(traces)
-    found = [chains.spread(0.0)]
+    found = [chains.replication(0.0)]
     for number, (at_s, life, agent, step) in enumerate(steps):
         if isinstance(step, Fault):
             chains.suffer(agent, step)
         else:
             chains.play(agent, life, step)
         if number + 1 == len(steps) or steps[number + 1][0] > at_s:
-            now = chains.spread(at_s)
+            now = chains.replication(at_s)
             if found[-1].at_s == at_s:
                 found[-1] = now
             elif replace(now, at_s=found[-1].at_s) != found[-1]:
@@ -122,13 +122,13 @@ class _Chains:
             self._copies_of_completed += more
         self._copies[block] += more
 
-    def spread(self, at_s: float) -> Spread:
+    def replication(self, at_s: float) -> Replication:
         paths = list(self._paths.values())
         first: list[tuple[int, str]] = paths[0] if paths else []
         while self._mutual < len(first) and self._sharing[first[self._mutual][0]] == len(paths):
             self._mutual += 1
         completed = len(self._completed)
-        return Spread(
+        return Replication(
             at_s,
             self._mutual,
             max(map(len, paths), default=0),

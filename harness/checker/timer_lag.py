@@ -12,7 +12,7 @@ TOLERATED = 0.05
 
 
 @dataclass(frozen=True)
-class Lateness:
+class TimerLag:
     """Of twenty vote timers, set to `asked_s`, one fired more than `late_s` late. Mission seconds."""
 
     late_s: float
@@ -23,7 +23,7 @@ class Lateness:
         return self.late_s <= TOLERATED * self.asked_s
 
 
-def lateness(traces: Iterable[Trace]) -> Lateness | None:
+def timer_lag(traces: Iterable[Trace]) -> TimerLag | None:
     """Over all votes that no reconcile interrupted; None if too few tell."""
     late: list[float] = []
     asked_s = 0.0
@@ -32,7 +32,7 @@ def lateness(traces: Iterable[Trace]) -> Lateness | None:
         if isinstance(setting, int | float):
             asked_s = float(setting)
             late += [lasted - asked_s for lasted in _votes(trace)]
-    return Lateness(quantiles(late, n=20)[-1], asked_s) if len(late) >= ENOUGH else None
+    return TimerLag(quantiles(late, n=20)[-1], asked_s) if len(late) >= ENOUGH else None
 
 
 def _votes(trace: Trace) -> Iterator[float]:

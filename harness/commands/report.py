@@ -16,7 +16,7 @@ from harness.errors import MachineError, RunDirectoryError
 
 def report_command(run: Annotated[Path, typer.Argument(help="A run directory.")]) -> None:
     """Write report.html, report.md, junit.xml and chains.svg again, also of a run that was killed half-way."""
-    left = report.read_remains(RunArchive(run, skim=True))
+    left = report.read_source(RunArchive(run, skim=True))
     try:
         page = report.write(left)
     except RunDirectoryError as error:
@@ -26,7 +26,7 @@ def report_command(run: Annotated[Path, typer.Argument(help="A run directory.")]
     sys.stdout.write(f"{page}\n")
 
 
-def _missing(left: report.Remains) -> Iterator[str]:
+def _missing(left: report.ReportSource) -> Iterator[str]:
     """A sentence for everything that a whole run would have left and this one has not."""
     recorded = "schema" in left.result
     if recorded and left.result.get("outcome") in (None, "running"):

@@ -128,7 +128,7 @@ def _show_end(console: Console, finished: Run) -> None:
     ]
     if slow:
         complain(f"vehicles {', '.join(slow)} did not keep up with the clock: choose a smaller --speedup")
-    late = finished.lateness
+    late = finished.timer_lag
     if late is not None and not late.tolerable:
         told = f"one in twenty of the agents' vote timers fired {late.late_s:.1f} or more mission seconds late"
         complain(f"this machine was too slow: {told} (set to {late.asked_s:g} s): choose a smaller --speedup")

@@ -7,7 +7,7 @@ played; who tries it finds out.
 from collections.abc import Callable, Collection
 from typing import Any
 
-from harness.explore.tape import Logged, Lost
+from harness.explore.recording import Logged, Lost
 from harness.scenario import Scenario
 from harness.scenario.faults import ASKED_FOR
 from harness.scenario.injection import INJECTIONS

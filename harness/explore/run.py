@@ -7,10 +7,10 @@ from pathlib import Path
 from harness.checker.characteristic import Characteristic
 from harness.errors import INTERRUPTED, VIOLATED
 from harness.explore.document import Document, document_of
+from harness.explore.recording import Recording, record
 from harness.explore.search import Judge, Searched, Violation, search, simulated, violated
 from harness.explore.shrink import BudgetSpentError, Shrinker
 from harness.explore.smaller import replays, scenario_of, shrink, size
-from harness.explore.tape import Recording, record
 from harness.explore.write import claim, evidence_lines, to_yaml, write
 from harness.scenario import Scenario
 

@@ -25,8 +25,8 @@ from harness.explore.document import (
     with_drops,
     with_key,
 )
+from harness.explore.recording import Logged, Recording
 from harness.explore.shrink import Shrinker
-from harness.explore.tape import Logged, Recording
 from harness.scenario import Scenario
 from ucp.events import EVENT_HEADER_BYTES
 from ucp.settings import Settings

@@ -10,7 +10,7 @@ from harness.archive.directory import default_path
 from harness.checker.characteristic import Characteristic
 from harness.errors import MachineError, RunDirectoryError
 from harness.explore.document import Document, at
-from harness.explore.tape import Lost, Recording
+from harness.explore.recording import Lost, Recording
 
 EVIDENCE_SHOWN = 5
 ORDER = (

@@ -19,7 +19,7 @@ Outcome = Literal["completed", "interrupted", "failed"]
 
 
 @dataclass
-class Played:
+class RunOutcome:
     """What became of a run, before anybody judges it."""
 
     outcome: Outcome = "completed"
@@ -60,7 +60,7 @@ def _same_connections(one: dict[str, Any], other: dict[str, Any]) -> bool:
 class Swarm(Protocol):
     """Agents that a mission is played with; times are mission seconds."""
 
-    played: Played
+    played: RunOutcome
 
     def now(self) -> float: ...
 
@@ -92,7 +92,7 @@ class Swarm(Protocol):
     async def completed(self) -> dict[int, int]:
         """How many blocks of its own each agent has completed that is neither dead nor paused."""
 
-    async def take_stock(self) -> Played:
+    async def snapshot(self) -> RunOutcome:
         """What has been played by now, with exports and traces up to now, for whoever judges a run that goes on."""
 
 
@@ -112,7 +112,7 @@ async def play(swarm: Swarm, scenario: Scenario) -> None:
     await settle(swarm, scenario)
 
 
-async def play_on(opening: AbstractAsyncContextManager[Swarm], scenario: Scenario, story: Story = play) -> Played:
+async def play_on(opening: AbstractAsyncContextManager[Swarm], scenario: Scenario, story: Story = play) -> RunOutcome:
     """Lead the swarm that opens through the story; what became of it."""
     async with opening as swarm:
         await story(swarm, scenario)

@@ -18,7 +18,7 @@ TRACK_S = 1.0
 """Mission seconds between two looks at where the vehicles are, where no radio asks for another time."""
 
 
-class Reach:
+class RadioRange:
     """The network of one run as it stands."""
 
     def __init__(self, scenario: Scenario) -> None:

@@ -14,10 +14,10 @@ from harness.errors import HarnessError, ScenarioError
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS
-from harness.play.mission import Played
+from harness.play.mission import RunOutcome
 from harness.play.progress import Silent
 from harness.pytest_plugin.findings import Findings, Judgement
-from harness.pytest_plugin.told import Sentence, Told
+from harness.pytest_plugin.live_story import Sentence, Told
 from harness.run.run import Recording, Run
 from harness.scenario import Scenario
 from harness.scenario.faults import ASKED_FOR
@@ -60,7 +60,7 @@ class Swarm:
     def __repr__(self) -> str:
         return f"<swarm, run in {self.directory}>"
 
-    def _play(self, backend: Backend, seed: int) -> Played:
+    def _play(self, backend: Backend, seed: int) -> RunOutcome:
         scenario, directory = self._told.scenario, self._recording.directory
         with self._runner:
             try:
@@ -186,10 +186,10 @@ class Swarm:
         """As of the first look since the last sentence, or of the moment for which `wait_idle` has waited."""
         __tracebackhide__ = True
         if self._seen is None:
-            self._seen = self._judge_by_now(self._hear(_take_stock))
+            self._seen = self._judge_by_now(self._hear(_snapshot))
         return self._seen
 
-    def _judge_by_now(self, played: Played) -> Findings:
+    def _judge_by_now(self, played: RunOutcome) -> Findings:
         self._recording.take_down(played)
         return Findings(self.directory, checker.check(checker.gather(RunArchive(self.directory))))
 
@@ -243,8 +243,8 @@ class Swarm:
         return self._recording.end(played)
 
 
-async def _take_stock(swarm: mission.Swarm) -> Played:
-    return await swarm.take_stock()
+async def _snapshot(swarm: mission.Swarm) -> RunOutcome:
+    return await swarm.snapshot()
 
 
 async def _now(swarm: mission.Swarm) -> float:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import count
 from operator import attrgetter
 
-from harness.archive.connectivity import Connectivity, State
+from harness.archive.connectivity import Connectivity, Topology
 from harness.archive.tracks import Fix, Tracks, between
 from harness.report.chain_tree import ranges
 
@@ -107,7 +107,7 @@ def listed(vehicles: frozenset[int]) -> str:
     return ", ".join(ranges(sorted(vehicles)))
 
 
-def divisions(states: Sequence[State]) -> list[Division]:
+def divisions(states: Sequence[Topology]) -> list[Division]:
     found: list[Division] = []
     before: dict[int, frozenset[int]] = {}
     for state in states:

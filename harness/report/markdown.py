@@ -6,7 +6,7 @@ from harness.archive.result import mapping
 from harness.present import words
 from harness.present.markdown import escaped, row
 from harness.report import facts, network, rogue, survival
-from harness.report.remains import Remains
+from harness.report.source import ReportSource
 from harness.report.verdicts import Verdict, headline, verdicts
 
 EVIDENCE_SHOWN = 3
@@ -15,7 +15,7 @@ FAULTS_SHOWN = 12
 TEXT_LENGTH = 240
 
 
-def to_markdown(left: Remains) -> str:
+def to_markdown(left: ReportSource) -> str:
     result = left.result
     judged, ended = verdicts(result), facts.outcome(result)
     said, _ = headline(judged, completed=ended is None)

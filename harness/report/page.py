@@ -17,7 +17,7 @@ from harness.report import facts, html, map_section, network, rogue, survival, s
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.map_svg import STYLE as MAP_STYLE
-from harness.report.remains import Remains
+from harness.report.source import ReportSource
 
 EVIDENCE_SHOWN = 3
 LONG_TEXT = 240
@@ -25,7 +25,7 @@ LONG_TEXT = 240
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 
-def draw(left: Remains) -> str:
+def draw(left: ReportSource) -> str:
     """The page, as HTML."""
     result, exports, ink = left.result, left.exports, left.ink
     judged, outcome = verdicts.verdicts(result), facts.outcome(result)

@@ -13,15 +13,15 @@ from markupsafe import Markup
 from pydantic import ValidationError
 
 from harness.archive.connectivity import Connectivity
-from harness.archive.history import LATEST_S, Course, Message, Reconcile, Vote, course, ends_at, possible
+from harness.archive.history import LATEST_S, History, Message, Reconcile, Vote, ends_at, history_of, possible
 from harness.archive.record import Fault
-from harness.archive.replication import spread
+from harness.archive.replication import replication_of
 from harness.archive.result import listing, number
 from harness.present import words
 from harness.present.colours import Ink
 from harness.report import facts, timeline_charts, timeline_lanes
 from harness.report.map_parts import divisions
-from harness.report.remains import Remains
+from harness.report.source import ReportSource
 from harness.report.timeline_lanes import OUTCOMES
 from harness.report.timeline_plot import Shade, axis, seconds
 
@@ -67,7 +67,7 @@ class Section:
     notes: list[str]
 
 
-def section(left: Remains, names: Mapping[str, str]) -> Section | None:
+def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
     """`names` are those of blocks by hash. None if there is no trace."""
     traces, ink = left.traces, left.ink
     if not traces:
@@ -75,7 +75,7 @@ def section(left: Remains, names: Mapping[str, str]) -> Section | None:
     notes = []
     faults = _faults(left.result)
     end_s = max(ends_at(traces), *(fault.at_s for fault in faults), _planned_s(left.result), 1.0)
-    told = course(traces, faults, end_s, whole=not left.archive.large)
+    told = history_of(traces, faults, end_s, whole=not left.archive.large)
     shades, shades_left_out = _shades(left.network, end_s)
     if shades_left_out:
         notes.append(f"{shades_left_out} shorter stretches of a parted network are not shaded")
@@ -93,7 +93,7 @@ def section(left: Remains, names: Mapping[str, str]) -> Section | None:
         picture.lane_height,
         picture.drawing,
         picture.legend,
-        timeline_charts.draw(spread(traces, faults), faults, shades, end_s),
+        timeline_charts.draw(replication_of(traces, faults), faults, shades, end_s),
         axis(end_s),
         messages,
         _table(told.votes, lambda vote: _vote_row(vote, names)),
@@ -185,7 +185,7 @@ def _reconcile_row(reconcile: Reconcile) -> list[str]:
     ]
 
 
-def _in_words(told: Course, agents: int, end_s: float) -> str:
+def _in_words(told: History, agents: int, end_s: float) -> str:
     """What the lanes show, for who does not see them."""
     approved = sum(vote.outcome == "approved" for vote in told.votes)
     return (

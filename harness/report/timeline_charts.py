@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from harness.archive.record import Fault
-from harness.archive.replication import Spread
+from harness.archive.replication import Replication
 from harness.present import words
 from harness.present.svg import n
 from harness.report.timeline_plot import Shade, plot, seconds, shaded, short
@@ -16,7 +16,7 @@ MAX_MOMENTS = 600
 
 _TOP, _BOTTOM = 14, 4  # room above the highest value and below 0
 
-Figure = Callable[[Spread], float | None]
+Figure = Callable[[Replication], float | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,18 +37,18 @@ _LOOKS = ("broken", "whole")
 """Of two lines; one by itself is whole."""
 
 
-def draw(spreads: Sequence[Spread], faults: Sequence[Fault], shades: Sequence[Shade], end_s: float) -> list[Chart]:
+def draw(spreads: Sequence[Replication], faults: Sequence[Fault], shades: Sequence[Shade], end_s: float) -> list[Chart]:
     """A chart for each group of figures; `spreads` are how things stood from when on, in order, one at least."""
     moments = thinned(spreads, end_s)
     behind = shaded(shades, faults, HEIGHT)
     return [_chart(name, figures, moments, behind, end_s) for name, figures in _CHARTS]
 
 
-def thinned(spreads: Sequence[Spread], end_s: float) -> Sequence[Spread]:
+def thinned(spreads: Sequence[Replication], end_s: float) -> Sequence[Replication]:
     """Where there are many: of those that nobody could tell apart in the whole picture, the worst and the last."""
     if len(spreads) <= MAX_MOMENTS:
         return spreads
-    kept: dict[int, tuple[Spread, Spread]] = {}
+    kept: dict[int, tuple[Replication, Replication]] = {}
     for one in spreads:
         place = int(one.at_s / end_s * MAX_MOMENTS / 2)
         worst = min(kept[place][0], one, key=lambda moment: moment.mutual_chain) if place in kept else one
@@ -57,7 +57,7 @@ def thinned(spreads: Sequence[Spread], end_s: float) -> Sequence[Spread]:
 
 
 def _chart(
-    name: str, figures: Sequence[tuple[str, Figure]], moments: Sequence[Spread], behind: Markup, end_s: float
+    name: str, figures: Sequence[tuple[str, Figure]], moments: Sequence[Replication], behind: Markup, end_s: float
 ) -> Chart:
     highest = max((value for _, figure in figures for one in moments if (value := figure(one)) is not None), default=0)
     looks = _LOOKS[-len(figures) :]
@@ -93,7 +93,7 @@ def _chart(
     )
 
 
-def _steps(moments: Sequence[Spread], figure: Figure, per_px: float, end_s: float) -> str:
+def _steps(moments: Sequence[Replication], figure: Figure, per_px: float, end_s: float) -> str:
     """A line that goes up or down where the value does, and begins where there is one."""
     path = ""
     last: float | None = None
@@ -106,6 +106,6 @@ def _steps(moments: Sequence[Spread], figure: Figure, per_px: float, end_s: floa
     return f"{path}H{short(end_s)}" if path else ""
 
 
-def _tip(one: Spread, figures: Sequence[tuple[str, Figure]], name: str) -> str:
+def _tip(one: Replication, figures: Sequence[tuple[str, Figure]], name: str) -> str:
     said = ", ".join(f"{what} {words.value(figure(one))}" for what, figure in figures)
     return f"from {seconds(one.at_s)}: {name}: {said}"

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from markupsafe import Markup
 
-from harness.archive.history import CUT_SHORT, Commit, Course, Phase, Reconcile, Tie, Vote
+from harness.archive.history import CUT_SHORT, Commit, History, Phase, Reconcile, Tie, Vote
 from harness.archive.record import Fault
 from harness.present.svg import n
 from harness.report.timeline_plot import Shade, pin, plot, seconds, shaded, short, told
@@ -53,7 +53,7 @@ Span = TypeVar("Span", Vote, Reconcile)
 
 
 def draw(
-    course: Course,
+    course: History,
     faults: Sequence[Fault],
     shades: Sequence[Shade],
     agents: Sequence[int],
@@ -101,7 +101,7 @@ def draw(
 
 
 def _legend(
-    course: Course, faults: Sequence[Fault], shades: Sequence[Shade], *, by_phase: bool
+    course: History, faults: Sequence[Fault], shades: Sequence[Shade], *, by_phase: bool
 ) -> list[tuple[Markup, str]]:
     """What is in the picture, and no more."""
     outcomes = {vote.outcome for vote in course.votes}

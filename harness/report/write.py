@@ -3,27 +3,27 @@
 from pathlib import Path
 
 from harness.archive.archive import RunArchive
-from harness.collector import uncollected
 from harness.errors import RunDirectoryError
+from harness.gc_pause import gc_paused
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.junit import to_junit
 from harness.report.markdown import to_markdown
 from harness.report.page import draw
-from harness.report.remains import Remains, read_remains
+from harness.report.source import ReportSource, read_source
 from ucp.files import write_atomically
 
 
-@uncollected()
+@gc_paused()
 def write_report(archive: RunArchive) -> Path:
     """Write `report.html`, `chains.svg`, `report.md` and `junit.xml` into the run directory; the path of the page.
 
     Raises RunDirectoryError if there is nothing of a run in the directory, or if the disk refuses the report. What is
     missing or damaged is said on the page.
     """
-    return write(read_remains(archive))
+    return write(read_source(archive))
 
 
-def write(left: Remains) -> Path:
+def write(left: ReportSource) -> Path:
     """As `write_report` does, of what was read."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))

@@ -18,12 +18,12 @@ from harness.archive.record import RogueInjection, RunRecord, Survival
 from harness.backend_names import BackendName
 from harness.checker.injections import account
 from harness.checker.survival import survival
-from harness.checker.timer_lag import Lateness, lateness
+from harness.checker.timer_lag import TimerLag, timer_lag
 from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
-from harness.play.mission import Played
+from harness.play.mission import RunOutcome
 from harness.play.progress import Progress
 from harness.scenario import Scenario
 from netem import uml
@@ -35,18 +35,18 @@ PACKAGES = ("ucp-harness", "pymavlink", "pyroute2")
 class Run:
     """A finished run: where it is, how it ended, what was found, and the exit status of the command line.
 
-    `lateness` is that of the agents' timers, of processes only, and if enough of them tell.
+    `timer_lag` is that of the agents' timers, of processes only, and if enough of them tell.
     """
 
     directory: Path
-    played: Played
+    played: RunOutcome
     result: checker.Result
     survival: Survival
     rogue: list[RogueInjection]
     exit_status: int
     wall_s: float
     report: Path
-    lateness: Lateness | None
+    timer_lag: TimerLag | None
 
 
 def run(scenario: Scenario, seed: int, out: Path, progress: Progress, backend: BackendName = "process") -> Run:
@@ -92,7 +92,7 @@ class Recording:
         """This is what the run plays: the scenario that it began with, and what it was told since."""
         self._update(scenario=scenario)
 
-    def take_down(self, played: Played) -> None:
+    def take_down(self, played: RunOutcome) -> None:
         """What has been played by now."""
         self._update(
             engine=played.engine,
@@ -108,7 +108,7 @@ class Recording:
             capture=played.capture,
         )
 
-    def end(self, played: Played) -> Run:
+    def end(self, played: RunOutcome) -> Run:
         """Judge what was played, and write record and report. Raises MachineError if the disk refuses them."""
         self._record = _updated(self._record, outcome=played.outcome, outcome_detail=played.outcome_detail)
         self.take_down(played)
@@ -124,7 +124,7 @@ class Recording:
         except RunDirectoryError as error:
             raise MachineError(f"{error}; run.json has the verdict") from None
         status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)
-        late = None if in_virtual_time(self._record.backend) else lateness(evidence.traces.values())
+        late = None if in_virtual_time(self._record.backend) else timer_lag(evidence.traces.values())
         return Run(self.directory.path, played, result, survived, rogue, status, wall_s, page, late)
 
     def _update(self, **keys: Any) -> None:
@@ -138,7 +138,7 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
 
 async def _until_interrupted(
     backend: Backend, scenario: Scenario, seed: int, directory: RunDirectory, progress: Progress
-) -> Played:
+) -> RunOutcome:
     interrupted = asyncio.Event()
     loop = asyncio.get_running_loop()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

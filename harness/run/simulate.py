@@ -13,8 +13,8 @@ from harness.archive.record import JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
 from harness.play import mission
-from harness.play.mission import Played
-from harness.play.simulation.backend import Life, Simulation
+from harness.play.mission import RunOutcome
+from harness.play.simulation.backend import Incarnation, Simulation
 from harness.play.simulation.on_disk import header
 from harness.play.simulation.virtual_time import VirtualTime
 from harness.scenario import Scenario
@@ -26,7 +26,7 @@ from ucp.trace import HandlerRun
 class Simulated:
     """A simulated run, judged."""
 
-    played: Played
+    played: RunOutcome
     evidence: Evidence
     result: checker.Result
 
@@ -68,7 +68,7 @@ class InMemory:
         self._maker = ExportMaker()
         self._kept: dict[int, Export] = {}
 
-    def begin(self, life: Life) -> None:
+    def begin(self, life: Incarnation) -> None:
         if not self.tracing:
             return
         trace = self._traces.get(life.agent.agent_id)

@@ -5,7 +5,7 @@ Most of it is virtual, and the same on every machine. What a run costs this mach
 
 from harness.checker import Result
 from harness.matrix.metrics import Figures, Metric, figure, uniform
-from harness.play.mission import Played
+from harness.play.mission import RunOutcome
 from harness.scenario import Scenario
 
 METRICS = (
@@ -32,7 +32,7 @@ FITTED = ("messages", "bytes", "messages_per_block", "messages_per_minute", "rec
 BY_NAME = {metric.name: metric for metric in (*METRICS, *MACHINE_METRICS)}
 
 
-def measure(scenario: Scenario, played: Played, result: Result) -> Figures:
+def measure(scenario: Scenario, played: RunOutcome, result: Result) -> Figures:
     """The checker's figures, and what follows from them.
 
     `load`: the blocks completed in the time that a vote takes. One vote at a time can succeed, so from 1 on they come

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from harness.checker import Result
-from harness.play.mission import Played
+from harness.play.mission import RunOutcome
 from harness.run.run import versions
 from harness.run.sweep import Failed, sweep
 from harness.scale.cell import Run, growths, sum_up
@@ -15,7 +15,7 @@ from harness.scale.model import Scale, Size
 from harness.scale.record import Blemish, ScaleRecord
 from harness.scenario import Scenario
 
-Judge = Callable[[Scenario, int], tuple[Played, Result]]
+Judge = Callable[[Scenario, int], tuple[RunOutcome, Result]]
 """Plays a scenario with a seed, and judges it."""
 
 
@@ -85,7 +85,7 @@ def _effort(scale: Scale, size: Size) -> float:
     return size.agents**2 * (size.minutes + min(scale.settle_minutes, size.agents / 2))
 
 
-def _simulated(scenario: Scenario, seed: int) -> tuple[Played, Result]:
+def _simulated(scenario: Scenario, seed: int) -> tuple[RunOutcome, Result]:
     """Without traces, which cost more than the run: characteristic 1 is then not judged, 2 and 3 only at the end."""
     from harness.run.simulate import simulate
 

@@ -16,7 +16,7 @@ from harness.archive.archive import RunArchive
 from harness.difference import compare
 from harness.errors import HarnessError, RunDirectoryError
 from harness.play.progress import Silent
-from harness.report import read_remains
+from harness.report import read_source
 from harness.run.run import run
 from tests.harness.virtual import scenario
 
@@ -95,7 +95,7 @@ def test_all_tools_say_the_same_of_a_damaged_run(
 def reported(directory: Path) -> set[str] | None:
     """What the report says is damaged or missing; None if it refuses a record of another version."""
     try:
-        remains = read_remains(RunArchive(directory, skim=True))
+        remains = read_source(RunArchive(directory, skim=True))
     except RunDirectoryError as error:
         assert "its schema is" in str(error) or not [*(directory / "agents").glob("*.json")]
         return None
@@ -163,7 +163,7 @@ def test_each_file_is_read_once(whole: Path, monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(archive_module, reader, noting(getattr(archive_module, reader), read))
     archive = RunArchive(whole)
     checker.check(checker.gather(archive))
-    remains = read_remains(archive)
+    remains = read_source(archive)
     assert remains.traces
     assert remains.files_missing == remains.chains_missing == []
     assert len(read) == len({*map(str, read)}) == 3 + 1 + 2  # exports at the end, and before a final reconcile

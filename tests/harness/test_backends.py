@@ -12,7 +12,7 @@ from harness.backend_names import BACKEND_NAMES
 from harness.errors import ScenarioError
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
-from harness.play.mission import Played, Swarm
+from harness.play.mission import RunOutcome, Swarm
 from harness.play.progress import Progress, Silent
 from harness.run.run import run
 from harness.scenario import Scenario
@@ -25,7 +25,7 @@ from tests.ucp.air import Air
 
 class OnPerfectAir(Swarm):
     def __init__(self, roster: list[int], seed: int, rundir: RunDirectory) -> None:
-        self.played = Played(engine="perfect air")
+        self.played = RunOutcome(engine="perfect air")
         self.air = Air(roster)
         self._seed = seed
         self._rundir = rundir
@@ -54,7 +54,7 @@ class OnPerfectAir(Swarm):
         return True
 
     async def keep_chains(self) -> None:
-        await self.take_stock()
+        await self.snapshot()
         self._rundir.keep_exports_before_final_reconcile()
 
     async def reconcile(self, agent_id: int) -> None:
@@ -66,7 +66,7 @@ class OnPerfectAir(Swarm):
     async def completed(self) -> dict[int, int]:
         return {number: len(agent.state.completed) for number, agent in self.air.agents.items()}
 
-    async def take_stock(self) -> Played:
+    async def snapshot(self) -> RunOutcome:
         write_exports(self.air, self._rundir.agents)
         return self.played
 
@@ -94,7 +94,7 @@ class PerfectAir(Backend):
         swarm = OnPerfectAir(list(scenario.roster), seed, rundir)
         yield swarm
         swarm.played.mission_s = swarm.now()
-        await swarm.take_stock()
+        await swarm.snapshot()
 
 
 @pytest.fixture

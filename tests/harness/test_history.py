@@ -8,9 +8,9 @@ import pytest
 from harness.archive import archive
 from harness.archive import history as told
 from harness.archive.archive import RunArchive
-from harness.archive.history import Message, Phase, Reconcile, Tie, Vote, course, ends_at
+from harness.archive.history import Message, Phase, Reconcile, Tie, Vote, ends_at, history_of
 from harness.archive.record import Fault
-from harness.archive.replication import Spread, spread
+from harness.archive.replication import Replication, replication_of
 from harness.archive.traces import Header, Trace
 from harness.checker.uniform_chain import common_prefix
 from harness.play.progress import Silent
@@ -64,7 +64,7 @@ def a_trace(agent: int, *lives: list[HandlerRun]) -> Trace:
 def test_a_tie_has_its_votes_and_the_phases_of_its_reconciles() -> None:
     simulated = played("forced_tie")
     traces, names = simulated.evidence.traces, simulated.evidence.names
-    found = course(traces, faults(simulated), ends_at(traces))
+    found = history_of(traces, faults(simulated), ends_at(traces))
     assert [(vote.agent, names[vote.block], vote.start_s, vote.end_s, vote.outcome) for vote in found.votes] == [
         (1, "1.1", 22.0, 32.0, "not approved"),
         (1, "1.1", 42.0, 52.0, "approved"),
@@ -86,7 +86,7 @@ def test_a_tie_has_its_votes_and_the_phases_of_its_reconciles() -> None:
 def test_a_lost_commit_is_a_message_that_one_agent_did_not_handle() -> None:
     simulated = played("lost_last_commit")
     traces, names = simulated.evidence.traces, simulated.evidence.names
-    found = course(traces, [], ends_at(traces))
+    found = history_of(traces, [], ends_at(traces))
     assert found.messages is not None
     heard = {
         names[message.block or ""]: sorted(agent for agent, _ in message.receipts)
@@ -104,7 +104,7 @@ def test_what_a_loss_cuts_short_ends_with_it_and_the_rest_with_the_run() -> None
     proposed = a_run(5.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")])
     begun = [a_run(6.0, "reconcile_begin", "begun", trigger={"operator": "reconcile"}), a_run(6.0, "reconcile_phase_1")]
     traces = {1: a_trace(1, [proposed, *begun], [a_run(30.0, "process_next_deque_block", "proposed")])}
-    found = course(traces, [Fault(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
+    found = history_of(traces, [Fault(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
     assert found.votes == [Vote(1, "aa", 5.0, 8.0, told.CUT_SHORT), Vote(1, "", 30.0, 50.0, told.CUT_SHORT)]
     phases = [Phase("phase 1", 6.0, 8.0, 1)]
     assert found.reconciles == [Reconcile(1, 6.0, 8.0, "asked by the operator", phases, done=False)]
@@ -113,7 +113,7 @@ def test_what_a_loss_cuts_short_ends_with_it_and_the_rest_with_the_run() -> None
 def test_what_an_agent_still_did_while_it_was_killed_ends_at_its_next_life_at_the_latest() -> None:
     proposed = [a_run(at_s, "process_next_deque_block", "proposed") for at_s in (8.2, 30.0)]
     traces = {1: a_trace(1, [proposed[0]], [proposed[1]])}
-    found = course(traces, [Fault(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
+    found = history_of(traces, [Fault(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
     assert [(vote.start_s, vote.end_s) for vote in found.votes] == [(8.2, 30.0), (30.0, 50.0)]
 
 
@@ -123,7 +123,7 @@ def test_a_message_is_of_the_life_that_sent_it() -> None:
         a_run(at_s, "receive_commit_block", trigger={"message": "Commit Block", "from": 1, "seq": 0})
         for at_s in (2.0, 21.0)
     ]
-    found = course({1: a_trace(1, *sends), 2: a_trace(2, hears)}, [], 30.0)
+    found = history_of({1: a_trace(1, *sends), 2: a_trace(2, hears)}, [], 30.0)
     assert found.messages == [
         Message(1, 1.0, "Commit Block", None, [(2, 2.0)]),
         Message(1, 20.0, "Commit Block", None, [(2, 21.0)]),
@@ -134,8 +134,8 @@ def test_a_message_is_of_the_life_that_sent_it() -> None:
 def test_a_handler_run_without_a_possible_time_is_left_out(at_s: float) -> None:
     commit = a_run(at_s, "receive_commit_block", changes=[("complete", "aa"), ("chain+", "aa")])
     traces = {1: a_trace(1, [a_run(1.0, "build_data_block"), commit])}
-    assert course(traces, [], ends_at(traces)).commits == []
-    assert spread(traces, []) == [Spread(0.0, 0, 0, 1, None, None)]
+    assert history_of(traces, [], ends_at(traces)).commits == []
+    assert replication_of(traces, []) == [Replication(0.0, 0, 0, 1, None, None)]
     assert ends_at(traces) == 1.0
 
 
@@ -143,7 +143,7 @@ def test_a_handler_run_without_a_possible_time_is_left_out(at_s: float) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_in_the_end_the_spread_is_what_the_checker_says(seed: int, final_reconcile: bool) -> None:
     simulated = simulate(scenario(**ROUGH, final_reconcile=final_reconcile), seed, tracing=True)
-    end, figures = spread(simulated.evidence.traces, faults(simulated))[-1], simulated.result.figures
+    end, figures = replication_of(simulated.evidence.traces, faults(simulated))[-1], simulated.result.figures
     assert end.copies_mean is not None
     assert {
         "mutual_chain": end.mutual_chain,
@@ -159,7 +159,7 @@ def test_at_every_moment_the_spread_is_that_of_the_chains_replayed() -> None:
     traces = simulated.evidence.traces
     chains: dict[int, list[str]] = {agent: [] for agent in traces}
     completed: set[str] = set()
-    found = {one.at_s: one for one in spread(traces, [])}
+    found = {one.at_s: one for one in replication_of(traces, [])}
     now = found[0.0]
     runs = sorted(
         ((one.t, agent, one) for agent, trace in traces.items() for one in trace.runs), key=lambda step: step[0]
@@ -193,7 +193,9 @@ def changes(at_s: float, *operations: str) -> HandlerRun:
 def test_the_mutual_chain_shrinks_when_one_agent_takes_blocks_off() -> None:
     both = [changes(1.0, "chain+ aa"), changes(2.0, "chain+ bb")]
     traces = {1: a_trace(1, both), 2: a_trace(2, [*both, changes(3.0, "chain- bb"), changes(4.0, "chain+ cc")])}
-    assert [(one.at_s, one.mutual_chain, one.longest_chain, one.distinct_chains) for one in spread(traces, [])] == [
+    assert [
+        (one.at_s, one.mutual_chain, one.longest_chain, one.distinct_chains) for one in replication_of(traces, [])
+    ] == [
         (0.0, 0, 0, 1),
         (1.0, 1, 1, 1),
         (2.0, 2, 2, 1),
@@ -208,7 +210,7 @@ def test_what_is_on_a_lost_disk_is_no_copy_any_more(disk: Any, copies: list[int]
     downs = [
         Fault(at_s=at_s, what=what, detail="", agents=[1], disk=disk) for at_s, what in ((5.0, "reboot"), (7.0, "boot"))
     ]
-    found = spread(traces, downs)
+    found = replication_of(traces, downs)
     assert [[one for one in found if one.at_s <= at_s][-1].copies_min for at_s in (1.0, 5.0, 7.0, 9.0)] == copies
 
 
@@ -224,12 +226,12 @@ def test_large_traces_tell_the_same_without_the_messages(tmp_path: Path, monkeyp
     assert skimmed.problems == []
     assert part == {agent_id: trace.skimmed() for agent_id, trace in whole.items()}
     assert sum(len(trace.runs) for trace in part.values()) < sum(len(trace.runs) for trace in whole.values())
-    one, other = course(whole, [], 900.0), course(part, [], 900.0, whole=False)
+    one, other = history_of(whole, [], 900.0), history_of(part, [], 900.0, whole=False)
     assert (one.votes, one.commits, one.ties) == (other.votes, other.commits, other.ties)
     assert one.reconciles == other.reconciles
     assert one.messages
     assert other.messages is None
-    assert spread(whole, []) == spread(part, [])
+    assert replication_of(whole, []) == replication_of(part, [])
 
 
 def test_a_trace_that_is_none_or_not_of_this_run_is_left_out_in_one_sentence(tmp_path: Path) -> None:

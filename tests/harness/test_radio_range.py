@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from harness.errors import ScenarioError
-from harness.play.mission import Played
-from harness.play.radio_range import Reach, tracks_of
+from harness.play.mission import RunOutcome
+from harness.play.radio_range import RadioRange, tracks_of
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.changes import RANGE, NetworkChange, final_reconcile
@@ -30,7 +30,7 @@ def asking(conditions: NetworkConditions) -> NetworkChange:
 
 
 def test_who_flies_out_of_range_is_cut_off_and_back_again() -> None:
-    reach = Reach(scenario())
+    reach = RadioRange(scenario())
     assert reach.move(1.0, at(0, 50, 90)) is None, "all hear all, as before"
     apart = reach.move(2.0, at(0, 50, 200))
     assert apart is not None and (apart.at_s, apart.what, apart.detail) == (2.0, RANGE, "1 2 | 3")
@@ -44,7 +44,7 @@ def test_who_flies_out_of_range_is_cut_off_and_back_again() -> None:
 
 
 def test_what_the_timeline_asks_and_where_the_vehicles_are_hold_together() -> None:
-    reach = Reach(scenario())
+    reach = RadioRange(scenario())
     reach.move(1.0, at(0, 50, 200))
     asked = reach.ask(asking(NetworkConditions(LinkConditions(0.2), partition=(frozenset({1}),))))
     assert asked.conditions.link(1, 2) == LinkConditions(0.2) and asked.conditions.link(1, 3).loss == 1.0
@@ -54,7 +54,7 @@ def test_what_the_timeline_asks_and_where_the_vehicles_are_hold_together() -> No
 
 
 def test_a_final_reconcile_hears_over_any_distance() -> None:
-    reach = Reach(scenario())
+    reach = RadioRange(scenario())
     reach.move(1.0, at(0, 50, 200))
     cleared = reach.ask(final_reconcile(9.0))
     assert cleared.conditions == NetworkConditions() and cleared.losses == {"1-3": 0.0, "2-3": 0.0}
@@ -62,11 +62,11 @@ def test_a_final_reconcile_hears_over_any_distance() -> None:
 
 
 def test_without_a_radio_distance_does_not_matter() -> None:
-    assert Reach(scenario(network={})).move(1.0, at(0, 1e6, 2e6)) is None
+    assert RadioRange(scenario(network={})).move(1.0, at(0, 1e6, 2e6)) is None
 
 
 def test_on_record_is_who_is_connected_and_not_each_step_of_it() -> None:
-    played = Played()
+    played = RunOutcome()
     change = {"at_s": 1.0, "what": RANGE, "detail": "1 2 | 3", "fully_connected": False}
     for record in (
         change,

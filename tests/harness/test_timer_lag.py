@@ -3,7 +3,7 @@
 import pytest
 
 from harness.archive.traces import Header, Trace
-from harness.checker.timer_lag import ENOUGH, lateness
+from harness.checker.timer_lag import ENOUGH, timer_lag
 from ucp.trace import HandlerRun, State
 
 
@@ -29,7 +29,7 @@ def _votes(*late_s: float, reconciling: bool = False) -> Trace:
 
 @pytest.mark.parametrize(("late_s", "tolerable"), [(0.2, True), (0.6, False)])
 def test_lateness_is_that_of_the_latest_twentieth(late_s: float, tolerable: bool) -> None:
-    found = lateness([_votes(*[0.01] * 36), _votes(*[late_s] * 4)])
+    found = timer_lag([_votes(*[0.01] * 36), _votes(*[late_s] * 4)])
     assert found is not None
     assert found.late_s == pytest.approx(late_s)
     assert found.asked_s == 10.0
@@ -37,14 +37,14 @@ def test_lateness_is_that_of_the_latest_twentieth(late_s: float, tolerable: bool
 
 
 def test_one_late_timer_of_many_is_nothing_to_speak_of() -> None:
-    found = lateness([_votes(*[0.01] * 99, 5.0)])
+    found = timer_lag([_votes(*[0.01] * 99, 5.0)])
     assert found is not None
     assert found.tolerable
 
 
 def test_too_few_votes_tell_nothing() -> None:
-    assert lateness([_votes(*[5.0] * (ENOUGH - 1))]) is None
+    assert timer_lag([_votes(*[5.0] * (ENOUGH - 1))]) is None
 
 
 def test_a_vote_that_a_reconcile_paused_does_not_count() -> None:
-    assert lateness([_votes(*[50.0] * 100, reconciling=True)]) is None
+    assert timer_lag([_votes(*[50.0] * 100, reconciling=True)]) is None

@@ -9,7 +9,7 @@ import pytest
 
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 from netem.errors import ConditionsError
-from netem.medium import Lots, Medium
+from netem.medium import Medium, RandomDraws
 
 BROADCASTS = 20_000
 DATA_BYTES = 83  # makes a frame of 1000 bits
@@ -22,7 +22,7 @@ def medium(vehicles: int = 3, seed: int = 1, *, conditions: NetworkConditions | 
     return air
 
 
-def draw(air: Medium, sender: int, now: float = 0.0) -> Lots:
+def draw(air: Medium, sender: int, now: float = 0.0) -> RandomDraws:
     return air.draw(sender, now, DATA_BYTES)
 
 

@@ -12,7 +12,7 @@ from ucp.agent import HANDLERS, Agent
 from ucp.block import Block, next_chain_hash
 from ucp.messages import CommitBlock, Message, decode, encode
 from ucp.quirks import Quirks
-from ucp.store import Holdings
+from ucp.store import StoredState
 
 
 def state_of(agent: Agent) -> bytes:
@@ -74,7 +74,7 @@ def test_well_formed_messages_of_a_liar_never_break_characteristics_2_and_3(lies
         agent = air.agents[1]
         agent.receive_message(2 + number % 60, number, lie, air.now)
         air.run_until(air.now + 3)
-        held = [block.block_hash for block in Holdings.of(agent.state).blocks()]
+        held = [block.block_hash for block in StoredState.of(agent.state).blocks()]
         assert len(held) == len(set(held))
         assert not agent.state.idle or set(agent.state.completed) <= {block.block_hash for block in agent.state.chain}
 

@@ -15,7 +15,7 @@ from ucp.core import Core
 from ucp.events import LoggableEvent
 from ucp.settings import Settings
 from ucp.state import AgentState
-from ucp.store import Holdings, Store, StoreError
+from ucp.store import Store, StoredState, StoreError
 
 
 class StoringAir(Air):
@@ -46,7 +46,7 @@ def a_store(path: Path, blocks: int = 5) -> AgentState:
     return core
 
 
-def found(path: Path) -> Holdings | None:
+def found(path: Path) -> StoredState | None:
     return Store(path, Agent(1, [1, 2], INITIAL_DATA).state).found
 
 
@@ -59,7 +59,7 @@ def test_at_every_moment_the_store_holds_what_the_agent_holds(tmp_path: Path) ->
         agent = air.agents[1]
         if step % 40 == 0 and (agent.state.reconcile_stack or step % 400 == 0):
             stored = Store(tmp_path / "store", Agent(1, [1, 2, 3], INITIAL_DATA).state).found
-            assert stored == Holdings.of(agent.state)
+            assert stored == StoredState.of(agent.state)
             kinds |= {kind for kind in ("chain", "deque", "stack") if getattr(stored, kind)}
     assert kinds == {"chain", "deque", "stack"}
 
@@ -73,13 +73,13 @@ def test_an_agent_that_boots_has_what_it_held_and_commits_what_it_had_completed(
     for _ in range(40):
         for _ in range(rng.randrange(1, 80)):
             air.step()
-        before = Holdings.of(air.agents[1].state)
+        before = StoredState.of(air.agents[1].state)
         aside += len(before.stack) + len(before.deque)
         air.agents[1] = Agent(1, [1, 2, 3], INITIAL_DATA)
         air.agents[1].boot(before, air.now)
         air.flush(1)
         assert not air.agents[1].state.idle or not (before.stack or before.deque)
-        assert {block.block_hash for block in Holdings.of(air.agents[1].state).blocks()} == {
+        assert {block.block_hash for block in StoredState.of(air.agents[1].state).blocks()} == {
             block.block_hash for block in before.blocks()
         }
         completed_by = {agent_id: set(agent.state.completed) for agent_id, agent in air.agents.items()}
@@ -95,7 +95,7 @@ def test_an_agent_that_boots_has_what_it_held_and_commits_what_it_had_completed(
 def test_the_first_run_after_a_boot_names_all_that_was_found() -> None:
     agent = Agent(1, [1, 2], INITIAL_DATA)
     mine, other, waiting, popped = Block(1, 1, b"a"), Block(2, 2, b"b"), Block(1, 3, b"c"), Block(2, 1, b"d")
-    agent.boot(Holdings([mine.block_hash, waiting.block_hash], [mine, other], [waiting], [popped]), 60.0)
+    agent.boot(StoredState([mine.block_hash, waiting.block_hash], [mine, other], [waiting], [popped]), 60.0)
     first, second = agent.trace()
     assert (first.handler, first.trigger, first.branch) == ("reconcile_finalize", {"boot": 2}, "done")
     hashes = {name: block.block_hash.hex() for name, block in locals().items() if isinstance(block, Block)}
@@ -117,7 +117,7 @@ def test_wherever_the_last_write_is_torn_the_blocks_before_it_are_found(tmp_path
     path = tmp_path / "store"
     state = a_store(path)
     whole = path.read_bytes()
-    assert found(path) == Holdings.of(state)
+    assert found(path) == StoredState.of(state)
     last = whole.rfind(b"\n", 0, -1) + 1
     for end in range(last, len(whole) - 1):
         path.write_bytes(whole[:end])
@@ -151,7 +151,7 @@ def test_a_store_that_lost_its_end_is_good_again_from_the_first_thing_that_is_wr
     while agent.state.completed == store.found.completed:
         agent.add_event(LoggableEvent(0, 7, bytes(256)), 1.0)
     store.write([change for run in agent.trace() for change in run.changes])
-    assert found(path) == Holdings.of(agent.state)
+    assert found(path) == StoredState.of(agent.state)
     assert not list(tmp_path.glob(".*"))
 
 
@@ -192,4 +192,4 @@ def test_a_full_disk_ends_the_store_and_leaves_what_was_written(
     assert store.problem == "No space left on device"
     assert path.read_bytes() == before
     assert not list(tmp_path.glob(".*"))
-    assert found(path) == Holdings.of(state)
+    assert found(path) == StoredState.of(state)

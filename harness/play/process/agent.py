@@ -57,7 +57,7 @@ class AgentFailedError(HarnessError):
 
 
 @dataclass
-class _Life:
+class _Incarnation:
     """`store` is where it keeps what it holds, if the scenario asks for that; `status` is its last."""
 
     directory: Path
@@ -82,7 +82,7 @@ class AgentProcess:
         self.outcome = "not started"
         self.detail: str | None = None
         self._rundir = rundir
-        self._lives: list[_Life] = []
+        self._lives: list[_Incarnation] = []
         self._process: Program | None = None
         self._being_asked = asyncio.Lock()
         """Nobody stops or kills it while it is asked for its status."""
@@ -147,11 +147,11 @@ class AgentProcess:
         await self._wait_until_it_answers(self._process)
         self.outcome = "running"
 
-    def _begin_life(self) -> _Life:
+    def _begin_life(self) -> _Incarnation:
         directory = self._rundir.agent(self.agent_id, len(self._lives) + 1)
         kept = self.outcome == "rebooting"
         store = self._lives[-1].store if kept else directory / f"{self.agent_id}.store"
-        self._lives.append(_Life(directory, store, reboot=kept))
+        self._lives.append(_Incarnation(directory, store, reboot=kept))
         return self._lives[-1]
 
     async def _wait_until_it_answers(self, process: Program) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Self
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.play.control import Status
-from harness.play.mission import Played
+from harness.play.mission import RunOutcome
 from harness.play.process.agent import AgentProcess, reboots_with_disk
 from harness.play.process.lab import Lab, OpenLab
 from harness.play.process.preflight import on_the_air
@@ -22,7 +22,7 @@ from harness.play.process.rogue import RogueProcess
 from harness.play.process.vehicle import VehicleProcess, system_ids
 from harness.play.process.watchers import Watchers, unless_interrupted
 from harness.play.progress import Progress, Snapshot
-from harness.play.radio_range import TRACK_S, Reach
+from harness.play.radio_range import TRACK_S, RadioRange
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
 from harness.scenario.faults import Fault
@@ -67,7 +67,7 @@ class ProcessRun:
         self.rundir = rundir
         self.progress = progress
         self.interrupted = interrupted
-        self.played = Played()
+        self.played = RunOutcome()
         self._kinds = kinds
         self._open_lab = open_lab
         self._keeps_disks = keeps_disks
@@ -79,7 +79,7 @@ class ProcessRun:
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
         self._capture: Capture | None = None
-        self._reach = Reach(scenario)
+        self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()
         self._watchers = Watchers()
         self._starting: dict[int, asyncio.Task[None]] = {}
@@ -320,7 +320,7 @@ class ProcessRun:
     async def completed(self) -> dict[int, int]:
         return {agent_id: status.completed for agent_id, status in (await self._statuses()).items()}
 
-    async def take_stock(self) -> Played:
+    async def snapshot(self) -> RunOutcome:
         await asyncio.gather(*(agent.export() for agent in self._awake()))
         for agent in self.agents:
             agent.put_together()

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
 from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
-from netem.medium import Lots, Medium
+from netem.medium import Medium, RandomDraws
 from ucp.interest import ANSWERED, ASKED, MATTERS, ONLY_COUNTED, STILL_ASKED, Question
 from ucp.messages import BlockAddResponse, Message
 from ucp.settings import Settings
@@ -28,7 +28,7 @@ SWEEP_EVERY = 1000
 
 
 @dataclass(slots=True, eq=False)
-class Flight:
+class InFlight:
     """One broadcast on its way."""
 
     sender: int
@@ -37,7 +37,7 @@ class Flight:
     matters: Callable[[AgentState, int, Message], bool]
     sent_at: float
     rank: int
-    lots: Lots
+    lots: RandomDraws
 
     def __lt__(self, other: object) -> bool:
         return False  # of two copies that arrive at one agent in one instant either is the first
@@ -47,7 +47,7 @@ class Flight:
 class _Topic:
     """What anybody says to one question, by sender in the order in which it was sent, and who asks."""
 
-    answers: dict[int, list[Flight]] = field(default_factory=dict)
+    answers: dict[int, list[InFlight]] = field(default_factory=dict)
     askers: dict[int, "_Asked"] = field(default_factory=dict)
     said: int = 0
     """How many answers there are."""
@@ -79,14 +79,14 @@ Logged = tuple[int, int, bytes]
 
 
 @dataclass(frozen=True, slots=True)
-class Stray:
+class RogueDatagram:
     """A datagram that no agent has sent, under the address of vehicle `source`."""
 
     source: int
     datagram: bytes
 
 
-Happening = tuple[float, int, int, Flight | Logged | Stray | None]
+Happening = tuple[float, int, int, InFlight | Logged | RogueDatagram | None]
 """(mission seconds, rank, number of the agent, what): a message, an event, or None for the end of a timer.
 
 The number after the last agent's is the rogue node's.
@@ -120,7 +120,7 @@ class VirtualAir:
         self._topics: dict[Question, _Topic] = defaultdict(_Topic)
         self._asked_by: list[dict[bool, _Asked]] = [{} for _ in roster]
         self._swept_at = 0
-        self._waiting: dict[str, list[tuple[Flight, int]]] = defaultdict(list)
+        self._waiting: dict[str, list[tuple[InFlight, int]]] = defaultdict(list)
         self._named: dict[str, float] = {}
 
     def until(self, mission_s: float) -> Iterator[Happening]:
@@ -138,7 +138,7 @@ class VirtualAir:
         self._rank += 1
         heappush(self._coming, (at, self._rank, number, what))
 
-    def inject(self, at: float, stray: Stray, numbers: Iterable[int]) -> None:
+    def inject(self, at: float, stray: RogueDatagram, numbers: Iterable[int]) -> None:
         """`stray` reaches the agents with these numbers at `at`."""
         self._rank += 1
         self.quiet_at = max(self.quiet_at, at)
@@ -150,7 +150,7 @@ class VirtualAir:
         self._rank += 1
         lots = self._medium.draw(number, now, data_bytes)
         kind = type(message)
-        flight = Flight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots)
+        flight = InFlight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots)
         if kind in ASKED and not self._deliver_all:
             self._ask(number, ASKED[kind](message, self._settings))
         if now + lots.latest > self.quiet_at:
@@ -162,7 +162,7 @@ class VirtualAir:
         else:
             self._answer(ANSWERED[kind](message), flight, number)
 
-    def _deliver(self, flight: Flight) -> None:
+    def _deliver(self, flight: InFlight) -> None:
         """Let it arrive at everybody but those who will certainly not answer."""
         coming, busy_until, deliver_all = self._coming, self.busy_until, self._deliver_all
         now, rank = flight.sent_at, flight.rank
@@ -173,7 +173,7 @@ class VirtualAir:
 
     # Answers, to whom they matter
 
-    def hear(self, number: int) -> list[tuple[float, int, Flight]]:
+    def hear(self, number: int) -> list[tuple[float, int, InFlight]]:
         """(mission seconds, rank, answer) of the answers that the agent tallies and has not been told of, in order.
 
         Those that have come since it asked: of each agent the first.
@@ -227,7 +227,7 @@ class VirtualAir:
             for flights in topic.answers.values():
                 self._arrive_first(flights, number, asked)
 
-    def _answer(self, question: Question, flight: Flight, sender: int) -> None:
+    def _answer(self, question: Question, flight: InFlight, sender: int) -> None:
         """Keep an answer for those who ask, or will before it arrives."""
         topic = self._topics[question]
         topic.said += 1
@@ -243,7 +243,7 @@ class VirtualAir:
         if flight.rank - self._swept_at > SWEEP_EVERY:
             self._sweep(flight)
 
-    def _arrive_first(self, flights: Iterable[Flight], receiver: int, asked: _Asked) -> None:
+    def _arrive_first(self, flights: Iterable[InFlight], receiver: int, asked: _Asked) -> None:
         """Let that answer arrive that comes first, unless another comes before it."""
         first = self._first(flights, receiver, asked.since)
         if first is not None and first[:2] < asked.first:
@@ -251,7 +251,7 @@ class VirtualAir:
             asked.first = at, rank
             heappush(self._coming, (at, rank, receiver, flight))
 
-    def _first(self, flights: Iterable[Flight], receiver: int, since: Place) -> tuple[float, int, Flight] | None:
+    def _first(self, flights: Iterable[InFlight], receiver: int, since: Place) -> tuple[float, int, InFlight] | None:
         """(mission seconds, rank, flight) of the flight that arrives first after `since`."""
         since_s, since_rank, _ = since
         born_at = self.born_at[receiver]
@@ -269,7 +269,7 @@ class VirtualAir:
                     first_at, first = at, flight
         return None if first is None else (first_at, first.rank, first)
 
-    def _sweep(self, latest: Flight) -> None:
+    def _sweep(self, latest: InFlight) -> None:
         """Forget the answers that have arrived everywhere and that nobody waits for."""
         self._swept_at = latest.rank
         heard_before = min([latest.sent_at, *self.paused_at.values()])
@@ -284,7 +284,7 @@ class VirtualAir:
 
     # Scripted fates
 
-    def _scripted(self, now: float, number: int, flight: Flight) -> bool:
+    def _scripted(self, now: float, number: int, flight: InFlight) -> bool:
         """Send `flight` as the script says, to everybody; False if the script says nothing of it."""
         decided = self._script.decide(
             now, flight.sender, flight.message, flight.lots, lambda receiver: self._medium.hears(number, receiver)
@@ -304,7 +304,7 @@ class VirtualAir:
                 self._arrive(waiting, receiver, at + RIGHT_AFTER_S)
         return True
 
-    def _arrive(self, flight: Flight, receiver: int, at: float) -> None:
+    def _arrive(self, flight: InFlight, receiver: int, at: float) -> None:
         self.quiet_at = max(self.quiet_at, at)
         heappush(self._coming, (at, flight.rank, receiver, flight))
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from random import Random
 from typing import TYPE_CHECKING, Any, Protocol
 
-from harness.collector import uncollected
-from harness.play.mission import Played
-from harness.play.radio_range import TRACK_S, Reach, tracks_of
+from harness.gc_pause import gc_paused
+from harness.play.mission import RunOutcome
+from harness.play.radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.seeds import agent_seed
-from harness.play.simulation.air import NEVER, Flight, Happening, Logged, Stray, VirtualAir
+from harness.play.simulation.air import NEVER, Happening, InFlight, Logged, RogueDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, NameOf
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, disconnected_until, injected_nothing
@@ -29,7 +29,7 @@ from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
 from ucp.messages import datagram_bytes
-from ucp.store import Holdings
+from ucp.store import StoredState
 from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Recorder(Protocol):
     tracing: bool
     """Whether handler runs are wanted; if not, `write` is not called."""
 
-    def begin(self, life: "Life") -> None:
+    def begin(self, life: "Incarnation") -> None:
         """An agent starts, or starts anew."""
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
@@ -73,7 +73,7 @@ class Recorder(Protocol):
 
 
 @dataclass(slots=True)
-class Life:
+class Incarnation:
     """An agent from its start, restart or reboot on."""
 
     agent: Agent
@@ -81,7 +81,7 @@ class Life:
     clock: Clock | None
     """None shows mission time."""
     born_at: float
-    found: Holdings | None = None
+    found: StoredState | None = None
     """What was on its disk, if it came back from a brown-out with it."""
     deadline: float | None = None
     """When its next timer ends, in mission seconds."""
@@ -114,7 +114,7 @@ class Simulation:
         self.scenario = scenario
         self.roster = scenario.roster
         self.seed = seed
-        self.played = Played(engine=ENGINE)
+        self.played = RunOutcome(engine=ENGINE)
         self.stage = "mission"
         self.network = ""
         self._initial_data = f"{scenario.name}, seed {seed}".encode()
@@ -125,12 +125,12 @@ class Simulation:
         self._now = 0.0
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
-        self._lives: list[list[Life]] = [[] for _ in self.roster]
-        self._alive: list[Life | None] = [None] * (len(self.roster) + 1)
+        self._lives: list[list[Incarnation]] = [[] for _ in self.roster]
+        self._alive: list[Incarnation | None] = [None] * (len(self.roster) + 1)
         """By number; the last is the rogue node's, which is no agent and has no life."""
-        self._disks: dict[int, Holdings] = {}
+        self._disks: dict[int, StoredState] = {}
         """What is on the disk of the agents that reboot with it."""
-        self._reach = Reach(scenario)
+        self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
         self._moves_at = NEVER
@@ -233,7 +233,7 @@ class Simulation:
     async def completed(self) -> dict[int, int]:
         return {life.agent.agent_id: len(life.agent.state.completed) for life in self.living() if life.waiting is None}
 
-    async def take_stock(self) -> Played:
+    async def snapshot(self) -> RunOutcome:
         played = self._played_by_now()
         self._recorder.export(self)
         return played
@@ -244,7 +244,7 @@ class Simulation:
             self._rogue.close()
         self.played = self._played_by_now()
 
-    def _played_by_now(self) -> Played:
+    def _played_by_now(self) -> RunOutcome:
         for number, life in enumerate(self._alive):
             if life is not None:
                 self._hear(number, life)
@@ -262,10 +262,10 @@ class Simulation:
 
     # What is there
 
-    def living(self) -> Iterator[Life]:
+    def living(self) -> Iterator[Incarnation]:
         return (life for life in self._alive if life is not None)
 
-    def timestamp_us(self, life: Life) -> int:
+    def timestamp_us(self, life: Incarnation) -> int:
         """What the agent's clock shows, in microseconds; never less than 0."""
         return max(0, round(self._local(life) * MICROSECONDS))
 
@@ -302,7 +302,7 @@ class Simulation:
 
     def _run(self, until: float) -> None:
         """All that happens up to `until`."""
-        with uncollected():
+        with gc_paused():
             self._play(until)
         self._now = until
 
@@ -320,10 +320,10 @@ class Simulation:
             elif what is not None:
                 life.waiting.append(happening)
 
-    def _happen(self, number: int, life: Life, what: Flight | Logged | Stray | None) -> None:
-        if self._tracing or (isinstance(what, Flight) and type(what.message) in ONLY_COUNTED):
+    def _happen(self, number: int, life: Incarnation, what: InFlight | Logged | RogueDatagram | None) -> None:
+        if self._tracing or (isinstance(what, InFlight) and type(what.message) in ONLY_COUNTED):
             self._hear(number, life)
-        if isinstance(what, Flight):
+        if isinstance(what, InFlight):
             agent, sender, message = life.agent, what.sender, what.message
             if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent.state, sender, message)):
                 agent.receive_message(sender, what.sequence, message, self._local(life))
@@ -333,7 +333,7 @@ class Simulation:
                     self._say(number, life)  # of the handlers of messages only a reconcile's touch timers
         elif what is None:
             self._timer_ends(number, life)
-        elif isinstance(what, Stray):
+        elif isinstance(what, RogueDatagram):
             self._hear(number, life)
             life.agent.receive_datagram(what.datagram, self._local(life))
             self._after(number, life)
@@ -344,7 +344,7 @@ class Simulation:
             self._expect_event(number, life)
             self._after(number, life)
 
-    def _timer_ends(self, number: int, life: Life) -> None:
+    def _timer_ends(self, number: int, life: Incarnation) -> None:
         soonest = life.agent.next_timer()
         if soonest is None or life.deadline is None or life.deadline > self._now:
             return  # it was stopped, or started anew, since it was expected to end now
@@ -353,7 +353,7 @@ class Simulation:
         self._air.no_longer_asked(number, life.agent.state)
         self._after(number, life)
 
-    def _hear(self, number: int, life: Life) -> None:
+    def _hear(self, number: int, life: Incarnation) -> None:
         """Tell the agent of the answers that have come and that it only tallies: before anybody looks at the tally."""
         if life.waiting is not None:
             return
@@ -366,7 +366,7 @@ class Simulation:
                 if self._tracing:
                     self._take_down(agent, at)
 
-    def _after(self, number: int, life: Life) -> None:
+    def _after(self, number: int, life: Incarnation) -> None:
         """Do what the agent says after an input: send, trace, and wait for its next timer."""
         agent = life.agent
         self._say(number, life)
@@ -381,7 +381,7 @@ class Simulation:
         busy_until = agent.answers_nobody_until()
         self._air.busy_until[number] = 0.0 if busy_until is None else _mission_time(life, busy_until)
 
-    def _say(self, number: int, life: Life) -> None:
+    def _say(self, number: int, life: Incarnation) -> None:
         """Send what the agent has to say."""
         for sequence, message in life.agent.messages_to_send():
             data_bytes = datagram_bytes(message)
@@ -398,7 +398,7 @@ class Simulation:
 
     # An agent's life
 
-    def _start(self, number: int, found: Holdings | None = None) -> None:
+    def _start(self, number: int, found: StoredState | None = None) -> None:
         agent_id = self.roster[number]
         scenario = self.scenario
         seed = agent_seed(self.seed, agent_id, len(self._lives[number]) + 1)
@@ -411,7 +411,7 @@ class Simulation:
             tracing=self._tracing,
         )
         source = RandomEvents(Random(seed), scenario.events.mean_s)
-        life = Life(agent, source, scenario.clocks.get(agent_id), self._now, found)
+        life = Incarnation(agent, source, scenario.clocks.get(agent_id), self._now, found)
         self._lives[number].append(life)
         self._alive[number] = life
         self._air.born_at[number] = self._now
@@ -421,7 +421,7 @@ class Simulation:
             self._after(number, life)
         self._expect_event(number, life)
 
-    def _expect_event(self, number: int, life: Life) -> None:
+    def _expect_event(self, number: int, life: Incarnation) -> None:
         if self.scenario.events.source != "scripted":
             due, event_id, data = life.source.next()
             this_life = len(self._lives[number])
@@ -434,7 +434,7 @@ class Simulation:
         if (life := self._alive[number]) is not None:
             self._hear(number, life)
             if disk_kept:
-                self._disks[number] = Holdings.of(life.agent.state)
+                self._disks[number] = StoredState.of(life.agent.state)
         self._alive[number] = None
         self._air.is_gone(number)
 
@@ -458,7 +458,7 @@ class Simulation:
         if life is not None and life.waiting is not None:
             self._resume(number, life, life.waiting)
 
-    def _resume(self, number: int, life: Life, waiting: list[Happening]) -> None:
+    def _resume(self, number: int, life: Incarnation, waiting: list[Happening]) -> None:
         """What has waited is handled as a process does it: what the socket holds, then timers, then events.
 
         What an agent asks while there is more in the socket may be answered by what came since.
@@ -466,7 +466,7 @@ class Simulation:
         life.waiting, life.resumed_at = None, self._now
         place = self._air.place
         for happening in waiting:
-            if isinstance(happening[3], Flight | Stray):
+            if isinstance(happening[3], InFlight | RogueDatagram):
                 self._air.place = happening[:3]
                 self._happen(number, life, happening[3])
         self._air.place = place
@@ -474,19 +474,19 @@ class Simulation:
         self._hear(number, life)
         self._timer_ends(number, life)
         for happening in waiting:
-            if not isinstance(happening[3], Flight | Stray):
+            if not isinstance(happening[3], InFlight | RogueDatagram):
                 self._happen(number, life, happening[3])
 
     # An agent's clock
 
-    def _local(self, life: Life, mission_s: float | None = None) -> float:
+    def _local(self, life: Incarnation, mission_s: float | None = None) -> float:
         """What the agent takes for mission time: now, or at `mission_s`."""
         clock = life.clock
         now = self._now if mission_s is None else mission_s
         return now if clock is None else clock.offset_s + (1 + clock.drift) * now
 
 
-def _mission_time(life: Life, local: float) -> float:
+def _mission_time(life: Incarnation, local: float) -> float:
     """When the agent's clock shows `local`."""
     clock = life.clock
     return local if clock is None else (local - clock.offset_s) / (1 + clock.drift)

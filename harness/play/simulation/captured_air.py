@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from harness.play.simulation.air import Flight, Happening, Stray, VirtualAir
+from harness.play.simulation.air import Happening, InFlight, RogueDatagram, VirtualAir
 from netem.capture import begin_file
 from netem.frames import udp_broadcast
 from netem.pcapng import PcapngFile
@@ -57,10 +57,10 @@ class CapturedAir(VirtualAir):
     def until(self, mission_s: float) -> Iterator[Happening]:
         for happening in super().until(mission_s):
             at, _, number, what = happening
-            if isinstance(what, Flight):
+            if isinstance(what, InFlight):
                 frame = _frame(what.sender, what.sequence, what.message)
                 self._capture.take_down(at, number, frame, outbound=False)
-            elif isinstance(what, Stray):
+            elif isinstance(what, RogueDatagram):
                 frame = udp_broadcast(what.source, PORT, what.datagram)
                 self._capture.take_down(at, number, frame, outbound=False)
             yield happening

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from harness.scenario.fates import Fate
-from netem.medium import Lots
+from netem.medium import RandomDraws
 from ucp.messages import Message, block_named
 
 RIGHT_AFTER_S = 1e-6
@@ -51,7 +51,7 @@ class FateScript:
             self._about[part.fate.message, part.fate.sender].append(part)
 
     def decide(
-        self, now: float, sender: int, message: Message, lots: Lots, hears: Callable[[int], bool]
+        self, now: float, sender: int, message: Message, lots: RandomDraws, hears: Callable[[int], bool]
     ) -> Decided | None:
         """What becomes of a message that agent `sender` broadcasts; None if no fate is about it."""
         parts = [part for part in self._fitting(now, sender, message) if self._picks(part)]

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from harness.archive.directory import RunDirectory
-from harness.play.simulation.backend import Life, Simulation
+from harness.play.simulation.backend import Incarnation, Simulation
 from netem.radio import Place
 from ucp.export import export_chain
 from ucp.files import TraceFile, write_json_atomically
@@ -21,7 +21,7 @@ class OnDisk:
         self._rundir = rundir
         self._traces: dict[int, TraceFile] = {}
 
-    def begin(self, life: Life) -> None:
+    def begin(self, life: Incarnation) -> None:
         agent_id = life.agent.agent_id
         if agent_id not in self._traces:
             self._traces[agent_id] = TraceFile(self._rundir.agents / f"{agent_id}.trace.jsonl")
@@ -61,7 +61,7 @@ class OnDisk:
             trace.close()
 
 
-def header(life: Life) -> dict[str, Any]:
+def header(life: Incarnation) -> dict[str, Any]:
     """The first line of a trace, as keywords of `ucp.trace.header_line`."""
     agent = life.agent
     clock = {"epoch_us": 0, "speedup": 1, **(life.clock.model_dump() if life.clock else {})}

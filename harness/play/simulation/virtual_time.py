@@ -11,7 +11,7 @@ from harness.play.backend import Backend
 from harness.play.control import Status
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
-from harness.play.simulation.backend import Life, Simulation
+from harness.play.simulation.backend import Incarnation, Simulation
 from harness.play.simulation.captured_air import CapturedAir, VirtualCapture
 from harness.play.simulation.on_disk import OnDisk
 from harness.scenario import Scenario
@@ -93,7 +93,7 @@ def _snapshot(simulation: Simulation) -> Snapshot:
     return Snapshot(simulation.stage, simulation.now(), simulation.scenario.duration_s, simulation.network, statuses)
 
 
-def _status(life: Life) -> Status:
+def _status(life: Incarnation) -> Status:
     state = life.agent.state
     return Status.model_construct(
         idle=state.idle,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.directory import TRACKS_FILE
-from harness.play.radio_range import Reach
+from harness.play.radio_range import RadioRange
 from harness.scenario import Scenario
 from harness.scenario.changes import NetworkChange, timeline_of
 from netem.radio import Place
@@ -34,7 +34,7 @@ def split_and_rejoin(vehicle: int) -> Way:
 
 def write_flight(run_dir: Path, scenario: Scenario, ways: Mapping[int, Way], seconds: int) -> None:
     """Fly `ways` for so many seconds, a look a second, and have the scenario's network follow."""
-    reach = Reach(scenario)
+    reach = RadioRange(scenario)
     changes = timeline_of(scenario)
     lines: list[dict[str, Any]] = []
     tracks = []

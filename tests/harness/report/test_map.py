@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 
 from harness.archive.archive import RunArchive
-from harness.archive.connectivity import NETWORK_FILE, State, read_connectivity
+from harness.archive.connectivity import NETWORK_FILE, Topology, read_connectivity
 from harness.archive.tracks import TRACKS_FILE, read_tracks
 from harness.present.colours import Ink, inks
 from harness.report import map_section, write_report
@@ -56,8 +56,8 @@ def said(section: Section) -> list[str]:
     return [" ".join(filter(None, (one.at, one.what, one.network))).replace("\u00a0", " ") for one in section.moments]
 
 
-def state(at_s: float, *components: set[int]) -> State:
-    return State(at_s, "range", tuple(frozenset(component) for component in components))
+def state(at_s: float, *components: set[int]) -> Topology:
+    return Topology(at_s, "range", tuple(frozenset(component) for component in components))
 
 
 def test_a_split_and_a_rejoin_are_on_the_map_in_their_parts(tmp_path: Path) -> None:

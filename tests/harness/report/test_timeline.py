@@ -13,8 +13,8 @@ import pytest
 
 from harness.archive import archive
 from harness.archive.archive import RunArchive
-from harness.archive.history import Commit, Course, Phase, Reconcile, Tie, Vote
-from harness.archive.replication import Spread
+from harness.archive.history import Commit, History, Phase, Reconcile, Tie, Vote
+from harness.archive.replication import Replication
 from harness.play.progress import Silent
 from harness.report import timeline, timeline_charts, timeline_lanes, write_report
 from harness.run.run import run
@@ -133,7 +133,7 @@ def test_a_long_restless_run_is_thinned_and_says_so() -> None:
     reconciles = [Reconcile(agent, at_s, at_s + 1, "why", phases, done=True) for agent, at_s in spans]
     commits = [Commit(agent, at_s + part / 4, "aa", "heard") for agent, at_s in spans for part in range(4)]
     ties = [Tie(agent, at_s, "tie: block") for agent, at_s in spans]
-    restless = Course(votes, reconciles, commits, ties, None)
+    restless = History(votes, reconciles, commits, ties, None)
     picture = timeline_lanes.draw(restless, [], [], range(1, 51), {}, 200.0, "")
     assert picture.notes == [
         "Of 10000 votes the 6000 longest are drawn",
@@ -151,7 +151,7 @@ def test_a_long_restless_run_is_thinned_and_says_so() -> None:
 
 
 def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> None:
-    spreads = [Spread(float(at_s), 9 - 9 * (at_s == 777), 9, 1, 1, 1.0) for at_s in range(5000)]
+    spreads = [Replication(float(at_s), 9 - 9 * (at_s == 777), 9, 1, 1, 1.0) for at_s in range(5000)]
     kept = timeline_charts.thinned(spreads, 5000.0)
     assert len(kept) <= timeline_charts.MAX_MOMENTS
     assert spreads[777] in kept

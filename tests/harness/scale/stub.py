@@ -2,7 +2,7 @@
 
 from harness.checker import Result
 from harness.checker.characteristic import Characteristic
-from harness.play.mission import Played
+from harness.play.mission import RunOutcome
 from harness.scale import Scale
 from harness.scenario import Scenario
 
@@ -17,7 +17,7 @@ def scale(
     return Scale(agents=list(agents), minutes=list(minutes), loss=list(loss), seeds=seeds)
 
 
-def judge(scenario: Scenario, seed: int) -> tuple[Played, Result]:
+def judge(scenario: Scenario, seed: int) -> tuple[RunOutcome, Result]:
     """Each agent completes a block in 200 s; 3 N^1.5 B messages, none without loss; 40 agents never settle."""
     agents, loss = len(scenario.roster), scenario.network.loss
     blocks = round(agents * scenario.duration_s / 200)
@@ -34,5 +34,5 @@ def judge(scenario: Scenario, seed: int) -> tuple[Played, Result]:
         "bytes": 100 * messages,
         "messages_per_block": messages / blocks,
     }
-    played = Played(mission_s=scenario.duration_s + 100, settled=agents < 40)
+    played = RunOutcome(mission_s=scenario.duration_s + 100, settled=agents < 40)
     return played, Result({"3": Characteristic("3", "holds", "")}, figures)

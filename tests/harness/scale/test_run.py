@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from harness.checker import Result
-from harness.play.mission import Played
+from harness.play.mission import RunOutcome
 from harness.scale import Scale, ScaleRecord, outputs, run_scale, table
 from harness.scale.complexity import BEGIN, END, PAGE, tables
 from harness.scale.picture import PANELS, draw
@@ -70,7 +70,7 @@ def test_what_is_not_of_this_machine_does_not_depend_on_the_number_of_jobs() -> 
 def test_the_longest_come_first_and_results_are_in_order() -> None:
     order: list[tuple[int, float]] = []
 
-    def noted(scenario: Scenario, seed: int) -> tuple[Played, Result]:
+    def noted(scenario: Scenario, seed: int) -> tuple[RunOutcome, Result]:
         order.append((len(scenario.roster), scenario.duration_s / 60))
         return judge(scenario, seed)
 
@@ -98,7 +98,7 @@ def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> N
 def test_an_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
     calls = itertools.count()
 
-    def interrupted(scenario: Scenario, seed: int) -> tuple[Played, Result]:
+    def interrupted(scenario: Scenario, seed: int) -> tuple[RunOutcome, Result]:
         if next(calls) == 5:
             raise KeyboardInterrupt
         return judge(scenario, seed)
@@ -112,7 +112,7 @@ def test_an_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
 
 
 def test_an_interrupt_before_the_first_run_ended_leaves_files_all_the_same(tmp_path: Path) -> None:
-    def interrupted(scenario: Scenario, seed: int) -> tuple[Played, Result]:
+    def interrupted(scenario: Scenario, seed: int) -> tuple[RunOutcome, Result]:
         raise KeyboardInterrupt
 
     finished = run_scale(scale(), 1, interrupted)
@@ -123,7 +123,7 @@ def test_an_interrupt_before_the_first_run_ended_leaves_files_all_the_same(tmp_p
 
 
 def test_a_run_that_fails_is_told_and_the_others_count() -> None:
-    def breaks(scenario: Scenario, seed: int) -> tuple[Played, Result]:
+    def breaks(scenario: Scenario, seed: int) -> tuple[RunOutcome, Result]:
         if seed == 2 and len(scenario.roster) == 5:
             raise KeyError("block")
         return judge(scenario, seed)

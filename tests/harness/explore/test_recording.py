@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from harness.explore.document import document_of, with_agents
+from harness.explore.recording import record
 from harness.explore.smaller import replays, scenario_of
-from harness.explore.tape import record
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
 

@@ -16,8 +16,8 @@ from harness.report import capture, swarm
 
 
 @dataclass(frozen=True)
-class Remains:
-    """Made by `read_remains`."""
+class ReportSource:
+    """Made by `read_source`."""
 
     archive: RunArchive
     run_dir: Path
@@ -54,11 +54,11 @@ class Remains:
         return [*map(self.archive.within, said), *self.network.problems, *filter(None, [capture.gaps(self.result)])]
 
 
-def read_remains(archive: RunArchive) -> Remains:
+def read_source(archive: RunArchive) -> ReportSource:
     """Raises RunDirectoryError if this is no run directory, or one of another version."""
     error, directory = archive.record_error, archive.directory
     if directory is None or not (archive.result or archive.roster):
         raise error or RunDirectoryError(f"{directory}: there is nothing of a run here; is this a run directory?")
     if error is not None and not isinstance(error, DamagedResultError):
         raise error
-    return Remains(archive, directory, swarm.agent_inks(archive))
+    return ReportSource(archive, directory, swarm.agent_inks(archive))

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def uncollected() -> Iterator[None]:
+def gc_paused() -> Iterator[None]:
     """A context, or a decorator, in which it does not look."""
     collects = gc.isenabled()
     gc.disable()

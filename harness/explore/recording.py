@@ -16,7 +16,7 @@ from harness.play.simulation.fate_script import Decided, FateScript, NameOf
 from harness.run.simulate import InMemory, simulate_in_memory
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
-from netem.medium import Lots
+from netem.medium import RandomDraws
 from ucp.messages import CommitBlock, Message, block_named
 from ucp.trace import HandlerRun
 
@@ -57,12 +57,12 @@ class Recording:
 
 
 def record(scenario: Scenario, seed: int) -> Recording:
-    tape = _Tape()
+    tape = _Recorder()
     simulated = simulate_in_memory(tape, scenario, seed, fate_script=partial(_Listening, tape=tape))
     return Recording(simulated.result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
 
 
-class _Tape(InMemory):
+class _Recorder(InMemory):
     def __init__(self) -> None:
         super().__init__(tracing=True)
         self.events: list[Logged] = []
@@ -97,7 +97,7 @@ class _Tape(InMemory):
 class _Listening(FateScript):
     """Decides what the script says, and takes down what is lost, whether by script or by chance."""
 
-    def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _Tape) -> None:
+    def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _Recorder) -> None:
         super().__init__(fates, roster, name_of)
         self.listens = True
         self._name = name_of
@@ -105,7 +105,7 @@ class _Listening(FateScript):
         self._tape = tape
         self._sent: Counter[tuple[str, int]] = Counter()
 
-    def decide(self, now: float, sender: int, message: Message, lots: Lots, hears: Any) -> Decided | None:
+    def decide(self, now: float, sender: int, message: Message, lots: RandomDraws, hears: Any) -> Decided | None:
         decided = super().decide(now, sender, message, lots, hears)
         self._sent[message.NAME, sender] += 1
         arrivals = lots.to_all() if decided is None else [*decided.arrivals, *decided.waiting]

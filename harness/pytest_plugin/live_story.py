@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from harness.errors import ScenarioError
 from harness.play import mission
-from harness.play.mission import Played
+from harness.play.mission import RunOutcome
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of
 from harness.scenario.load import explain, parse
@@ -89,7 +89,7 @@ class Told:
             self._played_s = change.at_s
         await swarm.until(mission_s)
 
-    async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> Played | None:
+    async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> RunOutcome | None:
         """Go on until everybody has voted since something was last told, and all are idle; None if that takes longer.
 
         What has been played by then is taken while nobody stirs: real processes go on. A vote is what makes an agent
@@ -102,7 +102,7 @@ class Told:
             await self.until(swarm, min(end_s, swarm.now() + LOOK_EVERY_S))
         while await swarm.until_idle(end_s - swarm.now()):
             chains = await swarm.top_chain_hashes()
-            played = await swarm.take_stock()
+            played = await swarm.snapshot()
             busy = any(agent.get("idle") is False for agent in played.agents.values())
             if not busy and await swarm.top_chain_hashes() == chains:
                 return played
