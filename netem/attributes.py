@@ -32,13 +32,13 @@ def text(kind: int, value: str) -> bytes:
 
 def parse(data: bytes) -> dict[int, bytes]:
     """Payloads by kind; of a kind that comes again, the last."""
-    found = {}
+    payloads = {}
     offset = 0
     while offset + _HEADER.size <= len(data):
         length, kind = _HEADER.unpack_from(data, offset)
-        found[kind & _KIND] = data[offset + _HEADER.size : offset + length]
+        payloads[kind & _KIND] = data[offset + _HEADER.size : offset + length]
         offset += max(_HEADER.size, (length + 3) & ~3)
-    return found
+    return payloads
 
 
 def parse_number(payload: bytes | None) -> int | None:

@@ -95,9 +95,9 @@ class Capture:
         returncode = await self._process.terminate(_STOP_S)
         if returncode != 0:
             raise self._ended(returncode)
-        said: dict[str, Any] = json.loads(self._last_word())
-        self.processor_s = said["processor_s"]
-        return {int(vehicle): counted for vehicle, counted in said["vehicles"].items()}
+        report: dict[str, Any] = json.loads(self._last_word())
+        self.processor_s = report["processor_s"]
+        return {int(vehicle): counted for vehicle, counted in report["vehicles"].items()}
 
     def _ended(self, returncode: int) -> CaptureError:
         how = in_words(returncode) if returncode < 0 else self._last_word()

@@ -143,7 +143,7 @@ def _exception(what: str, error: dict[str, Any]) -> Exception:
         return SpawnError(message)
     if what == "connect" and kind == "os":
         # OSError with a number is of the right class: ConnectionRefusedError, TimeoutError.
-        found = OSError(code, message.split("] ", 1)[-1])
-        return found if isinstance(found, (ConnectionError, TimeoutError)) else ConnectionError(*found.args)
+        exception = OSError(code, message.split("] ", 1)[-1])
+        return exception if isinstance(exception, (ConnectionError, TimeoutError)) else ConnectionError(*exception.args)
     kinds: dict[str, type[NetemError]] = {"conditions": ConditionsError, "engine": EngineError}
     return kinds.get(kind, LabError)(message)

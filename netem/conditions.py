@@ -116,7 +116,7 @@ class NetworkConditions:
         """
         roster, open_air = tuple(vehicles), LinkConditions()
         cut = {pair: LinkConditions(loss=1.0) for pair in permutations(roster, 2) if self.is_cut(*pair)}
-        heard = {pair: open_air for one in roster for pair in ((listener, one), (one, listener))}
+        heard = {pair: open_air for vehicle in roster for pair in ((listener, vehicle), (vehicle, listener))}
         return replace(self, links={**self.links, **cut, **heard}, partition=())
 
     def at_speed(self, speedup: float) -> NetworkConditions:

@@ -28,6 +28,6 @@ def table(distribution: Distribution, size: int) -> tuple[int, ...]:
         "uniform": [2 * share - 1 for share in at],
         "normal": normal,
         "pareto": pareto,
-        "paretonormal": [0.25 * one + 0.75 * other for one, other in zip(normal, pareto, strict=True)],
+        "paretonormal": [0.25 * n + 0.75 * p for n, p in zip(normal, pareto, strict=True)],
     }[distribution]
     return tuple(min(round(deviation * SCALE), 32767) for deviation in deviations)

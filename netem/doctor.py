@@ -33,9 +33,9 @@ class Finding:
 def examine() -> list[Finding]:
     """Everything that the lab needs, in the order in which it needs it. Takes about half a second."""
     ok, word = namespaces.probe()
-    found = [Finding("namespaces", ok, word, "" if ok else namespaces.way_out(word))]
+    findings = [Finding("namespaces", ok, word, "" if ok else namespaces.way_out(word))]
     if not ok:
-        return found
+        return findings
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder, "lab.log")
         tried = {name: _try(name, log) for name in ("netem", "nftables")}
@@ -43,19 +43,19 @@ def examine() -> list[Finding]:
     broken = next((e for e in tried.values() if isinstance(e, LabError) and getattr(e, "stage", "") != "engine"), None)
     if broken is not None:
         reason = str(getattr(broken, "reason", broken))
-        return [*found, Finding("network", False, reason, getattr(broken, "way_out", ""))]
-    found.append(Finding("network", True, "bridge, veth pairs and a namespace for each vehicle"))
+        return [*findings, Finding("network", False, reason, getattr(broken, "way_out", ""))]
+    findings.append(Finding("network", True, "bridge, veth pairs and a namespace for each vehicle"))
     for name, result in tried.items():
         if isinstance(result, str):
-            found.append(Finding(name, True, "works", needed=False))
+            findings.append(Finding(name, True, "works", needed=False))
         else:
             reason = str(getattr(result, "reason", result))
-            found.append(Finding(name, False, reason, getattr(result, "way_out", ""), needed=False))
+            findings.append(Finding(name, False, reason, getattr(result, "way_out", ""), needed=False))
     if isinstance(chosen, str):
-        found.append(Finding("engine", True, f"{chosen}, the first that works of netem and nftables"))
+        findings.append(Finding("engine", True, f"{chosen}, the first that works of netem and nftables"))
     else:
-        found.append(Finding("engine", False, str(chosen), getattr(chosen, "way_out", "")))
-    return found
+        findings.append(Finding("engine", False, str(chosen), getattr(chosen, "way_out", "")))
+    return findings
 
 
 def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:

@@ -93,7 +93,7 @@ class Applied:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Applied:
         """The inverse of `to_json`."""
-        figures = {int(vehicle): ReceiverFigures.from_json(one) for vehicle, one in value["receivers"].items()}
+        figures = {int(vehicle): ReceiverFigures.from_json(entry) for vehicle, entry in value["receivers"].items()}
         return cls(value["engine"], figures)
 
 
@@ -171,11 +171,11 @@ class Engine(ABC):
 @lru_cache(maxsize=1 << 15)
 def _differing(asked: LinkConditions, held: LinkConditions) -> tuple[str, ...]:
     """The keys of what is held in other values than asked, beyond the resolution of engines."""
-    one, other = _flat(asked.to_json()), _flat(held.to_json())
+    wanted, actual = _flat(asked.to_json()), _flat(held.to_json())
     if not (asked.delay and asked.delay.jitter_s and held.delay and held.delay.jitter_s):
-        for flat in (one, other):
+        for flat in (wanted, actual):
             flat.pop("delay.distribution", None)  # of what does not vary
-    return tuple(key for key in one | other if not _close(key, one.get(key, 0), other.get(key, 0)))
+    return tuple(key for key in wanted | actual if not _close(key, wanted.get(key, 0), actual.get(key, 0)))
 
 
 def _close(key: str, asked: float | str, held: float | str) -> bool:
@@ -185,10 +185,10 @@ def _close(key: str, asked: float | str, held: float | str) -> bool:
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for key, item in value.items():
-        found |= _flat(item, f"{prefix}{key}.") if isinstance(item, Mapping) else {prefix + key: item}
-    return found
+        flat |= _flat(item, f"{prefix}{key}.") if isinstance(item, Mapping) else {prefix + key: item}
+    return flat
 
 
 def _in_brief(value: object) -> str:

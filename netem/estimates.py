@@ -154,19 +154,19 @@ def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
     """The share that `hits` are of `count` draws, each of which is worth so many independent ones (Wilson, 1927)."""
     if count == 0:
         return _NOTHING
-    found, draws = hits / count, count * worth
-    centre = (found + _Z**2 / (2 * draws)) / (1 + _Z**2 / draws)
-    margin = _Z / (1 + _Z**2 / draws) * math.sqrt(found * (1 - found) / draws + (_Z / (2 * draws)) ** 2)
+    ratio, draws = hits / count, count * worth
+    centre = (ratio + _Z**2 / (2 * draws)) / (1 + _Z**2 / draws)
+    margin = _Z / (1 + _Z**2 / draws) * math.sqrt(ratio * (1 - ratio) / draws + (_Z / (2 * draws)) ** 2)
     low, high = max(0.0, centre - margin), min(1.0, centre + margin)
-    return Estimate(found, 0.0 if hits == 0 else low, 1.0 if hits == count else high, count)
+    return Estimate(ratio, 0.0 if hits == 0 else low, 1.0 if hits == count else high, count)
 
 
 def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
     """The mean of independent values, which were taken from so many `packets` (None: one each)."""
     if len(values) < 2:
         return _NOTHING
-    found, margin = fmean(values), _Z * math.sqrt(variance(values) / len(values))
-    return Estimate(found, found - margin, found + margin, len(values) if packets is None else packets)
+    average, margin = fmean(values), _Z * math.sqrt(variance(values) / len(values))
+    return Estimate(average, average - margin, average + margin, len(values) if packets is None else packets)
 
 
 def deviation(values: Sequence[float]) -> Estimate:
@@ -186,11 +186,11 @@ def _losses(heard: Heard) -> list[bool]:
 
 def _independence(losses: Sequence[bool]) -> float:
     """How many independent draws one of a chain is worth for its mean: (1 - c) / (1 + c), c from one to the next."""
-    found = fmean(losses)
-    if not 0 < found < 1:
+    loss = fmean(losses)
+    if not 0 < loss < 1:
         return 1.0
-    both = fmean(one and other for one, other in pairwise(losses))
-    correlation = min(max(0.0, (both - found**2) / (found * (1 - found))), 0.999)
+    both = fmean(earlier and later for earlier, later in pairwise(losses))
+    correlation = min(max(0.0, (both - loss**2) / (loss * (1 - loss))), 0.999)
     return (1 - correlation) / (1 + correlation)
 
 

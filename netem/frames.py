@@ -25,7 +25,7 @@ def checksum(data: bytes) -> int:
 
 def udp_broadcast(sender: int, port: int, data: bytes) -> bytes:
     """The Ethernet frame in which a vehicle of the lab broadcasts a datagram, from `port` to `port`."""
-    source, everyone = (socket.inet_aton(one) for one in (addresses.address(sender), addresses.BROADCAST))
+    source, everyone = (socket.inet_aton(address) for address in (addresses.address(sender), addresses.BROADCAST))
     length = _UDP.size + len(data)
     pseudo_header = source + everyone + struct.pack("!HH", socket.IPPROTO_UDP, length)
     whole = checksum(pseudo_header + _UDP.pack(port, port, length, 0) + data)

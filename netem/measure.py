@@ -159,8 +159,8 @@ def studies(engine: str) -> tuple[Study, ...]:
     """
     if engine == "nftables":
         return (_receivers(_losses()), _pairs())
-    found = 1.0 if engine == "medium" else 1 - _UNPROTECTED_BITS / _FRAME_BITS
-    return (_receivers([*_losses(), *_rest(found)]), _receivers(_duplicates()), _pairs())
+    noticed = 1.0 if engine == "medium" else 1 - _UNPROTECTED_BITS / _FRAME_BITS
+    return (_receivers([*_losses(), *_rest(noticed)]), _receivers(_duplicates()), _pairs())
 
 
 @dataclass(frozen=True)
@@ -174,11 +174,11 @@ class _Case:
 
 def _losses() -> list[_Case]:
     shares = (0.01, 0.05, 0.15, 0.5)
-    return [_Case(f"loss {one:g}", LinkConditions(one), (("lost", one, estimates.lost, ""),)) for one in shares]
+    return [_Case(f"loss {share:g}", LinkConditions(share), (("lost", share, estimates.lost, ""),)) for share in shares]
 
 
-def _rest(found: float) -> list[_Case]:
-    """All else but duplicates; `found` is the share of corruptions that a receiver notices."""
+def _rest(noticed: float) -> list[_Case]:
+    """All else but duplicates; `noticed` is the share of corruptions that a receiver notices."""
     bursts = GilbertElliott(p=0.05, r=0.25)
     fixed, jitter_s = Delay(0.1), 0.02
     rate, limit = 500_000.0, 50
@@ -199,7 +199,7 @@ def _rest(found: float) -> list[_Case]:
             LinkConditions(delay=fixed, reorder=0.25),
             (("came at once", 0.25, partial(estimates.came_at_once, delay_s=fixed.mean_s), ""),),
         ),
-        _Case("corrupt 0.2", LinkConditions(corrupt=0.2), (("lost", 0.2 * found, estimates.lost, ""),)),
+        _Case("corrupt 0.2", LinkConditions(corrupt=0.2), (("lost", 0.2 * noticed, estimates.lost, ""),)),
         _Case(
             f"rate {rate / 1000:g} kbit/s",
             LinkConditions(rate=rate),
@@ -251,14 +251,14 @@ def _pairs() -> Study:
             (_OTHER_SENDER, _SENDER): LinkConditions(back),
         },
     )
-    other, cut = _FIRST_FREE, _FIRST_FREE + 1
+    bystander, cut = _FIRST_FREE, _FIRST_FREE + 1
     asked = f"loss {there:g} there, {back:g} back, else {rest:g}"
     return Study(
         conditions.with_partition([[cut]]),
         (
             Question(_SENDER, _OTHER_SENDER, asked, "lost there", there, estimates.lost),
             Question(_OTHER_SENDER, _SENDER, asked, "lost back", back, estimates.lost),
-            Question(_SENDER, other, asked, "lost elsewhere", rest, estimates.lost),
+            Question(_SENDER, bystander, asked, "lost elsewhere", rest, estimates.lost),
             Question(_SENDER, cut, "partition", "passed", 0.0, estimates.passed),
         ),
     )

@@ -97,7 +97,7 @@ class Medium:
 
     def _air_of(self, number: int, sender: int, conditions: NetworkConditions) -> _Air:
         links = [conditions.link(sender, receiver) for receiver in self._vehicles]
-        hears = [number != other and self.hears(number, other) for other in range(len(links))]
+        hears = [number != index and self.hears(number, index) for index in range(len(links))]
         if all(_is_plain(link) for link in set(links)):
             self._links[number] = []
             return _PlainAir(links, hears, self._words[number])

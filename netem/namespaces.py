@@ -90,8 +90,8 @@ def probe() -> tuple[bool, str]:
 
 def not_executed(word: str) -> tuple[str, str] | None:
     """The program that a tool did not start, and why, if that is what its `word` says: namespaces were allowed."""
-    found = re.fullmatch(r"(?:unshare|setpriv): failed to execute (.+): (.+)", word)
-    return (found[1], found[2]) if found else None
+    match = re.fullmatch(r"(?:unshare|setpriv): failed to execute (.+): (.+)", word)
+    return (match[1], match[2]) if match else None
 
 
 def user() -> str:

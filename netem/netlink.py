@@ -96,16 +96,16 @@ class Netlink:
     def dump(self, what: str, kind: int, message: Any) -> list[Any]:
         """Everything that the kernel lists for a GET request, decoded by the class of `message` (bytes stay bytes)."""
         self._socket.send(self._encode(message, kind, NLM_F_DUMP))
-        found: list[Any] = []
+        entries: list[Any] = []
         while True:
             for kind, flags, _, payload in self._receive():
                 if kind == _NLMSG_DONE:
-                    return found
+                    return entries
                 if kind == _NLMSG_ERROR:
                     if error := _refusal(what, flags, payload):
                         raise error
-                    return found
-                found.append(payload if isinstance(message, bytes) else _decode(message, kind, flags, payload))
+                    return entries
+                entries.append(payload if isinstance(message, bytes) else _decode(message, kind, flags, payload))
 
     def _encode(self, message: Any, kind: int, flags: int) -> bytes:
         self._sequence += 1

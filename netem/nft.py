@@ -104,8 +104,8 @@ class NftablesEngine(Engine):
         for vehicle, port in zip(self._vehicles, self._ports, strict=True):
             commands.append(_flush("chain", f"cut_{port}"))
             if len(groups) > 1:
-                other = _match("!=", {"meta": {"key": "mark"}}, mark[vehicle])
-                commands.append(_rule(f"cut_{port}", other, {"counter": f"cut_{port}"}, {"drop": None}))
+                foreign = _match("!=", {"meta": {"key": "mark"}}, mark[vehicle])
+                commands.append(_rule(f"cut_{port}", foreign, {"counter": f"cut_{port}"}, {"drop": None}))
         return commands
 
     def _loss(self, conditions: NetworkConditions) -> list[list[dict[str, Any]]]:

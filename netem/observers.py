@@ -101,23 +101,23 @@ async def _observe(engine: EngineName, study: Study, packets: int, pause_s: floa
                 senders[sender] = await _Program.start(lab, folder, sender, "broadcast", *stream)
             timers_s = {sender: (await program.end())["late_s"] for sender, program in senders.items()}
             counted = await _quiet(lab)
-            said = {vehicle: await listener.stop() for vehicle, listener in listeners.items()}
+            reports = {vehicle: await listener.stop() for vehicle, listener in listeners.items()}
     came = {
-        (sender, vehicle): _arrivals(said[vehicle], own)
+        (sender, vehicle): _arrivals(reports[vehicle], own)
         for vehicle in vehicles
         for sender, own in numbers.items()
         if sender != vehicle  # whose own broadcasts come back to it at once
     }
-    check(study, said, came, counted)
+    check(study, reports, came, counted)
     heard = {}
     for sender in study.senders:
         reference = sorted(came[sender, REFERENCE])
-        sent_s, way_s = [one.sent_s for one in reference], [one.at_s - one.sent_s for one in reference]
+        sent_s, way_s = [packet.sent_s for packet in reference], [packet.at_s - packet.sent_s for packet in reference]
         if missing := packets - len(reference):
             raise DisturbedError(f"{missing} of {packets} packets were lost where nothing is asked; {_TRY_AGAIN}")
         for receiver in study.receivers:
             if receiver != sender:
-                arrivals = [(one.number, one.at_s) for one in came[sender, receiver]]
+                arrivals = [(packet.number, packet.at_s) for packet in came[sender, receiver]]
                 heard[sender, receiver] = Heard(sent_s, arrivals, Lateness(way_s, timers_s[sender]))
     return heard
 
@@ -129,9 +129,9 @@ def check(
     counted: Applied,
 ) -> None:
     """Raises DisturbedError if the machine itself lost packets; of corrupted ones nobody can say who lost them."""
-    for vehicle, one in said.items():
+    for vehicle, report in said.items():
         links = [link for link in came if link[1] == vehicle]
-        if one["overflow"]:
+        if report["overflow"]:
             raise DisturbedError(f"The receive buffer of vehicle {vehicle} overflowed; {_TRY_AGAIN}")
         missing = counted.receivers[vehicle].passed - sum(len(came[link]) for link in links)
         if missing and not any(study.conditions.link(*link).corrupt for link in links):
@@ -146,9 +146,9 @@ class Arrival(NamedTuple):
     at_s: float
 
 
-def _arrivals(said: Mapping[str, Any], own: range) -> list[Arrival]:
+def _arrivals(report: Mapping[str, Any], own: range) -> list[Arrival]:
     """Those of one sender, which has these numbers."""
-    each = zip(said["numbers"], said["at_s"], said["delays_s"], strict=True)
+    each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
     return [Arrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
 
 

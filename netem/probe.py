@@ -53,15 +53,15 @@ def collect(source: socket.socket, size: int) -> list[tuple[bytes, int]]:
     asked, wake = socket.socketpair()
     signal.signal(signal.SIGTERM, lambda *_: wake.send(b"x"))
     say("ready")
-    found: list[tuple[bytes, int]] = []
+    packets: list[tuple[bytes, int]] = []
     while not select.select([asked], [], [], _LOOK_EVERY_S)[0]:
         if _filled(source) > 0.25:
-            found += _drain(source, size)
+            packets += _drain(source, size)
     while True:
         rest = _drain(source, size)
-        found += rest
+        packets += rest
         if not rest and not select.select([source], [], [], _QUIET_S)[0]:
-            return found
+            return packets
 
 
 def _filled(source: socket.socket) -> float:
@@ -71,13 +71,13 @@ def _filled(source: socket.socket) -> float:
 
 
 def _drain(source: socket.socket, size: int) -> list[tuple[bytes, int]]:
-    found = []
+    packets = []
     with contextlib.suppress(BlockingIOError):
         while True:
             data, ((_, _, stamp),), _, _ = source.recvmsg(size, 64, socket.MSG_DONTWAIT)
             seconds, nanoseconds = _STAMP.unpack(stamp)
-            found.append((data, seconds * 1_000_000_000 + nanoseconds))
-    return found
+            packets.append((data, seconds * 1_000_000_000 + nanoseconds))
+    return packets
 
 
 def receive(port: str) -> None:
@@ -87,14 +87,14 @@ def receive(port: str) -> None:
     except PermissionError:  # for the machine's own root only; another has what net.core.rmem_max gives
         source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
     source.bind(("", int(port)))
-    found = [(*_DATAGRAM.unpack_from(data), at_ns) for data, at_ns in collect(source, 2048)]
+    packets = [(*_DATAGRAM.unpack_from(data), at_ns) for data, at_ns in collect(source, 2048)]
     lines = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
     counters = dict(zip(*lines, strict=True))
     say(
         {
-            "numbers": [number for number, _, _ in found],
-            "delays_s": [(at_ns - sent_ns) / 1e9 for _, sent_ns, at_ns in found],
-            "at_s": [at_ns / 1e9 for _, _, at_ns in found],
+            "numbers": [number for number, _, _ in packets],
+            "delays_s": [(at_ns - sent_ns) / 1e9 for _, sent_ns, at_ns in packets],
+            "at_s": [at_ns / 1e9 for _, _, at_ns in packets],
             "overflow": int(counters["RcvbufErrors"]) + int(counters["MemErrors"]),
             "corrupt": int(counters["InCsumErrors"]),
         }

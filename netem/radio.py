@@ -107,11 +107,11 @@ class LogDistance:
 
 def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], float]:
     """The loss between each two vehicles, in whole steps; those that lose nothing to the radio are left out."""
-    found: dict[frozenset[int], float] = {}
+    losses: dict[frozenset[int], float] = {}
     for one, other in combinations(places, 2):
         if lost := round(radio.loss(places[one].distance_m(places[other])) * STEPS) / STEPS:
-            found[frozenset((one, other))] = lost
-    return found
+            losses[frozenset((one, other))] = lost
+    return losses
 
 
 def over_the_air(conditions: NetworkConditions, losses: Mapping[frozenset[int], float]) -> NetworkConditions:
@@ -131,17 +131,17 @@ def components(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> tupl
     A link that loses everything is none.
     """
     left = list(vehicles)
-    found: list[frozenset[int]] = []
+    groups: list[frozenset[int]] = []
     while left:
         reached, ahead = {left[0]}, [left[0]]
         while ahead:
-            one = ahead.pop()
-            nearby = {other for other in left if other not in reached and _both_ways(conditions, one, other)}
+            vehicle = ahead.pop()
+            nearby = {peer for peer in left if peer not in reached and _both_ways(conditions, vehicle, peer)}
             reached |= nearby
             ahead += nearby
-        found.append(frozenset(reached))
+        groups.append(frozenset(reached))
         left = [vehicle for vehicle in left if vehicle not in reached]
-    return tuple(sorted(found, key=lambda group: (-len(group), min(group))))
+    return tuple(sorted(groups, key=lambda group: (-len(group), min(group))))
 
 
 def _both_ways(conditions: NetworkConditions, one: int, other: int) -> bool:

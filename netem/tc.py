@@ -129,7 +129,7 @@ class NetemEngine(Engine):
         alone = []
         for receiver, links in wanted.items():
             held = self._classes[receiver]
-            leaving = {kind: it.link for kind, it in held.items() if kind not in links and it.link is not None}
+            leaving = {kind: holds.link for kind, holds in held.items() if kind not in links and holds.link is not None}
             first = links
             if leaving and any(link.duplicate for link in (*leaving.values(), *links.values())):
                 # New classes meet old ones, and a netem that duplicates would have to be alone (see the module):
@@ -138,7 +138,7 @@ class NetemEngine(Engine):
                 first = {kind: replace(link, duplicate=0.0) for kind, link in (leaving | links).items()}
             self._set(receiver, first)
         self._move(kinds, groups)
-        self._retire(lambda receiver, found: not found.waiting or receiver in alone)
+        self._retire(lambda receiver, counted: not counted.waiting or receiver in alone)
         for receiver in alone:
             self._set(receiver, wanted[receiver])
         self._figured = figures
@@ -158,7 +158,7 @@ class NetemEngine(Engine):
             request = port.change_class(kind, link, table=table)
             requests += [request] if known else port.add_class(kind, link)
             changed[kind] = _Holds(link, shape or (before.distribution if before else "uniform"))
-        held.update({kind: replace(it, link=None) for kind, it in changed.items()})
+        held.update({kind: replace(holds, link=None) for kind, holds in changed.items()})
         self._netlink.send(requests)
         held.update(changed)
 
@@ -170,8 +170,8 @@ class NetemEngine(Engine):
         self._netlink.send([self._ports[vehicle].hear(group[vehicle]) for vehicle in hears])
         moved = [vehicle for vehicle in self._vehicles if self._marks[vehicle] != new[vehicle]]
         self._netlink.send([self._ports[vehicle].mark(*new[vehicle]) for vehicle in moved])
-        old = [(v, other) for v, heard in self._hears.items() for other in heard if other != group[v]]
-        self._netlink.send([self._ports[vehicle].hear_no_more(other) for vehicle, other in old])
+        old = [(v, former) for v, heard in self._hears.items() for former in heard if former != group[v]]
+        self._netlink.send([self._ports[vehicle].hear_no_more(former) for vehicle, former in old])
         self._kinds, self._groups, self._marks = kinds, groups, {**new}
         self._hears = {vehicle: {group[vehicle]} for vehicle in self._vehicles}
 
@@ -181,10 +181,10 @@ class NetemEngine(Engine):
         unused = {v: unused for v, held in self._classes.items() if (unused := [k for k in held if k not in used])}
         if not unused:
             return
-        found = self._found()
+        classes = self._found()
         for receiver, kinds in unused.items():
             for kind in kinds:
-                counted = found[receiver].get(kind)
+                counted = classes[receiver].get(kind)
                 if counted is not None and not gone(receiver, counted):
                     continue
                 try:
@@ -199,8 +199,8 @@ class NetemEngine(Engine):
 
     def _found(self) -> dict[int, dict[int, Class]]:
         """What classes each receiver's port has."""
-        found = TrafficControl.classes(self._netlink)
-        return {vehicle: found.get(port.index, {}) for vehicle, port in self._ports.items()}
+        classes = TrafficControl.classes(self._netlink)
+        return {vehicle: classes.get(port.index, {}) for vehicle, port in self._ports.items()}
 
     def _filters(self) -> tuple[dict[int, tuple[int, int] | None], dict[int, tuple[set[int], int]]]:
         """What each port marks and hears."""
@@ -209,12 +209,12 @@ class NetemEngine(Engine):
 
     def read(self) -> Applied:
         try:
-            self._retire(lambda _, found: not found.waiting)
-            found = self._found()
+            self._retire(lambda _, counted: not counted.waiting)
+            classes = self._found()
             marks, heard = self._filters()
         except NetlinkError as error:
             raise EngineError(f"The kernel did not say what it holds: {error}") from error
-        return Applied(self.name, {v: self._figures(v, found[v], marks, *heard[v]) for v in self._vehicles})
+        return Applied(self.name, {v: self._figures(v, classes[v], marks, *heard[v]) for v in self._vehicles})
 
     def _figures(
         self,
@@ -237,8 +237,8 @@ class NetemEngine(Engine):
             else:
                 held[sender] = LinkConditions()  # an HTB passes what it has no class for
         gone = self._gone[receiver]
-        passed = gone.passed + sum(one.passed for one in classes.values())
-        lost = gone.lost + sum(one.dropped for one in classes.values())
+        passed = gone.passed + sum(counted.passed for counted in classes.values())
+        lost = gone.lost + sum(counted.dropped for counted in classes.values())
         return ReceiverFigures.of(held, tuple(cut_from), passed, lost, cut)
 
     def _with_distribution(self, link: LinkConditions, receiver: int, kind: int) -> LinkConditions:
@@ -268,8 +268,8 @@ def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[fro
 def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> dict[int, LinkConditions]:
     """What a receiver does to each kind that it can hear; alone in the lab, to its own."""
     senders = {number: next((v for v in kind if v != receiver), None) for kind, number in kinds.items()}
-    found = {n: conditions.link(sender, receiver) for n, sender in senders.items() if sender is not None}
-    return found or {n: conditions.link(receiver, receiver) for n in senders}
+    links = {n: conditions.link(sender, receiver) for n, sender in senders.items() if sender is not None}
+    return links or {n: conditions.link(receiver, receiver) for n in senders}
 
 
 def _number(sets: Iterable[frozenset[int]], before: _Numbers, taken: Iterable[int]) -> _Numbers:

@@ -154,7 +154,7 @@ class TrafficControl:
     @staticmethod
     def classes(netlink: Netlink) -> dict[int, dict[int, Class]]:
         """For every port by interface number, what its classes do: one question for the whole switch."""
-        found: dict[int, dict[int, Class]] = {}
+        classes: dict[int, dict[int, Class]] = {}
         for entry in netlink.dump("list qdiscs", RTM_GETQDISC, bytes(_TCMSG.size)):
             _, _, _, index, _, parent, _ = _TCMSG.unpack_from(entry)
             attributes = parse(entry[_TCMSG.size :])
@@ -164,8 +164,8 @@ class TrafficControl:
             (passed,) = struct.unpack_from("=8xI", statistics[1])
             waiting, _, dropped = struct.unpack_from("=3I", statistics[3])
             link = _link(attributes[_OPTIONS])
-            found.setdefault(index, {})[parent & 0xFFFF] = Class(link, passed, dropped, waiting)
-        return found
+            classes.setdefault(index, {})[parent & 0xFFFF] = Class(link, passed, dropped, waiting)
+        return classes
 
     def _filter(self, kind: str, parent: int, priority: int, handle: int, *options: bytes) -> bytes:
         header = self._header(parent, handle, priority << 16 | _ETH_P_ALL)

@@ -219,17 +219,17 @@ class _Guest:
                 stack.enter_context((self._folder / name).open("rb", buffering=0))
                 for name in ("stdout", "stderr", "word")
             )
-            said = b""
+            received = b""
             heard = time.monotonic()
             while True:
                 ended = self._process.poll() is not None
-                told = word.read()
-                said += told
+                chunk = word.read()
+                received += chunk
                 came = [_copy(stdout, sys.stdout.buffer), _copy(stderr, sys.stderr.buffer)]
-                self.up = self.up or bool(said)
-                if told or any(came):
+                self.up = self.up or bool(received)
+                if chunk or any(came):
                     heard = time.monotonic()
-                elif (status := _last_word(said)) is not None:
+                elif (status := _last_word(received)) is not None:
                     return status
                 elif ended:
                     raise self._failed("it ended" if self.up else "it did not boot")
@@ -240,8 +240,8 @@ class _Guest:
 
     def _failed(self, what: str) -> UmlError:
         lines = (self._folder / "kernel").read_text(errors="replace").splitlines()
-        told = [line.strip() for line in lines if line.strip()] or ["nothing"]
-        last = next((line for line in told if "LD_PRELOAD" in line or "panic" in line), told[-1])
+        printed = [line.strip() for line in lines if line.strip()] or ["nothing"]
+        last = next((line for line in printed if "LD_PRELOAD" in line or "panic" in line), printed[-1])
         return UmlError(f"User Mode Linux failed: {what}; it last said: {last}")
 
     def end(self) -> None:
@@ -261,9 +261,9 @@ def _copy(source: io.FileIO, target: BinaryIO) -> bool:
     return bool(data)
 
 
-def _last_word(said: bytes) -> int | None:
+def _last_word(received: bytes) -> int | None:
     """The exit status, once its line is whole; the lines before it are empty."""
-    *lines, _ = said.split(b"\n")
+    *lines, _ = received.split(b"\n")
     return next((int(line) for line in lines if line.strip()), None)
 
 

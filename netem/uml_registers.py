@@ -38,8 +38,8 @@ def needed(kernel: Path | None) -> bool:
         return False
     if kernel is None:
         return True
-    said = subprocess.run([kernel, "--version"], capture_output=True, text=True, errors="replace", check=False).stdout
-    version = re.match(r"(\d+)\.(\d+)", said)
+    text = subprocess.run([kernel, "--version"], capture_output=True, text=True, errors="replace", check=False).stdout
+    version = re.match(r"(\d+)\.(\d+)", text)
     return version is None or (int(version[1]), int(version[2])) < _MENDED
 
 

@@ -50,7 +50,7 @@ class Receiver:
 
     def messages(self) -> list[dict[str, Any]]:
         """The messages that are complete; raises WireError if the stream makes no sense."""
-        found = []
+        messages = []
         while len(self._data) >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(self._data)
             if length > MAX_MESSAGE:
@@ -66,8 +66,8 @@ class Receiver:
                 raise WireError(f"a message that is no JSON: {error}") from error
             if not isinstance(message, dict):
                 raise WireError("a message that is no JSON object")
-            found.append(message)
-        return found
+            messages.append(message)
+        return messages
 
     def close(self) -> None:
         while self.descriptors:

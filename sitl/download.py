@@ -176,9 +176,9 @@ def _kept(part: Path, noted: Path) -> tuple[int, _Origin] | None:
 
 def _fits(answer: Any, have: int, origin: _Origin) -> bool:
     """Whether a partial answer is the rest of the file whose first `have` bytes are here."""
-    said = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+)", answer.headers.get("Content-Range", ""))
+    match = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+)", answer.headers.get("Content-Range", ""))
     wanted = (have, origin.size - 1, origin.size)
-    return said is not None and tuple(map(int, said.groups())) == wanted and _validator(answer) == origin.validator
+    return match is not None and tuple(map(int, match.groups())) == wanted and _validator(answer) == origin.validator
 
 
 def _validator(answer: Any) -> str | None:

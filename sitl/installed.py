@@ -129,10 +129,10 @@ def current(vehicle: VehicleType, environ: Mapping[str, str]) -> Installed | Non
         directory = (cache(environ) / vehicle / CURRENT).resolve(strict=True)
     except (OSError, VehicleError):
         return None
-    found = Installed(vehicle, directory)
-    if found.damage:
-        raise UnusableBinaryError(f"{directory} is damaged, {found.damage}: run {install_command(vehicle)}")
-    return found
+    version = Installed(vehicle, directory)
+    if version.damage:
+        raise UnusableBinaryError(f"{directory} is damaged, {version.damage}: run {install_command(vehicle)}")
+    return version
 
 
 def install_command(vehicle: VehicleType) -> str:

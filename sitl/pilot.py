@@ -131,9 +131,9 @@ class Pilot:
 
     def _failed(self, procedure: Procedure, awaited: str, reason: str) -> FlightError:
         state = self.state
-        said = f"its last words: {state.texts[-1]!r}" if state.texts else "it never said why"
+        words = f"its last words: {state.texts[-1]!r}" if state.texts else "it never said why"
         return FlightError(
-            f"vehicle {self.vehicle_id} did not {procedure.purpose}: waiting for {awaited}, {reason}; {said} (it is "
+            f"vehicle {self.vehicle_id} did not {procedure.purpose}: waiting for {awaited}, {reason}; {words} (it is "
             f"{'armed' if state.armed else 'not armed'}, in mode {mode_name(self.vehicle_type, state.mode)}; "
             f"all it sent is in {self.link.tlog_path})"
         )

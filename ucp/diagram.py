@@ -91,7 +91,7 @@ def _causes(handler: EventHandler[Any]) -> Iterator[str]:
             yield f"{timer} timer expires"
     for event, local in ON_LOCAL_EVENT.items():
         if local is handler:
-            by = [str(other.algorithm) for other in HANDLERS.values() if event in other.triggers]
+            by = [str(cause.algorithm) for cause in HANDLERS.values() if event in cause.triggers]
             yield f"triggered by {', '.join(by)}" if by else "the vehicle logs an event"
 
 

@@ -117,10 +117,10 @@ class Store:
                 f"{self._path} is the store of agent {header.get('agent_id')} in another mission, or of another "
                 "version: name another file as `store`"
             )
-        found, known = StoredState(), dict[str, Block]()
+        stored, known = StoredState(), dict[str, Block]()
         for entry in entries:
-            found.replay(entry, known)
-        return found
+            stored.replay(entry, known)
+        return stored
 
     def write(self, changes: list[Change]) -> None:
         """Have these changes, of one input to the agent, on disk. The first of a life name all that was found."""
@@ -128,7 +128,10 @@ class Store:
             return
         new = dict.fromkeys(block_hash for _, block_hash in changes if block_hash not in self._written)
         blocks = [self._block(block_hash) for block_hash in new]
-        entry = {"changes": changes, "blocks": [[one.agent_id, one.timestamp_us, _base64(one)] for one in blocks]}
+        entry = {
+            "changes": changes,
+            "blocks": [[block.agent_id, block.timestamp_us, _base64(block)] for block in blocks],
+        }
         try:
             if self._file is None:
                 self._file = self._begin(_line(self._header) + _line(entry))

@@ -47,12 +47,12 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
     had = set()
     last_change = {agent_id: trace.chain_changed_at() for agent_id, trace in evidence.traces.items()}
     for agent_id in differing & set(evidence.traces):
-        others = max((t for other, t in last_change.items() if other != agent_id), default=0.0)
+        others_changed_at = max((t for peer, t in last_change.items() if peer != agent_id), default=0.0)
         for life in evidence.traces[agent_id].lives():
             began = False
             for _, run in life:
                 if run.handler == "reconcile_begin" and run.branch == "begun":
-                    began = run.t >= max(since, others)
+                    began = run.t >= max(since, others_changed_at)
                 elif began and run.handler == "reconcile_finalize" and not run.state.reconciling:
                     had.add(agent_id)
     return had

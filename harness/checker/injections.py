@@ -64,7 +64,7 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
     injections = injections_of(scenario)
     if not injections:
         return []
-    tallies = {one.number: _Tally() for one in injections}
+    tallies = {injection.number: _Tally() for injection in injections}
     copies: dict[_Key, list[tuple[float, int]]] = defaultdict(list)
     for line in archive.injected(_Line):
         if line.injection in tallies:
@@ -77,7 +77,9 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
                     tally.handled[message][run.branch] += 1
                     tally.changed[message] += bool(run.changes)
                     tally.reached[message].add((key, copy))
-    return [_told(one.at_s, one.what, one.detail, tallies[one.number]) for one in injections]
+    return [
+        _told(injection.at_s, injection.what, injection.detail, tallies[injection.number]) for injection in injections
+    ]
 
 
 def in_words(one: RogueInjection) -> str:
@@ -88,8 +90,8 @@ def in_words(one: RogueInjection) -> str:
         done.append(f"and {sum(count for _, count in branches[BRANCHES_NAMED:])} more")
     of_them = [f"{sum(one.refused.values())} of them malformed"] if one.refused else []
     of_them += [f"{one.untraced} not told from their originals"] if one.untraced else []
-    said = "; ".join([f"{one.sent} sent", *of_them, *([", ".join(done)] if done else [])])
-    return f"{one.what} at {one.at_s:g} s, {one.detail}: {said}"
+    counts = "; ".join([f"{one.sent} sent", *of_them, *([", ".join(done)] if done else [])])
+    return f"{one.what} at {one.at_s:g} s, {one.detail}: {counts}"
 
 
 def done_with(messages: InjectedMessages) -> str:
@@ -114,14 +116,14 @@ def _take_down(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, 
 
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
     """The handler runs that these messages triggered, or forged ones."""
-    found: dict[_Key, list[HandlerRun]] = defaultdict(list)
+    triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:
         sequence = run.trigger.get("seq")
         if isinstance(sequence, int):
             key = (run.trigger.get("from"), sequence, run.trigger.get("message"))
             if key in copies or injection_of(sequence) is not None:
-                found[key].append(run)
-    return found
+                triggered[key].append(run)
+    return triggered
 
 
 def _paired(
@@ -133,7 +135,7 @@ def _paired(
         yield from ((forged, 0, run) for run in runs)
         return
     left = list(runs)
-    for copy, (at_s, number) in sorted(enumerate(copies or ()), key=lambda it: it[1], reverse=True):
+    for copy, (at_s, number) in sorted(enumerate(copies or ()), key=lambda numbered: numbered[1], reverse=True):
         if left and left[-1].t >= at_s - SKEW_S:
             yield number, copy, left.pop()
 

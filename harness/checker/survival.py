@@ -75,15 +75,15 @@ def _losses(evidence: Evidence, lost: list[Fault], at_end: Mapping[str, list[int
         for operation, block_hash in run.changes
         if operation == "complete"
     }
-    found = []
+    losses = []
     for number, fault in enumerate(lost):
         vehicles = fault.agents or []
         by_then = {block: agent_id for block, (at_s, agent_id) in completed.items() if at_s <= fault.at_s}
         left = {agent_id: then[number] for agent_id, then in held.items() if agent_id not in vehicles}
         survived = by_then.keys() & set().union(*left.values())
         gone = (by_then.keys() & set().union(*(held[agent_id][number] for agent_id in vehicles))) - survived
-        told = [block for block, agent_id in by_then.items() if block in gone or agent_id in vehicles]
-        found.append(
+        blocks = [block for block, agent_id in by_then.items() if block in gone or agent_id in vehicles]
+        losses.append(
             Loss(
                 at_s=fault.at_s,
                 what=fault.what,
@@ -100,22 +100,22 @@ def _losses(evidence: Evidence, lost: list[Fault], at_end: Mapping[str, list[int
                         holders=[agent_id for agent_id, then in left.items() if block in then],
                         holders_at_end=at_end.get(block, []),
                     )
-                    for block in sorted(told, key=lambda block: completed[block])
+                    for block in sorted(blocks, key=lambda block: completed[block])
                 ],
             )
         )
-    return found
+    return losses
 
 
 def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) -> list[set[str]]:
     """The blocks that an agent held at each of the instants, the moment before it was lost itself."""
-    waiting, found = deque(instants), []
+    waiting, blocks_held = deque(instants), []
     held, at_s = Held(), -math.inf
 
     def take_down() -> None:
         instant = waiting.popleft()
         gone = any(at_s <= loss < instant for loss in lost_at)
-        found.append(set() if gone else {block for block, copies in held.copies.items() if copies})
+        blocks_held.append(set() if gone else {block for block, copies in held.copies.items() if copies})
 
     for life in trace.lives():
         new = Held()
@@ -126,7 +126,7 @@ def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) 
             held.replay(run)
     while waiting:
         take_down()
-    return found
+    return blocks_held
 
 
 def in_words(survived: Survival) -> list[str]:
@@ -144,11 +144,11 @@ def in_words(survived: Survival) -> list[str]:
 
 
 def _loss_in_words(loss: Loss) -> str:
-    one = len(loss.vehicles) == 1
-    sentence = f"at {loss.at_s:.0f} s {_vehicles(loss.vehicles)} {'was' if one else 'were'} lost ({loss.what})"
+    alone = len(loss.vehicles) == 1
+    sentence = f"at {loss.at_s:.0f} s {_vehicles(loss.vehicles)} {'was' if alone else 'were'} lost ({loss.what})"
     if loss.completed is None or loss.gone is None:
         return f"{sentence}; without all traces nobody knows what was where"
-    return f"{sentence}, and with {'it' if one else 'them'} {_of(loss.gone, loss.completed)}"
+    return f"{sentence}, and with {'it' if alone else 'them'} {_of(loss.gone, loss.completed)}"
 
 
 def _least_held_in_words(least: LeastHeld) -> str:

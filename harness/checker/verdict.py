@@ -27,12 +27,14 @@ class Result:
 
     @property
     def violated(self) -> bool:
-        return any(one.verdict == "violated" for one in self.characteristics.values())
+        return any(characteristic.verdict == "violated" for characteristic in self.characteristics.values())
 
     def to_json(self) -> dict[str, Any]:
         """The `characteristics` and `figures` of `ucp-run/1`, and `errors`."""
         return {
-            "characteristics": {number: one.to_json() for number, one in self.characteristics.items()},
+            "characteristics": {
+                number: characteristic.to_json() for number, characteristic in self.characteristics.items()
+            },
             "figures": self.figures,
             "errors": self.errors,
         }

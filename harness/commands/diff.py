@@ -23,47 +23,47 @@ def diff_command(
     as_json: Annotated[bool, typer.Option("--json", help="The differences as JSON on standard output.")] = False,
 ) -> None:
     """Say where two runs part: exit status 0 if they do not, 1 if they do."""
-    found = compare(run_a, run_b)
+    difference = compare(run_a, run_b)
     if as_json:
-        print_json({"a": str(run_a), "b": str(run_b), **found.to_json()})
+        print_json({"a": str(run_a), "b": str(run_b), **difference.to_json()})
     else:
         console = Console()
-        for line in _lines(found):
+        for line in _lines(difference):
             console.print(Text(line), soft_wrap=True)
-    for sentence in found.errors:
+    for sentence in difference.errors:
         complain(sentence)
-    if found.verdict == "differ":
+    if difference.verdict == "differ":
         raise typer.Exit(DIFFERENT)
 
 
-def _lines(found: Difference) -> Iterator[str]:
+def _lines(difference: Difference) -> Iterator[str]:
     """All that there is to say, A being the first run and B the second."""
-    for one in found.keys:
-        yield f"{one.key}: {_value(one.a)} in A, {_value(one.b)} in B"
-    runs = f"{found.handler_runs} handler runs of {len(found.agents)} agents, and their chains"
-    match found.verdict:
+    for differing in difference.keys:
+        yield f"{differing.key}: {_value(differing.a)} in A, {_value(differing.b)} in B"
+    runs = f"{difference.handler_runs} handler runs of {len(difference.agents)} agents, and their chains"
+    match difference.verdict:
         case "identical":
             yield f"identical to the last byte: {runs}"
         case "same but for times":
             yield f"the same: {runs}; only times, and the hashes that cover them, differ"
         case _:
-            yield from _differences(found)
+            yield from _differences(difference)
 
 
-def _differences(found: Difference) -> Iterator[str]:
-    first = found.first
+def _differences(difference: Difference) -> Iterator[str]:
+    first = difference.first
     if first is not None:
-        parting = found.agents[first].run
+        parting = difference.agents[first].run
         assert parting is not None, "it is what makes it the first"
         yield f"the runs part first at {parting.at_s:.3f} s, with agent {first}"
-    for agent_id, one in found.agents.items():
-        yield f"agent {agent_id}: {'the same' if one == AgentDifference(None, None) else ''}".rstrip()
-        if one.run is not None:
-            yield f"  parts at handler run {one.run.number}"
-            yield from (f"    {where}  {words}" for where, words in zip("AB", _both(one.run), strict=True))
-        if one.chain is not None:
-            a, b = (block or "not there" for block in (one.chain.a, one.chain.b))
-            yield f"  block {one.chain.place} of its chain is {a} in A, {b} in B"
+    for agent_id, agent_difference in difference.agents.items():
+        yield f"agent {agent_id}: {'the same' if agent_difference == AgentDifference(None, None) else ''}".rstrip()
+        if agent_difference.run is not None:
+            yield f"  parts at handler run {agent_difference.run.number}"
+            yield from (f"    {where}  {words}" for where, words in zip("AB", _both(agent_difference.run), strict=True))
+        if agent_difference.chain is not None:
+            a, b = (block or "not there" for block in (agent_difference.chain.a, agent_difference.chain.b))
+            yield f"  block {agent_difference.chain.place} of its chain is {a} in A, {b} in B"
 
 
 def _both(parting: Parting) -> tuple[str, str]:
@@ -82,7 +82,7 @@ def _step(step: Step | None, changes: bool, sent: bool) -> str:
     if changes and step.changes:
         words += f"; {', '.join(' '.join(change) for change in step.changes)}"
     if sent and step.sent:
-        words += f"; sends {', '.join(' '.join(filter(None, one)) for one in step.sent)}"
+        words += f"; sends {', '.join(' '.join(filter(None, message)) for message in step.sent)}"
     return words
 
 

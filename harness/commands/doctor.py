@@ -39,12 +39,12 @@ def doctor_command(
     if measure and able:
         with calibration.saying(Console(stderr=True)) as say:
             engines = calibration.measure_engines(findings, say)
-    found = [finding.to_json() for finding in findings]
+    records = [finding.to_json() for finding in findings]
     if as_json:
-        print_json({"findings": found, "measured": [one.to_json() for one in engines]} if measure else found)
+        print_json({"findings": records, "measured": [engine.to_json() for engine in engines]} if measure else records)
     elif engines:
         Console().print(calibration.render(engines))
     if not able:
         raise typer.Exit(CANNOT_HERE)
-    if not all(one.ok for one in engines):
+    if not all(engine.ok for engine in engines):
         raise typer.Exit(VIOLATED)

@@ -59,7 +59,7 @@ def _told(
     everything = join(captures)
     exchanges, names = Exchanges(everything), Names(everything, runs)
     selected = list(selection.of(everything, captures))
-    shown = [one for one in selected if one.lost_by] if lost else selected
+    shown = [transmission for transmission in selected if transmission.lost_by] if lost else selected
     chapters = None if follow is None else list(story(names.find(follow), shown, exchanges))
     if as_json:
         yield from document(

@@ -130,7 +130,7 @@ def _show_end(console: Console, finished: Run) -> None:
         complain(f"vehicles {', '.join(slow)} did not keep up with the clock: choose a smaller --speedup")
     late = finished.timer_lag
     if late is not None and not late.tolerable:
-        told = f"one in twenty of the agents' vote timers fired {late.late_s:.1f} or more mission seconds late"
-        complain(f"this machine was too slow: {told} (set to {late.asked_s:g} s): choose a smaller --speedup")
+        lateness = f"one in twenty of the agents' vote timers fired {late.late_s:.1f} or more mission seconds late"
+        complain(f"this machine was too slow: {lateness} (set to {late.asked_s:g} s): choose a smaller --speedup")
     wall = f"{finished.wall_s:.0f}" if finished.wall_s >= 10 else f"{finished.wall_s:.1f}"
     console.print(f"{wall} s; report: {finished.report}", highlight=False, soft_wrap=True)

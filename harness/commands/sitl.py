@@ -58,12 +58,12 @@ def install_into_cache(
 def print_path(vehicle: Vehicle = "copter") -> None:
     """Print the directory of the installed binary, as ARDUPILOT_SITL wants it."""
     try:
-        found = current(vehicle, os.environ)
+        installed = current(vehicle, os.environ)
     except VehicleError as error:
         raise MachineError(str(error)) from None
-    if found is None:
+    if installed is None:
         raise MachineError(f"no {vehicle} is installed: run {install_command(vehicle)}")
-    sys.stdout.write(f"{found.directory}\n")
+    sys.stdout.write(f"{installed.directory}\n")
 
 
 @app.command("list")
@@ -107,16 +107,16 @@ def _offers(vehicle: VehicleType) -> Iterator[_Offer]:
         if binary and binary.is_file():
             problem = None if os.access(binary, os.X_OK) else f"{name} is not executable"
             yield _Offer(vehicle, source, str(binary), binary.stat().st_size, problem=problem)
-    for one in all_installed(vehicle, os.environ):
+    for installed in all_installed(vehicle, os.environ):
         yield _Offer(
             vehicle,
             "cache",
-            str(one.directory),
-            sum(path.stat().st_size for path in one.directory.iterdir()),
-            one.directory.name,
-            one.manifest.fetched_at if one.manifest else None,
-            one.is_current,
-            one.damage,
+            str(installed.directory),
+            sum(path.stat().st_size for path in installed.directory.iterdir()),
+            installed.directory.name,
+            installed.manifest.fetched_at if installed.manifest else None,
+            installed.is_current,
+            installed.damage,
         )
 
 

@@ -26,13 +26,17 @@ EVIDENCE_SHOWN = 5
 
 def show_result(console: Console, result: checker.Result) -> None:
     table = Table.grid(padding=(0, 2))
-    for number, one in result.characteristics.items():
-        verdict = Text(f"{MARKS[one.verdict]} {one.verdict}", style=STYLES[one.verdict])
-        table.add_row(number, one.name, verdict, Text(one.reason))
-        for finding in one.evidence[:EVIDENCE_SHOWN]:
+    for number, characteristic in result.characteristics.items():
+        verdict = Text(
+            f"{MARKS[characteristic.verdict]} {characteristic.verdict}", style=STYLES[characteristic.verdict]
+        )
+        table.add_row(number, characteristic.name, verdict, Text(characteristic.reason))
+        for finding in characteristic.evidence[:EVIDENCE_SHOWN]:
             table.add_row("", "", "", Text(f"agent {finding.agent_id}: {finding.detail}", style="red"))
-        if len(one.evidence) > EVIDENCE_SHOWN:
-            table.add_row("", "", "", Text(f"and {len(one.evidence) - EVIDENCE_SHOWN} more in run.json or --json"))
+        if len(characteristic.evidence) > EVIDENCE_SHOWN:
+            table.add_row(
+                "", "", "", Text(f"and {len(characteristic.evidence) - EVIDENCE_SHOWN} more in run.json or --json")
+            )
     console.print(table)
     known = {name: value for name, value in result.figures.items() if value is not None}
     words = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in known.items())

@@ -19,10 +19,10 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
     if isinstance(a, dict) and isinstance(b, dict):
         pairs = [(name, a.get(name), b.get(name)) for name in {**a, **b}]
     elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
-        pairs = [(index, one, other) for index, (one, other) in enumerate(zip(a, b, strict=True))]
+        pairs = [(index, value_a, value_b) for index, (value_a, value_b) in enumerate(zip(a, b, strict=True))]
     else:
         if a != b:
             yield KeyDifference(key, a, b)
         return
-    for name, one, other in pairs:
-        yield from differing_keys(one, other, f"{key}.{name}" if key else str(name))
+    for name, value_a, value_b in pairs:
+        yield from differing_keys(value_a, value_b, f"{key}.{name}" if key else str(name))

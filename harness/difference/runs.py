@@ -67,39 +67,41 @@ class Difference:
     @property
     def first(self) -> int | None:
         """The agent that parts first in mission time, the lowest ID of several; None if no trace parts."""
-        at_s = {agent_id: one.run.at_s for agent_id, one in self.agents.items() if one.run is not None}
+        at_s = {
+            agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None
+        }
         return min(at_s, key=lambda agent_id: (at_s[agent_id], agent_id), default=None)
 
     @property
     def verdict(self) -> str:
         """`identical`, `same but for times`, or `differ`; keys that differ make no difference by themselves."""
-        if any(one.run or one.chain for one in self.agents.values()):
+        if any(difference.run or difference.chain for difference in self.agents.values()):
             return "differ"
         return "identical" if self.exact else "same but for times"
 
     def to_json(self) -> dict[str, Any]:
         return {
             "verdict": self.verdict,
-            "keys": [asdict(one) for one in self.keys],
+            "keys": [asdict(key) for key in self.keys],
             "first": self.first,
             "handler_runs": self.handler_runs,
-            "agents": {str(agent_id): asdict(one) for agent_id, one in self.agents.items()},
+            "agents": {str(agent_id): asdict(difference) for agent_id, difference in self.agents.items()},
             "errors": self.errors,
         }
 
 
 def compare(a: Path, b: Path) -> Difference:
     """Raises RunDirectoryError if the two cannot be compared: no run directory, no trace, another roster or backend."""
-    one, other = _Run(a), _Run(b)
-    _refuse_what_cannot_be_compared(one, other)
+    run_a, run_b = _Run(a), _Run(b)
+    _refuse_what_cannot_be_compared(run_a, run_b)
     agents: dict[int, AgentDifference] = {}
     handler_runs, exact = 0, True
-    for agent_id in one.roster:
-        same, to_the_byte, parting = _compare_traces(one, other, agent_id)
+    for agent_id in run_a.roster:
+        same, to_the_byte, parting = _compare_traces(run_a, run_b, agent_id)
         handler_runs, exact = handler_runs + same, exact and to_the_byte
-        agents[agent_id] = AgentDifference(parting, _compare_chains(one.chain(agent_id), other.chain(agent_id)))
-    keys = [*differing_keys(one.asked(), other.asked())]
-    return Difference(keys, agents, handler_runs, exact, [*one.problems(), *other.problems()])
+        agents[agent_id] = AgentDifference(parting, _compare_chains(run_a.chain(agent_id), run_b.chain(agent_id)))
+    keys = [*differing_keys(run_a.asked(), run_b.asked())]
+    return Difference(keys, agents, handler_runs, exact, [*run_a.problems(), *run_b.problems()])
 
 
 class _Run:
@@ -140,8 +142,8 @@ def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
         if not run.roster:
             raise RunDirectoryError(f"{run.path / RUN_FILE}: it names no agents: play the run again")
     if a.roster != b.roster:
-        one, other = (", ".join(ranges([*run.roster])) for run in (a, b))
-        raise RunDirectoryError(f"A has agents {one}, and B has {other}: compare runs of the same agents")
+        roster_a, roster_b = (", ".join(ranges([*run.roster])) for run in (a, b))
+        raise RunDirectoryError(f"A has agents {roster_a}, and B has {roster_b}: compare runs of the same agents")
     if a.result.get("backend") != b.result.get("backend"):
         raise RunDirectoryError(
             "one run was in virtual time, whose traces leave out messages that change nothing, and one was not: "
@@ -152,18 +154,18 @@ def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
 def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, Parting | None]:
     """How many handler runs are the same, whether to the last byte, and where the traces part."""
     same, exact = 0, True
-    for one, other in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):
-        if one is None or other is None or (one.life, one.text) != (other.life, other.text):
+    for line_a, line_b in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):
+        if line_a is None or line_b is None or (line_a.life, line_a.text) != (line_b.life, line_b.text):
             exact = False
-            step, other_step = one and Step.of(one, a.names), other and Step.of(other, b.names)
-            if step != other_step:
-                return same, exact, Parting(same + 1, step, other_step)
+            step_a, step_b = line_a and Step.of(line_a, a.names), line_b and Step.of(line_b, b.names)
+            if step_a != step_b:
+                return same, exact, Parting(same + 1, step_a, step_b)
         same += 1
     return same, exact, None
 
 
 def _compare_chains(a: list[str], b: list[str]) -> ChainParting | None:
-    for place, (one, other) in enumerate(zip_longest(a, b), 1):
-        if one != other:
-            return ChainParting(place, one, other)
+    for place, (block_a, block_b) in enumerate(zip_longest(a, b), 1):
+        if block_a != block_b:
+            return ChainParting(place, block_a, block_b)
     return None

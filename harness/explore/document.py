@@ -53,8 +53,10 @@ def scripted(document: Document, logged: list[Logged], drops: list[Document]) ->
     document = _without_flight(document)
     network = _without_loss(document.get("network", {}))
     entries = [_silent_change(entry) for entry in document.get("timeline", [])]
-    document = with_key(with_key(document, "network", network), "timeline", [one for one in entries if len(one) > 1])
-    document = with_key(document, "schedule", [_silent_schedule(one) for one in document.get("schedule", [])])
+    document = with_key(
+        with_key(document, "network", network), "timeline", [entry for entry in entries if len(entry) > 1]
+    )
+    document = with_key(document, "schedule", [_silent_schedule(schedule) for schedule in document.get("schedule", [])])
     document["events"] = {"source": "scripted", **({"script": script} if script else {})}
     return with_drops(document, drops)
 
@@ -95,9 +97,11 @@ def _without_flight(document: Document) -> Document:
 def _without_loss(network: Document) -> Document:
     silent = {**network, **_silent(network)}
     if "receivers" in network:
-        silent["receivers"] = {name: {**one, **_silent(one)} for name, one in network["receivers"].items()}
+        silent["receivers"] = {
+            name: {**receiver, **_silent(receiver)} for name, receiver in network["receivers"].items()
+        }
     if "links" in network:
-        silent["links"] = [{**one, **_silent(one)} for one in network["links"]]
+        silent["links"] = [{**link, **_silent(link)} for link in network["links"]]
     return silent
 
 
@@ -123,16 +127,16 @@ def _silent_schedule(schedule: Document) -> Document:
 
 
 def _with_networks(ramp: Document, change: Callable[[Document], Document]) -> Document:
-    return {**ramp, "network": [change(one) for one in ramp["network"]]} if "network" in ramp else ramp
+    return {**ramp, "network": [change(network) for network in ramp["network"]]} if "network" in ramp else ramp
 
 
 def with_agents(document: Document, kept: Collection[int]) -> Document:
     """Without the other agents, and all that is said of them."""
     document = {**document, "agents": sorted(kept)}
-    document = with_key(document, "events.script", [one for one in script(document) if one["agent"] in kept])
-    document = with_key(document, "fates", [one for one in document.get("fates", []) if _named_in(one) <= {*kept}])
-    document = with_key(document, "timeline", [*filter(None, (_entry(one, kept) for one in timeline(document)))])
-    schedules = [_schedule(one, kept) for one in document.get("schedule", [])]
+    document = with_key(document, "events.script", [event for event in script(document) if event["agent"] in kept])
+    document = with_key(document, "fates", [fate for fate in document.get("fates", []) if _named_in(fate) <= {*kept}])
+    document = with_key(document, "timeline", [*filter(None, (_entry(entry, kept) for entry in timeline(document)))])
+    schedules = [_schedule(schedule, kept) for schedule in document.get("schedule", [])]
     document = with_key(document, "schedule", [schedule for schedule in schedules if schedule])
     flights = [_of(flight, ("vehicles",), kept) for flight in document.get("flight", [])]
     document = with_key(document, "flight", [flight for flight in flights if flight["vehicles"]])
@@ -203,18 +207,21 @@ def timeline(document: Document) -> list[Document]:
 
 def instants(document: Document) -> list[float]:
     """When anything is logged or changed, or a change of the network passes, in order."""
-    passes = {one["at_s"] + one["for_s"] for one in timeline(document) if "for_s" in one}
-    return sorted({one["at_s"] for one in (*script(document), *timeline(document))} | passes)
+    passes = {entry["at_s"] + entry["for_s"] for entry in timeline(document) if "for_s" in entry}
+    return sorted({entry["at_s"] for entry in (*script(document), *timeline(document))} | passes)
 
 
 def cut_after(document: Document, last_s: float) -> Document:
     """Over at `last_s`, and without what would come later."""
     document = {**document, "duration_s": max(1.0, last_s)}
     for key in ("events.script", "timeline"):
-        before = [one for one in at(document, key) or [] if one["at_s"] <= last_s]
-        document = with_key(document, key, [_over_by(one, last_s) for one in before])
-    schedule = [one for one in document.get("schedule", []) if one.get("from_s", 0.0) < last_s]
-    clipped = [{**one, "until_s": min(one["until_s"], last_s)} if "until_s" in one else one for one in schedule]
+        before = [entry for entry in at(document, key) or [] if entry["at_s"] <= last_s]
+        document = with_key(document, key, [_over_by(entry, last_s) for entry in before])
+    schedules = [schedule for schedule in document.get("schedule", []) if schedule.get("from_s", 0.0) < last_s]
+    clipped = [
+        {**schedule, "until_s": min(schedule["until_s"], last_s)} if "until_s" in schedule else schedule
+        for schedule in schedules
+    ]
     return with_key(document, "schedule", clipped)
 
 
@@ -227,10 +234,10 @@ def _over_by(entry: Document, last_s: float) -> Document:
 def moved(document: Document, to: Callable[[float], float]) -> Document:
     """Everything that happens happens at another time."""
     for key in ("events.script", "timeline"):
-        document = with_key(document, key, [_moved(one, to) for one in at(document, key) or []])
+        document = with_key(document, key, [_moved(entry, to) for entry in at(document, key) or []])
     return {**document, "duration_s": max(1.0, to(document.get("duration_s", 1200.0)))}
 
 
-def _moved(one: Document, to: Callable[[float], float]) -> Document:
-    lasts = {"for_s": round(to(one["at_s"] + one["for_s"]) - to(one["at_s"]), 6)} if "for_s" in one else {}
-    return {**one, "at_s": to(one["at_s"]), **lasts}
+def _moved(entry: Document, to: Callable[[float], float]) -> Document:
+    lasts = {"for_s": round(to(entry["at_s"] + entry["for_s"]) - to(entry["at_s"]), 6)} if "for_s" in entry else {}
+    return {**entry, "at_s": to(entry["at_s"]), **lasts}

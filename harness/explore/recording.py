@@ -89,9 +89,11 @@ class _Recorder(InMemory):
                     self.sent[agent_id, sent.seq] = Lost(run.t, sent.message, agent_id, 0, count, None)
             if run.branch == "ignored by quirk":
                 sent_by, sequence = run.trigger["from"], run.trigger["seq"]
-                one = self.sent.get((int(sent_by), int(sequence)))
-                if one is not None:  # a rogue node's is no agent's
-                    self.lost.append(Lost(one.at_s, one.message, one.sender, agent_id, one.count, None, by_quirk=True))
+                lost = self.sent.get((int(sent_by), int(sequence)))
+                if lost is not None:  # a rogue node's is no agent's
+                    self.lost.append(
+                        Lost(lost.at_s, lost.message, lost.sender, agent_id, lost.count, None, by_quirk=True)
+                    )
 
 
 class _Listening(FateScript):

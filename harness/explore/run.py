@@ -84,7 +84,11 @@ def explore(
 
     original = document_of(scenario)
     shrinker = Shrinker(
-        original, still, jobs=jobs, max_runs=max_runs, adopted=lambda it: watcher.step(it.runs, size(it.best))
+        original,
+        still,
+        jobs=jobs,
+        max_runs=max_runs,
+        adopted=lambda shrinker: watcher.step(shrinker.runs, size(shrinker.best)),
     )
     how = "and nothing more could be left out"
     first = size(original)
@@ -112,12 +116,12 @@ def _written(
     recorded: Callable[[Document], Recording],
 ) -> Shrunk:
     result = judge(scenario_of(document), seed)
-    found = {number: result.characteristics[number] for number in violated(result)}
+    characteristics = {number: result.characteristics[number] for number in violated(result)}
     replay = f"ucp-harness run {path} --backend sim --seed {seed}"
     header = [
-        *evidence_lines(found),
+        *evidence_lines(characteristics),
         f"Shrunk from {source}, seed {seed}: {words}.",
         f"  {replay}",
     ]
     written = write(path, to_yaml(document, header, recorded(document)))
-    return Shrunk(written, seed, found, words, replay.replace(str(path), str(written)))
+    return Shrunk(written, seed, characteristics, words, replay.replace(str(path), str(written)))

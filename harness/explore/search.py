@@ -19,7 +19,9 @@ def simulated(scenario: Scenario, seed: int) -> Result:
 
 def violated(result: Result) -> tuple[str, ...]:
     """The numbers of the characteristics that are violated."""
-    return tuple(number for number, one in result.characteristics.items() if one.verdict == "violated")
+    return tuple(
+        number for number, characteristic in result.characteristics.items() if characteristic.verdict == "violated"
+    )
 
 
 @dataclass(frozen=True, slots=True)

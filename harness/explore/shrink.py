@@ -90,9 +90,9 @@ class Shrinker:
         parts = 2
         while len(kept) > 1:
             left = list(_leaving_out(kept, parts))
-            found = self.first(map(with_items, left))
-            if found is not None:
-                kept, parts = left[found], max(parts - 1, 2)
+            index = self.first(map(with_items, left))
+            if index is not None:
+                kept, parts = left[index], max(parts - 1, 2)
             elif parts >= len(kept):
                 return
             else:

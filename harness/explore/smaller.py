@@ -59,28 +59,28 @@ def shrink(shrinker: Shrinker, record: Record) -> None:
 
 def replays(document: Document, recording: Recording) -> Iterator[Document]:
     """What could play the recorded run again without chance; the last is `document` itself, chance and all."""
-    lost = [one for one in recording.lost if not one.by_quirk]
-    everything = scripted(document, recording.logged, [fate_by_count(one) for one in recording.lost])
+    lost = [loss for loss in recording.lost if not loss.by_quirk]
+    everything = scripted(document, recording.logged, [fate_by_count(loss) for loss in recording.lost])
     ignored = at(document, "quirks.ignore_commit")
     if ignored:
         yield with_key(everything, "quirks.ignore_commit", None)
-    faithful = scripted(document, recording.logged, [fate_by_count(one) for one in lost])
+    faithful = scripted(document, recording.logged, [fate_by_count(loss) for loss in lost])
     yield faithful
     yield with_key(faithful, "network.delay", DELAY_S)
-    yield {**document, "events": {"source": "scripted", "script": [event_of(one) for one in recording.logged]}}
+    yield {**document, "events": {"source": "scripted", "script": [event_of(event) for event in recording.logged]}}
     yield document
 
 
 def _by_time(shrinker: Shrinker, record: Record) -> None:
     document, lost = shrinker.best, record(shrinker.best).lost
     if document.get("fates"):
-        shrinker.first(with_drops(document, [fate_by_time(one, slack) for one in lost]) for slack in SLACKS_S)
+        shrinker.first(with_drops(document, [fate_by_time(loss, slack) for loss in lost]) for slack in SLACKS_S)
 
 
 def _by_count(shrinker: Shrinker, record: Record) -> None:
     document, lost = shrinker.best, record(shrinker.best).lost
     if document.get("fates"):
-        shrinker.first([with_drops(document, [fate_by_count(one) for one in lost])])
+        shrinker.first([with_drops(document, [fate_by_count(loss) for loss in lost])])
 
 
 def _less_time(shrinker: Shrinker) -> None:
@@ -153,7 +153,7 @@ def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
     if at(document, "settings.max_block_bytes") == largest or not script(document):
         return
     size = min(256, largest - EVENT_HEADER_BYTES)
-    events = [Logged(one.at_s, one.agent, size, True) for one in record(document).logged if one.completes]
+    events = [Logged(event.at_s, event.agent, size, True) for event in record(document).logged if event.completes]
     smaller = with_key(document, "events.script", [event_of(event) for event in events])
     shrinker.first([with_key(smaller, "settings.max_block_bytes", largest)])
 

@@ -58,7 +58,7 @@ def write(path: Path, text: str) -> Path:
 
 def to_yaml(document: Document, header: list[str], recording: Recording) -> str:
     """`recording` of this very document says when each message was sent that a fate is about."""
-    sent = {(one.message, one.sender, one.receiver, one.count): one for one in recording.lost}
+    sent = {(lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost}
     lines = [f"# {line}".rstrip() for line in header]
     if at(document, "settings.max_block_bytes") is not None:
         lines.append("# Blocks are full as soon as another event of the largest size might not fit: here, after one.")
@@ -71,11 +71,13 @@ def to_yaml(document: Document, header: list[str], recording: Recording) -> str:
 def evidence_lines(violated: dict[str, Characteristic]) -> list[str]:
     """What is violated, and how one sees it."""
     lines = []
-    for number, one in violated.items():
-        lines.append(f"Characteristic {number}, {one.name}, is violated, {one.reason}")
-        lines += [f"  agent {finding.agent_id}: {finding.detail}" for finding in one.evidence[:EVIDENCE_SHOWN]]
-        if len(one.evidence) > EVIDENCE_SHOWN:
-            lines.append(f"  and {len(one.evidence) - EVIDENCE_SHOWN} more")
+    for number, characteristic in violated.items():
+        lines.append(f"Characteristic {number}, {characteristic.name}, is violated, {characteristic.reason}")
+        lines += [
+            f"  agent {finding.agent_id}: {finding.detail}" for finding in characteristic.evidence[:EVIDENCE_SHOWN]
+        ]
+        if len(characteristic.evidence) > EVIDENCE_SHOWN:
+            lines.append(f"  and {len(characteristic.evidence) - EVIDENCE_SHOWN} more")
     return lines
 
 
@@ -88,10 +90,12 @@ def _lines(key: str, value: Any, sent: dict[Any, Lost]) -> Iterator[str]:
         yield from (f"    - {_flow(event)}" for event in value["script"])
     elif isinstance(value, list) and value and isinstance(value[0], dict):
         yield f"{key}:"
-        for one in value:
-            lost = sent.get((one.get("message"), one.get("sender"), one.get("receiver"), _hashable(one.get("count"))))
+        for entry in value:
+            lost = sent.get(
+                (entry.get("message"), entry.get("sender"), entry.get("receiver"), _hashable(entry.get("count")))
+            )
             about = f", block {lost.block}" if lost and lost.block else ""
-            yield f"  - {_flow(one)}" + (f"  # sent at {lost.at_s:.3f} s{about}" if lost else "")
+            yield f"  - {_flow(entry)}" + (f"  # sent at {lost.at_s:.3f} s{about}" if lost else "")
     else:
         yield f"{key}: {_flow(value)}"
 
@@ -108,7 +112,7 @@ def _flow(value: Any) -> str:
 def _plain(value: Any) -> Any:
     """Whole numbers without a point; agents that are keys as numbers."""
     if isinstance(value, dict):
-        return {int(key) if key.isdecimal() else key: _plain(one) for key, one in value.items()}
+        return {int(key) if key.isdecimal() else key: _plain(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value

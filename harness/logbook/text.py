@@ -44,12 +44,12 @@ def document(logbook: Logbook, decode: bool) -> dict[str, Any]:
 
 def words(event: LoggableEvent, telemetry: bool) -> str:
     """What an event of this source says."""
-    said = describe(event.event_id, event.data) if telemetry else ""
-    if said and said != "unreadable":
-        return said
+    description = describe(event.event_id, event.data) if telemetry else ""
+    if description and description != "unreadable":
+        return description
     shown = event.data[:_BYTES_SHOWN].hex() + ("…" if len(event.data) > _BYTES_SHOWN else "")
     raw = f"event {event.event_id}, {_count(len(event.data), 'byte')}" + (f": {shown}" if shown else "")
-    return f"{said}: {raw}" if said else raw
+    return f"{description}: {raw}" if description else raw
 
 
 def _block(block: ExportedBlock) -> str:

@@ -32,7 +32,10 @@ def examine() -> list[Finding]:
     python = Finding(
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
     )
-    lab = [Finding(one.name, one.ok, one.needed, one.detail, one.way_out) for one in lab_doctor.examine()]
+    lab = [
+        Finding(finding.name, finding.ok, finding.needed, finding.detail, finding.way_out)
+        for finding in lab_doctor.examine()
+    ]
     return [python, *lab, _user_mode_linux(), _docker(), _ardupilot()]
 
 
@@ -63,10 +66,10 @@ def _docker() -> Finding:
 
 def _ardupilot() -> Finding:
     try:
-        found = ArduPilot.find(None, os.environ)
+        ardupilot = ArduPilot.find(None, os.environ)
     except VehicleError as error:
         return Finding("ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle")
-    if found.defaults is None:
+    if ardupilot.defaults is None:
         way_out = "put ArduPilot's default parameters, copter.parm, beside it: without them it may refuse to arm"
-        return Finding("ArduPilot SITL", False, False, f"{found.binary}, without copter.parm", way_out)
-    return Finding("ArduPilot SITL", True, False, str(found.binary))
+        return Finding("ArduPilot SITL", False, False, f"{ardupilot.binary}, without copter.parm", way_out)
+    return Finding("ArduPilot SITL", True, False, str(ardupilot.binary))

@@ -31,8 +31,8 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
         raise ScenarioError(f"{path} is not JSON: an earlier night is its matrix.json") from None
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema != SCHEMA:
-        said = f"has schema {BOUNDED.repr(schema)}" if schema is not None else "names no schema"
-        raise ScenarioError(f"{path} {said}: an earlier night is its matrix.json, whose schema is {SCHEMA}")
+        claim = f"has schema {BOUNDED.repr(schema)}" if schema is not None else "names no schema"
+        raise ScenarioError(f"{path} {claim}: an earlier night is its matrix.json, whose schema is {SCHEMA}")
     try:
         record = MatrixRecord.model_validate(document)
     except ValidationError as error:
@@ -40,7 +40,7 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
         raise ScenarioError(
             f"{path} says of itself that it is a {SCHEMA}, but its `{place}` is not: make one with this version"
         ) from None
-    before, now = (one.model_dump(mode="json", exclude=_SAYS_NOTHING_OF_RUNS) for one in (record.matrix, matrix))
+    before, now = (side.model_dump(mode="json", exclude=_SAYS_NOTHING_OF_RUNS) for side in (record.matrix, matrix))
     differing = [f"`{key}`" for key in now if before[key] != now[key]]
     if differing:
         verb = "differs" if len(differing) == 1 else "differ"

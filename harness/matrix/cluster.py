@@ -51,13 +51,13 @@ def _connected(address: str) -> Iterator[Any]:
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong we say ourselves
     try:
-        found = asyncio.run(asyncio.wait_for(_versions(address), CONNECT_S))
+        versions = asyncio.run(asyncio.wait_for(_versions(address), CONNECT_S))
     except Exception as error:  # whatever another version, or no Dask at all, makes of our greeting
         raise MachineError(
             f"no Dask scheduler answers at {address} ({type(error).__name__}): start `dask scheduler` there, of "
             f"version {distributed.__version__}"
         ) from None
-    _refuse_other_versions(found, address)
+    _refuse_other_versions(versions, address)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", distributed.versions.VersionMismatchWarning)
         try:
@@ -82,11 +82,11 @@ async def _versions(address: str) -> dict[str, dict[str, str | None]]:
     return {node: {name: answer["packages"].get(name) for name in SAME_VERSIONS} for node, answer in answers.items()}
 
 
-def _refuse_other_versions(found: dict[str, dict[str, str | None]], address: str) -> None:
-    here, _, *workers = found.values()
+def _refuse_other_versions(versions: dict[str, dict[str, str | None]], address: str) -> None:
+    here, _, *workers = versions.values()
     if not workers:
         raise MachineError(f"the scheduler at {address} has no workers: start some with `dask worker {address}`")
-    for node, packages in found.items():
+    for node, packages in versions.items():
         for package, version in packages.items():
             if version != here[package]:
                 has = f"{package} {version}" if version else f"no {package}"

@@ -101,9 +101,9 @@ class Matrix(Model):
         if agents:
             first = agents[0] if isinstance(agents, list) else agents
             if scenario.get("agents", first) != first:
-                said = BOUNDED.repr(scenario["agents"])
+                its_agents = BOUNDED.repr(scenario["agents"])
                 raise ValueError(
-                    f"`scenario` sets agents to {said}, which the matrix's `agents` is for: remove it there"
+                    f"`scenario` sets agents to {its_agents}, which the matrix's `agents` is for: remove it there"
                 )
             scenario = {**scenario, "agents": first}
         return {**document, "scenario": scenario}
@@ -168,7 +168,7 @@ def load_matrix(path: Path, backend: BackendName | None = None) -> Matrix:
 
 
 def _each_once(values: list[Any]) -> list[Any]:
-    for index, one in enumerate(values):
-        if one in values[:index]:
-            raise ValueError(f"names {one} twice")
+    for index, value in enumerate(values):
+        if value in values[:index]:
+            raise ValueError(f"names {value} twice")
     return values

@@ -148,11 +148,11 @@ def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axi
 
 def curve(number: int, dots: Sequence[Dot], across: Axis, up: Axis) -> tuple[Markup, list[tuple[float, float]]]:
     """A panel's so-many-th line with its band of intervals, and the places of its dots; unknown means are left out."""
-    known = [one for one in dots if one.estimate.mean is not None]
-    bounded = [(one.x, one.estimate.low, one.estimate.high) for one in known]
+    known = [dot for dot in dots if dot.estimate.mean is not None]
+    bounded = [(dot.x, dot.estimate.low, dot.estimate.high) for dot in known]
     upper = [f"{n(across(x))} {n(up(high))}" for x, _, high in bounded if high is not None]
     lower = [f"{n(across(x))} {n(up(low))}" for x, low, _ in bounded if low is not None]
-    points = [(across(one.x), up(one.estimate.mean or 0.0)) for one in known]
+    points = [(across(dot.x), up(dot.estimate.mean or 0.0)) for dot in known]
     parts = []
     if upper:
         parts.append(
@@ -162,7 +162,7 @@ def curve(number: int, dots: Sequence[Dot], across: Axis, up: Axis) -> tuple[Mar
         )
     if points:
         parts.append(svg.line(points, number))
-    parts += [svg.dot(x, y, number, one.tip) for (x, y), one in zip(points, known, strict=True)]
+    parts += [svg.dot(x, y, number, dot.tip) for (x, y), dot in zip(points, known, strict=True)]
     return Markup("").join(parts), points
 
 
@@ -178,8 +178,8 @@ def _value_axis(panel: Panel, cells: Sequence[Cell], area: Area) -> Axis:
     if panel.shares:
         return svg.share_axis(area.up)
     estimates = [cell.estimates[name] for name, _ in panel.lines for cell in cells]
-    means = [one.mean for one in estimates if one.mean is not None]
-    highest = max([1.0, *means, *(0.98 * one.high for one in estimates if one.high is not None)])
+    means = [estimate.mean for estimate in estimates if estimate.mean is not None]
+    highest = max([1.0, *means, *(0.98 * estimate.high for estimate in estimates if estimate.high is not None)])
     step = svg.step(highest, 5)
     return svg.linear_axis(0.0, math.ceil(highest / step - 1e-9) * step, area.up)
 

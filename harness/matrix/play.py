@@ -43,7 +43,7 @@ class Player:
         scenario = self.matrix.scenario_at(task.point)
         in_memory = BACKENDS[task.point.backend].plays_in_memory
         result = self.judge(scenario, task.seed) if in_memory else self._for_real(scenario, task)
-        verdicts = {number: one.verdict for number, one in result.characteristics.items()}
+        verdicts = {number: characteristic.verdict for number, characteristic in result.characteristics.items()}
         return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts)
 
     def refuse(self, points: Iterable[Point]) -> None:

@@ -22,8 +22,8 @@ from harness.present.markdown import escaped, row
 def to_markdown(record: MatrixRecord) -> str:
     lines = [f"## {escaped(record.matrix.name)}", "", f"**{verdict(record)}**", "", *_table(record), ""]
     lines += [explanation(record) + unjudged(record), ""]
-    if found := [*troubles_of_all(record), *improvements(record)]:
-        lines += [*(f"- {escaped(sentence)}" for sentence in found), ""]
+    if findings := [*troubles_of_all(record), *improvements(record)]:
+        lines += [*(f"- {escaped(sentence)}" for sentence in findings), ""]
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     lines += [f"<sub>Begun {words.started(record.started_at)}; {versions}</sub>"]
     return "\n".join(lines) + "\n"
@@ -32,18 +32,18 @@ def to_markdown(record: MatrixRecord) -> str:
 def verdict(record: MatrixRecord) -> str:
     """What a reader in a hurry wants to know."""
     runs = sum(cell.runs for cell in record.cells)
-    said = [f"{words.value(runs)} runs"]
+    parts = [f"{words.value(runs)} runs"]
     if record.outcome == "interrupted":
-        said[0] += f" of {words.value(record.runs_asked)}, interrupted"
+        parts[0] += f" of {words.value(record.runs_asked)}, interrupted"
     bad = sum(map(violated, record.cells))
-    said.append(f"{bad} violated a characteristic" if bad else "none violated a characteristic")
+    parts.append(f"{bad} violated a characteristic" if bad else "none violated a characteristic")
     if record.failed:
-        said.append(f"{len(record.failed)} failed")
+        parts.append(f"{len(record.failed)} failed")
     if record.against:
         worse = len(record.against.regressions)
         which = f"{worse or 'no'} figure{'s' if worse > 1 else ''} worse"
-        said.append(f"{which} than on {words.started(record.against.started_at)}")
-    return "; ".join(said)
+        parts.append(f"{which} than on {words.started(record.against.started_at)}")
+    return "; ".join(parts)
 
 
 def _table(record: MatrixRecord) -> Iterator[str]:

@@ -39,7 +39,7 @@ def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
         means = (Text(say_mean(metric, estimate)) for metric, estimate in estimates)
         table.add_row(words.percent(cell.loss), str(cell.runs), *means, _violated(cell))
         if len(record.matrix.seed_list) > 1:
-            table.add_row("", "", *(Text(say_interval(*one), style="dim") for one in estimates))
+            table.add_row("", "", *(Text(say_interval(*pair), style="dim") for pair in estimates))
     return table
 
 

@@ -45,7 +45,7 @@ def put_between_markers(page: str, text: str) -> str:
 
 def _row(cell: Cell) -> list[str]:
     estimates = [(metric, cell.estimates[metric.name]) for metric in METRICS]
-    figures = (f"{say_mean(*one)}<br><sub>{say_interval(*one)}</sub>" for one in estimates)
+    figures = (f"{say_mean(*pair)}<br><sub>{say_interval(*pair)}</sub>" for pair in estimates)
     return [words.percent(cell.loss), OBSERVED.get(cell.loss, ""), *figures]
 
 

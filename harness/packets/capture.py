@@ -96,8 +96,8 @@ class Capture:
             first_ns, last_ns = min(first_ns, frame.time_ns), max(last_ns, frame.time_ns)
             try:
                 datagram, direction = _datagram(frame, datagrams)
-            except NotUcpError as other:
-                self.not_ucp[other.reason] += 1
+            except NotUcpError as not_ucp:
+                self.not_ucp[not_ucp.reason] += 1
             except MalformedDatagramError as malformed:
                 self.malformed[malformed.reason] += 1
             else:

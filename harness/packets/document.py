@@ -117,8 +117,8 @@ def document(
     del whole["datagrams"]
     yield json.dumps(whole)[:-1] + ', "datagrams": ['
     separator = ""
-    for one in shown:
-        yield separator + _datagram(one, exchanges, names).model_dump_json()
+    for transmission in shown:
+        yield separator + _datagram(transmission, exchanges, names).model_dump_json()
         separator = ","
     yield "]}"
 
@@ -137,8 +137,8 @@ def _capture(capture: Capture, clock: Clock) -> CaptureRecord:
     )
 
 
-def _datagram(one: Transmission, exchanges: Exchanges, names: Names) -> DatagramRecord:
-    said = one.said
+def _datagram(transmission: Transmission, exchanges: Exchanges, names: Names) -> DatagramRecord:
+    summary = transmission.said
     answers = [
         AnswerRecord(
             by=answer.by,
@@ -146,22 +146,22 @@ def _datagram(one: Transmission, exchanges: Exchanges, names: Names) -> Datagram
             answer=answer.response.said.answer if answer.response else None,
             response=answer.response.number if answer.response else None,
         )
-        for answer in exchanges.answers(one)
+        for answer in exchanges.answers(transmission)
     ]
     return DatagramRecord(
-        number=one.number,
-        at_s=one.at_s,
-        sender=one.sender,
-        sequence=one.sequence,
-        message=said.message,
-        block=None if said.block_hash is None else names.known(said.block_hash),
-        block_hash=None if said.block_hash is None else said.block_hash.hex(),
-        chain_hash=None if said.chain_hash is None else said.chain_hash.hex(),
-        answer=said.answer,
-        origin=one.origin,
-        seen_leaving=one.seen_leaving,
-        received=[ReceptionRecord(**reception._asdict()) for reception in one.received],
-        lost_by=list(one.lost_by),
-        not_listening=list(one.absent),
-        answers=answers if said.asks else None,
+        number=transmission.number,
+        at_s=transmission.at_s,
+        sender=transmission.sender,
+        sequence=transmission.sequence,
+        message=summary.message,
+        block=None if summary.block_hash is None else names.known(summary.block_hash),
+        block_hash=None if summary.block_hash is None else summary.block_hash.hex(),
+        chain_hash=None if summary.chain_hash is None else summary.chain_hash.hex(),
+        answer=summary.answer,
+        origin=transmission.origin,
+        seen_leaving=transmission.seen_leaving,
+        received=[ReceptionRecord(**reception._asdict()) for reception in transmission.received],
+        lost_by=list(transmission.lost_by),
+        not_listening=list(transmission.absent),
+        answers=answers if summary.asks else None,
     )

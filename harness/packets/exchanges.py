@@ -60,15 +60,15 @@ def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission
     asked: dict[Subject, list[_Asked]] = {}
     reached: dict[tuple[Name, Subject], list[_Asked]] = {}
     sent: dict[tuple[Name, Subject], list[Transmission]] = {}
-    for one in transmissions:
-        if subject := one.said.asks:
-            asked.setdefault(subject, []).append((one.at_s, one.number))
-            for reception in one.received:
-                arrivals = [(reception.at_s, one.number)] * reception.copies
-                arrivals[-1] = reception.last_s, one.number
+    for transmission in transmissions:
+        if subject := transmission.said.asks:
+            asked.setdefault(subject, []).append((transmission.at_s, transmission.number))
+            for reception in transmission.received:
+                arrivals = [(reception.at_s, transmission.number)] * reception.copies
+                arrivals[-1] = reception.last_s, transmission.number
                 reached.setdefault((reception.by, subject), []).extend(arrivals)
-        elif (subject := one.said.answers) and one.origin != "forged":
-            sent.setdefault((one.sender, subject), []).append(one)
+        elif (subject := transmission.said.answers) and transmission.origin != "forged":
+            sent.setdefault((transmission.sender, subject), []).append(transmission)
     for (name, subject), responses in sent.items():
         # Where it is not known what reached the responder, all that others asked may have.
         others = (what for what in asked.get(subject, ()) if transmissions[what[1]].sender != name)

@@ -49,10 +49,10 @@ def capture_files(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         if path.is_dir():
             inner = path / DIRECTORY
-            found = [file for file in (inner if inner.is_dir() else path).iterdir() if file.suffix in SUFFIXES]
-            if not found:
+            captures = [file for file in (inner if inner.is_dir() else path).iterdir() if file.suffix in SUFFIXES]
+            if not captures:
                 raise RunDirectoryError(f"{path}: holds no captures (*.pcapng): `ucp-harness run --capture` makes them")
-            files += sorted(found, key=lambda file: (len(file.name), file.name))
+            files += sorted(captures, key=lambda file: (len(file.name), file.name))
         elif path.exists():
             files.append(path)
         else:

@@ -20,13 +20,13 @@ def count_losses(transmissions: Iterable[Transmission]) -> list[Pair]:
     """All pairs, by sender and receiver. What somebody forged is no agent's loss."""
     sent: dict[tuple[int, Name], int] = {}
     lost: dict[tuple[int, Name], int] = {}
-    for one in transmissions:
-        if one.origin == "forged":
+    for transmission in transmissions:
+        if transmission.origin == "forged":
             continue
-        for receiver in (*one.reached, *one.lost_by):
-            sent[one.sender, receiver] = sent.get((one.sender, receiver), 0) + 1
-        for receiver in one.lost_by:
-            lost[one.sender, receiver] = lost.get((one.sender, receiver), 0) + 1
+        for receiver in (*transmission.reached, *transmission.lost_by):
+            sent[transmission.sender, receiver] = sent.get((transmission.sender, receiver), 0) + 1
+        for receiver in transmission.lost_by:
+            lost[transmission.sender, receiver] = lost.get((transmission.sender, receiver), 0) + 1
     pairs = (
         Pair(sender, receiver, count, lost.get((sender, receiver), 0)) for (sender, receiver), count in sent.items()
     )

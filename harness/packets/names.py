@@ -30,8 +30,8 @@ class Names:
         for run in runs:
             self._learn_from_exports(run)
         known = bool(self._blocks)
-        for one in transmissions:
-            self._learn(one, known)
+        for transmission in transmissions:
+            self._learn(transmission, known)
 
     def block(self, block_hash: bytes) -> str:
         return self._blocks.get(block_hash) or block_hash.hex()[:DIGITS]
@@ -47,17 +47,17 @@ class Names:
         top = self._top_of[chain_hash]
         return f"{digits} ({'inception' if top is None else self.block(top)})"
 
-    def find(self, said: str) -> bytes:
+    def find(self, wanted: str) -> bytes:
         """The block of that name, or whose hash begins so. Raises CaptureError if there is none, or several."""
-        named = [block_hash for block_hash, name in self._blocks.items() if name == said]
-        found = named or [block_hash for block_hash in self._spoken_of if block_hash.hex().startswith(said.lower())]
-        found = [block_hash for block_hash in found if block_hash in self._spoken_of]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise CaptureError(f"--follow {said} fits {len(found)} blocks: give more digits of the hash")
+        named = [block_hash for block_hash, name in self._blocks.items() if name == wanted]
+        hashes = named or [block_hash for block_hash in self._spoken_of if block_hash.hex().startswith(wanted.lower())]
+        hashes = [block_hash for block_hash in hashes if block_hash in self._spoken_of]
+        if len(hashes) == 1:
+            return hashes[0]
+        if hashes:
+            raise CaptureError(f"--follow {wanted} fits {len(hashes)} blocks: give more digits of the hash")
         raise CaptureError(
-            f"--follow {said}: no message is about that block; give a name or a hash that is printed here"
+            f"--follow {wanted}: no message is about that block; give a name or a hash that is printed here"
         )
 
     def _learn_from_exports(self, run: Path) -> None:
@@ -72,28 +72,33 @@ class Names:
                 if block.chain_hash:
                     self._top_of[bytes.fromhex(block.chain_hash)] = bytes.fromhex(block.block_hash)
 
-    def _learn(self, one: Transmission, known: bool) -> None:
-        said = one.said
-        if said.block_hash is not None:
-            self._spoken_of.add(said.block_hash)
-        if one.origin == "forged":
+    def _learn(self, transmission: Transmission, known: bool) -> None:
+        summary = transmission.said
+        if summary.block_hash is not None:
+            self._spoken_of.add(summary.block_hash)
+        if transmission.origin == "forged":
             return
-        if said.message == CommitBlock.NAME and said.chain_hash is not None:
-            self._top_of[said.chain_hash] = said.block_hash
-        if one.origin == "captured" and not one.sequence:
-            self._from_start.add(one.sender)
-        proposes = said.message == BlockAddRequest.NAME and said.block_hash is not None
-        if proposes and not known and one.sender in self._from_start and said.block_hash not in self._blocks:
-            assert said.block_hash is not None
-            ordinal = self._proposed[one.sender] = self._proposed.get(one.sender, 0) + 1
-            self._blocks[said.block_hash] = f"{one.sender}.{ordinal}"
+        if summary.message == CommitBlock.NAME and summary.chain_hash is not None:
+            self._top_of[summary.chain_hash] = summary.block_hash
+        if transmission.origin == "captured" and not transmission.sequence:
+            self._from_start.add(transmission.sender)
+        proposes = summary.message == BlockAddRequest.NAME and summary.block_hash is not None
+        if (
+            proposes
+            and not known
+            and transmission.sender in self._from_start
+            and summary.block_hash not in self._blocks
+        ):
+            assert summary.block_hash is not None
+            ordinal = self._proposed[transmission.sender] = self._proposed.get(transmission.sender, 0) + 1
+            self._blocks[summary.block_hash] = f"{transmission.sender}.{ordinal}"
 
 
 def runs_of(paths: Iterable[Path]) -> list[Path]:
     """The run directories among `paths`, or that captures among them lie in."""
-    found = [
+    runs = [
         path if path.is_dir() else path.resolve().parent.parent
         for path in paths
         if path.is_dir() or path.resolve().parent.name == DIRECTORY
     ]
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(runs))

@@ -32,16 +32,16 @@ class Selection:
         if self.receiver is not None and self.receiver not in vehicles:
             known = f"captures are of {', '.join(map(str, vehicles))}" if vehicles else "nor of any other vehicle"
             raise CaptureError(f"--to {self.receiver}: there is no capture of that vehicle; {known}")
-        for one in transmissions:
-            if self._fits(one):
+        for transmission in transmissions:
+            if self._fits(transmission):
                 if self.receiver is None:
-                    yield one
-                elif self.receiver in (towards := one.towards(self.receiver)).reached or towards.lost_by:
+                    yield transmission
+                elif self.receiver in (towards := transmission.towards(self.receiver)).reached or towards.lost_by:
                     yield towards
 
-    def _fits(self, one: Transmission) -> bool:
+    def _fits(self, transmission: Transmission) -> bool:
         return (
-            (self.sender is None or one.sender == self.sender)
-            and (self.message is None or one.said.message.lower() == self.message.lower())
-            and (self.between_s is None or self.between_s[0] <= one.at_s <= self.between_s[1])
+            (self.sender is None or transmission.sender == self.sender)
+            and (self.message is None or transmission.said.message.lower() == self.message.lower())
+            and (self.between_s is None or self.between_s[0] <= transmission.at_s <= self.between_s[1])
         )

@@ -17,26 +17,28 @@ class Chapter(NamedTuple):
 
 def story(block_hash: bytes, transmissions: Iterable[Transmission], exchanges: Exchanges) -> Iterator[Chapter]:
     """All that is about the block, in the order of sending; answers are with what they answer."""
-    told: set[int] = set()
-    for one in transmissions:
-        answers = [answer for answer in exchanges.responses(one) if answer.said.block_hash == block_hash]
-        if (one.said.block_hash == block_hash and one.number not in told) or answers:
-            told.update(answer.number for answer in answers)
-            yield Chapter(one, answers)
+    answer_numbers: set[int] = set()
+    for transmission in transmissions:
+        answers = [answer for answer in exchanges.responses(transmission) if answer.said.block_hash == block_hash]
+        if (transmission.said.block_hash == block_hash and transmission.number not in answer_numbers) or answers:
+            answer_numbers.update(answer.number for answer in answers)
+            yield Chapter(transmission, answers)
 
 
 def in_order(chapters: Iterable[Chapter]) -> list[Transmission]:
     """All of a story's transmissions, each once, in the order of sending."""
-    told = {one.number: one for chapter in chapters for one in (chapter.begins, *chapter.answers)}
-    return [told[number] for number in sorted(told)]
+    by_number = {
+        transmission.number: transmission for chapter in chapters for transmission in (chapter.begins, *chapter.answers)
+    }
+    return [by_number[number] for number in sorted(by_number)]
 
 
 def carried_to(chapters: Iterable[Chapter]) -> dict[int, float]:
     """Vehicle -> the mission second at which the block itself first reached it."""
     first: dict[int, float] = {}
-    for one in in_order(chapters):
-        if one.said.message in CARRY_A_BLOCK:
-            for reception in one.received:
+    for transmission in in_order(chapters):
+        if transmission.said.message in CARRY_A_BLOCK:
+            for reception in transmission.received:
                 if isinstance(reception.by, int):
                     first[reception.by] = min(reception.at_s, first.get(reception.by, reception.at_s))
     return first

@@ -36,61 +36,61 @@ class Wording:
         self._names = names
         self._paint = paint
 
-    def transmission(self, one: Transmission) -> str:
+    def transmission(self, transmission: Transmission) -> str:
         """When, who, what, and who received it."""
-        what = f"{one.said.message:<26}  {self.said(one.said):<46}"
-        parts = [f"{one.at_s:>12.3f}  {one.sender:>5}  {what}  -> {_receivers(one)}"]
-        if one.lost_by:
-            parts.append(self._paint(f"lost by {_list(one.lost_by)}"))
-        if one.absent:
-            parts.append(f"not listening: {_list(one.absent)}")
+        what = f"{transmission.said.message:<26}  {self.said(transmission.said):<46}"
+        parts = [f"{transmission.at_s:>12.3f}  {transmission.sender:>5}  {what}  -> {_receivers(transmission)}"]
+        if transmission.lost_by:
+            parts.append(self._paint(f"lost by {_list(transmission.lost_by)}"))
+        if transmission.absent:
+            parts.append(f"not listening: {_list(transmission.absent)}")
         parts += [
             f"again at {reception.by}: {reception.copies} copies until {reception.last_s:.3f} s"
-            for reception in one.received
+            for reception in transmission.received
             if reception.copies > 1
         ]
-        if one.origin == "forged":
-            by = "" if one.seen_leaving is None else f", but by {one.seen_leaving}"
-            parts.append(self._paint(f"forged: not sent by {one.sender}{by}"))
-        elif one.origin == "inferred":
-            parts.append(f"seen by others: {one.sender} was not captured")
+        if transmission.origin == "forged":
+            by = "" if transmission.seen_leaving is None else f", but by {transmission.seen_leaving}"
+            parts.append(self._paint(f"forged: not sent by {transmission.sender}{by}"))
+        elif transmission.origin == "inferred":
+            parts.append(f"seen by others: {transmission.sender} was not captured")
         return "  ".join(parts)
 
-    def said(self, said: Said) -> str:
-        block = "" if said.block_hash is None else f"block {self._names.block(said.block_hash)}"
-        chain = "" if said.chain_hash is None else f"chain {self._names.chain(said.chain_hash)}"
-        match said.message:
+    def said(self, summary: Said) -> str:
+        block = "" if summary.block_hash is None else f"block {self._names.block(summary.block_hash)}"
+        chain = "" if summary.chain_hash is None else f"chain {self._names.chain(summary.chain_hash)}"
+        match summary.message:
             case BlockAddRequest.NAME:
                 return f"{block} on {chain}"
             case BlockAddResponse.NAME:
-                return f"{said.answer} {block}" + (f" on {chain}" if chain else "")
+                return f"{summary.answer} {block}" + (f" on {chain}" if chain else "")
             case CommitBlock.NAME:
                 return f"{block} makes {chain}"
             case ChainContainQuery.NAME:
                 return f"{chain}?"
             case ChainContainResponse.NAME:
-                return f"{said.answer} {chain}"
+                return f"{summary.answer} {chain}"
             case ChainHashSuccessorQuery.NAME:
                 return f"after {chain}?"
             case NextInSequenceResponse.NAME:
-                return f"{block or said.answer} after {chain}"
+                return f"{block or summary.answer} after {chain}"
             case _:
                 return block
 
     def answers(self, answers: Iterable[Answer]) -> str:
         """What came of a request; vehicles of which the same is to say are together."""
         together: dict[str, list[Name]] = {}
-        for one in sorted(answers, key=lambda answer: _OUTCOMES.index(answer.outcome)):
-            together.setdefault(self._outcome(one), []).append(one.by)
+        for answer in sorted(answers, key=lambda answer: _OUTCOMES.index(answer.outcome)):
+            together.setdefault(self._outcome(answer), []).append(answer.by)
         return "answers: " + "; ".join(f"{what}: {_list(who)}" for what, who in together.items())
 
     def _outcome(self, answer: Answer) -> str:
         if answer.response is None:
             return self._paint(answer.outcome) if answer.outcome == "request lost" else answer.outcome
-        said = answer.response.said
-        word = str(said.answer)
-        if said.answer == "block" and said.block_hash is not None:
-            word = f"block {self._names.block(said.block_hash)}"
+        summary = answer.response.said
+        word = str(summary.answer)
+        if summary.answer == "block" and summary.block_hash is not None:
+            word = f"block {self._names.block(summary.block_hash)}"
         return word if answer.outcome == "answered" else self._paint(f"{word}, but the response was lost")
 
 
@@ -109,10 +109,10 @@ def lines(
     transmissions: Iterable[Transmission], exchanges: Exchanges, wording: Wording, answers_of: int | None
 ) -> Iterator[str]:
     """Each transmission; below a request, what came of it at each vehicle, or at `answers_of` alone."""
-    for one in transmissions:
-        yield wording.transmission(one)
-        if one.said.asks:
-            wanted = [answer for answer in exchanges.answers(one) if answers_of in (None, answer.by)]
+    for transmission in transmissions:
+        yield wording.transmission(transmission)
+        if transmission.said.asks:
+            wanted = [answer for answer in exchanges.answers(transmission) if answers_of in (None, answer.by)]
             if wanted:
                 yield f"{_INDENT}   {wording.answers(wanted)}"
 
@@ -124,7 +124,7 @@ def life(chapters: Sequence[Chapter], exchanges: Exchanges, wording: Wording) ->
         for answer in chapter.answers:
             yield f"    {wording.transmission(answer)}"
         if chapter.begins.said.asks:
-            missing = [one for one in exchanges.answers(chapter.begins) if one.outcome != "answered"]
+            missing = [answer for answer in exchanges.answers(chapter.begins) if answer.outcome != "answered"]
             if missing:
                 yield f"{_INDENT}   {wording.answers(missing)}"
     reached = sorted(carried_to(chapters).items(), key=lambda item: (item[1], item[0]))
@@ -134,15 +134,15 @@ def life(chapters: Sequence[Chapter], exchanges: Exchanges, wording: Wording) ->
 
 def tail(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[str]:
     """Totals, and what else was in the captures."""
-    lost = sum(len(one.lost_by) for one in transmissions)
-    received = sum(len(one.received) for one in transmissions)
+    lost = sum(len(transmission.lost_by) for transmission in transmissions)
+    received = sum(len(transmission.received) for transmission in transmissions)
     counted = [
         _count(len(transmissions), "datagram"),
         f"received {_count(received, 'time')}, lost {_count(lost, 'time')}",
         *(
             f"{count} {what}"
             for what in ("inferred", "forged")
-            if (count := sum(one.origin == what for one in transmissions))
+            if (count := sum(transmission.origin == what for transmission in transmissions))
         ),
     ]
     yield ", ".join(counted)
@@ -156,12 +156,12 @@ def tail(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[
             yield f"{title}: {_count(count, 'frame')}, {reason}, at {where}"
 
 
-def _receivers(one: Transmission) -> str:
-    if not one.received:
+def _receivers(transmission: Transmission) -> str:
+    if not transmission.received:
         return "nobody"
-    if len(one.received) <= _NAMED:
-        return _list(one.reached)
-    return f"{len(one.received)} of {len(one.received) + len(one.lost_by)}"
+    if len(transmission.received) <= _NAMED:
+        return _list(transmission.reached)
+    return f"{len(transmission.received)} of {len(transmission.received) + len(transmission.lost_by)}"
 
 
 def _list(names: Iterable[Name]) -> str:

@@ -82,9 +82,13 @@ def join(captures: Captures) -> list[Transmission]:
     """All transmissions, in the order of sending."""
     by_number = {capture.number: capture for capture in captures.used}
     listeners = _Listeners(captures.used)
-    found = [one for datagram in captures.datagrams for one in _of(datagram, by_number, listeners, captures.clock)]
-    found.sort(key=lambda one: (one.at_s, one.sender, one.sequence))
-    return [one._replace(number=number) for number, one in enumerate(found)]
+    transmissions = [
+        transmission
+        for datagram in captures.datagrams
+        for transmission in _of(datagram, by_number, listeners, captures.clock)
+    ]
+    transmissions.sort(key=lambda transmission: (transmission.at_s, transmission.sender, transmission.sequence))
+    return [transmission._replace(number=number) for number, transmission in enumerate(transmissions)]
 
 
 def _of(

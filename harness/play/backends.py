@@ -8,7 +8,7 @@ from harness.play.containers.backend import Containers
 from harness.play.process.processes import Processes
 from harness.play.simulation.virtual_time import VirtualTime
 
-BACKENDS: dict[BackendName, Backend] = {one.name: one for one in (Processes(), Containers(), VirtualTime())}
+BACKENDS: dict[BackendName, Backend] = {backend.name: backend for backend in (Processes(), Containers(), VirtualTime())}
 
 
 def in_virtual_time(name: Any) -> bool:

@@ -60,7 +60,7 @@ class RadioRange:
 
 def in_words(components: Iterable[Iterable[int]]) -> str:
     """Who is connected: "1 2 3 | 4 5"."""
-    return " | ".join(" ".join(map(str, sorted(one))) for one in components)
+    return " | ".join(" ".join(map(str, sorted(component))) for component in components)
 
 
 def tracks_of(scenario: Scenario) -> dict[int, Track]:

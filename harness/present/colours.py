@@ -67,7 +67,7 @@ def _text_on(fill: str) -> str:
 
 
 def _mixed(colour: Rgb, into: Rgb, share: float) -> str:
-    red, green, blue = (round(one + (other - one) * share) for one, other in zip(colour, into, strict=True))
+    red, green, blue = (round(start + (end - start) * share) for start, end in zip(colour, into, strict=True))
     return _hex((red, green, blue))
 
 

@@ -25,21 +25,21 @@ class Case:
 
 def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[Case]) -> str:
     """A file with one suite. Characters that XML cannot hold are written as question marks."""
-    told = list(cases)
-    failures, skipped = sum(bool(case.wrong) for case in told), sum(case.skipped is not None for case in told)
-    counts = {"tests": str(len(told)), "failures": str(failures), "errors": "0"}
+    all_cases = list(cases)
+    failures, skipped = sum(bool(case.wrong) for case in all_cases), sum(case.skipped is not None for case in all_cases)
+    counts = {"tests": str(len(all_cases)), "failures": str(failures), "errors": "0"}
     if wall_s is not None:
         counts["time"] = f"{max(wall_s, 0.0):.1f}"
     named = {"name": _text(suite), "timestamp": _text(started_at)}
     root = ElementTree.Element("testsuites", counts)
     element = ElementTree.SubElement(root, "testsuite", {**named, **counts, "skipped": str(skipped)})
-    for case in told:
-        one = ElementTree.SubElement(element, "testcase", classname=classname, name=_text(case.name))
+    for case in all_cases:
+        testcase = ElementTree.SubElement(element, "testcase", classname=classname, name=_text(case.name))
         if case.wrong:
-            failure = ElementTree.SubElement(one, "failure", message=_text(case.wrong[0]))
+            failure = ElementTree.SubElement(testcase, "failure", message=_text(case.wrong[0]))
             failure.text = _text("\n".join(case.wrong))
         elif case.skipped is not None:
-            ElementTree.SubElement(one, "skipped", message=_text(case.skipped))
+            ElementTree.SubElement(testcase, "skipped", message=_text(case.skipped))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 

@@ -55,10 +55,10 @@ class Findings:
     def characteristic(self, number: int) -> Judgement:
         """Raises ScenarioError for a number that is not 1 to 6."""
         __tracebackhide__ = True
-        found = self.result.characteristics.get(str(number))
-        if found is None:
+        characteristic = self.result.characteristics.get(str(number))
+        if characteristic is None:
             raise ScenarioError(f"there is no characteristic {number!r}: they are 1 to 6")
-        return Judgement.of(number, found)
+        return Judgement.of(number, characteristic)
 
     @property
     def figures(self) -> dict[str, float | int | None]:

@@ -46,8 +46,8 @@ def scenario_for(node: pytest.Item) -> Iterator[Findings]:
     """The findings of the scenario that the marker names, once it has been played."""
     with one_sentence():
         options = Options.of(node.config)
-        path, said = _marked(node)
-        backend, seed = _backend_and_seed(said["backend"], said["seed"], options)
+        path, keys = _marked(node)
+        backend, seed = _backend_and_seed(keys["backend"], keys["seed"], options)
         scenario = options.at_speedup(load_scenario(path))
         directory = new_directory(node, options)
         finished = play(scenario, seed, backend, directory)
@@ -78,8 +78,8 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
 def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[BackendName, int]:
     """What a marker says of them, unless the command line says something else. Raises ScenarioError."""
     if backend not in BACKEND_NAMES:
-        *others, last = map(repr, BACKEND_NAMES)
-        raise ScenarioError(f"`backend` is {backend!r}: it should be {', '.join(others)} or {last}")
+        *names, last = map(repr, BACKEND_NAMES)
+        raise ScenarioError(f"`backend` is {backend!r}: it should be {', '.join(names)} or {last}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ScenarioError(f"`seed` is {seed!r}: it should be a number, 0 or more")
     return options.backend or backend, seed if options.seed is None else options.seed

@@ -48,14 +48,14 @@ class Told:
         await swarm.begin(first)
         swarm.enter("mission")
         self.begun.set_result(None)
-        while told := await self._sentences.get():
-            sentence, answer = told
+        while asked := await self._sentences.get():
+            sentence, answer = asked
             try:
-                said = await sentence(swarm)
+                result = await sentence(swarm)
             except ScenarioError as mistake:  # of whoever tells, who may go on
                 answer.set_exception(mistake)
             else:
-                answer.set_result(said)
+                answer.set_result(result)
 
     def hear(self, sentence: Sentence, answer: Future[Any]) -> None:
         """Take the next sentence. What it says, or a mistake in it, is set in `answer`, unless the run ends first."""

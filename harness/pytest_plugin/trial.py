@@ -42,11 +42,11 @@ class Trial:
         lines = [played.outcome_detail] if played.outcome_detail else []
         if played.outcome == "completed":
             lines += [f"{fate}, so this run does not show what it was meant to" for fate in played.unmatched_fates]
-        for name, found in finished.result.characteristics.items():
+        for name, characteristic in finished.result.characteristics.items():
             number = int(name)
-            if not self._expect.as_expected(number, found.verdict):
+            if not self._expect.as_expected(number, characteristic.verdict):
                 expected = self._expect.characteristics.get(number)
-                lines += Judgement.of(number, found).lines()
+                lines += Judgement.of(number, characteristic).lines()
                 lines += [f"    expected: {expected}"] if expected else []
         return lines + list(self._expect.out_of_range(finished.result.figures))
 

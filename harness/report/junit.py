@@ -24,8 +24,8 @@ def _cases(result: dict[str, Any]) -> Iterator[Case]:
     judged, expect = verdicts(result), _expect(result)
     if wrong := [*_wrong_with_run(result), *([] if judged else ["There is no verdict."])]:
         yield Case("run", wrong)
-    for one in judged:
-        yield _characteristic(one, expect)
+    for verdict in judged:
+        yield _characteristic(verdict, expect)
     if expect.figures:
         figures: dict[str, float | None] = {name: number(result, "figures", name) for name in expect.figures}
         yield Case("expected figures", list(expect.out_of_range(figures)))
@@ -46,15 +46,15 @@ def _expect(result: dict[str, Any]) -> Expect:
         return Expect()
 
 
-def _characteristic(one: Verdict, expect: Expect) -> Case:
-    name, known = f"{one.number}. {one.name}", NUMBERS.get(one.number, 0)
+def _characteristic(verdict: Verdict, expect: Expect) -> Case:
+    name, known = f"{verdict.number}. {verdict.name}", NUMBERS.get(verdict.number, 0)
     expected = expect.characteristics.get(known)
-    if one.verdict == (expected or "holds"):
+    if verdict.verdict == (expected or "holds"):
         return Case(name)
-    said = f"{one.verdict}: {one.reason}" if one.reason else one.verdict
-    if expected is None and one.verdict != "violated":
-        return Case(name, skipped=said)
-    return Case(name, [said, *map(_evidence, one.evidence), *([f"expected: {expected}"] if expected else [])])
+    message = f"{verdict.verdict}: {verdict.reason}" if verdict.reason else verdict.verdict
+    if expected is None and verdict.verdict != "violated":
+        return Case(name, skipped=message)
+    return Case(name, [message, *map(_evidence, verdict.evidence), *([f"expected: {expected}"] if expected else [])])
 
 
 def _evidence(piece: dict[str, Any]) -> str:

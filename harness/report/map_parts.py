@@ -62,14 +62,14 @@ class Division:
         """Such as "all 5 connected", or "A 1-3; B 4, 5; alone 6"."""
         if self.together:
             return f"all {len(self.together)} connected" if len(self.together) > 1 else "1 vehicle"
-        said = [f"{letter(number)} {listed(members)}" for number, members in self.parts.items()]
-        if len(said) > MAX_NAMED:
+        phrases = [f"{letter(number)} {listed(members)}" for number, members in self.parts.items()]
+        if len(phrases) > MAX_NAMED:
             largest = max(self.parts.values(), key=len)
-            said = [f"{len(said)} parts, the largest of {len(largest)}"]
+            phrases = [f"{len(phrases)} parts, the largest of {len(largest)}"]
         if self.alone:
             few = len(ranges(sorted(self.alone))) <= MAX_NAMED
-            said.append(f"alone {listed(self.alone)}" if few else f"{len(self.alone)} alone")
-        return "; ".join(said) or "nobody left"
+            phrases.append(f"alone {listed(self.alone)}" if few else f"{len(self.alone)} alone")
+        return "; ".join(phrases) or "nobody left"
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,18 +108,18 @@ def listed(vehicles: frozenset[int]) -> str:
 
 
 def divisions(states: Sequence[Topology]) -> list[Division]:
-    found: list[Division] = []
+    divided: list[Division] = []
     before: dict[int, frozenset[int]] = {}
     for state in states:
         if len(state.components) == 1:
-            found.append(Division(state.at_s, state.what, {}, frozenset(), state.components[0]))
+            divided.append(Division(state.at_s, state.what, {}, frozenset(), state.components[0]))
             continue
         parts = [group for group in state.components if len(group) > 1]
         alone = frozenset().union(*(group for group in state.components if len(group) == 1))
         numbered = _numbered(parts, before)
         before = numbered or before
-        found.append(Division(state.at_s, state.what, numbered, alone, frozenset()))
-    return found
+        divided.append(Division(state.at_s, state.what, numbered, alone, frozenset()))
+    return divided
 
 
 def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]) -> dict[int, frozenset[int]]:
@@ -159,10 +159,10 @@ def lives(
             wreck = end
 
 
-def _stretches(vehicle: int, way: list[Fix], found: Sequence[Division]) -> Iterator[Stretch]:
-    now = next((division for division in reversed(found) if division.at_s <= way[0].at_s), None)
+def _stretches(vehicle: int, way: list[Fix], divided: Sequence[Division]) -> Iterator[Stretch]:
+    now = next((division for division in reversed(divided) if division.at_s <= way[0].at_s), None)
     begin = 0
-    for division in found:
+    for division in divided:
         unchanged = now is not None and now.place_of(vehicle) == division.place_of(vehicle)
         if unchanged or not way[0].at_s < division.at_s < way[-1].at_s:
             continue

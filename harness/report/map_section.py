@@ -86,9 +86,9 @@ def _telling(known: Sequence[Division], tracks: Tracks, end_s: float) -> list[tu
     for before, division, until_s in zip(known, known[1:], ends[1:], strict=False):
         if division.at_s > begin_s:
             weights[division.at_s] = division.changed_since(before) * (until_s - division.at_s)
-    told = sorted(weights, key=lambda at_s: -weights[at_s])[: MOMENTS - 2]
-    moments = sorted({begin_s, *told, end_s})
-    return [(at_s, next((one for one in reversed(known) if one.at_s <= at_s), None)) for at_s in moments]
+    changes = sorted(weights, key=lambda at_s: -weights[at_s])[: MOMENTS - 2]
+    moments = sorted({begin_s, *changes, end_s})
+    return [(at_s, next((division for division in reversed(known) if division.at_s <= at_s), None)) for at_s in moments]
 
 
 def _moment(
@@ -105,27 +105,29 @@ def _moment(
     links = network.links(at_s) if division else []
     lost = [life.end for life in flown if life.lost and life.end.at_s <= at_s and life.vehicle not in living]
     what = division.what if division and division.at_s == at_s and division.what not in (RANGE, "start") else ""
-    said = "the network is not on record" if division is None else division.in_words()
+    state = "the network is not on record" if division is None else division.in_words()
     at = words.duration(round(at_s, 1))
     picture = map_svg.draw_moment(
         seen,
         lost,
-        [(one, other) for one, other in links if one in seen and other in seen],
+        [(vehicle, fellow) for vehicle, fellow in links if vehicle in seen and fellow in seen],
         division,
         land,
         ink,
-        f"The swarm at {at}: {said}",
+        f"The swarm at {at}: {state}",
     )
-    return Moment(at, what, said, picture)
+    return Moment(at, what, state, picture)
 
 
 def _legend(flown: Sequence[Life], *, rebooted: bool) -> list[tuple[Markup, str]]:
     """What is on the map of the tracks, and no more."""
     parts: dict[str, set[int]] = {}
     for life in flown:
-        for one in life.stretches:
-            part = one.division.part_of(life.vehicle) if one.division else None
-            parts.setdefault(map_svg.look(one.division, life.vehicle), set()).update(() if part is None else (part,))
+        for stretch in life.stretches:
+            part = stretch.division.part_of(life.vehicle) if stretch.division else None
+            parts.setdefault(map_svg.look(stretch.division, life.vehicle), set()).update(
+                () if part is None else (part,)
+            )
     means = {"whole": "connected to all", "unknown": "network not on record", "alone": "alone, cut off from all"}
     entries = [
         (which, means.get(which) or f"part {', '.join(map(letter, sorted(parts[which])))}")
@@ -141,7 +143,9 @@ def _legend(flown: Sequence[Life], *, rebooted: bool) -> list[tuple[Markup, str]
 def _description(tracks: Tracks, land: Extent, moments: Sequence[Moment]) -> str:
     """What the map shows, in words."""
     count = len(tracks.by_vehicle)
-    said = "; ".join(f"at {one.at}{f', {one.what}' if one.what else ''}: {one.network}" for one in moments)
+    states = "; ".join(
+        f"at {moment.at}{f', {moment.what}' if moment.what else ''}: {moment.network}" for moment in moments
+    )
     vehicles = f"{count} vehicles" if count > 1 else "1 vehicle"
     area = f"{land.width_m:.0f} m from west to east, {land.height_m:.0f} m from south to north"
-    return f"{vehicles}; {area}; {said}."
+    return f"{vehicles}; {area}; {states}."

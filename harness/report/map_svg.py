@@ -104,9 +104,9 @@ def draw_moment(
 def _links(at: Mapping[int, Point], links: Sequence[tuple[int, int]], division: Division | None) -> Markup:
     drawn: dict[str, list[str]] = {}
     shortest = sorted(links, key=lambda pair: math.dist(at[pair[0]], at[pair[1]]))
-    for one, other in shortest[:MAX_LINKS]:
-        (x1, y1), (x2, y2) = at[one], at[other]
-        drawn.setdefault(look(division, one), []).append(f"M{n(x1)} {n(y1)}L{n(x2)} {n(y2)}")
+    for vehicle, fellow in shortest[:MAX_LINKS]:
+        (x1, y1), (x2, y2) = at[vehicle], at[fellow]
+        drawn.setdefault(look(division, vehicle), []).append(f"M{n(x1)} {n(y1)}L{n(x2)} {n(y2)}")
     return Markup("").join(
         Markup('<path class="link {}" d="{}"/>').format(which, "".join(lines)) for which, lines in drawn.items()
     )
@@ -177,14 +177,14 @@ def _frame(to_px: Projection) -> Markup:
 
 def _ways(stretches: Sequence[Stretch], to_px: Projection) -> Markup:
     """Quiet ones first, so that parts are seen over them."""
-    lines = thinned([[to_px(fix) for fix in one.fixes] for one in stretches], MAX_POINTS)
-    looks = [look(one.division, one.vehicle) for one in stretches]
+    lines = thinned([[to_px(fix) for fix in stretch.fixes] for stretch in stretches], MAX_POINTS)
+    looks = [look(stretch.division, stretch.vehicle) for stretch in stretches]
     drawn = sorted(zip(looks, stretches, lines, strict=True), key=lambda way: LOOKS.index(way[0]))
     return Markup("\n").join(
         Markup('<path class="way {}" d="M{}"><title>{}</title></path>').format(
-            which, "L".join(f"{n(x)} {n(y)}" for x, y in line), _told(one)
+            which, "L".join(f"{n(x)} {n(y)}" for x, y in line), _told(stretch)
         )
-        for which, one, line in drawn
+        for which, stretch, line in drawn
     )
 
 

@@ -25,7 +25,7 @@ def tags(
     drawn = []
     for vehicle, place in tagged:
         for box in _boxes(len(str(vehicle)), place):
-            if _inside(box, to_px) and not any(_overlap(box, other) for other in taken):
+            if _inside(box, to_px) and not any(_overlap(box, taken_box) for taken_box in taken):
                 taken.append(box)
                 drawn.append(_tag(vehicle, box, place, ink[vehicle]))
                 break

@@ -18,8 +18,8 @@ TEXT_LENGTH = 240
 def to_markdown(left: ReportSource) -> str:
     result = left.result
     judged, ended = verdicts(result), facts.outcome(result)
-    said, _ = headline(judged, completed=ended is None)
-    lines = [f"## {_short(facts.title(result))}", "", f"**{said}**", ""]
+    verdict, _ = headline(judged, completed=ended is None)
+    lines = [f"## {_short(facts.title(result))}", "", f"**{verdict}**", ""]
     lines += [_short(" \u00b7 ".join(facts.summary(result, left.exports))), ""]
     if ended:
         lines += [f"**{_short(ended[0])}** {_short(ended[1])}".rstrip(), ""]
@@ -39,16 +39,16 @@ def to_markdown(left: ReportSource) -> str:
 def _verdict_table(judged: Sequence[Verdict]) -> Iterator[str]:
     yield row(["", "characteristic", "verdict", "reason"])
     yield row(["--:", "---", "---", "---"])
-    for one in judged:
-        yield row(map(_short, [one.number, one.name, f"{one.icon} {one.verdict}", one.reason]))
+    for verdict in judged:
+        yield row(map(_short, [verdict.number, verdict.name, f"{verdict.icon} {verdict.verdict}", verdict.reason]))
     yield ""
 
 
 def _evidence(judged: Sequence[Verdict]) -> list[str]:
     return _listed(
-        f"characteristic {one.number}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
-        for one in judged
-        for piece in (one.evidence[:EVIDENCE_SHOWN] if one.kind == "violated" else ())
+        f"characteristic {verdict.number}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
+        for verdict in judged
+        for piece in (verdict.evidence[:EVIDENCE_SHOWN] if verdict.kind == "violated" else ())
     )
 
 
@@ -66,10 +66,10 @@ def _faults(faults: Sequence[tuple[str, str, str]]) -> Iterator[str]:
 
 def _listed(sentences: Iterable[str]) -> list[str]:
     """An item for each; nothing, if there is none."""
-    found = list(sentences)
-    items = [f"- {_short(sentence)}" for sentence in found[:SENTENCES_SHOWN]]
-    if len(found) > SENTENCES_SHOWN:
-        items.append(f"- and {len(found) - SENTENCES_SHOWN} more in report.html")
+    all_sentences = list(sentences)
+    items = [f"- {_short(sentence)}" for sentence in all_sentences[:SENTENCES_SHOWN]]
+    if len(all_sentences) > SENTENCES_SHOWN:
+        items.append(f"- and {len(all_sentences) - SENTENCES_SHOWN} more in report.html")
     return [*items, ""] if items else []
 
 

@@ -47,13 +47,15 @@ def strip(result: dict[str, Any]) -> Markup | None:
 
 def _one_after_another(changes: list[Change], end_s: float) -> list[tuple[float, str, float]]:
     """When which of them stands; after one that passes the one that stood before."""
-    found = []
+    steps = []
     for place, (at_s, until_s, state) in enumerate(changes):
-        found.append((at_s, *state))
+        steps.append((at_s, *state))
         if until_s < end_s:
-            beneath = (one for _, other_until_s, one in reversed(changes[:place]) if other_until_s > until_s)
-            found.append((until_s, *next(beneath, ("", 0.0))))
-    return found
+            beneath = (
+                other_state for _, other_until_s, other_state in reversed(changes[:place]) if other_until_s > until_s
+            )
+            steps.append((until_s, *next(beneath, ("", 0.0))))
+    return steps
 
 
 def _loss(conditions: dict[str, Any]) -> tuple[str, float] | None:

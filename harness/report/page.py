@@ -29,11 +29,11 @@ def draw(left: ReportSource) -> str:
     """The page, as HTML."""
     result, exports, ink = left.result, left.exports, left.ink
     judged, outcome = verdicts.verdicts(result), facts.outcome(result)
-    told = timeline.section(left, name_blocks(exports.by_agent))
+    timeline_section = timeline.section(left, name_blocks(exports.by_agent))
     return html.render(
         _TEMPLATE,
         styles=[TREE_STYLE + MAP_STYLE + timeline.STYLE + html.PAGE_STYLE],
-        script=timeline.SCRIPT if told else "",
+        script=timeline.SCRIPT if timeline_section else "",
         title=facts.title(result),
         about=mapping(result, "scenario").get("about"),
         summary=facts.summary(result, exports),
@@ -48,7 +48,7 @@ def draw(left: ReportSource) -> str:
         survival=survival.section(result, ink),
         pictures=_pictures(exports.by_agent, left.archive.before_final_reconcile, ink),
         blocks=swarm.block_rows(exports.by_agent, ink),
-        timeline=told,
+        timeline=timeline_section,
         strip=network.strip(result),
         network=network.start(result),
         faults=network.faults(result),

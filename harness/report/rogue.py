@@ -36,28 +36,28 @@ class Section:
 
 def section(result: dict[str, Any]) -> Section | None:
     """None if no rogue node was on the air, or the record says nothing of it that can be read."""
-    rows = [row for one in _injections(result) for row in _rows(one)]
+    rows = [row for injection in _injections(result) for row in _rows(injection)]
     return Section(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
 
 
 def sentences(result: dict[str, Any]) -> list[str]:
     """One for each injection."""
-    return [in_words(one) for one in _injections(result)]
+    return [in_words(injection) for injection in _injections(result)]
 
 
 def _injections(result: dict[str, Any]) -> list[RogueInjection]:
     try:
-        return [RogueInjection.model_validate(one) for one in listing(result, "rogue")]
+        return [RogueInjection.model_validate(injection) for injection in listing(result, "rogue")]
     except ValidationError:
         return []
 
 
-def _rows(one: RogueInjection) -> list[Row]:
-    told = [(of.message, of.sent, done_with(of), words.value(of.changed)) for of in one.messages]
-    told += [(f"none: {reason}", count, "refused", "\u2013") for reason, count in one.refused.items()]
-    told += [("any", one.untraced, "not told from their originals", "\u2013")] if one.untraced else []
-    begun = (words.duration(one.at_s), one.what, one.detail)
+def _rows(injection: RogueInjection) -> list[Row]:
+    outcomes = [(of.message, of.sent, done_with(of), words.value(of.changed)) for of in injection.messages]
+    outcomes += [(f"none: {reason}", count, "refused", "\u2013") for reason, count in injection.refused.items()]
+    outcomes += [("any", injection.untraced, "not told from their originals", "\u2013")] if injection.untraced else []
+    begun = (words.duration(injection.at_s), injection.what, injection.detail)
     return [
         Row(*begun, message, words.value(sent), done, changed)
-        for message, sent, done, changed in told or [("\u2013", 0, "nothing sent", "\u2013")]
+        for message, sent, done, changed in outcomes or [("\u2013", 0, "nothing sent", "\u2013")]
     ]

@@ -50,8 +50,8 @@ class ReportSource:
     def files_missing(self) -> list[str]:
         """Likewise for everything else that a whole run leaves."""
         exports = set(self.exports.errors)
-        said = [*(problem for problem in self.archive.problems if problem not in exports), *self.archive.gaps]
-        return [*map(self.archive.within, said), *self.network.problems, *filter(None, [capture.gaps(self.result)])]
+        problems = [*(problem for problem in self.archive.problems if problem not in exports), *self.archive.gaps]
+        return [*map(self.archive.within, problems), *self.network.problems, *filter(None, [capture.gaps(self.result)])]
 
 
 def read_source(archive: RunArchive) -> ReportSource:

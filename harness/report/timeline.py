@@ -75,7 +75,7 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
     notes = []
     faults = _faults(left.result)
     end_s = max(ends_at(traces), *(fault.at_s for fault in faults), _planned_s(left.result), 1.0)
-    told = history_of(traces, faults, end_s, whole=not left.archive.large)
+    course = history_of(traces, faults, end_s, whole=not left.archive.large)
     shades, shades_left_out = _shades(left.network, end_s)
     if shades_left_out:
         notes.append(f"{shades_left_out} shorter stretches of a parted network are not shaded")
@@ -83,9 +83,9 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
         notes.append(f"of {len(faults)} faults and changes of the network the first {MAX_FAULTS} are drawn")
         faults = faults[:MAX_FAULTS]
     agents = [(agent, ink[agent]) for agent in sorted(traces)]
-    messages, without = _messages(told.messages, [agent for agent, _ in agents], names)
+    messages, without = _messages(course.messages, [agent for agent, _ in agents], names)
     picture = timeline_lanes.draw(
-        told, faults, shades, [agent for agent, _ in agents], names, end_s, _in_words(told, len(agents), end_s)
+        course, faults, shades, [agent for agent, _ in agents], names, end_s, _in_words(course, len(agents), end_s)
     )
     drawn = Drawn(
         end_s,
@@ -96,8 +96,8 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
         timeline_charts.draw(replication_of(traces, faults), faults, shades, end_s),
         axis(end_s),
         messages,
-        _table(told.votes, lambda vote: _vote_row(vote, names)),
-        _table(told.reconciles, _reconcile_row),
+        _table(course.votes, lambda vote: _vote_row(vote, names)),
+        _table(course.reconciles, _reconcile_row),
     )
     return Section(drawn, [*notes, *without, *picture.notes])
 
@@ -109,26 +109,26 @@ def _planned_s(result: dict[str, Any]) -> float:
 
 
 def _faults(result: dict[str, Any]) -> list[Fault]:
-    found = []
+    faults = []
     for fault in listing(result, "faults"):
         try:
-            found.append(Fault.model_validate(fault))
+            faults.append(Fault.model_validate(fault))
         except ValidationError:
             continue
-    return possible(found)
+    return possible(faults)
 
 
 def _shades(network: Connectivity, end_s: float) -> tuple[list[Shade], int]:
     """When the network was parted, and how many shorter times there were no room for."""
     known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
-    found = [
+    shades = [
         Shade(division.at_s, min(until_s, end_s), division.in_words())
         for division, until_s in zip(known, ends, strict=False)
         if not division.together and division.living and division.at_s < min(until_s, end_s)
     ]
-    kept = sorted(found, key=lambda shade: shade.start_s - shade.end_s)[:MAX_SHADES]
-    return sorted(kept, key=lambda shade: shade.start_s), len(found) - len(kept)
+    kept = sorted(shades, key=lambda shade: shade.start_s - shade.end_s)[:MAX_SHADES]
+    return sorted(kept, key=lambda shade: shade.start_s), len(shades) - len(kept)
 
 
 def _messages(
@@ -160,9 +160,9 @@ def _messages(
 Span = TypeVar("Span", Vote, Reconcile)
 
 
-def _table(found: Sequence[Span], row: Callable[[Span], list[str]]) -> Table:
-    first = sorted(found, key=lambda one: (one.start_s, one.agent))[:MAX_ROWS]
-    return Table([row(one) for one in first], len(found) - len(first))
+def _table(spans: Sequence[Span], row: Callable[[Span], list[str]]) -> Table:
+    first = sorted(spans, key=lambda span: (span.start_s, span.agent))[:MAX_ROWS]
+    return Table([row(span) for span in first], len(spans) - len(first))
 
 
 def _vote_row(vote: Vote, names: Mapping[str, str]) -> list[str]:
@@ -185,11 +185,11 @@ def _reconcile_row(reconcile: Reconcile) -> list[str]:
     ]
 
 
-def _in_words(told: History, agents: int, end_s: float) -> str:
+def _in_words(course: History, agents: int, end_s: float) -> str:
     """What the lanes show, for who does not see them."""
-    approved = sum(vote.outcome == "approved" for vote in told.votes)
+    approved = sum(vote.outcome == "approved" for vote in course.votes)
     return (
-        f"Timeline of {agents} agents over {words.duration(round(end_s, 1))}: {len(told.votes)} votes, {approved} of"
-        f" them approved, {len(told.commits)} commits, {len(told.reconciles)} reconciles, {len(told.ties)} ties."
+        f"Timeline of {agents} agents over {words.duration(round(end_s, 1))}: {len(course.votes)} votes, {approved} of"
+        f" them approved, {len(course.commits)} commits, {len(course.reconciles)} reconciles, {len(course.ties)} ties."
         " The tables below list votes and reconciles."
     )

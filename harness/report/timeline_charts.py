@@ -29,9 +29,12 @@ class Chart:
 
 
 _CHARTS: tuple[tuple[str, tuple[tuple[str, Figure], ...]], ...] = (
-    ("blocks in chain", (("longest", lambda one: one.longest_chain), ("mutual", lambda one: one.mutual_chain))),
-    ("distinct chains", (("chains", lambda one: one.distinct_chains),)),
-    ("copies in chains", (("mean", lambda one: one.copies_mean), ("fewest", lambda one: one.copies_min))),
+    (
+        "blocks in chain",
+        (("longest", lambda spread: spread.longest_chain), ("mutual", lambda spread: spread.mutual_chain)),
+    ),
+    ("distinct chains", (("chains", lambda spread: spread.distinct_chains),)),
+    ("copies in chains", (("mean", lambda spread: spread.copies_mean), ("fewest", lambda spread: spread.copies_min))),
 )
 _LOOKS = ("broken", "whole")
 """Of two lines; one by itself is whole."""
@@ -49,35 +52,37 @@ def thinned(spreads: Sequence[Replication], end_s: float) -> Sequence[Replicatio
     if len(spreads) <= MAX_MOMENTS:
         return spreads
     kept: dict[int, tuple[Replication, Replication]] = {}
-    for one in spreads:
-        place = int(one.at_s / end_s * MAX_MOMENTS / 2)
-        worst = min(kept[place][0], one, key=lambda moment: moment.mutual_chain) if place in kept else one
-        kept[place] = worst, one
-    return [one for pair in kept.values() for one in dict.fromkeys(pair)]
+    for spread in spreads:
+        place = int(spread.at_s / end_s * MAX_MOMENTS / 2)
+        worst = min(kept[place][0], spread, key=lambda moment: moment.mutual_chain) if place in kept else spread
+        kept[place] = worst, spread
+    return [spread for pair in kept.values() for spread in dict.fromkeys(pair)]
 
 
 def _chart(
     name: str, figures: Sequence[tuple[str, Figure]], moments: Sequence[Replication], behind: Markup, end_s: float
 ) -> Chart:
-    highest = max((value for _, figure in figures for one in moments if (value := figure(one)) is not None), default=0)
+    highest = max(
+        (value for _, figure in figures for moment in moments if (value := figure(moment)) is not None), default=0
+    )
     looks = _LOOKS[-len(figures) :]
     per_px = max(highest, 1) / (HEIGHT - _TOP - _BOTTOM)
     lines = [
         Markup('<path class="line {}" d="{}"/>').format(look, _steps(moments, figure, per_px, end_s))
         for look, (_, figure) in zip(looks, figures, strict=True)
     ]
-    until = [*(one.at_s for one in moments[1:]), end_s]
+    until = [*(moment.at_s for moment in moments[1:]), end_s]
     tips = [
         Markup('<rect class="tip" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
-            short(one.at_s), short(until_s - one.at_s), HEIGHT, _tip(one, figures, name)
+            short(moment.at_s), short(until_s - moment.at_s), HEIGHT, _tip(moment, figures, name)
         )
-        for one, until_s in zip(moments, until, strict=True)
-        if until_s > one.at_s
+        for moment, until_s in zip(moments, until, strict=True)
+        if until_s > moment.at_s
     ]
     base = Markup('<path class="base" d="M0 {}H{}"/>').format(n(HEIGHT - _BOTTOM), short(end_s))
     scale = Markup('<text class="scale" x="4" y="11">{}</text>').format(words.value(highest))
-    said = ", ".join(f"{what} {words.value(figure(moments[-1]))}" for what, figure in figures)
-    description = f"{name} along mission time, at most {words.value(highest)}; at the end {said}"
+    at_end = ", ".join(f"{what} {words.value(figure(moments[-1]))}" for what, figure in figures)
+    description = f"{name} along mission time, at most {words.value(highest)}; at the end {at_end}"
     return Chart(
         name,
         [
@@ -97,15 +102,15 @@ def _steps(moments: Sequence[Replication], figure: Figure, per_px: float, end_s:
     """A line that goes up or down where the value does, and begins where there is one."""
     path = ""
     last: float | None = None
-    for one in moments:
-        value = figure(one)
+    for moment in moments:
+        value = figure(moment)
         if value is not None and value != last:
             y = n(HEIGHT - _BOTTOM - value / per_px)
-            path += f"H{short(one.at_s)}V{y}" if path else f"M{short(one.at_s)} {y}"
+            path += f"H{short(moment.at_s)}V{y}" if path else f"M{short(moment.at_s)} {y}"
             last = value
     return f"{path}H{short(end_s)}" if path else ""
 
 
-def _tip(one: Replication, figures: Sequence[tuple[str, Figure]], name: str) -> str:
-    said = ", ".join(f"{what} {words.value(figure(one))}" for what, figure in figures)
-    return f"from {seconds(one.at_s)}: {name}: {said}"
+def _tip(moment: Replication, figures: Sequence[tuple[str, Figure]], name: str) -> str:
+    values = ", ".join(f"{what} {words.value(figure(moment))}" for what, figure in figures)
+    return f"from {seconds(moment.at_s)}: {name}: {values}"

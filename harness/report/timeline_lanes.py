@@ -107,8 +107,8 @@ def _legend(
     outcomes = {vote.outcome for vote in course.votes}
     phases = {phase.name for reconcile in course.reconciles for phase in reconcile.phases}
     entries = [
-        (f'<rect class="vote {_look(outcome)}" x="4" y="4" width="26" height="8"/>', f"vote {said}")
-        for outcome, said in (
+        (f'<rect class="vote {_look(outcome)}" x="4" y="4" width="26" height="8"/>', f"vote {label}")
+        for outcome, label in (
             ("approved", "approved"),
             ("not approved", "not approved"),
             ("chain changed", "undecided"),
@@ -182,13 +182,13 @@ def _look(outcome: str) -> str:
 
 
 def _vote(vote: Vote, names: Mapping[str, str]) -> Markup:
-    said = f"agent {vote.agent}: vote on {named(vote.block, names)}, {_from_to(vote)}:"
+    tip = f"agent {vote.agent}: vote on {named(vote.block, names)}, {_from_to(vote)}:"
     return Markup('<rect class="vote %s" x="%s" y="3" width="%s" height="%s"><title>%s</title></rect>') % (
         _look(vote.outcome),
         short(vote.start_s),
         short(vote.end_s - vote.start_s),
         _VOTE_HEIGHT,
-        f"{said} {OUTCOMES.get(vote.outcome, vote.outcome[:40])}",
+        f"{tip} {OUTCOMES.get(vote.outcome, vote.outcome[:40])}",
     )
 
 
@@ -206,17 +206,17 @@ def _phases(reconcile: Reconcile, lane_height: int) -> list[Markup]:
 
 
 def _bar(reconcile: Reconcile, lane_height: int) -> Markup:
-    said = f"agent {reconcile.agent}: reconcile ({reconcile.reason}), {phases_in_words(reconcile)}"
-    return _reconcile_bar(reconcile, BAR_HEIGHT, lane_height, said)
+    tip = f"agent {reconcile.agent}: reconcile ({reconcile.reason}), {phases_in_words(reconcile)}"
+    return _reconcile_bar(reconcile, BAR_HEIGHT, lane_height, tip)
 
 
-def _reconcile_bar(span: Phase | Reconcile, height: int, lane_height: int, said: str) -> Markup:
+def _reconcile_bar(span: Phase | Reconcile, height: int, lane_height: int, tip: str) -> Markup:
     return Markup('<rect class="reconcile" x="%s" y="%s" width="%s" height="%s"><title>%s</title></rect>') % (
         short(span.start_s),
         lane_height - 3 - height,
         short(span.end_s - span.start_s),
         height,
-        f"{said}, {_from_to(span)}",
+        f"{tip}, {_from_to(span)}",
     )
 
 
@@ -226,9 +226,9 @@ def _from_to(span: Vote | Reconcile | Phase) -> str:
 
 def _commit(group: Sequence[Commit], lane_height: int, names: Mapping[str, str]) -> Markup:
     first, last = group[0], group[-1]
-    said = f"agent {first.agent} commits {named(first.block, names)} ({first.how}), {seconds(first.at_s)}"
+    tip = f"agent {first.agent} commits {named(first.block, names)} ({first.how}), {seconds(first.at_s)}"
     if len(group) > 1:
-        said = f"agent {first.agent} commits {len(group)} blocks, {seconds(first.at_s)} to {seconds(last.at_s)}"
+        tip = f"agent {first.agent} commits {len(group)} blocks, {seconds(first.at_s)} to {seconds(last.at_s)}"
     top, bottom = _VOTE_HEIGHT + 4, lane_height - _PHASES_HEIGHT - 1
     if bottom - top < 6:
         top, bottom = 2, lane_height - 2
@@ -236,7 +236,7 @@ def _commit(group: Sequence[Commit], lane_height: int, names: Mapping[str, str])
         short(first.at_s),
         top,
         bottom,
-        said,
+        tip,
     )
 
 

@@ -46,18 +46,18 @@ def verdicts(result: dict[str, Any]) -> list[Verdict]:
     numbers = sorted({*judged, *SHORT_NAMES} if judged else [], key=lambda key: (len(key), key))
     verdicts = []
     for key in numbers:
-        found = mapping(judged, key)
-        verdict = words.value(found.get("verdict") or "not judged")
-        evidence = listing(found, "evidence")
+        entry = mapping(judged, key)
+        verdict = words.value(entry.get("verdict") or "not judged")
+        evidence = listing(entry, "evidence")
         verdicts.append(
             Verdict(
                 number=key,
-                name=words.value(found.get("name") or SHORT_NAMES.get(key, "")),
+                name=words.value(entry.get("name") or SHORT_NAMES.get(key, "")),
                 statement=STATEMENTS.get(key, ""),
                 verdict=verdict,
                 icon=ICONS.get(verdict, "?"),
                 kind={"holds": "holds", "violated": "violated"}.get(verdict, "unknown"),
-                reason=words.value(found.get("reason") or ""),
+                reason=words.value(entry.get("reason") or ""),
                 evidence=[_evidence(piece) for piece in evidence[:EVIDENCE_KEPT]],
                 evidence_left_out=max(0, len(evidence) - EVIDENCE_KEPT),
             )

@@ -85,8 +85,8 @@ def outcome_of(work: Callable[[T], R], task: T) -> R | Failed | HarnessError:
         return Failed(str(error)) if error.exit_status == VIOLATED else error
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
-        said = f": {error}" if str(error) else ""
-        return Failed(f"{type(error).__name__}{said} ({Path(place.filename).name} line {place.lineno})")
+        detail = f": {error}" if str(error) else ""
+        return Failed(f"{type(error).__name__}{detail} ({Path(place.filename).name} line {place.lineno})")
 
 
 def raised(outcome: R | HarnessError) -> R:

@@ -75,7 +75,7 @@ def growths(scale: Scale, cells: Sequence[Cell], runs: Sequence[Run], metrics: I
     """At each loss, over agents for each mission length, over blocks for each number of agents, and over both; where
     load falls on both sides of 1, over agents also for each side."""
     overloaded = {Size(cell.loss, cell.minutes, cell.agents) for cell in cells if cell.overloaded}
-    found: list[Growth] = []
+    grown: list[Growth] = []
 
     def add(metric: str, over: tuple[Variable, ...], load: Load, loss: float, **fixed: float) -> None:
         def belongs(run: Run) -> bool:
@@ -88,7 +88,7 @@ def growths(scale: Scale, cells: Sequence[Cell], runs: Sequence[Run], metrics: I
 
         law = fit(over, _points(over, BY_NAME[metric].of, [run for run in runs if belongs(run)]))
         if law:
-            found.append(Growth(metric=metric, over=over, loss=loss, load=load, law=law, **fixed))  # type: ignore[arg-type]
+            grown.append(Growth(metric=metric, over=over, loss=loss, load=load, law=law, **fixed))  # type: ignore[arg-type]
 
     for loss in scale.loss:
         both = len({cell.overloaded for cell in cells if cell.loss == loss}) == 2
@@ -101,7 +101,7 @@ def growths(scale: Scale, cells: Sequence[Cell], runs: Sequence[Run], metrics: I
                 add(metric, ("blocks",), "any", loss, agents=agents)
             for load in parts:
                 add(metric, ("agents", "blocks"), load, loss)
-    return found
+    return grown
 
 
 def _points(

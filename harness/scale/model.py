@@ -66,10 +66,10 @@ def read_request(agents: str, minutes: str, loss: str, seeds: int, settle_minute
     _within("--settle", f"{settle_minutes:g}", 0 < settle_minutes <= MAX_MINUTES, allowed)
     return Scale(
         agents=_numbers(
-            "--agents", agents, int, lambda it: 1 <= it <= MAX_AGENTS, f"a number of agents is 1..{MAX_AGENTS}"
+            "--agents", agents, int, lambda number: 1 <= number <= MAX_AGENTS, f"a number of agents is 1..{MAX_AGENTS}"
         ),
-        minutes=_numbers("--minutes", minutes, float, lambda it: 0 < it <= MAX_MINUTES, allowed),
-        loss=_numbers("--loss", loss, float, lambda it: 0 <= it <= 1, "a loss is a probability 0..1"),
+        minutes=_numbers("--minutes", minutes, float, lambda number: 0 < number <= MAX_MINUTES, allowed),
+        loss=_numbers("--loss", loss, float, lambda number: 0 <= number <= 1, "a loss is a probability 0..1"),
         seeds=seeds,
         settle_minutes=settle_minutes,
     )
@@ -91,6 +91,6 @@ def _numbers(option: str, text: str, kind: type[N], possible: Callable[[N], bool
     return sorted(numbers)
 
 
-def _within(option: str, said: str, possible: bool, allowed: str) -> None:
+def _within(option: str, given: str, possible: bool, allowed: str) -> None:
     if not possible:
-        raise ScenarioError(f"{option} is {said}: {allowed}")
+        raise ScenarioError(f"{option} is {given}: {allowed}")

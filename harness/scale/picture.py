@@ -81,10 +81,10 @@ def description(record: ScaleRecord) -> str:
         return "No run has ended."
     parts = []
     for panel in PANELS:
-        for one in _series(record, panel):
-            values = (f"{_say(panel, cell)} at {_at(panel, cell)}" for cell in one.cells)
-            power = f" (exponent {_exponent(one.law, panel)})" if one.law else ""
-            parts.append(f"{_title(record, panel)}, {one.name}{power}: {', '.join(values)}.")
+        for line in _series(record, panel):
+            values = (f"{_say(panel, cell)} at {_at(panel, cell)}" for cell in line.cells)
+            power = f" (exponent {_exponent(line.law, panel)})" if line.law else ""
+            parts.append(f"{_title(record, panel)}, {line.name}{power}: {', '.join(values)}.")
     return " ".join(parts)
 
 
@@ -119,15 +119,15 @@ def _legend(record: ScaleRecord) -> Markup:
     """The lines over agents."""
     parts = []
     x = svg.MARGIN + 4.0
-    for one in _series(record, PANELS[0]):
+    for line in _series(record, PANELS[0]):
         parts.append(
             Markup('<g class="series {}">{}{}</g>').format(
-                svg.CLASSES[one.number],
-                svg.line([(x, 77), (x + 26, 77)], one.number),
-                svg.name(x + 32, 81, "start", one.number, one.name),
+                svg.CLASSES[line.number],
+                svg.line([(x, 77), (x + 26, 77)], line.number),
+                svg.name(x + 32, 81, "start", line.number, line.name),
             )
         )
-        x += 60 + 7 * len(one.name)
+        x += 60 + 7 * len(line.name)
     return Markup("").join(parts)
 
 
@@ -137,8 +137,8 @@ def _series(record: ScaleRecord, panel: Panel) -> list[Series]:
     fixed, unit = ("minutes", "\u00a0min") if over_agents else ("agents", " agents")
     losses = record.scale.loss if over_agents else record.scale.loss[-1:]
 
-    def line_of(one: Cell | Growth) -> tuple[float, float | None]:
-        return one.loss, getattr(one, fixed)
+    def line_of(item: Cell | Growth) -> tuple[float, float | None]:
+        return item.loss, getattr(item, fixed)
 
     lines = [line for line in product(losses, getattr(record.scale, fixed)) if line in map(line_of, record.cells)]
     laws = {
@@ -168,48 +168,48 @@ def _panel(record: ScaleRecord, panel: Panel, area: Area) -> Markup:
         map(say_number, across.ticks),
         (f"{100 * tick:.0f}\u00a0%" if panel.shares else say_number(tick) for tick in up.ticks),
     )
-    drawn = [_line(panel, one, across, up) for one in lines]
-    exponents = [(one, one.law) for one in lines if one.law]
-    for row, (one, law) in enumerate(reversed(exponents)):
-        drawn.append(_power(panel, one, law, across.end - 4, up.start - 8 - 15 * row))
+    drawn = [_line(panel, line, across, up) for line in lines]
+    exponents = [(line, line.law) for line in lines if line.law]
+    for row, (line, law) in enumerate(reversed(exponents)):
+        drawn.append(_power(panel, line, law, across.end - 4, up.start - 8 - 15 * row))
     return Markup('<g class="panel">{}{}</g>\n').format(frame, Markup("").join(drawn))
 
 
-def _line(panel: Panel, one: Series, across: Axis, up: Axis) -> Markup:
+def _line(panel: Panel, line: Series, across: Axis, up: Axis) -> Markup:
     """The law with its exponent, or what joins the dots; and the dots, with tooltips."""
-    points = [(x, y, cell) for cell in one.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
-    ends = _ends(panel, one) or [(x, y) for x, y, _ in points]
-    parts = [svg.line([(across(x), up(y)) for x, y in ends], one.number)] if ends else []
+    points = [(x, y, cell) for cell in line.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
+    ends = _ends(panel, line) or [(x, y) for x, y, _ in points]
+    parts = [svg.line([(across(x), up(y)) for x, y in ends], line.number)] if ends else []
     parts += [
-        svg.dot(across(x), up(y), one.number, f"{_at(panel, cell)}, {one.name}: {_say(panel, cell)}")
+        svg.dot(across(x), up(y), line.number, f"{_at(panel, cell)}, {line.name}: {_say(panel, cell)}")
         for x, y, cell in points
     ]
-    return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[one.number], Markup("").join(parts))
+    return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[line.number], Markup("").join(parts))
 
 
-def _power(panel: Panel, one: Series, law: Law, x: float, y: float) -> Markup:
+def _power(panel: Panel, line: Series, law: Law, x: float, y: float) -> Markup:
     """The exponent of a law, and of what if the legend does not say it, in the corner that growth leaves empty."""
     value, margin = _exponent(law, panel).split("\u00b1")
     text = Markup('{}{}<tspan dy="-4" font-size="10">{}</tspan><tspan dy="4" font-size="10"> \u00b1{}</tspan>').format(
-        f"{one.name}: " if panel.over == "blocks" else "", SYMBOLS[panel.over], value, margin
+        f"{line.name}: " if panel.over == "blocks" else "", SYMBOLS[panel.over], value, margin
     )
     return Markup('<g class="series {}">{}</g>').format(
-        svg.CLASSES[one.number], svg.name(x, y, "end", one.number, text)
+        svg.CLASSES[line.number], svg.name(x, y, "end", line.number, text)
     )
 
 
-def _ends(panel: Panel, one: Series) -> list[tuple[float, float]]:
+def _ends(panel: Panel, line: Series) -> list[tuple[float, float]]:
     """Of the law's line, from dot to dot."""
-    xs = [x for cell in one.cells if (x := _x(panel, cell)) and _y(panel, cell)]
-    if not one.law or not xs:
+    xs = [x for cell in line.cells if (x := _x(panel, cell)) and _y(panel, cell)]
+    if not line.law or not xs:
         return []
-    power = one.law.exponents[panel.over].value
-    return [(x, one.law.factor * x**power) for x in (min(xs), max(xs))]
+    power = line.law.exponents[panel.over].value
+    return [(x, line.law.factor * x**power) for x in (min(xs), max(xs))]
 
 
 def _across(panel: Panel, lines: Sequence[Series], area: Area) -> Axis:
     """Over agents the ticks are their numbers, as far as there is room."""
-    xs = sorted({x for one in lines for cell in one.cells if (x := _x(panel, cell))}) or [1.0, 10.0]
+    xs = sorted({x for line in lines for cell in line.cells if (x := _x(panel, cell))}) or [1.0, 10.0]
     if panel.over == "blocks":
         return svg.log_axis(xs[0], xs[-1], area.across)
     axis = Axis(xs[0] * 0.9, xs[-1] * 1.1, *area.across, (), log=True)
@@ -223,8 +223,8 @@ def _across(panel: Panel, lines: Sequence[Series], area: Area) -> Axis:
 def _up(panel: Panel, lines: Sequence[Series], area: Area) -> Axis:
     if panel.shares:
         return svg.share_axis(area.up)
-    ys = [y for one in lines for cell in one.cells if (y := _y(panel, cell))]
-    ys += [y for one in lines for _, y in _ends(panel, one)]
+    ys = [y for line in lines for cell in line.cells if (y := _y(panel, cell))]
+    ys += [y for line in lines for _, y in _ends(panel, line)]
     return svg.log_axis(min(ys, default=1.0), max(ys, default=10.0), area.up)
 
 

@@ -39,13 +39,13 @@ def render(record: ScaleRecord) -> RenderableType:
 
 def rows(record: ScaleRecord, loss: float) -> list[tuple[str, Variable, dict[str, Law]]]:
     """Of which runs, over what, and a law per metric."""
-    found: dict[tuple[float, str, Variable], dict[str, Law]] = {}
+    by_row: dict[tuple[float, str, Variable], dict[str, Law]] = {}
     for growth in (*record.growths, *record.machine_growths):
         if growth.loss == loss:
             for variable in growth.over:
                 key = len(growth.over) + (growth.over[0] == "blocks") / 2, series(growth), variable
-                found.setdefault(key, {})[growth.metric] = growth.law
-    return [(name, variable, laws) for (_, name, variable), laws in sorted(found.items(), key=lambda it: it[0][0])]
+                by_row.setdefault(key, {})[growth.metric] = growth.law
+    return [(name, variable, laws) for (_, name, variable), laws in sorted(by_row.items(), key=lambda item: item[0][0])]
 
 
 def series(growth: Growth) -> str:

@@ -80,9 +80,9 @@ def injections_of(scenario: Scenario) -> list[Injected]:
 def injected_nothing(scenario: Scenario, sent: Mapping[int, int]) -> list[str]:
     """A sentence for each injection that came to nothing; `sent` has the datagrams of each that has begun."""
     return [
-        f"{one.what} at {one.at_s:g} s ({one.detail}) sent nothing, for nothing like it was heard"
-        for one in injections_of(scenario)
-        if sent.get(one.number) == 0
+        f"{injected.what} at {injected.at_s:g} s ({injected.detail}) sent nothing, for nothing like it was heard"
+        for injected in injections_of(scenario)
+        if sent.get(injected.number) == 0
     ]
 
 

@@ -126,5 +126,5 @@ class Expect(Model):
         for name, wanted in self.figures.items():
             figure = figures.get(name)
             if figure is None or figure not in wanted:
-                found = "not known" if figure is None else f"{figure:g}"
-                yield f"{name.replace('_', ' ')} is {found}, and should be {wanted.describe()}"
+                shown = "not known" if figure is None else f"{figure:g}"
+                yield f"{name.replace('_', ' ')} is {shown}, and should be {wanted.describe()}"

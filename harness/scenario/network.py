@@ -162,8 +162,8 @@ class Disturbance(Model):
 
     def said(self) -> Said:
         """What it changes of the network, partitions apart."""
-        said: Said = self.network.whole() if self.network else {}
-        return said if self.loss is None else laid_over(said, {None: {"loss": self.loss}})
+        changes: Said = self.network.whole() if self.network else {}
+        return changes if self.loss is None else laid_over(changes, {None: {"loss": self.loss}})
 
     @property
     def groups(self) -> tuple[frozenset[int], ...]:
@@ -219,16 +219,16 @@ def _named(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Iterator
 
 
 def _said_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Said:
-    said: Said = {vehicle: receiver.said() for vehicle, receiver in receivers.items()}
+    differences: Said = {vehicle: receiver.said() for vehicle, receiver in receivers.items()}
     for index, link in enumerate(links):
         keys = link.said()
         for sender, receiver in link.pairs():
             if sender == receiver:
                 raise ConditionsError(f"links.{index}: a link from vehicle {sender} to itself carries nothing")
-            if (sender, receiver) in said:
+            if (sender, receiver) in differences:
                 raise ConditionsError(f"links.{index}: from {sender} to {receiver} is named twice: which one counts?")
-            said[sender, receiver] = keys
-    return said
+            differences[sender, receiver] = keys
+    return differences
 
 
 def laid_over(network: Said, layer: Said) -> Said:
@@ -246,21 +246,21 @@ def of_whom(where: Where) -> str:
 def conditions_of(network: Said, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
     """The conditions that a whole network comes to; raises ConditionsError if its keys contradict each other."""
     for_all = network[None]
-    found: dict[Where, LinkConditions] = {}
+    conditions: dict[Where, LinkConditions] = {}
     known: dict[tuple[Any, ...], LinkConditions] = {}  # of many links there are few kinds
-    for where, said in network.items():
+    for where, keys in network.items():
         receiver = where[1] if isinstance(where, tuple) else where
-        last = for_all | network.get(receiver, {}) | said
+        last = for_all | network.get(receiver, {}) | keys
         values = tuple(last[key] for key in KEYS)
         if values not in known:
             try:
                 known[values] = _conditions(last)
             except ConditionsError as error:
                 raise ConditionsError(f"{_key(where)}{error}") from None
-        found[where] = known[values]
-    receivers = {where: link for where, link in found.items() if isinstance(where, int)}
-    links = {where: link for where, link in found.items() if isinstance(where, tuple)}
-    return NetworkConditions(found[None], receivers, links, partition)
+        conditions[where] = known[values]
+    receivers = {where: link for where, link in conditions.items() if isinstance(where, int)}
+    links = {where: link for where, link in conditions.items() if isinstance(where, tuple)}
+    return NetworkConditions(conditions[None], receivers, links, partition)
 
 
 def _key(where: Where) -> str:
@@ -269,9 +269,9 @@ def _key(where: Where) -> str:
     return f"links from {where[0]} to {where[1]}: " if isinstance(where, tuple) else f"receivers.{where}: "
 
 
-def _conditions(said: dict[str, Any]) -> LinkConditions:
-    loss, delay = said["loss"], said["delay"]
-    values = said | {key: None for key in ("rate", "limit") if said[key] == "none"}
+def _conditions(keys: dict[str, Any]) -> LinkConditions:
+    loss, delay = keys["loss"], keys["delay"]
+    values = keys | {key: None for key in ("rate", "limit") if keys[key] == "none"}
     values["loss"] = GilbertElliott(**loss.model_dump()) if isinstance(loss, Bursts) else loss
     values["delay"] = Delay(**delay.model_dump()) if isinstance(delay, Jitter) else Delay(delay)
     return LinkConditions(**values)

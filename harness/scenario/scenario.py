@@ -101,7 +101,7 @@ class Scenario(Model):
     def _faults_with_their_keys(self) -> list[tuple[str, Fault]]:
         begun = [(f"timeline.{index}", entry.fault) for index, entry in enumerate(self.timeline) if entry.fault]
         begun.sort(key=lambda keyed: keyed[1].at_s)
-        course = [(f"{where}.{fault.what}", one) for where, fault in begun for one in fault.course()]
+        course = [(f"{where}.{fault.what}", stage) for where, fault in begun for stage in fault.course()]
         return sorted(course, key=lambda keyed: keyed[1].at_s)
 
     def network_steps(self) -> Iterator[Step]:
@@ -172,8 +172,8 @@ class Scenario(Model):
             if entry.network is not None:
                 yield from ((f"timeline.{index}.network.{key}", vehicle) for key, vehicle in entry.network.named())
             if entry.injection is not None:
-                injected, it = entry.injection
-                yield from ((f"timeline.{index}.{injected}.sender", agent) for agent in (it.sender,) if agent)
+                name, injection = entry.injection
+                yield from ((f"timeline.{index}.{name}.sender", agent) for agent in (injection.sender,) if agent)
 
     @model_validator(mode="after")
     def _plans_can_be_flown(self) -> "Scenario":

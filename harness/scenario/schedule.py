@@ -79,13 +79,13 @@ class Ramp(Model):
             for number, end in enumerate(self._ends())
         )
         return {
-            where: {key: value + (last[where][key] - value) * share for key, value in said.items()}
-            for where, said in first.items()
+            where: {key: value + (last[where][key] - value) * share for key, value in keys.items()}
+            for where, keys in first.items()
         }
 
 
-def _values(said: Said) -> Iterator[tuple[Where, str, Any]]:
-    return ((where, key, value) for where, keys in said.items() for key, value in keys.items())
+def _values(end: Said) -> Iterator[tuple[Where, str, Any]]:
+    return ((where, key, value) for where, keys in end.items() for key, value in keys.items())
 
 
 class Repeated(Disturbance):
@@ -96,15 +96,15 @@ class Repeated(Disturbance):
 
     @model_validator(mode="after")
     def _of_something(self) -> "Repeated":
-        if all(said is None for said in (self.loss, self.delay, self.partition, self.network)):
+        if all(value is None for value in (self.loss, self.delay, self.partition, self.network)):
             raise ValueError("needs at least one of `loss`, `delay`, `partition` or `network`")
         if self.delay is not None and self.network is not None and self.network.delay is not None:
             raise ValueError("`delay` and `network.delay` are the same thing: leave one of them out")
         return self
 
     def said(self) -> Said:
-        said = super().said()
-        return said if self.delay is None else laid_over(said, {None: {"delay": self.delay}})
+        changes = super().said()
+        return changes if self.delay is None else laid_over(changes, {None: {"delay": self.delay}})
 
 
 Nemesis = Literal["halves", "isolate", "majorities ring", "bridge", "flapping"]
@@ -205,9 +205,9 @@ def _majorities_ring(shuffled: list[int]) -> Layer:
 
 
 def _bridge(shuffled: list[int]) -> Layer:
-    _, *others = shuffled
-    one, other = others[: len(others) // 2], others[len(others) // 2 :]
-    return Layer(cut=frozenset(pair for a in one for b in other for pair in ((a, b), (b, a))))
+    _, *rest = shuffled
+    left, right = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+    return Layer(cut=frozenset(pair for a in left for b in right for pair in ((a, b), (b, a))))
 
 
 def _flapping(shuffled: list[int]) -> Layer:

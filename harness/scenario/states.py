@@ -36,13 +36,13 @@ class Network:
 
     def uncut(self) -> NetworkConditions:
         """The conditions that there would be without partitions and cuts. Raises ConditionsError."""
-        said = self.said
+        network = self.said
         for entry in self.passing:
-            said = laid_over(said, entry.said())
+            network = laid_over(network, entry.said())
         for layer in self.layers:
             if layer.said:
-                said = laid_over(said, layer.said)
-        return conditions_of(said)
+                network = laid_over(network, layer.said)
+        return conditions_of(network)
 
     def conditions(self) -> NetworkConditions:
         """Raises ConditionsError if they contradict each other."""
@@ -55,10 +55,10 @@ class Network:
         """Groups whose members no partition keeps apart."""
         passing = [entry.groups for entry in self.passing if entry.disturbs == PARTITION]
         standing = passing[-1] if passing else self.partition
-        partitions = [one for one in (standing, *(layer.partition for layer in self.layers)) if one]
+        partitions = [partition for partition in (standing, *(layer.partition for layer in self.layers)) if partition]
         if len(partitions) < 2:
             return partitions[0] if partitions else ()
-        sides = [NetworkConditions(partition=one).groups(self.roster) for one in partitions]
+        sides = [NetworkConditions(partition=partition).groups(self.roster) for partition in partitions]
         together = (frozenset.intersection(*each) for each in product(*sides))
         return tuple(group for group in together if group)
 
@@ -104,21 +104,21 @@ def steps(
         for at_s, what, layer in schedule.steps(roster, end_s):
             scheduled[at_s].append((number, what, layer))
     for at_s in sorted({0.0, *begins, *ends, *scheduled}):
-        said, keys = [], []
+        words, keys = [], []
         over = [timeline[number] for number in ends.get(at_s, ())]
         network.passing = [entry for entry in network.passing if entry not in over]
         for number in begins.get(at_s, ()):
             network.play(timeline[number])
-            said.append(timeline[number].disturbs or "")
+            words.append(timeline[number].disturbs or "")
             keys.append(f"timeline.{number}.{timeline[number].disturbs}")
         if over:
-            said.append("undone")
+            words.append("undone")
             keys += [f"the end of timeline.{number}" for number in ends[at_s]]
         for number, what, layer in scheduled.get(at_s, ()):
             network.layers[number] = layer
-            said.append(what)
+            words.append(what)
             keys.append(f"schedule.{number}")
-        yield Step(at_s, ", ".join(dict.fromkeys(said)) or "start", keys, network)
+        yield Step(at_s, ", ".join(dict.fromkeys(words)) or "start", keys, network)
 
 
 def refuse_ambiguity(timeline: Sequence[TimelineEntry]) -> None:
@@ -127,17 +127,17 @@ def refuse_ambiguity(timeline: Sequence[TimelineEntry]) -> None:
     for number, entry in sorted(enumerate(timeline), key=lambda numbered: numbered[1].at_s):
         until_s = math.inf if entry.for_s is None else entry.ends_at_s
         for where, key in _changed(entry):
-            others = under_way[where, key]
-            while others and others[-1][0] <= entry.at_s:
-                others.pop()
-            if others and until_s > others[-1][0]:
-                other_until_s, other = others[-1]
+            earlier = under_way[where, key]
+            while earlier and earlier[-1][0] <= entry.at_s:
+                earlier.pop()
+            if earlier and until_s > earlier[-1][0]:
+                other_until_s, other_number = earlier[-1]
                 lasts = "for good" if entry.for_s is None else f"until {until_s:g} s"
                 raise ValueError(
-                    f"timeline.{number} changes {key}{of_whom(where)} {lasts}, and timeline.{other} until "
+                    f"timeline.{number} changes {key}{of_whom(where)} {lasts}, and timeline.{other_number} until "
                     f"{other_until_s:g} s: which holds when? Have timeline.{number} begin then, or be over by then"
                 )
-            others.append((until_s, number))
+            earlier.append((until_s, number))
 
 
 def _changed(entry: TimelineEntry) -> Iterator[tuple[Where, str]]:
@@ -145,4 +145,4 @@ def _changed(entry: TimelineEntry) -> Iterator[tuple[Where, str]]:
     if entry.disturbs in (PARTITION, "heal"):
         yield None, "the partition"
     elif entry.disturbs:
-        yield from ((where, key) for where, said in entry.said().items() for key in said)
+        yield from ((where, key) for where, keys in entry.said().items() for key in keys)

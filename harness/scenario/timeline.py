@@ -55,7 +55,7 @@ class _Entry(Disturbance):
     @property
     def injection(self) -> tuple[InjectionName, Injection] | None:
         """What a rogue node sends, if it does."""
-        return next(((name, found) for name in INJECTIONS if (found := getattr(self, name)) is not None), None)
+        return next(((name, injection) for name in INJECTIONS if (injection := getattr(self, name)) is not None), None)
 
     @property
     def fault(self) -> Fault | None:
@@ -101,8 +101,8 @@ def _keys_of_faults() -> dict[str, Any]:
     """The fields of an entry that faults bring along: the agents, by the fault's name, and its further keys."""
     annotations: dict[str, Any] = {}
     for kind in ASKED_FOR:
-        said = get_type_hints(kind, include_extras=True)
-        annotations |= {kind.what: Agents, **{key: said[key] for key in kind.further_keys()}}
+        hints = get_type_hints(kind, include_extras=True)
+        annotations |= {kind.what: Agents, **{key: hints[key] for key in kind.further_keys()}}
     return {key: (annotation | None, None) for key, annotation in annotations.items()}
 
 

@@ -48,12 +48,12 @@ def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
     """`directory` is the matrix's, beside whose files the page will be."""
     by_point = [(point, list(runs)) for point, runs in groupby(finished.runs, key=lambda run: run.point)]
     room = MAX_ROWS // max(1, len(by_point))
-    found = []
+    cells = []
     for point, runs in by_point:
         runs.sort(key=lambda run: (run.failed is None, "violated" not in run.verdicts.values()))
         figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
         played = ["ucp-harness", "run", scenario_file(point), "--backend", point.backend, "--seed", str(runs[0].seed)]
-        found.append(
+        cells.append(
             CellRuns(
                 anchor(point),
                 name_of(finished.record.matrix, point),
@@ -64,16 +64,16 @@ def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
                 max(0, len(runs) - room),
             )
         )
-    return found
+    return cells
 
 
 def _count(runs: Sequence[Run]) -> str:
-    said = [f"{words.value(len(runs))} run{'s' if len(runs) > 1 else ''}"]
+    counts = [f"{words.value(len(runs))} run{'s' if len(runs) > 1 else ''}"]
     if number := sum("violated" in run.verdicts.values() for run in runs):
-        said.append(f"{number} violated a characteristic")
+        counts.append(f"{number} violated a characteristic")
     if number := sum(run.failed is not None for run in runs):
-        said.append(f"{number} failed")
-    return ", ".join(said)
+        counts.append(f"{number} failed")
+    return ", ".join(counts)
 
 
 def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:

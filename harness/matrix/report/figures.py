@@ -39,6 +39,6 @@ class Figure:
 
 def known(cells: Iterable[Cell]) -> list[Figure]:
     """Those that a run told, first what the mission left; the violated at least."""
-    told = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
-    metrics = [metric for metric in BEFORE_FINAL_RECONCILE + METRICS if metric.name in told]
+    names = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
+    metrics = [metric for metric in BEFORE_FINAL_RECONCILE + METRICS if metric.name in names]
     return [Figure(metric) for metric in (*metrics, _VIOLATED)]

@@ -107,13 +107,13 @@ def _tile(record: MatrixRecord, figure: Figure, point: Point, cell: Cell | None,
     if cell is None:
         return Tile(None, "\u2013", "", [], f"{name}: no run has ended", None)
     estimate, marks = figure.of(cell), _marks(record, figure, cell)
-    said = ", ".join([say(figure.metric, estimate), *(mark.text for mark in marks)])
+    text = ", ".join([say(figure.metric, estimate), *(mark.text for mark in marks)])
     return Tile(
         None if estimate.mean is None else _shade(estimate.mean, *scale),
         say_mean(figure.metric, estimate),
         say_interval(figure.metric, estimate),
         marks,
-        f"{name}: {figure.metric.label} {said}",
+        f"{name}: {figure.metric.label} {text}",
         f"#{anchor(point)}",
     )
 

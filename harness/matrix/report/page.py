@@ -52,7 +52,9 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
 
 def _choosing(shown: list[figures.Figure]) -> str:
     """Of what is drawn for each figure only the chosen one's is shown; on paper all heatmaps are."""
-    others = [f"main:has(#show-{one.metric.name}:checked) {{}} .figure:not(.of-{one.metric.name})" for one in shown]
+    others = [
+        f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown
+    ]
     on_screen, always = (",\n".join(rule.format(place) for rule in others) for place in ("", ".trend"))
     return f"@media screen {{\n{on_screen} {{ display: none; }}\n}}\n{always} {{ display: none; }}\n"
 

@@ -33,15 +33,19 @@ def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures:
 def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: Figure) -> list[tuple[str, Markup]]:
     """A drawing for each number of agents and backend, with its name if there are several."""
     of_night = [{cell.point: figure.of(cell) for cell in night.cells} for night in nights]
-    said = [words.started(night.started_at)[:16] for night in nights]
+    begun = [words.started(night.started_at)[:16] for night in nights]
     drawings = []
     for cells in series(tonight):
         cells = sorted(cells, key=lambda cell: cell.loss)
         areas = svg.grid(len(cells), COLUMNS, 0, PANEL_HEIGHT)
         panels = []
         for cell, area in zip(cells, areas, strict=True):
-            known = [(at, one[cell.point]) for at, one in enumerate(of_night) if cell.point in one]
-            dots = [Dot(at, one, f"{said[at]}: {say(figure.metric, one)}") for at, one in known if _is_sane(one)]
+            known = [(at, by_point[cell.point]) for at, by_point in enumerate(of_night) if cell.point in by_point]
+            dots = [
+                Dot(at, estimate, f"{begun[at]}: {say(figure.metric, estimate)}")
+                for at, estimate in known
+                if _is_sane(estimate)
+            ]
             panels.append(_panel(figure, cell, dots, [night.started_at[5:10] for night in nights], area))
         height = math.ceil(len(cells) / COLUMNS) * PANEL_HEIGHT + FOOT
         name = ", ".join(series_name(tonight.matrix, cells[0].point))
@@ -73,7 +77,9 @@ def _panel(figure: Figure, cell: Cell, dots: Sequence[Dot], dates: Sequence[str]
 
 def _value_axis(figure: Figure, estimates: Sequence[Estimate], area: Area) -> Axis:
     """Around all intervals, and never so narrow that a trifle looks like a change."""
-    bounds = [bound for one in estimates for bound in (one.low, one.mean, one.high) if bound is not None]
+    bounds = [
+        bound for estimate in estimates for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None
+    ]
     low, high = min(bounds, default=0.0), max(bounds, default=1.0)
     least = 0.04 if figure.metric.unit != "number" else max(0.2, 0.1 * abs(high))
     margin = max(0.0, least - (high - low)) / 2

@@ -60,10 +60,10 @@ class Output:
             end = _FRAME.size + length
             if len(self._unread) < end:
                 return
-            said = bytes(self._unread[_FRAME.size : end])
+            content = bytes(self._unread[_FRAME.size : end])
             del self._unread[:end]
             file = self._files[STDERR if output == STDERR else STDOUT]
-            file.write(said)
+            file.write(content)
             file.flush()
 
     def close(self) -> None:

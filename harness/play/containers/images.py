@@ -169,11 +169,11 @@ def _package(name: str) -> Path:
 
 def outermost(paths: Iterable[Path]) -> list[Path]:
     """Each directory once, without those that lie in another."""
-    found: list[Path] = []
+    roots: list[Path] = []
     for path in sorted(set(paths)):
-        if not any(path.is_relative_to(outer) for outer in found):
-            found.append(path)
-    return found
+        if not any(path.is_relative_to(outer) for outer in roots):
+            roots.append(path)
+    return roots
 
 
 def idle_command() -> list[str]:

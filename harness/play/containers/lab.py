@@ -91,14 +91,14 @@ class ContainerLab:
             loop.call_soon_threadsafe(say, word)
 
         def choose() -> dict[Role, Image]:
-            found: dict[Role, Image] = {}
+            chosen: dict[Role, Image] = {}
             if asked.image is not None:
-                found["agent"] = images.named(self._engine, asked.image)
+                chosen["agent"] = images.named(self._engine, asked.image)
             if asked.image is None or scenario.vehicles.kind != "none":
                 from_host = asked.image_from_host
                 ours = images.from_host(self._engine) if from_host else images.project(self._engine, tell)
-                found = {"vehicle": ours, "agent": ours, **found}
-            return found
+                chosen = {"vehicle": ours, "agent": ours, **chosen}
+            return chosen
 
         try:
             self._images = await self._engine.in_thread(choose)
@@ -278,11 +278,14 @@ class ContainerLab:
         """All of the run, also those that were under way when somebody stopped waiting for them."""
         self._closed = True
         await self._engine.settle()
-        found = await self._engine.ask(
+        containers = await self._engine.ask(
             "list containers", self._engine.api.containers, all=True, filters={"label": f"{ownership.RUN}={self._name}"}
         )
         removed = await asyncio.gather(
-            *(self._engine.in_thread(remove, self._engine, one["Id"], one["Names"][0][1:]) for one in found),
+            *(
+                self._engine.in_thread(remove, self._engine, container["Id"], container["Names"][0][1:])
+                for container in containers
+            ),
             return_exceptions=True,
         )
         for error in filter(None, removed):

@@ -19,12 +19,12 @@ class Cleaned:
 def clean(engine: Engine) -> Cleaned:
     """Remove every container of a run that is over, and nothing else. Raises DockerError."""
     cleaned = Cleaned()
-    for one in engine.do("list containers", engine.api.containers, all=True, filters={"label": ownership.RUN}):
-        name = one["Names"][0].removeprefix("/")
-        if ownership.lives(one["Labels"].get(ownership.OWNER, "")):
+    for container in engine.do("list containers", engine.api.containers, all=True, filters={"label": ownership.RUN}):
+        name = container["Names"][0].removeprefix("/")
+        if ownership.lives(container["Labels"].get(ownership.OWNER, "")):
             cleaned.still.append(name)
         else:
-            remove(engine, one["Id"], name)
+            remove(engine, container["Id"], name)
             cleaned.removed.append(name)
     return cleaned
 

@@ -39,10 +39,10 @@ def agent_command(scenario: Scenario) -> list[str]:
     if scenario.agent_command is None:
         return [sys.executable, "-P", "-m", "ucp.node"]
     program, *arguments = scenario.agent_command
-    found = shutil.which(program)
-    if found is None:
+    path = shutil.which(program)
+    if path is None:
         raise ScenarioError(f"`agent_command`: {program} is no program: give a path, or a name on PATH")
-    return [str(Path(found).absolute()), *arguments]  # agents work in a directory of their own
+    return [str(Path(path).absolute()), *arguments]  # agents work in a directory of their own
 
 
 class AgentFailedError(HarnessError):

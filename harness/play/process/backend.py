@@ -363,7 +363,9 @@ class ProcessRun:
                 await self._stop_rogue(self._rogue)
             self.played.counters = self._of_the_swarm(await lab.read())
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
-            await asyncio.gather(*(agent.stop() for agent in self.agents), *(one.stop() for one in self.vehicles))
+            await asyncio.gather(
+                *(agent.stop() for agent in self.agents), *(vehicle.stop() for vehicle in self.vehicles)
+            )
             for agent in self.agents:
                 agent.put_together()
         except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed

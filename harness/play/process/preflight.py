@@ -54,15 +54,15 @@ def _networks(scenario: Scenario) -> list[NetworkConditions]:
     """
     states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
     out_of_reach = {frozenset(scenario.roster[:2]): 0.5} if scenario.network.radio else {}
-    found: list[NetworkConditions] = []
+    networks: list[NetworkConditions] = []
     for state in states:
         try:
             network = on_the_air(over_the_air(state, out_of_reach).healed(), scenario).at_speed(scenario.speedup)
         except ConditionsError as error:
             raise ScenarioError(f"`network` at `speedup` {scenario.speedup:g}: {error}") from None
-        if network not in found:
-            found.append(network)
-    return found
+        if network not in networks:
+            networks.append(network)
+    return networks
 
 
 def refuse_what_this_machine_cannot(scenario: Scenario) -> None:

@@ -35,8 +35,8 @@ def system_ids(vehicle_ids: Sequence[int]) -> dict[int, int]:
     """
     taken = {vehicle_id for vehicle_id in vehicle_ids if vehicle_id <= MAX_SYSID}
     free = [sysid for sysid in range(1, MAX_SYSID + 1) if sysid not in taken] or [MAX_SYSID]
-    others = (vehicle_id for vehicle_id in vehicle_ids if vehicle_id > MAX_SYSID)
-    lent = {vehicle_id: free[number % len(free)] for number, vehicle_id in enumerate(others)}
+    borrowers = (vehicle_id for vehicle_id in vehicle_ids if vehicle_id > MAX_SYSID)
+    lent = {vehicle_id: free[number % len(free)] for number, vehicle_id in enumerate(borrowers)}
     return {vehicle_id: lent.get(vehicle_id, vehicle_id) for vehicle_id in vehicle_ids}
 
 
@@ -178,6 +178,6 @@ class VehicleProcess:
             lines = self._output.read_text(encoding="utf-8", errors="replace").splitlines()[-LAST_WORDS:]
         except OSError:
             lines = []
-        said = " / ".join(line.strip() for line in lines if line.strip())
+        words = " / ".join(line.strip() for line in lines if line.strip())
         where = f"vehicles/{self._directory.name}/{self._output.name}"
-        return f"; its last words ({where}): {said}" if said else f"; it said nothing ({where})"
+        return f"; its last words ({where}): {words}" if words else f"; it said nothing ({where})"

@@ -80,10 +80,10 @@ class RogueNode:
     def _send(self) -> None:
         """Send what there is to send, and wait for what is due next."""
         assert self._rogue is not None, "there is nothing to send before the start"
-        for one in self._rogue.to_send():
+        for injected in self._rogue.to_send():
             now = self._clock.now()
-            self._mouth.send(udp_broadcast(one.source, PORT, one.datagram))
-            self._journal.add(one, now)
+            self._mouth.send(udp_broadcast(injected.source, PORT, injected.datagram))
+            self._journal.add(injected, now)
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -47,7 +47,7 @@ def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, r
         Kind.OPTIONAL_HASH: lambda: rng.choice([None, rng.randbytes(HASH_BYTES)]),
         Kind.BLOCK: block,
     }
-    message, layer = rng.choice([(it, layer) for it, layer in LAYERS.items() if name in (None, it.NAME)])
+    message, layer = rng.choice([(message, layer) for message, layer in LAYERS.items() if name in (None, message.NAME)])
     return layer(**{field: content[kind]() for field, kind in message.WIRE.items()})
 
 

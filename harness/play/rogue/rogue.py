@@ -59,8 +59,8 @@ class Injected:
         except MalformedDatagramError as malformed:
             return {**record, "bytes": len(self.datagram), "refused": malformed.reason}
         block = block_named(message)
-        said = {"message": message.NAME, "sender": sender, "sequence": sequence}
-        return {**record, **said, "block": block.hex() if block else None, "bytes": len(self.datagram)}
+        decoded = {"message": message.NAME, "sender": sender, "sequence": sequence}
+        return {**record, **decoded, "block": block.hex() if block else None, "bytes": len(self.datagram)}
 
 
 @dataclass(slots=True)
@@ -171,7 +171,7 @@ class Rogue:
 
     def _replay(self, number: int, replay: Replay) -> None:
         matching = ((sender, data) for sender, name, data in reversed(self._heard) if replay.matches(name, sender))
-        last = [found for found, _ in zip(matching, range(replay.count), strict=False)]
+        last = [heard for heard, _ in zip(matching, range(replay.count), strict=False)]
         for sender, data in reversed(last):
             self._send(Injected(number, "replay", sender, data))
 

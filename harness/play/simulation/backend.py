@@ -272,11 +272,11 @@ class Simulation:
     def _agent_to_json(self, number: int) -> dict[str, Any]:
         lives = self._lives[number]
         life = self._alive[number]
-        completed = dict.fromkeys(block.hex() for one in lives for block in one.agent.state.completed)
+        completed = dict.fromkeys(block.hex() for life in lives for block in life.agent.state.completed)
         for block in life.agent.state.completed if life else ():
             del completed[block.hex()]
-        reboots = sum(one.found is not None for one in lives)
-        dropped = sum((one.agent.dropped for one in lives), Counter())
+        reboots = sum(life.found is not None for life in lives)
+        dropped = sum((life.agent.dropped for life in lives), Counter())
         return {
             "outcome": "exported" if life else "rebooting" if number in self._disks else "killed",
             "restarts": len(lives) - 1 - reboots,
@@ -398,7 +398,7 @@ class Simulation:
 
     # An agent's life
 
-    def _start(self, number: int, found: StoredState | None = None) -> None:
+    def _start(self, number: int, stored: StoredState | None = None) -> None:
         agent_id = self.roster[number]
         scenario = self.scenario
         seed = agent_seed(self.seed, agent_id, len(self._lives[number]) + 1)
@@ -411,13 +411,13 @@ class Simulation:
             tracing=self._tracing,
         )
         source = RandomEvents(Random(seed), scenario.events.mean_s)
-        life = Incarnation(agent, source, scenario.clocks.get(agent_id), self._now, found)
+        life = Incarnation(agent, source, scenario.clocks.get(agent_id), self._now, stored)
         self._lives[number].append(life)
         self._alive[number] = life
         self._air.born_at[number] = self._now
         self._recorder.begin(life)
-        if found is not None:
-            agent.boot(found, self._local(life))
+        if stored is not None:
+            agent.boot(stored, self._local(life))
             self._after(number, life)
         self._expect_event(number, life)
 

@@ -52,10 +52,10 @@ class VirtualRogue:
         self._journal.close()
 
     def _send(self, now: float) -> None:
-        for one in self._rogue.to_send():
-            hearing = [number for number, agent in enumerate(self._roster) if agent != one.source]
-            self._air.inject(now + MOMENT_S, RogueDatagram(one.source, one.datagram), hearing)
-            self._journal.add(one, now)
+        for injected in self._rogue.to_send():
+            hearing = [number for number, agent in enumerate(self._roster) if agent != injected.source]
+            self._air.inject(now + MOMENT_S, RogueDatagram(injected.source, injected.datagram), hearing)
+            self._journal.add(injected, now)
         soonest = self._rogue.next_timer()
         if soonest is not None and (self._wakes_at is None or soonest < self._wakes_at):
             self._wakes_at = soonest
