@@ -15,7 +15,7 @@ from harness.backend_names import BACKEND_NAMES
 
 if TYPE_CHECKING:
     from harness.pytest_plugin.findings import Findings
-    from harness.pytest_plugin.swarm_in_test import Swarm
+    from harness.pytest_plugin.swarm_in_test import SwarmInTest
     from harness.pytest_plugin.trial import Trial
 
 TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
@@ -60,7 +60,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 @pytest.fixture
-def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
+def swarm(request: pytest.FixtureRequest) -> Iterator[SwarmInTest]:
     """Agents to tell what happens, sentence by sentence: five of them, without loss, unless a marker says otherwise."""
     from harness.pytest_plugin.fixtures import swarm_for
 

@@ -13,7 +13,7 @@ from harness.pytest_plugin import TRIAL
 from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.findings import Findings
 from harness.pytest_plugin.options import Options
-from harness.pytest_plugin.swarm_in_test import Swarm
+from harness.pytest_plugin.swarm_in_test import SwarmInTest
 from harness.pytest_plugin.trial import Trial, one_sentence
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
@@ -22,7 +22,7 @@ from harness.scenario.load import parse
 DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
 
 
-def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
+def swarm_for(node: pytest.Item) -> Iterator[SwarmInTest]:
     """The swarm of a test. `Trial` ends and judges it, or it ends here if the test does not come to its end."""
     with one_sentence():
         options = Options.of(node.config)
@@ -32,7 +32,7 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
         backend, seed = _backend_and_seed(keys.pop("backend"), keys.pop("seed"), options)
         scenario = options.at_speedup(parse(keys))
         directory = new_directory(node, options)
-        swarm = Swarm(scenario, seed, backend, directory)
+        swarm = SwarmInTest(scenario, seed, backend, directory)
     trial = node.stash[TRIAL] = Trial(scenario.expect, swarm.finish)
     try:
         yield swarm

@@ -29,7 +29,7 @@ class RunEndedError(Exception):
     """The run has ended before the test: an agent or a vehicle failed, or the machine."""
 
 
-class Swarm:
+class SwarmInTest:
     """Agents on any backend, told what happens. Times are mission seconds, agents are named by their IDs.
 
     Between two sentences virtual time stands still; real processes go on, and what is due then comes with the next.

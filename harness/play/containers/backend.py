@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
-from harness.play.process.lab import Lab
+from harness.play.process.lab import MissionLab
 from harness.play.process.preflight import refuse_what_programs_cannot
 from harness.play.process.processes import Processes
 from harness.scenario import Scenario
@@ -30,7 +30,7 @@ class Containers(Processes):
             return list(scenario.agent_command)  # a program in the image
         return super().agent_command(scenario)
 
-    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> Lab:
+    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> MissionLab:
         from harness.play.containers.lab import ContainerLab
 
         return await ContainerLab.open(scenario, rundir, say)

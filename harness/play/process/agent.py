@@ -22,7 +22,7 @@ from harness.archive.directory import RunDirectory
 from harness.archive.traces import SUFFIX, read_trace
 from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, Status
-from harness.play.process.lab import Lab, Program
+from harness.play.process.lab import MissionLab, Program
 from harness.play.process.mission_file import mission_file
 from harness.scenario import Scenario
 
@@ -106,7 +106,7 @@ class AgentProcess:
 
     async def start(
         self,
-        lab: Lab,
+        lab: MissionLab,
         scenario: Scenario,
         seed: int,
         initial_data: bytes,

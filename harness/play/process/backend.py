@@ -16,7 +16,7 @@ from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.play.control import Status
 from harness.play.mission import RunOutcome
 from harness.play.process.agent import AgentProcess, reboots_with_disk
-from harness.play.process.lab import Lab, OpenLab
+from harness.play.process.lab import MissionLab, OpenLab
 from harness.play.process.preflight import on_the_air
 from harness.play.process.rogue import RogueProcess
 from harness.play.process.vehicle import VehicleProcess, system_ids
@@ -158,7 +158,7 @@ class ProcessRun:
         vehicles = self.scenario.vehicles
         return home_in_field(number, Home(*vehicles.home), vehicles.spacing_m)
 
-    async def _start_vehicles(self, lab: Lab) -> None:
+    async def _start_vehicles(self, lab: MissionLab) -> None:
         if not self.vehicles:
             return
         self._show("starting vehicles")
@@ -169,14 +169,14 @@ class ProcessRun:
         for vehicle in self.vehicles:
             self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
 
-    async def _start_agents(self, lab: Lab) -> None:
+    async def _start_agents(self, lab: MissionLab) -> None:
         self._show("starting agents")
         await asyncio.gather(*(self._start_agent(agent, lab) for agent in self.agents))
         if self._rogue is not None:
             await self._rogue.start(lab.network)
             self._watchers.start(self._rogue.watch(), of="rogue")
 
-    async def _start_agent(self, agent: AgentProcess, lab: Lab) -> None:
+    async def _start_agent(self, agent: AgentProcess, lab: MissionLab) -> None:
         """Start it, into the mission if that is under way."""
         with_vehicle = bool(self.vehicles)
         keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
@@ -347,7 +347,7 @@ class ProcessRun:
     def _ended_early(self, error: HarnessError) -> None:
         self.played.end_early("interrupted" if isinstance(error, InterruptedRunError) else "failed", error)
 
-    async def _wind_up(self, lab: Lab) -> None:
+    async def _wind_up(self, lab: MissionLab) -> None:
         """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""
         self._show("exporting")
         self.played.mission_s = round(self.clock.now(), 1)

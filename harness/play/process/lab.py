@@ -44,7 +44,7 @@ class Program(Protocol):
         """End it with SIGTERM, or after `grace_s` seconds with SIGKILL; returns its return code."""
 
 
-class Lab(Protocol):
+class MissionLab(Protocol):
     """Raises NetemError wherever it fails; as netem.lab.Lab does, and says, what is not said here."""
 
     @property
@@ -92,5 +92,5 @@ class Lab(Protocol):
         """As `close`, but raises nothing."""
 
 
-OpenLab = Callable[[Scenario, RunDirectory, Callable[[str], None]], Awaitable[Lab]]
+OpenLab = Callable[[Scenario, RunDirectory, Callable[[str], None]], Awaitable[MissionLab]]
 """Brings up the lab of a run, saying what it does if that takes long. Raises NetemError or HarnessError."""

@@ -12,7 +12,7 @@ from harness.play.backend import Backend
 from harness.play.mission import Swarm
 from harness.play.process import agent
 from harness.play.process.backend import ProcessRun
-from harness.play.process.lab import Lab
+from harness.play.process.lab import MissionLab
 from harness.play.process.preflight import network_needs, refuse_what_programs_cannot
 from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.play.progress import Progress
@@ -31,7 +31,7 @@ class Processes(Backend):
         """What starts an agent, but for the mission file. Raises HarnessError if nothing would."""
         return agent.agent_command(scenario)
 
-    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> Lab:
+    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> MissionLab:
         """What vehicles and agents live in; see `harness.play.process.lab.OpenLab`."""
         return await ProcessLab.open(scenario.on_the_air, needs=network_needs(scenario), log=rundir.lab_log)
 

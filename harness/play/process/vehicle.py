@@ -10,7 +10,7 @@ from typing import Any
 
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
-from harness.play.process.lab import Lab, Program
+from harness.play.process.lab import MissionLab, Program
 from netem.radio import Place
 from sitl.pilot import Pilot
 from sitl.plan import By, Plan
@@ -56,7 +56,7 @@ class VehicleProcess:
     def _output(self) -> Path:
         return self._directory / "output.log"
 
-    async def start(self, lab: Lab, home: Home, speedup: float) -> None:
+    async def start(self, lab: MissionLab, home: Home, speedup: float) -> None:
         """Start the vehicle and connect its pilot. Raises VehicleFailedError."""
         self._home = home
         try:
@@ -74,7 +74,7 @@ class VehicleProcess:
         )
         await self._connect(lab, launch, speedup)
 
-    async def _connect(self, lab: Lab, launch: Launch, speedup: float) -> None:
+    async def _connect(self, lab: MissionLab, launch: Launch, speedup: float) -> None:
         assert self._process is not None
         deadline = asyncio.get_running_loop().time() + LISTEN_LIMIT_S
         while True:
