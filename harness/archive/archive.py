@@ -41,7 +41,7 @@ LARGE_BYTES = 16 * 1024 * 1024
 class RunArchive:
     """What is in run directories, in directories of exports, or in exports from anywhere, with the traces beside them.
 
-    `directory` is the first that was named, which has the run's record if there is one; None if files were named.
+    `directory` is the run's: the first that has a record, or the first that was named; None if only files were.
     With `skim`, handler runs that only took a message in are left out of traces that are `large`. Raises
     RunDirectoryError if a path does not exist, or is a directory of other things.
     """
@@ -50,7 +50,8 @@ class RunArchive:
         self._export_files = export_files(paths)
         self._skim = skim
         directories = [path for path in paths if path.is_dir()]
-        self.directory = directories[0] if directories else None
+        recorded = (path for path in directories if (path / RUN_FILE).exists())
+        self.directory = next(recorded, directories[0] if directories else None)
         beside = [path.parent for path in self._export_files]
         # A directory may have traces and no exports: the run was killed.
         self._agents = list(dict.fromkeys([*beside, *map(agents_directory, directories)]))
@@ -145,13 +146,14 @@ class RunArchive:
         traces: dict[int, Trace] = {}
         problems, gaps = [], []
         skim = self._skim and self.large
+        of_the_run = roster_of(self.result)  # none where nothing says who flew, as of exports from the field
         for path in self._trace_files:
             trace = read_trace(path, skim=skim)
             if trace is None:
                 problems.append(f"{path}: not a trace; it is left out")
                 continue
             agent_id = trace.header.agent_id
-            if agent_id in traces or (self.directory is not None and self.roster and agent_id not in self.roster):
+            if agent_id in traces or (of_the_run and agent_id not in of_the_run):
                 problems.append(f"{path}: of an agent that is not of this run, or has a trace already; it is left out")
                 continue
             recorded = self.record.agents.get(str(agent_id)) if self.record else None

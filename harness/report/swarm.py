@@ -25,7 +25,7 @@ class BlockRow:
 def agent_inks(archive: RunArchive) -> dict[int, Ink]:
     exports = archive.exports.by_agent
     makers = {block.agent_id for export in exports.values() for block in export.blocks()}
-    return inks({*archive.roster, *exports, *makers})
+    return inks({*archive.roster, *exports, *makers, *archive.traces})
 
 
 def missing(archive: RunArchive) -> list[str]:

@@ -16,7 +16,7 @@ from harness.archive.archive import RunArchive
 from harness.difference import compare
 from harness.errors import HarnessError, RunDirectoryError
 from harness.play.progress import Silent
-from harness.report import read_source
+from harness.report import read_source, write_report
 from harness.run.run import run
 from tests.harness.virtual import scenario
 
@@ -125,6 +125,36 @@ def test_a_whole_run_has_neither_problems_nor_gaps(whole: Path) -> None:
     archive = RunArchive(whole)
     assert (archive.problems, archive.gaps) == ([], [])
     assert archive.roster == [1, 2, 3] == [*archive.traces] == [*archive.exports.by_agent]
+
+
+def test_files_from_the_field_may_have_any_names(whole: Path, tmp_path: Path) -> None:
+    for agent, name in ((1, "1"), (2, "the blue one"), (3, "unnamed (2)")):
+        for kind in ("chain.json", "trace.jsonl"):
+            shutil.copy(whole / "agents" / f"{agent}.{kind}", tmp_path / f"{name}.{kind}")
+    archive = RunArchive(tmp_path)
+    assert archive.problems == []
+    assert [*archive.traces] == [*archive.exports.by_agent] == [1, 2, 3]
+
+
+def test_the_record_is_found_in_whichever_directory_has_it(whole: Path, tmp_path: Path) -> None:
+    shutil.copy(whole / "agents" / "2.chain.json", tmp_path)
+    (whole / "agents" / "2.chain.json").rename(moved := whole / "agents" / "2.chain.away")
+    try:
+        archive = RunArchive(tmp_path, whole)
+        assert archive.record is not None
+        assert archive.directory == whole
+        assert [*archive.exports.by_agent] == [*archive.traces] == [1, 2, 3]
+    finally:
+        moved.rename(whole / "agents" / "2.chain.json")
+
+
+def test_a_run_without_a_record_is_reported_with_whoever_left_a_trace(whole: Path, tmp_path: Path) -> None:
+    directory = tmp_path / "run"
+    shutil.copytree(whole, directory)
+    (directory / "run.json").write_text("{")
+    (directory / "agents" / "3.trace.jsonl").rename(directory / "agents" / "another name.trace.jsonl")
+    (directory / "agents" / "3.chain.json").unlink()
+    assert write_report(RunArchive(directory)).exists()
 
 
 def test_what_skimming_leaves_out_is_told_all_the_same(whole: Path, tmp_path: Path) -> None:
