@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from harness.backend_names import BackendName
 from harness.scenario import Scenario, faults
 from harness.scenario.faults import Disk
+from harness.scenario.verdicts import CharacteristicVerdict, Verdict
 
 SCHEMA = "ucp-run/1"
 
@@ -24,9 +25,18 @@ class Evidence(_Model):
     block_hash: str | None
 
 
-class CharacteristicVerdict(_Model):
+class JudgedCharacteristic(_Model):
     name: str
-    verdict: Literal["holds", "violated", "not applicable"]
+    verdict: CharacteristicVerdict
+    reason: str
+    evidence: list[Evidence]
+
+
+class Judged(_Model):
+    """A judgement beside the characteristics."""
+
+    name: str
+    verdict: Verdict
     reason: str
     evidence: list[Evidence]
 
@@ -215,7 +225,13 @@ class RunRecord(JudgedRecord):
     """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
     capture: dict[str, CapturedFrames] | None = None
     """Of each vehicle, if captures were asked for and came to their end."""
-    characteristics: dict[str, CharacteristicVerdict] = {}
+    characteristics: dict[str, JudgedCharacteristic] = {}
+    steps: Judged | None = None
+    """Whether every agent did at every step what the algorithms say."""
+    records: Judged | None = None
+    """Whether what two records tell about the same thing agrees."""
+    liveness: Judged | None = None
+    """Whether the swarm became idle once no more events came."""
     figures: dict[str, float | int | None] = {}
     survival: Survival | None = None
     rogue: list[RogueInjection] = []

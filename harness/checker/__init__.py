@@ -1,6 +1,6 @@
 """The checker: decides from exports, and more from traces, whether the six characteristics hold (Section 4.3).
 
-One file per characteristic, each a function from `Evidence` to `Characteristic`; `verdict.py` gathers them. Beside
+One file per characteristic, each a function from `Evidence` to `Judgement`; `verdict.py` gathers them. Beside
 them, `survival.py` says what the loss of vehicles took and could take.
 """
 

@@ -5,8 +5,8 @@ So a difference is a violation only where full connectivity is on record, and si
 differing agent that began after the others' chains had stopped changing. Else the characteristics do not apply.
 """
 
-from harness.checker.characteristic import agents
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import agents
 
 
 def why_unknown(evidence: Evidence) -> str | None:

@@ -1,16 +1,16 @@
 """Characteristic 5: in a fully connected system every completed block is in every living agent's chain, eventually."""
 
 from harness.checker.agreement import had_a_chance, why_no_chance, why_unknown
-from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding, Judgement, agents, violated
 
 NAME = "all committed everywhere"
 
 
-def check(evidence: Evidence) -> Characteristic:
+def check(evidence: Evidence) -> Judgement:
     unknown = why_unknown(evidence)
     if unknown:
-        return Characteristic(NAME, "not applicable", unknown)
+        return Judgement(NAME, "not applicable", unknown)
     gone, completed = _gone_and_left(evidence)
     lacking: dict[int, list[str]] = {}
     for agent_id, export in evidence.exports.items():
@@ -20,11 +20,11 @@ def check(evidence: Evidence) -> Characteristic:
             lacking[agent_id] = missing
     if not lacking:
         but = f"; {gone} more were gone with the agents that were killed" if gone else ""
-        return Characteristic(NAME, "holds", f"all {len(completed)} completed blocks are in every chain{but}")
+        return Judgement(NAME, "holds", f"all {len(completed)} completed blocks are in every chain{but}")
     no_chance = why_no_chance(evidence, set(lacking))
     if no_chance:
         lack = sum(map(len, lacking.values()))
-        return Characteristic(
+        return Judgement(
             NAME,
             "not applicable",
             f"{agents(set(lacking))} lack{'s' if len(lacking) == 1 else ''} {lack} cop{'y' if lack == 1 else 'ies'} "

@@ -4,8 +4,8 @@ Every handler run has a local trigger or a message that its sender really sent, 
 when its own timer does. Only traces can tell.
 """
 
-from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding, Judgement, agents, violated
 from harness.checker.waiting import waited_too_long
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
 from ucp.trace import HandlerRun
@@ -17,9 +17,9 @@ _OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
 _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 
 
-def check(evidence: Evidence) -> Characteristic:
+def check(evidence: Evidence) -> Judgement:
     if not evidence.traces:
-        return Characteristic(NAME, "not applicable", "no traces: exports do not show what triggered the handlers")
+        return Judgement(NAME, "not applicable", "no traces: exports do not show what triggered the handlers")
     sent = {
         agent_id: {(message.seq, message.message) for run in trace.runs for message in run.sent}
         for agent_id, trace in evidence.traces.items()
@@ -45,17 +45,15 @@ def check(evidence: Evidence) -> Characteristic:
         return violated(NAME, "a handler ran without a trigger of its own, or waited for another agent", findings)
     silent = sorted(set(evidence.roster or evidence.exports) - set(evidence.traces))
     if untraced or silent:
-        return Characteristic(
+        return Judgement(
             NAME,
             "not applicable",
             f"there is no trace of {agents(untraced | set(silent))}, so what they sent and did cannot be checked",
         )
     damaged = [agent_id for agent_id, trace in evidence.traces.items() if trace.problem]
     if damaged:
-        return Characteristic(NAME, "not applicable", f"the trace of {agents(damaged)} is incomplete")
-    return Characteristic(
-        NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent"
-    )
+        return Judgement(NAME, "not applicable", f"the trace of {agents(damaged)} is incomplete")
+    return Judgement(NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent")
 
 
 def _is_as_sent(run: HandlerRun, sent: dict[int, set[tuple[int, str]]]) -> bool:

@@ -4,14 +4,14 @@ import base64
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
-from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding, Judgement, agents, violated
 from ucp.block import Block, InceptionBlock, next_chain_hash
 
 NAME = "genuine"
 
 
-def check(evidence: Evidence) -> Characteristic:
+def check(evidence: Evidence) -> Judgement:
     findings: list[Finding] = []
     roster = evidence.roster
     completed = evidence.completed_blocks()
@@ -37,14 +37,14 @@ def check(evidence: Evidence) -> Characteristic:
     if findings:
         return violated(NAME, "a block is not what an agent of this mission made", findings)
     if not evidence.exports:
-        return Characteristic(NAME, "not applicable", "there is no export to look at")
+        return Judgement(NAME, "not applicable", "there is no export to look at")
     if unknown:
-        return Characteristic(
+        return Judgement(
             NAME,
             "not applicable",
             f"neither export nor trace tells what {agents(unknown)} completed, so who made their blocks is unknown",
         )
-    return Characteristic(
+    return Judgement(
         NAME, "holds", f"all hashes recompute, and each of {blocks} blocks was completed by the agent that it names"
     )
 

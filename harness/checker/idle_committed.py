@@ -1,25 +1,25 @@
 """Characteristic 2: an idle agent has committed every block that it completed."""
 
-from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding, Judgement, agents, violated
 
 NAME = "idle implies committed"
 
 
-def check(evidence: Evidence) -> Characteristic:
+def check(evidence: Evidence) -> Judgement:
     findings = [*_in_exports(evidence), *_in_traces(evidence)]
     if findings:
         return violated(NAME, "an idle agent held a completed block that was not in its chain", findings)
     if not evidence.exports:
-        return Characteristic(NAME, "not applicable", "there is no export to look at")
+        return Judgement(NAME, "not applicable", "there is no export to look at")
     busy = [agent_id for agent_id, export in evidence.exports.items() if not export.idle]
     if busy:
-        return Characteristic(NAME, "not applicable", f"{agents(busy)} never became idle, so it cannot be judged")
+        return Judgement(NAME, "not applicable", f"{agents(busy)} never became idle, so it cannot be judged")
     if evidence.missing:
-        return Characteristic(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
+        return Judgement(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
     looked = "at the end and after every traced step" if evidence.traces else "at the end"
     blocks = sum(len(export.completed) for export in evidence.exports.values())
-    return Characteristic(NAME, "holds", f"all {blocks} completed blocks are in their agents' chains, {looked}")
+    return Judgement(NAME, "holds", f"all {blocks} completed blocks are in their agents' chains, {looked}")
 
 
 def _in_exports(evidence: Evidence) -> list[Finding]:

@@ -2,13 +2,13 @@
 
 from collections import Counter
 
-from harness.checker.characteristic import Characteristic, Finding, agents, violated
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding, Judgement, agents, violated
 
 NAME = "single copy"
 
 
-def check(evidence: Evidence) -> Characteristic:
+def check(evidence: Evidence) -> Judgement:
     findings: list[Finding] = []
     for agent_id, export in evidence.exports.items():
         copies = Counter(block.block_hash for block in export.blocks())
@@ -28,8 +28,8 @@ def check(evidence: Evidence) -> Characteristic:
     if findings:
         return violated(NAME, "an agent held a block twice", findings)
     if not evidence.exports:
-        return Characteristic(NAME, "not applicable", "there is no export to look at")
+        return Judgement(NAME, "not applicable", "there is no export to look at")
     if evidence.missing:
-        return Characteristic(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
+        return Judgement(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
     looked = " and after every traced step" if evidence.traces else ""
-    return Characteristic(NAME, "holds", f"no block twice in {len(evidence.exports)} exports{looked}")
+    return Judgement(NAME, "holds", f"no block twice in {len(evidence.exports)} exports{looked}")

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping
 from harness.archive.exports import Export
 from harness.archive.record import BlockHolders, Fault, LeastHeld, Loss, Survival
 from harness.archive.traces import Held, Trace
-from harness.checker.characteristic import agents
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import agents
 
 LOSSES_TOLD = 5
 

@@ -3,27 +3,27 @@
 from collections import Counter
 
 from harness.checker.agreement import had_a_chance, why_no_chance, why_unknown
-from harness.checker.characteristic import Characteristic, Finding, violated
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding, Judgement, violated
 
 NAME = "one uniform chain"
 
 
-def check(evidence: Evidence) -> Characteristic:
+def check(evidence: Evidence) -> Judgement:
     unknown = why_unknown(evidence)
     if unknown:
-        return Characteristic(NAME, "not applicable", unknown)
+        return Judgement(NAME, "not applicable", unknown)
     chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}
     holders = Counter(chains.values())
     if len(holders) == 1:
-        return Characteristic(
+        return Judgement(
             NAME, "holds", f"{len(chains)} agents hold the same chain of {len(next(iter(holders)))} blocks"
         )
     most_common = max(holders, key=lambda chain: (holders[chain], len(chain), chain))
     differing = {agent_id for agent_id, chain in chains.items() if chain != most_common}
     no_chance = why_no_chance(evidence, differing)
     if no_chance:
-        return Characteristic(NAME, "not applicable", f"{len(holders)} distinct chains; {no_chance}")
+        return Judgement(NAME, "not applicable", f"{len(holders)} distinct chains; {no_chance}")
     findings = []
     for agent_id in sorted(had_a_chance(evidence, differing)):
         chain = chains[agent_id]

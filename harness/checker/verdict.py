@@ -1,12 +1,13 @@
-"""The whole verdict: six characteristics and the figures."""
+"""The whole verdict: six characteristics, what is judged beside them, and the figures."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from harness.checker import all_committed, distributed, genuine, idle_committed, single_copy, uniform_chain
-from harness.checker.characteristic import Characteristic
 from harness.checker.evidence import Evidence
 from harness.checker.figures import figures
+from harness.checker.judgement import Judgement
 
 CHECKS = {
     "1": distributed.check,
@@ -17,31 +18,47 @@ CHECKS = {
     "6": uniform_chain.check,
 }
 
+BESIDE: dict[str, Callable[[Evidence], Judgement]] = {}
+"""Judgements that are not of the thesis, by their keys: see `harness.scenario.verdicts`."""
+
 
 @dataclass(frozen=True)
 class Result:
-    characteristics: dict[str, Characteristic]
+    """`characteristics` by number; `beside` the judgements beside them, by key."""
+
+    characteristics: dict[str, Judgement]
     figures: dict[str, float | int | None]
+    beside: dict[str, Judgement] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
     """A sentence for each file that could not be used, or not wholly."""
 
     @property
-    def violated(self) -> bool:
-        return any(characteristic.verdict == "violated" for characteristic in self.characteristics.values())
+    def judgements(self) -> dict[str, Judgement]:
+        """All of them, by number or key, in the order in which they are shown."""
+        return {**self.characteristics, **self.beside}
+
+    @property
+    def bad(self) -> tuple[str, ...]:
+        """Numbers and keys of what makes the exit status 1."""
+        return tuple(key for key, judgement in self.judgements.items() if judgement.kind == "bad")
 
     def to_json(self) -> dict[str, Any]:
-        """The `characteristics` and `figures` of `ucp-run/1`, and `errors`."""
+        """The `characteristics`, `figures`, `errors` and judgements beside of `ucp-run/1`."""
         return {
             "characteristics": {
                 number: characteristic.to_json() for number, characteristic in self.characteristics.items()
             },
+            **{key: judgement.to_json() for key, judgement in self.beside.items()},
             "figures": self.figures,
             "errors": self.errors,
         }
 
 
 def check(evidence: Evidence) -> Result:
-    """Decide all six characteristics from the evidence."""
+    """Decide all six characteristics from the evidence, and what is judged beside them."""
     return Result(
-        {number: check_one(evidence) for number, check_one in CHECKS.items()}, figures(evidence), evidence.errors
+        {number: judge(evidence) for number, judge in CHECKS.items()},
+        figures(evidence),
+        {key: judge(evidence) for key, judge in BESIDE.items()},
+        evidence.errors,
     )

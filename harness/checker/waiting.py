@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.archive.traces import Trace
-from harness.checker.characteristic import Finding
 from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding
 from ucp.trace import HandlerRun
 
 SLACK_WALL_S = 1.0

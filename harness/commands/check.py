@@ -27,7 +27,7 @@ def check_command(
         show_survival(Console(), survived)
     for error in result.errors:
         complain(error)
-    if result.violated:
+    if result.bad:
         raise typer.Exit(VIOLATED)
     if result.errors or not evidence.exports:
         raise typer.Exit(WRONG_REQUEST)

@@ -18,24 +18,24 @@ from harness.archive.record import RogueInjection, Survival
 from harness.checker import injections, survival
 from harness.matrix.record import MatrixRecord
 from harness.scale.record import ScaleRecord
+from harness.scenario.verdicts import CHARACTERISTICS, Kind
 
-STYLES = {"holds": "green", "violated": "bold red", "not applicable": "yellow"}
-MARKS = {"holds": "✔", "violated": "✘", "not applicable": "-"}
+STYLES: dict[Kind, str] = {"good": "green", "bad": "bold red", "unknown": "yellow"}
+MARKS: dict[Kind, str] = {"good": "✔", "bad": "✘", "unknown": "-"}
 EVIDENCE_SHOWN = 5
 
 
 def show_result(console: Console, result: checker.Result) -> None:
     table = Table.grid(padding=(0, 2))
-    for number, characteristic in result.characteristics.items():
-        verdict = Text(
-            f"{MARKS[characteristic.verdict]} {characteristic.verdict}", style=STYLES[characteristic.verdict]
-        )
-        table.add_row(number, characteristic.name, verdict, Text(characteristic.reason))
-        for finding in characteristic.evidence[:EVIDENCE_SHOWN]:
+    for key, judgement in result.judgements.items():
+        verdict = Text(f"{MARKS[judgement.kind]} {judgement.verdict}", style=STYLES[judgement.kind])
+        number = key if key in CHARACTERISTICS else ""
+        table.add_row(number, judgement.name, verdict, Text(judgement.reason))
+        for finding in judgement.evidence[:EVIDENCE_SHOWN]:
             table.add_row("", "", "", Text(f"agent {finding.agent_id}: {finding.detail}", style="red"))
-        if len(characteristic.evidence) > EVIDENCE_SHOWN:
+        if len(judgement.evidence) > EVIDENCE_SHOWN:
             table.add_row(
-                "", "", "", Text(f"and {len(characteristic.evidence) - EVIDENCE_SHOWN} more in run.json or --json")
+                "", "", "", Text(f"and {len(judgement.evidence) - EVIDENCE_SHOWN} more in run.json or --json")
             )
     console.print(table)
     known = {name: value for name, value in result.figures.items() if value is not None}

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from harness.checker.characteristic import Characteristic
+from harness.checker.judgement import Judgement
 from harness.errors import INTERRUPTED, VIOLATED
 from harness.explore.document import Document, document_of
 from harness.explore.recording import Recording, record
-from harness.explore.search import Judge, Searched, Violation, search, simulated, violated
+from harness.explore.search import Judge, Searched, Violation, search, simulated
 from harness.explore.shrink import BudgetSpentError, Shrinker
 from harness.explore.smaller import replays, scenario_of, shrink, size
 from harness.explore.write import claim, evidence_lines, to_yaml, write
@@ -23,7 +23,7 @@ class Shrunk:
 
     path: Path
     seed: int
-    violated: dict[str, Characteristic]
+    violated: dict[str, Judgement]
     words: str
     replay: str
 
@@ -73,11 +73,11 @@ def explore(
     explored = Explored(searched, interrupted=searched.interrupted)
     if searched.violation is None:
         return explored
-    seed, number = searched.violation.seed, searched.violation.numbers[0]
+    seed, key = searched.violation.seed, searched.violation.keys[0]
     watcher.found(searched.violation)
 
     def still(candidate: Scenario) -> bool:
-        return number in violated(judge(candidate, seed))
+        return key in judge(candidate, seed).bad
 
     def recorded(document: Document) -> Recording:
         return record(scenario_of(document), seed)
@@ -116,12 +116,12 @@ def _written(
     recorded: Callable[[Document], Recording],
 ) -> Shrunk:
     result = judge(scenario_of(document), seed)
-    characteristics = {number: result.characteristics[number] for number in violated(result)}
+    judgements = {key: result.judgements[key] for key in result.bad}
     replay = f"ucp-harness run {path} --backend sim --seed {seed}"
     header = [
-        *evidence_lines(characteristics),
+        *evidence_lines(judgements),
         f"Shrunk from {source}, seed {seed}: {words}.",
         f"  {replay}",
     ]
     written = write(path, to_yaml(document, header, recorded(document)))
-    return Shrunk(written, seed, characteristics, words, replay.replace(str(path), str(written)))
+    return Shrunk(written, seed, judgements, words, replay.replace(str(path), str(written)))

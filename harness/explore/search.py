@@ -1,4 +1,4 @@
-"""Seed after seed in the simulation, until a run violates a characteristic."""
+"""Seed after seed in the simulation, until a run is judged bad."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,19 +17,12 @@ def simulated(scenario: Scenario, seed: int) -> Result:
     return simulate(scenario, seed, tracing=True).result
 
 
-def violated(result: Result) -> tuple[str, ...]:
-    """The numbers of the characteristics that are violated."""
-    return tuple(
-        number for number, characteristic in result.characteristics.items() if characteristic.verdict == "violated"
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """The run of `seed` violates these characteristics."""
+    """The run of `seed` violates these characteristics, by number, and judgements beside them, by key."""
 
     seed: int
-    numbers: tuple[str, ...]
+    keys: tuple[str, ...]
 
 
 @dataclass
@@ -49,9 +42,7 @@ def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: 
     """
     searched = Searched()
     try:
-        with sweep(
-            seeds, lambda seed: violated(judge(scenario, seed)), jobs, what="seeds" if shown else None
-        ) as outcomes:
+        with sweep(seeds, lambda seed: judge(scenario, seed).bad, jobs, what="seeds" if shown else None) as outcomes:
             for seed, outcome in outcomes:
                 searched.played += 1
                 if isinstance(outcome, Failed):

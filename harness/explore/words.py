@@ -9,6 +9,7 @@ from rich.console import Console
 from harness.explore.run import Explored, Watcher
 from harness.explore.search import Violation
 from harness.explore.write import evidence_lines
+from harness.scenario.verdicts import BAD_IN_WORDS
 
 LINE_EVERY_S = 10.0
 REDRAW_EVERY_S = 0.1
@@ -22,8 +23,8 @@ def watching(console: Console) -> Iterator[Watcher]:
     last = 0.0
 
     def found(violation: Violation) -> None:
-        numbers = " and ".join(violation.numbers)
-        console.print(f"seed {violation.seed} violates characteristic {numbers}; shrinking", highlight=False)
+        words = " and ".join(BAD_IN_WORDS[key] for key in violation.keys)
+        console.print(f"seed {violation.seed}: {words}; shrinking", highlight=False)
 
     def step(runs: int, words: str) -> None:
         nonlocal last

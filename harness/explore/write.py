@@ -7,10 +7,11 @@ from typing import Any
 import yaml
 
 from harness.archive.directory import default_path
-from harness.checker.characteristic import Characteristic
+from harness.checker.judgement import Judgement
 from harness.errors import MachineError, RunDirectoryError
 from harness.explore.document import Document, at
 from harness.explore.recording import Lost, Recording
+from harness.scenario.verdicts import CHARACTERISTICS
 
 EVIDENCE_SHOWN = 5
 ORDER = (
@@ -68,16 +69,17 @@ def to_yaml(document: Document, header: list[str], recording: Recording) -> str:
     return "\n".join(lines) + "\n"
 
 
-def evidence_lines(violated: dict[str, Characteristic]) -> list[str]:
+def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
     """What is violated, and how one sees it."""
     lines = []
-    for number, characteristic in violated.items():
-        lines.append(f"Characteristic {number}, {characteristic.name}, is violated, {characteristic.reason}")
-        lines += [
-            f"  agent {finding.agent_id}: {finding.detail}" for finding in characteristic.evidence[:EVIDENCE_SHOWN]
-        ]
-        if len(characteristic.evidence) > EVIDENCE_SHOWN:
-            lines.append(f"  and {len(characteristic.evidence) - EVIDENCE_SHOWN} more")
+    for key, judgement in violated.items():
+        if key in CHARACTERISTICS:
+            lines.append(f"Characteristic {key}, {judgement.name}, is violated, {judgement.reason}")
+        else:
+            lines.append(f"{judgement.name.capitalize()}: {judgement.verdict}, {judgement.reason}")
+        lines += [f"  agent {finding.agent_id}: {finding.detail}" for finding in judgement.evidence[:EVIDENCE_SHOWN]]
+        if len(judgement.evidence) > EVIDENCE_SHOWN:
+            lines.append(f"  and {len(judgement.evidence) - EVIDENCE_SHOWN} more")
     return lines
 
 

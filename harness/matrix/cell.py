@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from pydantic import BaseModel, ConfigDict
 
 from harness.backend_names import BackendName
-from harness.checker.characteristic import Verdict
-from harness.checker.verdict import CHECKS
 from harness.matrix.estimate import Estimate
 from harness.matrix.metrics import BEFORE_FINAL_RECONCILE, METRICS
 from harness.matrix.model import Point, Task
+from harness.scenario.verdicts import JUDGED, Verdict, kind_of
 
 
 class Placed(BaseModel):
@@ -28,7 +27,7 @@ class Placed(BaseModel):
 
 
 class Run(Placed):
-    """What one run leaves here: figures, and a verdict for each characteristic; or why it has none (`failed`)."""
+    """What one run leaves here: figures, and the verdicts by number or key; or why it has none (`failed`)."""
 
     seed: int
     figures: dict[str, float | int | None] = {}
@@ -43,7 +42,7 @@ class Run(Placed):
 class Cell(Placed):
     """`runs` at one point, of which `failed` have no figures; an estimate per metric; how often each verdict fell.
 
-    `violated` has the seeds of the runs that violated a characteristic, to play them again.
+    `violated` has the seeds of the runs that violated a characteristic, or what is judged beside them.
     """
 
     runs: int
@@ -57,12 +56,13 @@ def sum_up(point: Point, runs: Sequence[Run]) -> Cell:
     judged = [run for run in runs if run.failed is None]
     estimates = {metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS}
     before = {metric.name: metric.estimate(run.figures for run in judged) for metric in BEFORE_FINAL_RECONCILE}
-    violated = {number: [run.seed for run in judged if run.verdicts[number] == "violated"] for number in CHECKS}
+    verdicts = {key: {run.seed: run.verdicts[key] for run in judged if key in run.verdicts} for key in JUDGED}
+    bad = {key: [seed for seed in by_seed if kind_of(by_seed[seed]) == "bad"] for key, by_seed in verdicts.items()}
     return Cell(
         **point._asdict(),
         runs=len(runs),
         failed=len(runs) - len(judged),
         estimates=estimates | {name: estimate for name, estimate in before.items() if estimate.n},
-        verdicts={number: dict(Counter(run.verdicts[number] for run in judged)) for number in CHECKS},
-        violated={number: seeds for number, seeds in violated.items() if seeds},
+        verdicts={key: dict(Counter(by_seed.values())) for key, by_seed in verdicts.items() if by_seed},
+        violated={key: seeds for key, seeds in bad.items() if seeds},
     )

@@ -18,7 +18,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.checker.verdict import CHECKS
 from harness.errors import MachineError
 from harness.matrix.cell import Cell, Run
 from harness.matrix.junit import to_junit
@@ -29,6 +28,7 @@ from harness.matrix.report import to_html
 from harness.matrix.run import Finished
 from harness.matrix.scenarios import write_scenarios
 from harness.matrix.summary import to_markdown
+from harness.scenario.verdicts import BESIDE, CHARACTERISTICS, JUDGED
 from ucp.files import write_atomically, write_json_atomically
 
 
@@ -53,7 +53,7 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
     for metric in METRICS:
         estimate = cell.estimates[metric.name]
         row |= {metric.name: estimate.mean, f"{metric.name}_low": estimate.low, f"{metric.name}_high": estimate.high}
-    return row | {f"violated_{number}": len(cell.violated.get(number, [])) for number in CHECKS}
+    return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in JUDGED}
 
 
 def _run_rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
@@ -63,7 +63,8 @@ def _run_rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
             **run.point._asdict(),
             "seed": run.seed,
             **{name: run.figures.get(name) for name in figures},
-            **{f"characteristic_{number}": run.verdicts.get(number) for number in CHECKS},
+            **{f"characteristic_{number}": run.verdicts.get(number) for number in CHARACTERISTICS},
+            **{key: run.verdicts.get(key) for key in BESIDE},
             "failed": run.failed,
         }
 

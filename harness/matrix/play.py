@@ -43,7 +43,7 @@ class Player:
         scenario = self.matrix.scenario_at(task.point)
         in_memory = BACKENDS[task.point.backend].plays_in_memory
         result = self.judge(scenario, task.seed) if in_memory else self._for_real(scenario, task)
-        verdicts = {number: characteristic.verdict for number, characteristic in result.characteristics.items()}
+        verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}
         return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts)
 
     def refuse(self, points: Iterable[Point]) -> None:
@@ -63,7 +63,7 @@ class Player:
             raise InterruptedRunError(f"the run in {directory} was interrupted")
         if finished.played.outcome == "failed":
             raise RunFailedError(f"{finished.played.outcome_detail}; see {directory}")
-        if not finished.result.violated and self.matrix.keep == "violated":
+        if not finished.result.bad and self.matrix.keep == "violated":
             shutil.rmtree(directory)
         return finished.result
 

@@ -6,7 +6,6 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from harness.checker.verdict import CHECKS
 from harness.matrix.cell import Cell
 from harness.matrix.comparison import Change
 from harness.matrix.estimate import Estimate
@@ -14,6 +13,7 @@ from harness.matrix.metrics import BY_NAME, METRICS, Metric
 from harness.matrix.model import Matrix, Point
 from harness.matrix.record import MatrixRecord
 from harness.present import words
+from harness.scenario.verdicts import BAD_IN_WORDS, CHARACTERISTICS
 
 NAMED = 5
 """More runs of a cell than these are counted, not named; matrix.json names them all."""
@@ -110,23 +110,23 @@ def unjudged(record: MatrixRecord) -> str:
     judged = {
         number for cell in record.cells for number, counts in cell.verdicts.items() if set(counts) - {"not applicable"}
     }
-    never = [number for number in CHECKS if number not in judged]
+    never = [number for number in CHARACTERISTICS if number not in judged]
     if not never or not record.cells:
         return ""
     return f" Not applicable in any run: characteristic{'s' if len(never) > 1 else ''} {', '.join(never)}."
 
 
 def violated(cell: Cell) -> int:
-    """Runs that violated a characteristic."""
+    """Runs that violated a characteristic, or what is judged beside them."""
     return len({seed for seeds in cell.violated.values() for seed in seeds})
 
 
 def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
     """A sentence for each thing that is wrong in a cell."""
-    for number, seeds in cell.violated.items():
+    for key, seeds in cell.violated.items():
         which = ", ".join(map(str, seeds[:NAMED])) + (", \u2026" if len(seeds) > NAMED else "")
         plural = "s" if len(seeds) > 1 else ""
-        yield f"characteristic {number} violated in {len(seeds)} of {cell.runs} runs, seed{plural} {which}"
+        yield f"{BAD_IN_WORDS[key]} in {len(seeds)} of {cell.runs} runs, seed{plural} {which}"
     failed = [run for run in record.failed if run.point == cell.point]
     for run in failed[:NAMED]:
         yield f"seed {run.seed} failed: {run.reason}"

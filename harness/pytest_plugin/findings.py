@@ -6,36 +6,42 @@ from pathlib import Path
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.checker import Result
-from harness.checker.characteristic import Characteristic, Finding, Verdict
+from harness.checker.judgement import Finding, Judgement
 from harness.errors import ScenarioError
+from harness.scenario.verdicts import BESIDE, Verdict
 
 EVIDENCE_SHOWN = 5
 
 
 @dataclass(frozen=True, repr=False)
-class Judgement:
-    """The verdict on one characteristic; shown by a failing assert, it says why."""
+class JudgementInTest:
+    """What was judged, under its number or key; shown by a failing assert, it says why."""
 
-    number: int
+    key: str
     name: str
     verdict: Verdict
     reason: str
     evidence: list[Finding]
 
     @classmethod
-    def of(cls, number: int, found: Characteristic) -> "Judgement":
-        return cls(number, found.name, found.verdict, found.reason, found.evidence)
+    def of(cls, key: str, judgement: Judgement) -> "JudgementInTest":
+        return cls(key, judgement.name, judgement.verdict, judgement.reason, judgement.evidence)
+
+    @property
+    def title(self) -> str:
+        """ "characteristic 6, one uniform chain", "steps"."""
+        return self.key if self.key in BESIDE else f"characteristic {self.key}, {self.name}"
 
     @property
     def holds(self) -> bool:
         return self.verdict == "holds"
 
     def __repr__(self) -> str:
-        return f"<characteristic {self.number}, {self.name}: {self.verdict}: {self.reason}>"
+        return f"<{self.title}: {self.verdict}: {self.reason}>"
 
     def lines(self) -> list[str]:
         """The verdict in a line, and its evidence."""
-        lines = [f"characteristic {self.number}, {self.name}: {self.verdict}: {self.reason}"]
+        lines = [f"{self.title}: {self.verdict}: {self.reason}"]
         lines += [f"    agent {finding.agent_id}: {finding.detail}" for finding in self.evidence[:EVIDENCE_SHOWN]]
         if len(self.evidence) > EVIDENCE_SHOWN:
             lines.append(f"    and {len(self.evidence) - EVIDENCE_SHOWN} more in the report")
@@ -52,13 +58,13 @@ class Findings:
     def __repr__(self) -> str:
         return f"<run in {self.directory}>"
 
-    def characteristic(self, number: int) -> Judgement:
+    def characteristic(self, number: int) -> JudgementInTest:
         """Raises ScenarioError for a number that is not 1 to 6."""
         __tracebackhide__ = True
         characteristic = self.result.characteristics.get(str(number))
         if characteristic is None:
             raise ScenarioError(f"there is no characteristic {number!r}: they are 1 to 6")
-        return Judgement.of(number, characteristic)
+        return JudgementInTest.of(str(number), characteristic)
 
     @property
     def figures(self) -> dict[str, float | int | None]:

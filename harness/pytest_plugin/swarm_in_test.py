@@ -16,7 +16,7 @@ from harness.play.backend import Backend
 from harness.play.backends import BACKENDS
 from harness.play.mission import RunOutcome
 from harness.play.progress import Silent
-from harness.pytest_plugin.findings import Findings, Judgement
+from harness.pytest_plugin.findings import Findings, JudgementInTest
 from harness.pytest_plugin.live_story import Sentence, Told
 from harness.run.run import Recording, Run
 from harness.scenario import Scenario
@@ -156,7 +156,7 @@ class SwarmInTest:
 
     # What there is by now
 
-    def characteristic(self, number: int) -> Judgement:
+    def characteristic(self, number: int) -> JudgementInTest:
         """The verdict as things stand: `holds`, `verdict`, `reason` and `evidence`."""
         __tracebackhide__ = True
         return self._findings().characteristic(number)

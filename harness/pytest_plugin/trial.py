@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import pytest
 
 from harness.errors import HarnessError, MachineError
-from harness.pytest_plugin.findings import Judgement
+from harness.pytest_plugin.findings import JudgementInTest
 from harness.run.run import Run
 from harness.scenario.expect import Expect
 
@@ -42,11 +42,10 @@ class Trial:
         lines = [played.outcome_detail] if played.outcome_detail else []
         if played.outcome == "completed":
             lines += [f"{fate}, so this run does not show what it was meant to" for fate in played.unmatched_fates]
-        for name, characteristic in finished.result.characteristics.items():
-            number = int(name)
-            if not self._expect.as_expected(number, characteristic.verdict):
-                expected = self._expect.characteristics.get(number)
-                lines += Judgement.of(number, characteristic).lines()
+        for key, judgement in finished.result.judgements.items():
+            if not self._expect.as_expected(key, judgement.verdict):
+                expected = self._expect.verdict(key)
+                lines += JudgementInTest.of(key, judgement).lines()
                 lines += [f"    expected: {expected}"] if expected else []
         return lines + list(self._expect.out_of_range(finished.result.figures))
 

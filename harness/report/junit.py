@@ -10,7 +10,7 @@ from harness.present import words
 from harness.present.junit import Case, to_xml
 from harness.report import facts
 from harness.report.verdicts import Verdict, verdicts
-from harness.scenario.expect import NUMBERS, Expect
+from harness.scenario.expect import Expect
 
 
 def to_junit(result: dict[str, Any]) -> str:
@@ -47,12 +47,11 @@ def _expect(result: dict[str, Any]) -> Expect:
 
 
 def _characteristic(verdict: Verdict, expect: Expect) -> Case:
-    name, known = f"{verdict.number}. {verdict.name}", NUMBERS.get(verdict.number, 0)
-    expected = expect.characteristics.get(known)
-    if verdict.verdict == (expected or "holds"):
+    name, expected = verdict.title, expect.verdict(verdict.key)
+    if verdict.verdict == expected or (expected is None and verdict.kind == "holds"):
         return Case(name)
     message = f"{verdict.verdict}: {verdict.reason}" if verdict.reason else verdict.verdict
-    if expected is None and verdict.verdict != "violated":
+    if expected is None and not verdict.is_bad:
         return Case(name, skipped=message)
     return Case(name, [message, *map(_evidence, verdict.evidence), *([f"expected: {expected}"] if expected else [])])
 

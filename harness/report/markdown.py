@@ -46,9 +46,9 @@ def _verdict_table(judged: Sequence[Verdict]) -> Iterator[str]:
 
 def _evidence(judged: Sequence[Verdict]) -> list[str]:
     return _listed(
-        f"characteristic {verdict.number}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
+        f"{f'characteristic {verdict.number}' if verdict.number else verdict.name}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
         for verdict in judged
-        for piece in (verdict.evidence[:EVIDENCE_SHOWN] if verdict.kind == "violated" else ())
+        for piece in (verdict.evidence[:EVIDENCE_SHOWN] if verdict.is_bad else ())
     )
 
 

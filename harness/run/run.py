@@ -123,7 +123,7 @@ class Recording:
             page = report.write_report(archive)
         except RunDirectoryError as error:
             raise MachineError(f"{error}; run.json has the verdict") from None
-        status = played.exit_status or (VIOLATED if result.violated else WRONG_REQUEST if played.unmatched_fates else 0)
+        status = played.exit_status or (VIOLATED if result.bad else WRONG_REQUEST if played.unmatched_fates else 0)
         late = None if in_virtual_time(self._record.backend) else timer_lag(evidence.traces.values())
         return Run(self.directory.path, played, result, survived, rogue, status, wall_s, page, late)
 

@@ -42,11 +42,8 @@ def run_scale(scale: Scale, jobs: int, judge: Judge | None = None, *, shown: boo
         wall, processor = time.monotonic(), time.process_time()
         played, result = judge(scenario, seed)
         cost = {"processor_s": time.process_time() - processor, "wall_s": time.monotonic() - wall}
-        violated = tuple(
-            number for number, characteristic in result.characteristics.items() if characteristic.verdict == "violated"
-        )
         figures = {**measure(scenario, played, result), **{name: round(value, 3) for name, value in cost.items()}}
-        return Run(size, seed, figures, violated)
+        return Run(size, seed, figures, result.bad)
 
     runs: list[Run] = []
     interrupted = False

@@ -14,6 +14,7 @@ from harness.scale.cell import Cell, Growth
 from harness.scale.growth import Exponent, Law, Variable
 from harness.scale.metrics import BY_NAME
 from harness.scale.record import ScaleRecord
+from harness.scenario.verdicts import BAD_IN_WORDS
 
 NAMED = 5
 """More runs than these are counted, not named; scale.json names them all."""
@@ -152,7 +153,7 @@ def _table(headers: Iterable[str]) -> Table:
 
 def _blemishes(record: ScaleRecord) -> Iterable[Text]:
     for run in record.blemishes[:NAMED]:
-        what = f"failed: {run.failed}" if run.failed else f"violates characteristic {', '.join(run.violated)}"
+        what = f"failed: {run.failed}" if run.failed else f"{', '.join(BAD_IN_WORDS[key] for key in run.violated)}"
         size = f"{words.percent(run.loss)} loss, {run.minutes:g} min, {run.agents} agents"
         yield Text(f"{size}: seed {run.seed} {what}", style="red")
     if len(record.blemishes) > NAMED:

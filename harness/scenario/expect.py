@@ -2,6 +2,9 @@
 
 expect:
   characteristics: {1: holds, 5: holds, 6: not applicable}
+  steps: as specified
+  records: agree
+  liveness: finished
   figures: {mutual_chain: {min: 40}, distinct_chains: 1, reconciles: {max: 20}}
   backends: [sim, process]
   seeds: [1, 2, 3]
@@ -14,8 +17,15 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from harness.backend_names import BackendName
 from harness.scenario.model import BOUNDED, Model
-
-Verdict = Literal["holds", "violated", "not applicable"]
+from harness.scenario.verdicts import (
+    BESIDE,
+    CHARACTERISTICS,
+    CharacteristicVerdict,
+    LivenessVerdict,
+    RecordsVerdict,
+    StepsVerdict,
+    kind_of,
+)
 
 FigureName = Literal[
     "agents",
@@ -35,7 +45,7 @@ FigureName = Literal[
 ]
 """As in `harness.checker.figures`."""
 
-NUMBERS = {str(number): number for number in range(1, 7)}
+NUMBERS = {number: int(number) for number in CHARACTERISTICS}
 """The characteristics; JSON has strings for keys."""
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -83,12 +93,15 @@ def _exactly(value: Any) -> Any:
 
 
 class Expect(Model):
-    """A characteristic that is not named may be anything but violated.
+    """A characteristic that is not named may be anything but violated, and so what is judged beside them.
 
     Every seed is played on every backend.
     """
 
-    characteristics: dict[int, Verdict] = {}
+    characteristics: dict[int, CharacteristicVerdict] = {}
+    steps: StepsVerdict | None = None
+    records: RecordsVerdict | None = None
+    liveness: LivenessVerdict | None = None
     figures: dict[FigureName, Annotated[Range, BeforeValidator(_exactly)]] = {}
     backends: Annotated[list[BackendName], Field(min_length=1)] = ["sim"]
     seeds: Annotated[list[Annotated[int, Field(ge=0, strict=True)]], Field(min_length=1, max_length=10_000)] = [1]
@@ -117,9 +130,16 @@ class Expect(Model):
             raise ValueError("names one twice: each is a test of its own")
         return values
 
-    def as_expected(self, number: int, verdict: Verdict) -> bool:
-        expected = self.characteristics.get(number)
-        return verdict != "violated" if expected is None else verdict == expected
+    def verdict(self, key: str) -> str | None:
+        """What is expected of this characteristic, or judgement beside them; None if nothing is said of it."""
+        if key in BESIDE:
+            expected: str | None = getattr(self, key)
+            return expected
+        return self.characteristics.get(NUMBERS.get(key, 0))
+
+    def as_expected(self, key: str, verdict: str) -> bool:
+        expected = self.verdict(key)
+        return kind_of(verdict) != "bad" if expected is None else verdict == expected
 
     def out_of_range(self, figures: Mapping[str, float | None]) -> Iterator[str]:
         """A sentence for each figure that is not what it should be."""

@@ -19,7 +19,7 @@ def test_the_figures_and_characteristics_that_can_be_expected_are_those_that_the
 def test_a_characteristic_that_is_not_named_may_be_anything_but_violated() -> None:
     expect = Expect.model_validate({"characteristics": {5: "violated", "6": "not applicable"}})
     verdicts = ("holds", "violated", "not applicable")
-    as_expected = {n: [expect.as_expected(n, verdict) for verdict in verdicts] for n in (1, 5, 6)}
+    as_expected = {n: [expect.as_expected(str(n), verdict) for verdict in verdicts] for n in (1, 5, 6)}
     assert as_expected == {1: [True, False, True], 5: [False, True, False], 6: [False, False, True]}
 
 
@@ -44,3 +44,13 @@ def test_figures_are_compared_with_what_they_should_be(wanted: Any, figure: floa
 def test_a_scenario_says_what_it_expects_in_json_as_in_yaml() -> None:
     one = scenario(expect={"characteristics": {1: "holds"}, "figures": {"blocks": 3}, "seeds": [0, 2]})
     assert type(one).model_validate_json(one.model_dump_json()) == one
+
+
+def test_what_is_judged_beside_the_characteristics_can_be_expected_too() -> None:
+    expect = Expect.model_validate({"steps": "deviates", "liveness": "not finished"})
+    assert expect.as_expected("steps", "deviates")
+    assert not expect.as_expected("steps", "as specified")
+    assert expect.as_expected("liveness", "not finished")
+    assert not expect.as_expected("liveness", "never finishes")
+    assert expect.as_expected("records", "not applicable")
+    assert not expect.as_expected("records", "contradict")

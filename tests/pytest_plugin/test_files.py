@@ -83,7 +83,10 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
         ({"seeds": [1, 1]}, "*`expect.seeds` is *: names one twice: each is a test of its own"),
         ({"backends": ["kernel"]}, "*`expect.backends.0` is 'kernel': it should be 'process', 'docker' or 'sim'"),
         ({"characterstics": {1: "holds"}}, "*`expect.characterstics` is unknown: there are characteristics, *"),
-        ({"seed": [1], "figures": {}}, "*`expect.seed` is unknown: there are characteristics, figures, *"),
+        (
+            {"seed": [1], "figures": {}},
+            "*`expect.seed` is unknown: there are characteristics, steps, records, liveness, figures, *",
+        ),
     ],
 )
 def test_a_mistake_is_one_sentence_at_collection(

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from harness.checker.verdict import CHECKS
 from harness.matrix.cell import Run
 from harness.matrix.play import directory_name
 from harness.matrix.report.heatmap import anchor
@@ -15,6 +14,7 @@ from harness.matrix.scenarios import scenario_file
 from harness.matrix.table import name_of
 from harness.present import words
 from harness.report.verdicts import ICONS
+from harness.scenario.verdicts import JUDGED, kind_of
 
 MAX_ROWS = 12_000
 """Of all cells together, so that the page stays below 3 MB."""
@@ -50,7 +50,7 @@ def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
     room = MAX_ROWS // max(1, len(by_point))
     cells = []
     for point, runs in by_point:
-        runs.sort(key=lambda run: (run.failed is None, "violated" not in run.verdicts.values()))
+        runs.sort(key=lambda run: (run.failed is None, not _bad(run)))
         figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
         played = ["ucp-harness", "run", scenario_file(point), "--backend", point.backend, "--seed", str(runs[0].seed)]
         cells.append(
@@ -69,11 +69,15 @@ def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
 
 def _count(runs: Sequence[Run]) -> str:
     counts = [f"{words.value(len(runs))} run{'s' if len(runs) > 1 else ''}"]
-    if number := sum("violated" in run.verdicts.values() for run in runs):
-        counts.append(f"{number} violated a characteristic")
+    if number := sum(map(_bad, runs)):
+        counts.append(f"{number} judged bad")
     if number := sum(run.failed is not None for run in runs):
         counts.append(f"{number} failed")
     return ", ".join(counts)
+
+
+def _bad(run: Run) -> bool:
+    return any(kind_of(verdict) == "bad" for verdict in run.verdicts.values())
 
 
 def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:
@@ -81,7 +85,7 @@ def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:
     return Row(
         run.seed,
         kept if (directory / kept).exists() else None,
-        [] if run.failed is not None else [ICONS[run.verdicts[number]] for number in CHECKS],
+        [] if run.failed is not None else [ICONS[kind_of(run.verdicts.get(key, ""))] for key in JUDGED],
         [] if run.failed is not None else [words.value(run.figures.get(name)) for name in figures],
         run.failed,
     )

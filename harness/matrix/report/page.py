@@ -4,7 +4,6 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from harness.checker.verdict import CHECKS
 from harness.matrix.nights import Nights
 from harness.matrix.picture import draw
 from harness.matrix.record import MatrixRecord
@@ -15,7 +14,7 @@ from harness.matrix.summary import verdict
 from harness.matrix.table import explanation, improvements, name_of, troubles, unjudged
 from harness.present import svg, words
 from harness.report import html
-from harness.report.verdicts import SHORT_NAMES
+from harness.scenario.verdicts import JUDGED
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 _STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
@@ -42,7 +41,7 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
         heatmaps=[heatmap.heatmap(record, figure) for figure in shown],
         shades=range(heatmap.SHADES),
         cells=drilldown(finished, directory),
-        characteristics={number: SHORT_NAMES[number] for number in CHECKS},
+        judged=JUDGED,
         nights=nights,
         drawn=drawn,
         trends=[(figure, trend.trend(drawn, record, figure)) for figure in shown] if len(drawn) > 1 else [],

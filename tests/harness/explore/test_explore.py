@@ -11,7 +11,7 @@ import pytest
 from harness.checker import Result
 from harness.errors import RunDirectoryError
 from harness.explore import Explored, explore
-from harness.explore.search import simulated, violated
+from harness.explore.search import simulated
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
@@ -47,7 +47,7 @@ def test_all_that_is_irrelevant_is_left_out(tmp_path: Path) -> None:
     assert not smallest.timeline
     assert smallest.network.loss == 0
     assert explored.searched.violation is not None
-    assert violated(one_commit_is_lost(smallest, explored.searched.violation.seed)) == ("6",)
+    assert one_commit_is_lost(smallest, explored.searched.violation.seed).bad == ("6",)
 
 
 def test_the_file_says_to_people_what_it_is(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_a_real_violation_is_played_again_from_the_file(tmp_path: Path) -> None:
     assert explored.searched.violation is not None
     smallest = load_scenario(tmp_path / "tie.yaml")
     again = simulate(smallest, explored.searched.violation.seed, tracing=True)
-    assert explored.searched.violation.numbers[0] in violated(again.result)
+    assert explored.searched.violation.keys[0] in again.result.bad
     assert not again.played.unmatched_fates
     assert len(smallest.roster) < 5
     assert len(smallest.events.script) < 10
@@ -121,7 +121,7 @@ def test_ctrl_c_while_shrinking_writes_the_smallest_so_far(tmp_path: Path) -> No
     assert explored.shrunk is not None
     assert "interrupted" in explored.shrunk.words
     smallest = load_scenario(tmp_path / "small.yaml")
-    assert violated(one_commit_is_lost(smallest, explored.shrunk.seed)) == ("6",)
+    assert one_commit_is_lost(smallest, explored.shrunk.seed).bad == ("6",)
 
 
 def test_ctrl_c_while_searching_writes_nothing(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_a_reached_bound_is_said(tmp_path: Path) -> None:
     assert explored.shrunk is not None
     assert "in 10 runs, when the bound was reached" in explored.shrunk.words
     smallest = load_scenario(tmp_path / "small.yaml")
-    assert violated(one_commit_is_lost(smallest, explored.shrunk.seed)) == ("6",)
+    assert one_commit_is_lost(smallest, explored.shrunk.seed).bad == ("6",)
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_the_command_says_what_it_found_and_how_to_play_it_again(tmp_path: Path)
     path.write_text("name: tie\nagents: 4\nduration_s: 400\nnetwork: {loss: 0.3}\nquirks: {crash_on_tie: true}\n")
     done = harness("explore", path, "--jobs", 1, "--out", out)
     assert done.returncode == 1, done.stderr
-    assert "seed 0 violates characteristic" in done.stdout
+    assert "seed 0: characteristic" in done.stdout
     assert "4 agents, " in done.stdout
     assert "nothing more could be left out" in done.stdout
     assert done.stdout.splitlines()[-1].startswith(f"ucp-harness run {out} --backend sim --seed ")

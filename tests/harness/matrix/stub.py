@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.checker import Result
-from harness.checker.characteristic import Characteristic, Verdict
+from harness.checker.judgement import Judgement, Verdict
 from harness.matrix import Finished, Matrix, run_matrix
 from harness.matrix.play import Judge
 from harness.matrix.results import opened
@@ -36,7 +36,7 @@ def judge(scenario: Scenario, seed: int) -> Result:
     assert isinstance(loss, float)
     verdict: Verdict = "violated" if loss and seed == 2 else "holds"
     return Result(
-        {number: Characteristic(number, verdict if number == "3" else "holds", "") for number in CHARACTERISTICS},
+        {number: Judgement(number, verdict if number == "3" else "holds", "") for number in CHARACTERISTICS},
         {
             "agents": 5,
             "blocks": 40,

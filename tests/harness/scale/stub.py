@@ -1,7 +1,7 @@
 """A judge that needs no simulation: figures that follow known laws."""
 
 from harness.checker import Result
-from harness.checker.characteristic import Characteristic
+from harness.checker.judgement import Judgement
 from harness.play.mission import RunOutcome
 from harness.scale import Scale
 from harness.scenario import Scenario
@@ -35,4 +35,4 @@ def judge(scenario: Scenario, seed: int) -> tuple[RunOutcome, Result]:
         "messages_per_block": messages / blocks,
     }
     played = RunOutcome(mission_s=scenario.duration_s + 100, settled=agents < 40)
-    return played, Result({"3": Characteristic("3", "holds", "")}, figures)
+    return played, Result({"3": Judgement("3", "holds", "")}, figures)

@@ -1,12 +1,12 @@
-"""A verdict on one characteristic, with its reason and evidence.
+"""A verdict with its reason and evidence: on a characteristic, or beside them.
 
 A check that could not look is `not applicable`, never `holds`.
 """
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any
 
-Verdict = Literal["holds", "violated", "not applicable"]
+from harness.scenario.verdicts import Kind, Verdict, kind_of
 
 MAX_EVIDENCE = 50
 """More pieces of evidence than anyone reads are counted in the reason and not listed."""
@@ -23,11 +23,15 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Characteristic:
+class Judgement:
     name: str
     verdict: Verdict
     reason: str
     evidence: list[Finding] = field(default_factory=list)
+
+    @property
+    def kind(self) -> Kind:
+        return kind_of(self.verdict)
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -38,10 +42,14 @@ class Characteristic:
         }
 
 
-def violated(name: str, what: str, findings: list[Finding]) -> Characteristic:
+def violated(name: str, what: str, findings: list[Finding]) -> Judgement:
     """`what` completes the sentence "N times ...", as in "1 time an idle agent ..."."""
-    times = f"{len(findings)} time{'s' if len(findings) != 1 else ''}"
-    return Characteristic(name, "violated", f"{times}: {what}", findings[:MAX_EVIDENCE])
+    return Judgement(name, "violated", f"{times(len(findings))}: {what}", findings[:MAX_EVIDENCE])
+
+
+def times(count: int) -> str:
+    """ "1 time", "3 times"."""
+    return f"{count} time{'s' if count != 1 else ''}"
 
 
 def agents(ids: "list[int] | set[int] | tuple[int, ...]") -> str:
