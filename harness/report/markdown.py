@@ -46,7 +46,7 @@ def _verdict_table(judged: Sequence[Verdict]) -> Iterator[str]:
 
 def _evidence(judged: Sequence[Verdict]) -> list[str]:
     return _listed(
-        f"{f'characteristic {verdict.number}' if verdict.number else verdict.name}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
+        f"{verdict.topic}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
         for verdict in judged
         for piece in (verdict.evidence[:EVIDENCE_SHOWN] if verdict.is_bad else ())
     )

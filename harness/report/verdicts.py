@@ -45,6 +45,11 @@ class Verdict:
         return self.kind == "violated"
 
     @property
+    def topic(self) -> str:
+        """ "characteristic 6", "steps"."""
+        return f"characteristic {self.number}" if self.number else self.name
+
+    @property
     def title(self) -> str:
         """ "6. one uniform chain", "steps"."""
         return f"{self.number}. {self.name}" if self.number else self.name

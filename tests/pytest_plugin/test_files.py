@@ -85,7 +85,7 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
         ({"characterstics": {1: "holds"}}, "*`expect.characterstics` is unknown: there are characteristics, *"),
         (
             {"seed": [1], "figures": {}},
-            "*`expect.seed` is unknown: there are characteristics, steps, records, liveness, figures, *",
+            "*`expect.seed` is unknown: there are characteristics, steps, *",
         ),
     ],
 )
