@@ -84,6 +84,12 @@ class Medium:
         self.soonest = min(self.soonest, *(air.soonest_of_all for air in self._air))
         self.latest = max(self.latest, *(air.latest for air in self._air))
 
+    def certain_delays(self) -> tuple[float, float] | None:
+        """How soon and how late, in seconds, whatever is sent now arrives; None where chance decides what arrives."""
+        if not all(air.certain for air in self._air):
+            return None
+        return min(air.soonest_of_all for air in self._air), max(air.latest for air in self._air)
+
     def hears(self, sender: int, receiver: int) -> bool:
         """Whether no partition stands between the two, by their numbers."""
         return self._group[sender] == self._group[receiver]
@@ -114,6 +120,8 @@ class _Air(Protocol):
 
     soonest_of_all: float
     latest: float
+    certain: bool
+    """Whether one copy of each broadcast arrives at every receiver, or never any."""
 
     def draw(self, now: float, data_bytes: int) -> RandomDraws: ...
 
@@ -132,6 +140,7 @@ class _PlainAir:
         self.receivers = len(links)
         self.hears = hears
         self.lost_below = [round(link.independent_loss * _WORD) for link in links]
+        self.certain = all(lost in (0, _WORD) for lost, heard in zip(self.lost_below, hears, strict=True) if heard)
         self.soonest = [delay.mean_s - delay.jitter_s for delay in delays]
         self.soonest_of_all = min(self.soonest)
         self.per_lot = [2 * delay.jitter_s / _WORD for delay in delays]
@@ -215,6 +224,7 @@ class _AnyAir:
 
     soonest_of_all = 0.0
     latest = inf
+    certain = False
 
     def __init__(self, links: list[_Link], hears: list[bool], words: _Words, rare: tuple[Random, ...]) -> None:
         self._links = links

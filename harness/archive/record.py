@@ -80,6 +80,41 @@ class FinalReconcile(_Model):
     complete: bool
 
 
+class CycleStep(_Model):
+    """So long after the cycle begins anew, an agent runs this handler; `branch` is None if that was not traced."""
+
+    agent_id: int
+    after_s: float
+    handler: str
+    branch: str | None = None
+
+
+class CycleWait(_Model):
+    """An agent asks in each reconcile of the cycle, and these never answer."""
+
+    agent_id: int
+    for_agents: list[int]
+
+
+class Cycle(_Model):
+    """What agents that never finish go round in, at the latest since mission second `since_s`.
+
+    `period_s` is None of a standstill: nothing is on its way, no timer runs, and `agents` are not done. `proven`: the
+    global state recurs, and nothing is left to chance; otherwise the same handler runs were seen `periods` times in a
+    row.
+    """
+
+    since_s: float
+    period_s: float | None = None
+    periods: int | None = None
+    proven: bool = False
+    agents: list[int]
+    """Those that are not idle."""
+    steps: list[CycleStep] = []
+    """One period, in order."""
+    waits: list[CycleWait] = []
+
+
 class AgentRecord(_Model):
     """`outcome` is exported, not exported, killed, rebooting, crashed, hung, paused, running or not started.
 
@@ -201,6 +236,8 @@ class JudgedRecord(_Model):
     network: list[NetworkState] = []
     faults: list[Fault] = []
     final_reconcile: FinalReconcile | None = None
+    cycle: Cycle | None = None
+    """In virtual time, where the run stopped because the agents were seen never to finish."""
     mission_s: float | None = None
     agents: dict[str, AgentRecord] = {}
 

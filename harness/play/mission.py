@@ -31,6 +31,7 @@ class RunOutcome:
     final_reconcile: dict[str, Any] | None = None
     mission_s: float = 0.0
     settled: bool = False
+    cycle: dict[str, Any] | None = None
     counters: dict[str, Any] | None = None
     capture: dict[str, dict[str, int]] | None = None
     agents: dict[str, Any] = field(default_factory=dict)

@@ -99,6 +99,7 @@ class Recording:
             mission_s=played.mission_s,
             settled=played.settled,
             final_reconcile=played.final_reconcile,
+            cycle=played.cycle,
             network=played.network,
             faults=played.faults,
             agents=played.agents,

@@ -104,6 +104,7 @@ class InMemory:
                 "roster": simulation.roster,
                 "network": simulation.played.network,
                 "final_reconcile": simulation.played.final_reconcile,
+                "cycle": simulation.played.cycle,
                 "faults": simulation.played.faults,
                 "mission_s": simulation.played.mission_s,
                 "agents": simulation.played.agents,

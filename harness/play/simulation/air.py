@@ -11,7 +11,7 @@ before it looks at its tally (`hear`), and nobody works out when an answer reach
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
@@ -137,6 +137,11 @@ class VirtualAir:
         """The agent's timer ends, or it logs an event, at `at`."""
         self._rank += 1
         heappush(self._coming, (at, self._rank, number, what))
+
+    def order_of_timers(self, ends: Mapping[int, float]) -> list[int]:
+        """Numbers of the agents whose next timer ends when `ends` says, in the order in which that happens."""
+        coming = sorted(happening[:3] for happening in self._coming if happening[3] is None)
+        return list(dict.fromkeys(number for at, _, number in coming if ends.get(number) == at))
 
     def inject(self, at: float, stray: RogueDatagram, numbers: Iterable[int]) -> None:
         """`stray` reaches the agents with these numbers at `at`."""

@@ -18,6 +18,7 @@ from harness.play.radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.seeds import agent_seed
 from harness.play.simulation.air import NEVER, Happening, InFlight, Logged, RogueDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, NameOf
+from harness.play.simulation.recurrence import LOOK_AFTER_S, Recurrence, Waiting
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, disconnected_until, injected_nothing
 from harness.scenario.fates import Fate
@@ -29,6 +30,7 @@ from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
 from ucp.messages import datagram_bytes
+from ucp.quirks import Quirks
 from ucp.store import StoredState
 from ucp.trace import HandlerRun
 
@@ -139,6 +141,8 @@ class Simulation:
         self._script = fate_script(scenario.fates, self.roster, self._block_name)
         self._air = air(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
         self._rogue = self._rogue_node() if scenario.rogue else None
+        self._recurrence: Recurrence | None = None
+        """Is told of timers that end, once the swarm has had its time to finish."""
 
     def _rogue_node(self) -> "VirtualRogue":
         from harness.play.simulation.rogue import VirtualRogue  # scapy takes long to import
@@ -207,13 +211,55 @@ class Simulation:
         self._generating = False
 
     async def until_idle(self, limit_s: float) -> bool:
-        limit = self._now + limit_s
+        limit, look_at = self._now + limit_s, self._now + LOOK_AFTER_S
+        recurrence, self._recurrence, self.played.cycle = self._looks_for_recurrence(), None, None
         while self._now < limit:
             awake = (life for life in self.living() if life.waiting is None)
             last = max([self._air.quiet_at, *(life.deadline or 0.0 for life in awake)])
             if last <= self._now:
-                return all(life.waiting is None and life.agent.state.idle for life in self.living())
-            await self.until(min(limit, last))
+                return self._stands_still()
+            if recurrence is None or self._now < look_at:
+                await self.until(min(limit, last))
+            elif await self._recurs_until(min(limit, last), recurrence):
+                return False
+        return False
+
+    def _stands_still(self) -> bool:
+        """Whether all agents are idle, now that nothing is on its way and no timer runs; those that are not hang."""
+        hanging = [life.agent for life in self.living() if life.waiting is None and not life.agent.state.idle]
+        if hanging and not self._generating:
+            agents = [agent.agent_id for agent in hanging]
+            self.played.cycle = {"since_s": round(self._now, 3), "proven": True, "agents": agents}
+        return not hanging and all(life.waiting is None for life in self.living())
+
+    def _looks_for_recurrence(self) -> Recurrence | None:
+        """None while there is more to come than agents themselves do, or lots decide what becomes of them."""
+        moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
+        delays = self._medium.certain_delays()
+        if self._generating or moving or self._rogue is not None or self.scenario.quirks != Quirks() or delays is None:
+            return None
+        return Recurrence(delays)
+
+    async def _recurs_until(self, mission_s: float, recurrence: Recurrence) -> bool:
+        """As `until`, but no further than until the swarm is seen to go round in circles; whether it was."""
+        self._recurrence = recurrence
+        while self._now < mission_s:
+            if self._air.quiet_at > self._now:
+                await self.until(min(mission_s, self._air.quiet_at))
+                continue
+            lives = {number: life for number, life in enumerate(self._alive) if life and life.waiting is None}
+            for number, life in lives.items():
+                self._hear(number, life)
+            wakes_s = {number: life.deadline for number, life in lives.items() if life.deadline is not None}
+            next_s = min(wakes_s.values())
+            swarm = [Waiting(life.agent.state, self._local(life, next_s), life.deadline) for life in lives.values()]
+            fates = self._script.standing(self._now)
+            order = self._air.order_of_timers(wakes_s)
+            if fates is not None and recurrence.look(swarm, order, fates, self._script.last_s or 0.0):
+                self.played.cycle = recurrence.cycle(swarm)
+                return True
+            await self.until(min(mission_s, next_s))
+            recurrence.timers_have_ended(swarm)
         return False
 
     async def keep_chains(self) -> None:
@@ -349,6 +395,8 @@ class Simulation:
         if soonest is None or life.deadline is None or life.deadline > self._now:
             return  # it was stopped, or started anew, since it was expected to end now
         self._hear(number, life)
+        if self._recurrence is not None:
+            self._recurrence.timers_end(self._now, max(soonest, self._local(life)), life.agent.state)
         life.agent.handle_timer(max(soonest, self._local(life)))
         self._air.no_longer_asked(number, life.agent.state)
         self._after(number, life)

@@ -87,6 +87,13 @@ class FateScript:
                 decided.named.append((fate.name, arrivals[0]))
         return decided
 
+    def standing(self, now: float) -> tuple[int, ...] | None:
+        """How far each fate has counted, as far as that still matters; None while the time of one is to come."""
+        times = (time for part in self._parts for time in (part.fate.from_s, part.fate.until_s, part.fate.hold_until_s))
+        if any(time is not None and time > now for time in times):
+            return None
+        return tuple(min(part.fitting, max(part.fate.counts or (0,))) for part in self._parts)
+
     def unmatched(self, waiting: Collection[str]) -> list[str]:
         """A sentence for each fate that came to nothing: whoever wrote it believes that it did something.
 
