@@ -4,6 +4,7 @@ Every handler run has a local trigger or a message that its sender really sent, 
 when its own timer does. Only traces can tell.
 """
 
+from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
 from harness.checker.waiting import waited_too_long
@@ -20,10 +21,7 @@ _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 def check(evidence: Evidence) -> Judgement:
     if not evidence.traces:
         return Judgement(NAME, "not applicable", "no traces: exports do not show what triggered the handlers")
-    sent = {
-        agent_id: {(message.seq, message.message) for run in trace.runs for message in run.sent}
-        for agent_id, trace in evidence.traces.items()
-    }
+    sent = {agent_id: _sent(trace) for agent_id, trace in evidence.traces.items()}
     findings: list[Finding] = []
     untraced: set[int] = set()
     runs = 0
@@ -56,14 +54,29 @@ def check(evidence: Evidence) -> Judgement:
     return Judgement(NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent")
 
 
-def _is_as_sent(run: HandlerRun, sent: dict[int, set[tuple[int, str]]]) -> bool:
+_Sent = dict[str, set[int]]
+"""Name of a message -> sequence numbers."""
+
+
+def _sent(trace: Trace) -> _Sent:
+    sent: _Sent = {name: set() for name in _OF_MESSAGE}
+    for run in trace.runs:
+        for message in run.sent:
+            sent.setdefault(message.message, set()).add(message.seq)
+    return sent
+
+
+def _is_as_sent(run: HandlerRun, sent: dict[int, _Sent]) -> bool:
     """Whether the message that triggered the run is this handler's, and was sent by whom it names."""
     trigger = run.trigger
     name = trigger["message"]
-    return _OF_MESSAGE.get(name) == run.handler and (trigger.get("seq"), name) in sent.get(trigger.get("from"), ())  # type: ignore[arg-type]
+    return (
+        _OF_MESSAGE.get(name) == run.handler  # type: ignore[arg-type]
+        and trigger.get("seq") in sent.get(trigger.get("from"), {}).get(name, ())  # type: ignore[arg-type]
+    )
 
 
-def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, set[tuple[int, str]]]) -> str | None:
+def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, _Sent]) -> str | None:
     """What is wrong with the run's trigger, completing "the handler ..."; None if nothing is."""
     if run.handler not in HANDLERS or HANDLERS[run.handler].algorithm != run.algorithm:
         return "is not one of the 20 event handlers"
@@ -74,7 +87,7 @@ def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, set[tuple[int
         case {"message": str(name), "from": int(sender), "seq": int(sequence)}:
             if _OF_MESSAGE.get(name) != run.handler:
                 return f"was triggered by a {name}, which is another handler's"
-            if (sequence, name) not in sent[sender]:
+            if sequence not in sent[sender][name]:
                 return f"was triggered by {name} number {sequence}, which agent {sender} never sent"
         case {"timer": str(timer)}:
             if _OF_TIMER.get(timer) != run.handler:

@@ -1,12 +1,14 @@
 """What the checker looks at: exports, traces where there are any, and what the run's record says of the network."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
 from harness.archive.record import AgentRecord, JudgedRecord
 from harness.archive.traces import Trace
+from harness.checker.replay import Replayed, replay
 
 
 @dataclass
@@ -27,6 +29,11 @@ class Evidence:
 
     def name(self, block_hash: str) -> str:
         return self.names.get(block_hash, block_hash[:12])
+
+    @cached_property
+    def replayed(self) -> Replayed:
+        """What the traces show of what agents held after each step."""
+        return replay(self.traces, self.name)
 
     @property
     def roster(self) -> list[int] | None:

@@ -7,7 +7,7 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
-    findings = [*_in_exports(evidence), *_in_traces(evidence)]
+    findings = [*_in_exports(evidence), *evidence.replayed.idle_uncommitted]
     if findings:
         return violated(NAME, "an idle agent held a completed block that was not in its chain", findings)
     if not evidence.exports:
@@ -39,22 +39,4 @@ def _in_exports(evidence: Evidence) -> list[Finding]:
                     block_hash,
                 )
             )
-    return findings
-
-
-def _in_traces(evidence: Evidence) -> list[Finding]:
-    findings = []
-    for agent_id, trace in evidence.traces.items():
-        for line, run, held in trace.steps():
-            if run.state.idle and (held.not_in_chain or held.size["deque"] or held.size["stack"]):
-                waiting = next(iter(held.not_in_chain), None)
-                findings.append(
-                    Finding(
-                        agent_id,
-                        f"trace line {line}, t={run.t:g} s: idle after {run.handler} with "
-                        f"{held.size['deque']} blocks to be committed and {held.size['stack']} on the reconcile stack",
-                        evidence.name(waiting) if waiting else None,
-                        waiting,
-                    )
-                )
     return findings

@@ -16,15 +16,7 @@ def check(evidence: Evidence) -> Judgement:
             if count > 1:
                 name = evidence.name(block_hash)
                 findings.append(Finding(agent_id, f"exported {count} copies of block {name}", name, block_hash))
-    for agent_id, trace in evidence.traces.items():
-        for line, run, held in trace.steps():
-            where = f"trace line {line}, t={run.t:g} s, {run.handler}"
-            if held.impossible:
-                findings.append(Finding(agent_id, f"{where}: {held.impossible}"))
-            for _, block_hash in run.changes:
-                if held.copies[block_hash] > 1:
-                    name = evidence.name(block_hash)
-                    findings.append(Finding(agent_id, f"{where}: a second copy of block {name}", name, block_hash))
+    findings += evidence.replayed.copies
     if findings:
         return violated(NAME, "an agent held a block twice", findings)
     if not evidence.exports:

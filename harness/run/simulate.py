@@ -12,6 +12,7 @@ from harness.archive.exports import Export, ExportMaker
 from harness.archive.record import JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
+from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
 from harness.play.simulation.backend import Incarnation, Simulation
@@ -43,11 +44,12 @@ def simulate(scenario: Scenario, seed: int, *, tracing: bool = False, deliver_al
 def simulate_in_memory(memory: "InMemory", scenario: Scenario, seed: int, **options: Any) -> Simulated:
     """As `simulate`; `memory` keeps the run, and `options` are the simulation's."""
     VirtualTime().refuse(scenario)
-    simulation = Simulation(scenario, seed, memory, **options)
-    _without_waiting(mission.play(simulation, scenario))
-    simulation.end()
-    evidence = memory.evidence(simulation)
-    return Simulated(simulation.played, evidence, checker.check(evidence))
+    with gc_paused():
+        simulation = Simulation(scenario, seed, memory, **options)
+        _without_waiting(mission.play(simulation, scenario))
+        simulation.end()
+        evidence = memory.evidence(simulation)
+        return Simulated(simulation.played, evidence, checker.check(evidence))
 
 
 def _without_waiting(story: Coroutine[Any, Any, None]) -> None:
