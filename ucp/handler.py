@@ -6,7 +6,7 @@ local events that it may trigger. `ucp.core` holds it to that, and `ucp.diagram`
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Generic, Literal, ParamSpec
 
 from ucp.messages import Message
@@ -59,17 +59,5 @@ def event_handler(
 
     def declare(run: Callable[P, str]) -> EventHandler[P]:
         return EventHandler(run.__name__, run, algorithm, branches, sends, starts, triggers)
-
-    return declare
-
-
-def in_place_of(good: EventHandler[P], *branches: str) -> Callable[[Callable[P, str]], EventHandler[P]]:
-    """Declare a function to be a wrong handler that an agent can be given in the place of the `good` one.
-
-    It may do what that may, and returns `branches` besides.
-    """
-
-    def declare(run: Callable[P, str]) -> EventHandler[P]:
-        return replace(good, run=run, branches=good.branches + branches)
 
     return declare

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from ucp.block import MAX_AGENT_ID
 from ucp.events import MEAN_TIME_BETWEEN_EVENTS_S
-from ucp.quirks import Quirks
+from ucp.quirks import Quirks, check_quirk
 from ucp.settings import Settings
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
@@ -180,13 +180,14 @@ def _settings(document: Any) -> Settings:
 
 
 def _quirks(document: Any) -> Quirks:
-    quirks = Quirks()
+    if not isinstance(document, dict):
+        raise MissionError("`quirks` must be a JSON object")
     try:
-        for name, value in _known(document, "quirks", Quirks).items():
-            quirks.set(name, value)
+        for name, value in document.items():
+            check_quirk(name, value)
     except ValueError as error:
         raise MissionError(f"`quirks`: {error}") from None
-    return quirks
+    return document
 
 
 def _known(document: Any, key: str, kind: type) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from ucp.events import LoggableEvent, RandomEvents
 from ucp.export import export_chain
 from ucp.files import TraceFile, write_json_atomically
 from ucp.mission import Mission, MissionError, load_mission
+from ucp.quirks import check_quirk, wrong_handlers
 from ucp.store import Store, StoreError
 from ucp.telemetry import TelemetryEvents, follow
 from ucp.trace import HandlerRun, header_line
@@ -49,7 +50,7 @@ class Node:
             mission.roster,
             mission.initial_data,
             mission.settings,
-            handlers=mission.quirks.handlers(self._lots),
+            handlers=wrong_handlers(mission.quirks, self._lots),
         )
         self.generating = False
         self.handled = 0
@@ -266,12 +267,15 @@ class Node:
             raise CommandError(f"could not export the chain: {error.strerror}") from None
 
     def _quirk(self, request: dict[str, Any]) -> dict[str, Any]:
+        name: str = str(request.get("name"))
+        value: Any = request.get("value")
         try:
-            self.mission.quirks.set(str(request.get("name")), request.get("value"))
+            check_quirk(name, value)
         except ValueError as error:
             raise CommandError(str(error)) from None
-        self.agent.replace_handlers(self.mission.quirks.handlers(self._lots))
-        return dataclasses.asdict(self.mission.quirks)
+        self.mission.quirks[name] = value
+        self.agent.replace_handlers(wrong_handlers(self.mission.quirks, self._lots))
+        return self.mission.quirks
 
     def _reconcile(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.clock.running:

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, WithJsonSchema, field_validator, model_validator
 
 from harness.scenario.docker import Docker
 from harness.scenario.events import Events
@@ -24,7 +24,7 @@ from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError
 from sitl.plan import PlanError
 from ucp.block import MAX_AGENT_ID
-from ucp.quirks import Quirks
+from ucp.quirks import QUIRKS, check_quirk
 from ucp.settings import Settings
 
 
@@ -39,6 +39,15 @@ class Clock(Model):
 
     offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     drift: Annotated[float, Field(gt=-0.5, le=1.0)] = 0.0
+
+
+def _schema_of_quirks() -> dict[str, Any]:
+    probability, flag = {"type": "number", "minimum": 0, "maximum": 1}, {"type": "boolean"}
+    known = {
+        name: {"description": quirk.sentence, **(probability if quirk.chance else flag)}
+        for name, quirk in QUIRKS.items()
+    }
+    return {"type": "object", "properties": known, "additionalProperties": False}
 
 
 class Scenario(Model):
@@ -59,7 +68,8 @@ class Scenario(Model):
     """Any program that follows ucp/CONTRACT.md, with its arguments; the mission file's name is added."""
     docker: Docker = Docker()
     settings: Settings = Settings()
-    quirks: Quirks = Quirks()
+    quirks: Annotated[dict[str, bool | float], WithJsonSchema(_schema_of_quirks())] = {}
+    """Mistakes that all agents make (`ucp.quirks`)."""
     clocks: dict[VehicleKey, Clock] = {}
     fates: Annotated[list[Fate], Field(max_length=100_000)] = []
     settle: Settle = Settle()
@@ -135,7 +145,7 @@ class Scenario(Model):
     def _known_quirks(cls, quirks: Any) -> Any:
         if isinstance(quirks, dict):
             for name, value in quirks.items():
-                Quirks().set(name, value)
+                check_quirk(str(name), value)
         return quirks
 
     @model_validator(mode="after")

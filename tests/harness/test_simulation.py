@@ -110,7 +110,6 @@ def playable(timeline: list[dict[str, Any]]) -> bool:
     ),
     agents=st.integers(3, 7),
     mean_s=st.sampled_from([1, 3, 10]),
-    ignore_commit=probabilities,
     clocks=st.sampled_from([{}, {2: {"offset_s": -3.5, "drift": 0.001}, 3: {"offset_s": 10}}]),
     final_reconcile=st.booleans(),
     seed=st.integers(0, 1000),
@@ -121,7 +120,6 @@ def test_what_is_not_delivered_would_have_changed_nothing(
     schedule: list[dict[str, Any]],
     agents: int,
     mean_s: int,
-    ignore_commit: float,
     clocks: dict[int, Any],
     final_reconcile: bool,
     seed: int,
@@ -134,7 +132,6 @@ def test_what_is_not_delivered_would_have_changed_nothing(
         timeline=timeline,
         schedule=schedule,
         events={"source": "random", "mean_s": mean_s},
-        quirks={"ignore_commit": ignore_commit},
         clocks=clocks,
         settle={"limit_s": 300},
         final_reconcile=final_reconcile,
@@ -143,6 +140,18 @@ def test_what_is_not_delivered_would_have_changed_nothing(
     assert left_behind(needed) == left_behind(all_)
     assert effective_runs(needed) == effective_runs(all_)
     assert left_behind(simulate(one, seed)) == left_behind(needed)
+
+
+@pytest.mark.parametrize("quirk", ["vote_while_reconciling", "count_phase1_of_others"])
+def test_a_wrong_agent_hears_what_cannot_matter_to_a_right_one(quirk: str) -> None:
+    """One that answers while it reconciles, and one that counts answers to the questions of others."""
+    right = scenario(network={"loss": 0.2})
+    wrong = scenario(network={"loss": 0.2}, quirks={quirk: True})
+    unasked = left_behind(simulate(wrong, 1))
+    assert unasked == left_behind(simulate(wrong, 1, deliver_all=True))
+    assert unasked != left_behind(simulate(right, 1))
+    off = scenario(network={"loss": 0.2}, quirks={quirk: False})
+    assert digest(simulate(off, 1, tracing=True)) == digest(simulate(right, 1, tracing=True))
 
 
 def test_nor_where_flight_makes_the_network() -> None:
@@ -174,7 +183,7 @@ BURSTS = {
         ("perfect.yaml", 1, "e5b6c24af37b9538"),
         ("loss_15.yaml", 1, "f1e908c522dc6fd8"),
         ("loss_15.yaml", 2, "a8cce796a772945e"),
-        ("missed_commit.yaml", 1, "492a6c65e1d37673"),
+        ("missed_commit.yaml", 1, "10472e41ff7f2740"),
         ("partition_heal.yaml", 1, "988c978a053cea73"),
         ("split_rejoin.yaml", 1, "314fd04da1a47bb4"),
         ("attrition.yaml", 1, "2dcf131485a492fe"),

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
-from random import Random
 from types import ModuleType
 from typing import Any
 
@@ -18,7 +17,6 @@ import pytest
 import ucp
 from ucp.agent import HANDLERS
 from ucp.handler import EventHandler
-from ucp.quirks import Quirks
 
 Branch = tuple[str, str]
 """(handler, branch)"""
@@ -44,8 +42,8 @@ TABLE = """\
 OF_WRONG_AGENTS = """
 ## Of wrong agents
 
-An agent with [quirks](quirks.py) has wrong handlers in the place of some of these, which take branches of their own.
-
+An agent with [quirks](quirks) has wrong handlers in the place of some of these. Besides their branches they take two:
+"ignored by quirk", where `ignore_commit` strikes, and "crashed by quirk", where a handler ended by an exception.
 """
 
 WHEN: dict[str, dict[str, str]] = {
@@ -151,15 +149,6 @@ WHEN: dict[str, dict[str, str]] = {
 }
 
 
-WHEN_WRONG: dict[str, dict[str, str]] = {
-    "receive_commit_block": {"ignored by quirk": "the quirk `ignore_commit` strikes"},
-    "reconcile_phase_2_timer_expiration": {"tie: crashed by quirk": "a tie, and the quirk `crash_on_tie` is on"},
-}
-"""When the handlers of wrong agents take their branches that the good ones do not have."""
-
-WRONG = list(Quirks(1.0, True, True, True).handlers(Random(0)))
-
-
 def takes(handler: str, *branches: str) -> pytest.MarkDecorator:
     """The test takes these branches of `handler`. Can be given repeatedly, and as `marks` to one `pytest.param`."""
     return pytest.mark.branch(handler=handler, branches=branches)
@@ -228,15 +217,15 @@ def branches_of(handlers: Iterable[EventHandler[Any]]) -> list[Branch]:
 def page() -> str:
     tests = taken_by()
 
-    def rows(when: dict[str, dict[str, str]]) -> Iterator[str]:
-        for name, branches in when.items():
+    def rows() -> Iterator[str]:
+        for name, branches in WHEN.items():
             cells = f"{HANDLERS[name].title} | `{name}`"
             for branch, reason in branches.items():
                 named = "<br>".join(f"`{test}`" for test in tests.get((name, branch), ()))
                 yield f"| {cells} | {branch} | {reason} | {named} |\n"
                 cells = " | "
 
-    return INTRODUCTION + TABLE + "".join(rows(WHEN)) + OF_WRONG_AGENTS + TABLE + "".join(rows(WHEN_WRONG))
+    return INTRODUCTION + TABLE + "".join(rows()) + OF_WRONG_AGENTS
 
 
 if __name__ == "__main__":

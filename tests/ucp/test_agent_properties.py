@@ -11,7 +11,7 @@ from tests.ucp.test_messages import messages
 from ucp.agent import HANDLERS, Agent
 from ucp.block import Block, next_chain_hash
 from ucp.messages import CommitBlock, Message, decode, encode
-from ucp.quirks import Quirks
+from ucp.quirks import wrong_handlers
 from ucp.store import StoredState
 
 
@@ -100,7 +100,7 @@ def test_characteristics_2_to_4_hold_after_every_step(
 
     air = Air(range(1, agents + 1), fate)
     for agent in air.agents.values():
-        agent.replace_handlers(Quirks(ignore_commit=quirk).handlers(Random(0)))
+        agent.replace_handlers(wrong_handlers({"ignore_commit": quirk}, Random(0)))
     air.generate_events(seed, mean_s)
     for _ in range(400):
         if air.now > 150:

@@ -9,7 +9,7 @@ from tests.ucp.branches import takes
 from ucp.block import Block, next_chain_hash
 from ucp.events import LoggableEvent, decode_events
 from ucp.messages import BlockAddRequest, BlockAddResponse, CommitBlock, Message
-from ucp.quirks import Quirks, ignores_commits
+from ucp.quirks import check_quirk, wrong_handlers
 from ucp.settings import Settings
 
 
@@ -233,10 +233,9 @@ def test_a_second_copy_of_a_block_is_never_committed() -> None:
     assert len(agent.state.chain) == 1
 
 
-@takes("receive_commit_block", "ignored by quirk")
 def test_the_ignore_commit_quirk_misses_commits() -> None:
     air = Air([1, 2])
-    air.agents[2].replace_handlers([ignores_commits(1.0, Random(0))])
+    air.agents[2].replace_handlers(wrong_handlers({"ignore_commit": 1.0}, Random(0)))
     air.fill_block(1)
     air.settle()
     assert air.branches(2, "receive_commit_block") == ["ignored by quirk"]
@@ -264,7 +263,7 @@ def test_a_reconciling_agent_neither_votes_nor_commits_nor_proposes() -> None:
 )
 def test_an_impossible_quirk_is_refused(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=name):
-        Quirks().set(name, value)
+        check_quirk(name, value)
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,10 @@ import ucp
 from harness.archive.traces import Trace
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
-from tests.ucp.branches import WRONG
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, Agent
 from ucp.core import Core
 from ucp.diagram import PAGE, page
-from ucp.events import LoggableEvent
-from ucp.handler import EventHandler, LocalEvent, in_place_of
+from ucp.handler import EventHandler, LocalEvent
 from ucp.messages import Message, RequestForBlock
 from ucp.settings import Settings
 from ucp.state import AgentState
@@ -42,7 +40,6 @@ RUNS = {
 }
 HELD_ALREADY = ("reconcile_phase_3", "Reconcile Finalize")
 """What no chain in good faith leads to: the mutual successor is in the chain already."""
-QUIRKS = {"ignore_commit": 0.2, "crash_on_tie": True, "early_phase3_expiry": True, "stale_chain_hash": True}
 
 
 def traces(**keys: Any) -> Iterator[Trace]:
@@ -98,17 +95,6 @@ def test_every_line_of_a_trace_is_as_declared_and_all_that_is_declared_is_done()
     assert seen == declared - {HELD_ALREADY}
 
 
-def test_wrong_agents_too_do_only_what_they_declare() -> None:
-    handlers = HANDLERS | {handler.name: handler for handler in WRONG}
-    seen, branches = set(), set()
-    for quirk, value in QUIRKS.items():
-        for trace in traces(network={"loss": 0.3}, quirks={quirk: value}):
-            seen |= set(done(trace, handlers))
-            branches |= {run.branch for run in trace.runs}
-    assert HELD_ALREADY in seen
-    assert branches >= {"ignored by quirk", "tie: crashed by quirk"}
-
-
 def test_what_a_handler_does_not_declare_is_refused() -> None:
     core = Core(1, b"", Settings())
     core.running = HANDLERS["build_data_block"]
@@ -119,17 +105,6 @@ def test_what_a_handler_does_not_declare_is_refused() -> None:
     with pytest.raises(AssertionError, match="build_data_block does not declare that it triggers Reconcile Begin"):
         core.trigger("Reconcile Begin")
     assert not core.outbox and not core.triggered and not core.voting_timer.active
-
-
-def test_a_handler_in_the_place_of_another_may_do_what_that_may_and_takes_branches_of_its_own() -> None:
-    good = HANDLERS["build_data_block"]
-
-    @in_place_of(good, "forgotten")
-    def forgets(core: Core, event: LoggableEvent) -> str:
-        return "forgotten"
-
-    assert (forgets.name, forgets.algorithm, forgets.triggers) == (good.name, good.algorithm, good.triggers)
-    assert forgets.branches == ("building", "full", "forgotten")
 
 
 def test_each_algorithm_has_one_handler_and_each_handler_one_table_but_reconcile_finalize() -> None:

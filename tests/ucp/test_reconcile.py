@@ -19,7 +19,7 @@ from ucp.messages import (
     NextInSequenceResponse,
     RequestForBlock,
 )
-from ucp.quirks import crashes_on_a_tie, keeps_a_stale_chain_hash, lets_phase_3_expire_early
+from ucp.quirks import wrong_handlers
 from ucp.settings import Settings
 
 
@@ -321,16 +321,15 @@ def test_a_block_that_was_not_asked_for_does_not_delay_the_end_of_phase_3() -> N
     assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
 
 
-@takes("reconcile_phase_2_timer_expiration", "tie: crashed by quirk")
 def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever() -> None:
     air = in_phase_2(agents=3)
     agent = air.agents[1]
-    agent.replace_handlers([crashes_on_a_tie])
+    agent.replace_handlers(wrong_handlers({"crash_on_tie": True}, Random(0)))
     top = agent.state.chain.top_chain_hash
     agent.receive_message(2, 1, NextInSequenceResponse(top, A, 5), 6.0)
     agent.receive_message(3, 1, NextInSequenceResponse(top, None, 0), 6.0)
     air.settle()
-    assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["tie: crashed by quirk"]
+    assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["crashed by quirk"]
     assert agent.state.reconcile_in_progress
     assert agent.next_timer() is None
 
@@ -338,7 +337,7 @@ def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever()
 def test_the_field_test_s_early_phase_3_expiry_ends_every_reconcile_before_a_block_comes() -> None:
     air = diverged()
     agent = air.agents[1]
-    agent.replace_handlers([lets_phase_3_expire_early])
+    agent.replace_handlers(wrong_handlers({"early_phase3_expiry": True}, Random(0)))
     air.reconcile(1)
     assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
     assert set(air.branches(1, "receive_response_block_for_hash")) == {"not in phase 3"}
@@ -352,7 +351,7 @@ def test_the_field_test_s_early_phase_3_expiry_ends_every_reconcile_before_a_blo
 def test_the_field_test_s_stale_chain_hash_makes_an_agent_ask_for_what_it_has_just_got() -> None:
     air = diverged(blocks_on_2=2)
     agent = air.agents[1]
-    agent.replace_handlers([keeps_a_stale_chain_hash])
+    agent.replace_handlers(wrong_handlers({"stale_chain_hash": True}, Random(0)))
     air.reconcile(1)
     assert air.branches(1, "receive_response_block_for_hash")[0] == "committed"
     assert air.branches(1, "reconcile_phase_3") == ["asked", "held already"]

@@ -10,6 +10,9 @@ from sitl.vehicle import AGENT_PORT
 from ucp.messages import PORT
 from ucp.mission import SCHEMA
 
+NO_QUIRKS = {"ignore_commit": 0.0, "crash_on_tie": False, "early_phase3_expiry": False, "stale_chain_hash": False}
+"""The quirks that a mission file always has; the others are there if they are asked for."""
+
 
 def mission_file(
     agent_id: int,
@@ -41,7 +44,7 @@ def mission_file(
             "vehicle_port": AGENT_PORT,
         },
         "settings": dataclasses.asdict(scenario.settings),
-        "quirks": dataclasses.asdict(scenario.quirks),
+        "quirks": {**NO_QUIRKS, **scenario.quirks},
         "seed": agent_seed(seed, agent_id, life),
         "speedup": scenario.speedup,
         "epoch_us": epoch_us,

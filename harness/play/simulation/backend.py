@@ -30,7 +30,7 @@ from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
 from ucp.messages import datagram_bytes
-from ucp.quirks import Quirks
+from ucp.quirks import in_force, wrong_handlers
 from ucp.store import StoredState
 from ucp.trace import HandlerRun
 
@@ -97,8 +97,9 @@ class Incarnation:
 class Simulation:
     """A swarm in virtual time; see `harness.play.mission.Swarm`. Agents are numbered in the roster's order.
 
-    `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. `breathe` is
-    awaited every few mission seconds. `fate_script` makes what plays the scenario's fates, and `air` what carries
+    `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. Agents with
+    quirks always hear everything: what cannot matter to the right agent may matter to a wrong one. `breathe` is awaited
+    every few mission seconds. `fate_script` makes what plays the scenario's fates, and `air` what carries
     messages.
     """
 
@@ -122,7 +123,7 @@ class Simulation:
         self._initial_data = f"{scenario.name}, seed {seed}".encode()
         self._recorder = recorder
         self._tracing = recorder.tracing
-        self._deliver_all = deliver_all
+        self._deliver_all = deliver_all = deliver_all or bool(in_force(scenario.quirks))
         self._breathe = breathe
         self._now = 0.0
         self._generating = True
@@ -236,7 +237,8 @@ class Simulation:
         """None while there is more to come than agents themselves do, or lots decide what becomes of them."""
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
-        if self._generating or moving or self._rogue is not None or self.scenario.quirks != Quirks() or delays is None:
+        wrong = in_force(self.scenario.quirks)
+        if self._generating or moving or self._rogue is not None or wrong or delays is None:
             return None
         return Recurrence(delays)
 
@@ -373,10 +375,10 @@ class Simulation:
             agent, sender, message = life.agent, what.sender, what.message
             if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent.state, sender, message)):
                 agent.receive_message(sender, what.sequence, message, self._local(life))
-                if self._tracing or agent.state.reconcile_in_progress:
+                if self._tracing or self._deliver_all or agent.state.reconcile_in_progress:
                     self._after(number, life)
                 else:
-                    self._say(number, life)  # of the handlers of messages only a reconcile's touch timers
+                    self._say(number, life)  # of the right handlers of messages only a reconcile's touch timers
         elif what is None:
             self._timer_ends(number, life)
         elif isinstance(what, RogueDatagram):
@@ -455,7 +457,7 @@ class Simulation:
             self.roster,
             self._initial_data,
             scenario.settings,
-            handlers=scenario.quirks.handlers(Random(seed)),
+            handlers=wrong_handlers(scenario.quirks, Random(seed)),
             tracing=self._tracing,
         )
         source = RandomEvents(Random(seed), scenario.events.mean_s)

@@ -1,0 +1,60 @@
+"""Wrong agents: mistakes that an agent can be asked to make, to see what finds them.
+
+quirk.py      what a quirk is, and how it takes the place of what is right
+commit.py     the quirks of Algorithms 1-6
+reconcile.py  the quirks of Algorithms 7-20
+core.py       the quirks of what all handlers share
+
+An agent has quirks only if its mission, its scenario or the command `quirk` names them. The thesis's own are among
+them: `ignore_commit` (Section 4.2), and those of its tests and field tests (Sections 4.2 and 4.3) `crash_on_tie`,
+`early_phase3_expiry`, `stale_chain_hash`, `break_off_commit` and `wrong_topic`.
+"""
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from random import Random
+from typing import Any
+
+from ucp.agent import HANDLERS
+from ucp.handler import EventHandler
+from ucp.quirks import commit, core, reconcile
+from ucp.quirks.quirk import CRASHED, Quirk, ending_by_exceptions
+
+__all__ = ["CRASHED", "QUIRKS", "Quirk", "Quirks", "check_quirk", "in_force", "wrong_handlers"]
+
+Quirks = dict[str, bool | float]
+"""Quirk -> true, or its probability. False, 0 and a quirk that is left out are the same."""
+
+QUIRKS: dict[str, Quirk] = {
+    quirk.name: quirk
+    for module in (commit, reconcile, core)
+    for quirk in vars(module).values()
+    if isinstance(quirk, Quirk)
+}
+"""All quirks by name, in the order of their Algorithms."""
+
+
+def check_quirk(name: str, value: object) -> None:
+    """Raises ValueError: which quirks there are, or what the value may be."""
+    if name not in QUIRKS:
+        near = ", ".join(get_close_matches(name, QUIRKS, cutoff=0.0))
+        raise ValueError(f"unknown quirk {name!r}: of the {len(QUIRKS)} in ucp/quirks the nearest are {near}")
+    QUIRKS[name].check(value)
+
+
+def in_force(quirks: Mapping[str, bool | float]) -> dict[str, float]:
+    """The quirks that are neither false nor 0; with none the agent is a right one."""
+    return {name: float(quirks[name]) for name in QUIRKS if quirks.get(name)}
+
+
+def wrong_handlers(quirks: Mapping[str, bool | float], lots: Random) -> list[EventHandler[Any]]:
+    """The handlers of an agent with these quirks; none if no quirk is in force.
+
+    What is random about them is drawn from `lots`.
+    """
+    wrong = in_force(quirks)
+    handlers = {handler.algorithm: handler for handler in HANDLERS.values()}
+    for name, value in wrong.items():
+        for algorithm in QUIRKS[name].algorithms:
+            handlers[algorithm] = QUIRKS[name].in_place_of(handlers[algorithm], value, lots)
+    return [ending_by_exceptions(handler) for handler in handlers.values()] if wrong else []
