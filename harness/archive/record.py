@@ -115,6 +115,14 @@ class Cycle(_Model):
     waits: list[CycleWait] = []
 
 
+class HandlerRuns(_Model):
+    """How many handler runs an agent had counted by a moment between `from_s` and `until_s`, in one life."""
+
+    counted: int
+    from_s: float
+    until_s: float
+
+
 class AgentRecord(_Model):
     """`outcome` is exported, not exported, killed, rebooting, crashed, hung, paused, running or not started.
 
@@ -137,6 +145,8 @@ class AgentRecord(_Model):
     dropped: dict[str, int] | None = None
     send_failures: int | None = None
     trace_problem: str | None = None
+    handler_runs: list[HandlerRuns | None] = []
+    """What it said last in each of its lives; null of a life in which it said nothing."""
 
 
 class CapturedFrames(_Model):

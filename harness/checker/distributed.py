@@ -4,8 +4,7 @@ Every handler run has a local trigger or a message that its sender really sent, 
 when its own timer does. Only traces can tell.
 """
 
-from harness.archive.traces import Trace
-from harness.checker.evidence import Evidence
+from harness.checker.evidence import Evidence, Sendings
 from harness.checker.judgement import Finding, Judgement, agents, violated
 from harness.checker.waiting import waited_too_long
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
@@ -21,7 +20,7 @@ _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 def check(evidence: Evidence) -> Judgement:
     if not evidence.traces:
         return Judgement(NAME, "not applicable", "no traces: exports do not show what triggered the handlers")
-    sent = {agent_id: _sent(trace) for agent_id, trace in evidence.traces.items()}
+    sent = evidence.sendings
     findings: list[Finding] = []
     untraced: set[int] = set()
     runs = 0
@@ -54,29 +53,15 @@ def check(evidence: Evidence) -> Judgement:
     return Judgement(NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent")
 
 
-_Sent = dict[str, set[int]]
-"""Name of a message -> sequence numbers."""
-
-
-def _sent(trace: Trace) -> _Sent:
-    sent: _Sent = {name: set() for name in _OF_MESSAGE}
-    for run in trace.runs:
-        for message in run.sent:
-            sent.setdefault(message.message, set()).add(message.seq)
-    return sent
-
-
-def _is_as_sent(run: HandlerRun, sent: dict[int, _Sent]) -> bool:
+def _is_as_sent(run: HandlerRun, sent: dict[int, Sendings]) -> bool:
     """Whether the message that triggered the run is this handler's, and was sent by whom it names."""
     trigger = run.trigger
     name = trigger["message"]
-    return (
-        _OF_MESSAGE.get(name) == run.handler  # type: ignore[arg-type]
-        and trigger.get("seq") in sent.get(trigger.get("from"), {}).get(name, ())  # type: ignore[arg-type]
-    )
+    of_sender = sent.get(trigger.get("from"), {})  # type: ignore[arg-type]
+    return _OF_MESSAGE.get(name) == run.handler and trigger.get("seq") in of_sender.get(name, ())  # type: ignore[arg-type]
 
 
-def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, _Sent]) -> str | None:
+def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
     """What is wrong with the run's trigger, completing "the handler ..."; None if nothing is."""
     if run.handler not in HANDLERS or HANDLERS[run.handler].algorithm != run.algorithm:
         return "is not one of the 20 event handlers"
@@ -87,7 +72,7 @@ def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, _Sent]) -> st
         case {"message": str(name), "from": int(sender), "seq": int(sequence)}:
             if _OF_MESSAGE.get(name) != run.handler:
                 return f"was triggered by a {name}, which is another handler's"
-            if sequence not in sent[sender][name]:
+            if sequence not in sent[sender].get(name, ()):
                 return f"was triggered by {name} number {sequence}, which agent {sender} never sent"
         case {"timer": str(timer)}:
             if _OF_TIMER.get(timer) != run.handler:

@@ -1,14 +1,60 @@
 """What the checker looks at: exports, traces where there are any, and what the run's record says of the network."""
 
+from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ConfigDict
 
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
 from harness.archive.record import AgentRecord, JudgedRecord
 from harness.archive.traces import Trace
-from harness.checker.replay import Replayed, replay
+from harness.checker.replay import Life, replay
+
+if TYPE_CHECKING:
+    from harness.checker.records import Examination
+
+Sending = tuple[tuple[float, str | None], ...]
+"""When an agent sent messages of one type with the same sequence number, one in each life, and about which block."""
+Sendings = dict[Any, dict[Any, Sending]]
+"""Of an agent, by type and sequence number."""
+
+
+class InjectedDatagram(BaseModel):
+    """A line of `rogue.jsonl`: a message, a datagram that is none, or several that are only counted."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    message: str | None = None
+    sender: int | None = None
+    sequence: int | None = None
+    count: int | None = None
+
+
+@dataclass
+class InjectedMessages:
+    """What a rogue node sent, as far as traces can tell it from what agents sent."""
+
+    messages: set[tuple[Any, Any, Any]] = field(default_factory=set)
+    """Sender, sequence number and type."""
+    counted: bool = False
+    """There are more, of which only the number is on record."""
+
+    def take_down(self, datagrams: Iterable[InjectedDatagram]) -> "InjectedMessages":
+        for datagram in datagrams:
+            self.messages.add((datagram.sender, datagram.sequence, datagram.message))
+            self.counted |= datagram.count is not None
+        return self
+
+    def may_be(self, trigger: dict[str, Any]) -> bool:
+        """Whether the rogue may have sent the message that triggered a handler."""
+        if not self.messages:
+            return False
+        return self.counted or (trigger.get("from"), trigger.get("seq"), trigger.get("message")) in self.messages
 
 
 @dataclass
@@ -23,6 +69,7 @@ class Evidence:
     record: JudgedRecord | None = None
     errors: list[str] = field(default_factory=list)
     before_final_reconcile: dict[int, Export] = field(default_factory=dict)
+    injected: InjectedMessages = field(default_factory=InjectedMessages)
 
     def __post_init__(self) -> None:
         self.names = name_blocks(self.exports)
@@ -31,9 +78,33 @@ class Evidence:
         return self.names.get(block_hash, block_hash[:12])
 
     @cached_property
-    def replayed(self) -> Replayed:
-        """What the traces show of what agents held after each step."""
-        return replay(self.traces, self.name)
+    def lives(self) -> dict[int, list[Life]]:
+        """Each life of each agent that has a trace, replayed."""
+        inception = next((export.inception.chain_hash for export in self.exports.values()), None)
+        if inception is None:
+            states = (run.state for trace in self.traces.values() for run in trace.runs)
+            inception = next((state.top for state in states if state.chain == 0), None)
+        return {agent_id: replay(trace, inception) for agent_id, trace in self.traces.items()}
+
+    @cached_property
+    def sendings(self) -> dict[Any, Sendings]:
+        """What each agent sent, by its trace."""
+        sendings: dict[Any, Sendings] = {}
+        for agent_id, trace in self.traces.items():
+            of_agent: Sendings = defaultdict(dict)
+            for run in trace.runs:
+                for message in run.sent:
+                    of_type = of_agent[message.message]
+                    of_type[message.seq] = (*of_type.get(message.seq, ()), (run.t, message.block))
+            sendings[agent_id] = dict(of_agent)
+        return sendings
+
+    @cached_property
+    def examination(self) -> "Examination":
+        """What the records tell about the same things, held against each other."""
+        from harness.checker.records import cross_examine  # which looks at evidence
+
+        return cross_examine(self)
 
     @property
     def roster(self) -> list[int] | None:
@@ -51,15 +122,16 @@ class Evidence:
 
     def was_killed(self, agent_id: int) -> bool:
         """Whether the scenario killed the agent for good, and with it all that it held."""
-        agent = self._recorded(agent_id)
+        agent = self.recorded(agent_id)
         return agent is not None and agent.outcome == "killed"
 
     def was_restarted(self, agent_id: int) -> bool:
         """Whether the scenario killed and restarted the agent: its export knows its last life only."""
-        agent = self._recorded(agent_id)
+        agent = self.recorded(agent_id)
         return agent is not None and agent.restarts > 0
 
-    def _recorded(self, agent_id: int) -> AgentRecord | None:
+    def recorded(self, agent_id: int) -> AgentRecord | None:
+        """What the run's record says of the agent."""
         return self.record.agents.get(str(agent_id)) if self.record else None
 
     def was_paused(self, agent_id: int, from_s: float, until_s: float) -> bool:
@@ -112,4 +184,7 @@ def gather(archive: RunArchive) -> Evidence:
     problems = list(archive.problems)
     if archive.record_error is not None:
         problems[0] += "; the exports are checked without it"
-    return Evidence(archive.exports.by_agent, archive.traces, archive.record, problems, archive.before_final_reconcile)
+    injected = InjectedMessages().take_down(archive.injected(InjectedDatagram))
+    return Evidence(
+        archive.exports.by_agent, archive.traces, archive.record, problems, archive.before_final_reconcile, injected
+    )

@@ -7,7 +7,7 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
-    findings = [*_in_exports(evidence), *evidence.replayed.idle_uncommitted]
+    findings = [*_in_exports(evidence), *_in_traces(evidence)]
     if findings:
         return violated(NAME, "an idle agent held a completed block that was not in its chain", findings)
     if not evidence.exports:
@@ -39,4 +39,15 @@ def _in_exports(evidence: Evidence) -> list[Finding]:
                     block_hash,
                 )
             )
+    return findings
+
+
+def _in_traces(evidence: Evidence) -> list[Finding]:
+    findings = []
+    for agent_id, lives in evidence.lives.items():
+        for life in lives:
+            for sight in life.idle_too_early:
+                waiting, run = sight.block_hash, sight.run
+                detail = f"trace line {sight.line}, t={run.t:g} s: idle after {run.handler} with {sight.what}"
+                findings.append(Finding(agent_id, detail, evidence.name(waiting) if waiting else None, waiting))
     return findings

@@ -1,53 +1,203 @@
-"""What traces show of characteristics 2 and 3. Both ask what an agent held after each step, so it is replayed once."""
+"""A trace replayed: the changes of each handler run, in order, against what its `state` says the agent then held.
 
-from collections.abc import Callable, Iterator, Mapping
+One pass over each trace, for all who judge what an agent held at which step.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from harness.archive.traces import Held, Trace
-from harness.checker.judgement import Finding
-from ucp.trace import HandlerRun
+from harness.archive.history import LATEST_S
+from harness.archive.traces import Trace
+from ucp.block import HASH_BYTES, next_chain_hash
+from ucp.trace import HandlerRun, State
 
-NameOf = Callable[[str], str]
-"""A block's name from its hash."""
-
-
-@dataclass
-class Replayed:
-    """Where an agent was idle with blocks that are not in its chain, and where it held a block twice."""
-
-    idle_uncommitted: list[Finding] = field(default_factory=list)
-    copies: list[Finding] = field(default_factory=list)
+BEGINS_OR_ENDS_A_RECONCILE = frozenset(("reconcile_begin", "reconcile_finalize"))
 
 
-def replay(traces: Mapping[int, Trace], name: NameOf) -> Replayed:
-    replayed = Replayed()
-    for agent_id, trace in traces.items():
-        for life in trace.lives():
-            held = Held()
-            for line, run in life:
-                if run.changes:
-                    held.replay(run)
-                    replayed.copies += _copies(agent_id, line, run, held, name)
-                if run.state.idle and (held.not_in_chain or held.size["deque"] or held.size["stack"]):
-                    replayed.idle_uncommitted.append(_idle(agent_id, line, run, held, name))
-    return replayed
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What was seen at a line of a trace, lines counting from 1, and of which block."""
+
+    line: int
+    run: HandlerRun
+    what: str
+    block_hash: str | None = None
+
+    @property
+    def where(self) -> str:
+        return f"trace line {self.line}, t={self.run.t:g} s, {self.run.handler}"
 
 
-def _copies(agent_id: int, line: int, run: HandlerRun, held: Held, name: NameOf) -> Iterator[Finding]:
-    where = f"trace line {line}, t={run.t:g} s, {run.handler}"
-    if held.impossible:
-        yield Finding(agent_id, f"{where}: {held.impossible}")
-    for _, block_hash in run.changes:
-        if held.copies[block_hash] > 1:
-            yield Finding(agent_id, f"{where}: a second copy of block {name(block_hash)}", name(block_hash), block_hash)
+@dataclass(slots=True)
+class Life:
+    """One life of an agent: what it held at its end, and what was seen on the way.
+
+    `chain` is oldest first, `deque` front first, `stack` top last; all are block hashes.
+    """
+
+    header_line: int
+    runs: list[HandlerRun]
+    chain: list[str] = field(default_factory=list)
+    deque: list[str] = field(default_factory=list)
+    stack: list[str] = field(default_factory=list)
+    completed: list[str] = field(default_factory=list)
+    sent: int = 0
+    impossible: list[Sight] = field(default_factory=list)
+    """Changes that nobody can make."""
+    second_copies: list[Sight] = field(default_factory=list)
+    idle_too_early: list[Sight] = field(default_factory=list)
+    """Idle, with blocks of its own that are not in its chain, or anything in the deque or on the stack."""
+    otherwise: list[Sight] = field(default_factory=list)
+    """The first state that is not what the changes lead to: of lengths."""
+    another_top: list[Sight] = field(default_factory=list)
+    """The first top chain hash that is not that of the blocks of the chain (eq. 3.2)."""
+    flags: list[Sight] = field(default_factory=list)
+    """Flags that cannot be."""
+    back_in_time: list[Sight] = field(default_factory=list)
+    out_of_sequence: list[Sight] = field(default_factory=list)
+
+    @property
+    def last_line(self) -> int:
+        return self.header_line + len(self.runs)
 
 
-def _idle(agent_id: int, line: int, run: HandlerRun, held: Held, name: NameOf) -> Finding:
-    waiting = next(iter(held.not_in_chain), None)
-    return Finding(
-        agent_id,
-        f"trace line {line}, t={run.t:g} s: idle after {run.handler} with {held.size['deque']} blocks to be committed "
-        f"and {held.size['stack']} on the reconcile stack",
-        name(waiting) if waiting else None,
-        waiting,
-    )
+def replay(trace: Trace, inception: str | None) -> list[Life]:
+    """Each life of the agent. `inception` is the mission's chain hash CH_0; None if nobody knows it."""
+    return [_replayed(header_line, runs, inception) for header_line, runs in _lives(trace)]
+
+
+def _lives(trace: Trace) -> Iterator[tuple[int, list[HandlerRun]]]:
+    bounds = [0, *trace.starts, len(trace.runs)]
+    for number, start in enumerate(bounds[:-1]):
+        yield start + number + 1, trace.runs[start : bounds[number + 1]]
+
+
+def _replayed(header_line: int, runs: list[HandlerRun], inception: str | None) -> Life:
+    life = Life(header_line, runs)
+    holds = _Holds(life, inception)
+    checked: State | None = None
+    reconciling, compared, now, sequence = False, True, 0.0, 0
+    for line, run in enumerate(runs, header_line + 1):
+        state = run.state
+        if run.changes:
+            holds.change(line, run)
+            checked = None
+        if state is not checked:
+            checked = state
+            if compared:
+                compared = holds.compare(line, run)
+            if state.reconciling != reconciling:
+                reconciling = state.reconciling
+                if run.handler not in BEGINS_OR_ENDS_A_RECONCILE:
+                    what = f"a reconcile {'begins' if reconciling else 'ends'}, as only Algorithms 7 and 20 can make it"
+                    life.flags.append(Sight(line, run, what))
+            if state.idle and reconciling:
+                life.flags.append(Sight(line, run, "idle and reconciling at once"))
+        if state.idle and holds.anything_aside:
+            life.idle_too_early.append(holds.idle_too_early(line, run))
+        if not now <= run.t <= LATEST_S:
+            life.back_in_time.append(Sight(line, run, f"the clock goes from {now:g} s to {run.t:g} s"))
+        now = run.t
+        for message in run.sent:
+            if message.seq != sequence:
+                what = f"sent message number {message.seq}, where number {sequence} comes next"
+                life.out_of_sequence.append(Sight(line, run, what))
+                sequence = message.seq
+            sequence += 1
+            life.sent += 1
+    return life
+
+
+class _Holds:
+    """What an agent holds, step by step."""
+
+    def __init__(self, life: Life, inception: str | None) -> None:
+        self._life = life
+        self._copies: dict[str, int] = {}
+        self._places = {"chain": life.chain, "deque": life.deque, "stack": life.stack}
+        self._chain_hashes = [bytes.fromhex(inception)] if inception is not None else None
+        """Of the chain, the inception block's first; None if they are not known."""
+        self._completed: set[str] = set()
+        self._not_in_chain: dict[str, None] = {}
+        self.anything_aside = False
+
+    def change(self, line: int, run: HandlerRun) -> None:
+        life = self._life
+        for operation, block in run.changes:
+            if operation == "complete":
+                life.completed.append(block)
+                self._completed.add(block)
+                self._not_in_chain[block] = None
+                continue
+            place = self._places.get(operation[:-1])
+            if place is None or operation[-1] not in "+-":
+                life.impossible.append(Sight(line, run, f"unknown operation {operation!r}"))
+            elif operation[-1] == "-":
+                if impossible := self._take(operation[:-1], place, block):
+                    life.impossible.append(Sight(line, run, impossible, block))
+            else:
+                self._put(operation[:-1], place, block)
+                if self._copies[block] > 1:
+                    life.second_copies.append(Sight(line, run, "", block))
+        self.anything_aside = bool(self._not_in_chain or life.deque or life.stack)
+
+    def _put(self, name: str, place: list[str], block: str) -> None:
+        place.append(block)
+        self._copies[block] = self._copies.get(block, 0) + 1
+        if name == "chain":
+            self._not_in_chain.pop(block, None)
+            if self._chain_hashes is not None:
+                self._chain_hashes.append(next_chain_hash(self._chain_hashes[-1], _digest(block)))
+
+    def _take(self, name: str, place: list[str], block: str) -> str | None:
+        """Why the block cannot have been taken from there; it is taken all the same, if it is there."""
+        end = 0 if name == "deque" else -1
+        in_turn = bool(place) and place[end] == block
+        if in_turn:
+            place.pop(end)
+        elif block in place:
+            place.remove(block)
+        else:
+            return f"{block[:12]} leaves the {name} without having been there"
+        self._copies[block] -= 1
+        if name == "chain":
+            if block in self._completed:
+                self._not_in_chain[block] = None
+            if self._chain_hashes is not None:
+                del self._chain_hashes[len(place) + 1 :]
+        if in_turn or name == "stack":
+            return None
+        return f"{block[:12]} leaves the {name}, and is not {'in front' if name == 'deque' else 'on top'}"
+
+    def compare(self, line: int, run: HandlerRun) -> bool:
+        """Whether the state is what the changes have led to."""
+        life, state = self._life, run.state
+        if (state.chain, state.deque, state.stack) != (len(life.chain), len(life.deque), len(life.stack)):
+            what = (
+                f"says that {_lengths(state.chain, state.deque, state.stack)}, and the changes up to there leave "
+                f"{_lengths(len(life.chain), len(life.deque), len(life.stack), '')}"
+            )
+            life.otherwise.append(Sight(line, run, what))
+            return False
+        if self._chain_hashes is not None and state.top != self._chain_hashes[-1].hex():
+            what = f"the top chain hash {state.top[:12]} is not that of the {state.chain} blocks of the chain (eq. 3.2)"
+            life.another_top.append(Sight(line, run, what, life.chain[-1] if life.chain else None))
+            return False
+        return True
+
+    def idle_too_early(self, line: int, run: HandlerRun) -> Sight:
+        life = self._life
+        what = f"{len(life.deque)} blocks to be committed and {len(life.stack)} on the reconcile stack"
+        return Sight(line, run, what, next(iter(self._not_in_chain), None))
+
+
+def _digest(block_hash: str) -> bytes:
+    """The raw block hash; of what is none, nothing that is one."""
+    try:
+        return bytes.fromhex(block_hash)
+    except ValueError:
+        return bytes(HASH_BYTES)
+
+
+def _lengths(chain: int, deque: int, stack: int, holds: str = "holds ") -> str:
+    return f"the chain {holds}{chain} blocks, the deque {deque} and the stack {stack}"

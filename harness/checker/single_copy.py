@@ -16,7 +16,12 @@ def check(evidence: Evidence) -> Judgement:
             if count > 1:
                 name = evidence.name(block_hash)
                 findings.append(Finding(agent_id, f"exported {count} copies of block {name}", name, block_hash))
-    findings += evidence.replayed.copies
+    for agent_id, lives in evidence.lives.items():
+        for life in lives:
+            for sight in life.second_copies:
+                name = evidence.name(sight.block_hash or "")
+                detail = f"{sight.where}: a second copy of block {name}"
+                findings.append(Finding(agent_id, detail, name, sight.block_hash))
     if findings:
         return violated(NAME, "an agent held a block twice", findings)
     if not evidence.exports:

@@ -4,10 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from harness.checker import all_committed, distributed, genuine, idle_committed, single_copy, uniform_chain
+from harness.checker import all_committed, distributed, genuine, idle_committed, records, single_copy, uniform_chain
 from harness.checker.evidence import Evidence
 from harness.checker.figures import figures
 from harness.checker.judgement import Judgement
+from harness.checker.records.doubt import in_doubt
 
 CHECKS = {
     "1": distributed.check,
@@ -18,7 +19,7 @@ CHECKS = {
     "6": uniform_chain.check,
 }
 
-BESIDE: dict[str, Callable[[Evidence], Judgement]] = {}
+BESIDE: dict[str, Callable[[Evidence], Judgement]] = {"records": records.check}
 """Judgements that are not of the thesis, by their keys: see `harness.scenario.verdicts`."""
 
 
@@ -57,7 +58,7 @@ class Result:
 def check(evidence: Evidence) -> Result:
     """Decide all six characteristics from the evidence, and what is judged beside them."""
     return Result(
-        {number: judge(evidence) for number, judge in CHECKS.items()},
+        {number: in_doubt(number, judge(evidence), evidence.examination) for number, judge in CHECKS.items()},
         figures(evidence),
         {key: judge(evidence) for key, judge in BESIDE.items()},
         evidence.errors,

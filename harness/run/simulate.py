@@ -12,6 +12,7 @@ from harness.archive.exports import Export, ExportMaker
 from harness.archive.record import JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
+from harness.checker.evidence import InjectedDatagram, InjectedMessages
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
@@ -69,6 +70,7 @@ class InMemory:
         self._traces: dict[int, Trace] = {}
         self._maker = ExportMaker()
         self._kept: dict[int, Export] = {}
+        self._injected = InjectedMessages()
 
     def begin(self, life: Incarnation) -> None:
         if not self.tracing:
@@ -89,7 +91,7 @@ class InMemory:
         """The run's record has it."""
 
     def injected(self, record: dict[str, Any]) -> None:
-        """The account of the rogue node is made of a run directory."""
+        self._injected.take_down([InjectedDatagram.model_validate(record)])
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Nobody asks where vehicles were."""
@@ -112,7 +114,7 @@ class InMemory:
                 "agents": simulation.played.agents,
             }
         )
-        return Evidence(self._exports(simulation), self._traces, record, before_final_reconcile=self._kept)
+        return Evidence(self._exports(simulation), self._traces, record, [], self._kept, self._injected)
 
     def _exports(self, simulation: Simulation) -> dict[int, Export]:
         return {

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,14 @@ NOTHING_CAME_OF_IT = {
 
 
 def left_behind(simulated: Simulated) -> dict[str, Any]:
-    """Exports and figures: all that a run gives but its traces."""
+    """Exports and figures: all that a run gives but its traces, and how many handler runs are in them."""
     exports = {agent_id: export.model_dump() for agent_id, export in simulated.evidence.exports.items()}
-    return {"exports": exports, "figures": simulated.result.figures, "played": simulated.played}
+    agents = {
+        agent_id: {name: value for name, value in agent.items() if name != "handler_runs"}
+        for agent_id, agent in simulated.played.agents.items()
+    }
+    played = replace(simulated.played, agents=agents)
+    return {"exports": exports, "figures": simulated.result.figures, "played": played}
 
 
 def effective_runs(simulated: Simulated) -> dict[int, list[str]]:

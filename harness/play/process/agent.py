@@ -11,7 +11,7 @@ import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,6 +63,9 @@ class _Incarnation:
     directory: Path
     store: Path
     status: Status | None = None
+    asked_s: float = 0.0
+    answered_s: float = 0.0
+    """When the harness asked for `status`, and had it, in mission seconds."""
     killed: bool = False
     """The data that it held is gone."""
     reboot: bool = False
@@ -72,13 +75,24 @@ class _Incarnation:
     trace_brought: int = 0
     """Bytes of its trace that are where the checker looks for them."""
 
+    def handler_runs(self) -> dict[str, int | float] | None:
+        """How many it had counted when it was asked last."""
+        if self.status is None:
+            return None
+        between = {"from_s": round(self.asked_s, 3), "until_s": round(self.answered_s, 3)}
+        return {"counted": self.status.handled, **between}
+
 
 class AgentProcess:
-    """`status` is the agent's last, None while it has none; `outcome` is what became of it, for run.json."""
+    """`status` is the agent's last, None while it has none; `outcome` is what became of it, for run.json.
 
-    def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str]) -> None:
+    `now` tells mission seconds.
+    """
+
+    def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str], now: Callable[[], float]) -> None:
         self.agent_id = agent_id
         self._command = command
+        self._now = now
         self.outcome = "not started"
         self.detail: str | None = None
         self._rundir = rundir
@@ -158,7 +172,8 @@ class AgentProcess:
         deadline = asyncio.get_running_loop().time() + START_LIMIT_S
         while True:
             try:
-                self._take(await self._control.ask("status", timeout_s=ANSWER_LIMIT_S))
+                asked_s = self._now()
+                self._take(await self._control.ask("status", timeout_s=ANSWER_LIMIT_S), asked_s)
                 return
             except AgentSilentError:
                 if process.returncode is not None:
@@ -181,7 +196,7 @@ class AgentProcess:
         assert self._process is not None
         async with self._being_asked:
             if self.awake:
-                self._take(await self.ask("status"))  # its counters die with it
+                await self._ask_status()  # its counters die with it
             self._control.close()
             self.outcome = "rebooting" if disk_kept else "killed"
             self._lives[-1].killed = not disk_kept
@@ -223,16 +238,21 @@ class AgentProcess:
     async def poll(self) -> Status | None:
         """Ask for the status; None of an agent that is dead or paused. Raises AgentFailedError."""
         async with self._being_asked:
-            return self._take(await self.ask("status")) if self.awake else None
+            return await self._ask_status() if self.awake else None
 
-    def _take(self, answer: dict[str, Any]) -> Status:
+    async def _ask_status(self) -> Status:
+        asked_s = self._now()
+        return self._take(await self.ask("status"), asked_s)
+
+    def _take(self, answer: dict[str, Any], asked_s: float) -> Status:
         try:
             status = Status.model_validate(answer)
         except ValidationError as error:
             wrong = ", ".join(dict.fromkeys(str(problem["loc"][0]) for problem in error.errors()))
             detail = f"does not follow the agent contract: in its status {wrong} is missing or wrong"
             raise self._failed("broken", detail) from None
-        self._lives[-1].status = status
+        life = self._lives[-1]
+        life.status, life.asked_s, life.answered_s = status, asked_s, self._now()
         return status
 
     async def export(self) -> None:
@@ -300,6 +320,7 @@ class AgentProcess:
             "dropped": dict(sum((Counter(status.dropped) for status in statuses), Counter())),
             "send_failures": sum(failures) if failures else None,
             "trace_problem": next((status.trace_problem for status in statuses if status.trace_problem), None),
+            "handler_runs": [life.handler_runs() for life in lives],
         }
 
     @property

@@ -72,12 +72,12 @@ class ProcessRun:
         self._open_lab = open_lab
         self._keeps_disks = keeps_disks
         self._system_ids = system_ids(scenario.roster)
-        self.agents = [AgentProcess(agent_id, rundir, agent_command) for agent_id in scenario.roster]
         self.vehicles = [self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds]
         self._rogue = RogueProcess(scenario.rogue, scenario, seed, rundir) if scenario.rogue else None
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
+        self.agents = [AgentProcess(agent_id, rundir, agent_command, self.clock.now) for agent_id in scenario.roster]
         self._capture: Capture | None = None
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()

@@ -92,6 +92,9 @@ class Incarnation:
     resumed_at: float = 0.0
     """Whatever came before is handled then."""
     bytes_sent: int = 0
+    handler_runs: int = 0
+    """Counted while tracing."""
+    ended_at: float | None = None
 
 
 class Simulation:
@@ -336,7 +339,12 @@ class Simulation:
             "messages_sent": sum(life.agent.state.sent.total() for life in lives),
             "reconciles": sum(life.agent.state.reconciles for life in lives),
             "chain_changed_at_s": round(_mission_time(life, life.agent.state.chain_changed_at), 3) if life else None,
+            **({"handler_runs": [self._handler_runs(life) for life in lives]} if self._tracing else {}),
         }
+
+    def _handler_runs(self, life: Incarnation) -> dict[str, int | float]:
+        at_s = self._now if life.ended_at is None else life.ended_at
+        return {"counted": life.handler_runs, "from_s": round(at_s, 3), "until_s": round(at_s, 3)}
 
     def _block_name(self, block_hash: bytes) -> str | None:
         """`<agent>.<ordinal>` of a block that an agent has completed."""
@@ -414,14 +422,14 @@ class Simulation:
                 local = max(agent.state.now, self._local(life, at))
                 agent.receive_message(answer.sender, answer.sequence, answer.message, local)
                 if self._tracing:
-                    self._take_down(agent, at)
+                    self._take_down(life, at)
 
     def _after(self, number: int, life: Incarnation) -> None:
         """Do what the agent says after an input: send, trace, and wait for its next timer."""
         agent = life.agent
         self._say(number, life)
         if self._tracing:
-            self._take_down(agent, self._now)
+            self._take_down(life, self._now)
         soonest = agent.next_timer()
         deadline = None if soonest is None else max(self._now, _mission_time(life, soonest))
         if deadline != life.deadline:
@@ -440,11 +448,12 @@ class Simulation:
             if self._rogue is not None:
                 self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
 
-    def _take_down(self, agent: Agent, mission_s: float) -> None:
-        runs = agent.trace()
+    def _take_down(self, life: Incarnation, mission_s: float) -> None:
+        runs = life.agent.trace()
+        life.handler_runs += len(runs)
         for run in runs:
             run.t = mission_s
-        self._recorder.write(agent.agent_id, runs)
+        self._recorder.write(life.agent.agent_id, runs)
 
     # An agent's life
 
@@ -483,6 +492,7 @@ class Simulation:
         number = self._number[agent_id]
         if (life := self._alive[number]) is not None:
             self._hear(number, life)
+            life.ended_at = self._now
             if disk_kept:
                 self._disks[number] = StoredState.of(life.agent.state)
         self._alive[number] = None

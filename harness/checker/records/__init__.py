@@ -1,0 +1,73 @@
+"""Cross-examination: what two records tell about the same thing must agree.
+
+A comparison is a file here: a function from `Evidence` to the `Contradiction`s that it finds. An honest run has none,
+whatever became of its agents: what is killed, restarted, rebooted, paused, disturbed by a rogue node, or ends as its
+disk is full, is on record as such.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from harness.checker.evidence import Evidence
+from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
+from harness.checker.records import at_export, completed, counters, headers, messages, within
+from harness.checker.records.contradiction import Contradiction
+
+NAME = "every record"
+
+COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
+    headers.compare,
+    within.compare,
+    counters.compare,
+    at_export.compare,
+    completed.compare,
+    messages.compare,
+)
+
+
+@dataclass(frozen=True)
+class Examination:
+    contradictions: list[Contradiction]
+    short: dict[int, str]
+    """Agents whose trace is not whole -> how one knows."""
+
+    def touching(self, number: str) -> list[Finding]:
+        """What puts this characteristic in doubt."""
+        return [contradiction.finding for contradiction in self.contradictions if contradiction.touches == number]
+
+
+def cross_examine(evidence: Evidence) -> Examination:
+    contradictions = [contradiction for compare in COMPARISONS for contradiction in compare(evidence)]
+    short = {agent_id: trace.problem for agent_id, trace in evidence.traces.items() if trace.problem}
+    for contradiction in contradictions:
+        if contradiction.short:
+            short.setdefault(contradiction.finding.agent_id, contradiction.finding.detail)
+    return Examination(contradictions, short)
+
+
+def check(evidence: Evidence) -> Judgement:
+    examination = evidence.examination
+    found = [contradiction.finding for contradiction in examination.contradictions]
+    if found:
+        reason = f"{times(len(found))}: what two records tell about the same thing does not agree"
+        return Judgement(NAME, "contradict", reason, found[:MAX_EVIDENCE])
+    if not evidence.traces:
+        return Judgement(NAME, "not applicable", "there are no traces to hold against the exports")
+    if untraced := sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):
+        return Judgement(NAME, "not applicable", f"there is no trace of {agents(untraced)} to hold against the rest")
+    if examination.short:
+        return Judgement(NAME, "not applicable", not_whole(examination))
+    if not evidence.exports:
+        return Judgement(NAME, "not applicable", "there is no export to hold against the traces")
+    runs = sum(len(trace.runs) for trace in evidence.traces.values())
+    record = " and run.json" if evidence.record else ""
+    return Judgement(
+        NAME, "agree", f"{runs} handler runs in {len(evidence.traces)} traces, {len(evidence.exports)} exports{record}"
+    )
+
+
+def not_whole(examination: Examination) -> str:
+    agent_id, why = next(iter(examination.short.items()))
+    others = len(examination.short) - 1
+    more = f"; nor is that of {others} more" if others else ""
+    return f"the trace of agent {agent_id} is not whole: {why}{more}"

@@ -1,0 +1,27 @@
+"""By how much times of two records may differ, in mission seconds."""
+
+from harness.archive.traces import Header, Trace
+from harness.checker.waiting import SLACK_WALL_S
+from ucp.clock import MICROSECONDS
+
+ROUNDED_S = 2e-6
+"""Traces have microseconds."""
+
+
+def slack_s(trace: Trace) -> float:
+    """Two processes on one machine do not start their clocks in the same instant; virtual time has one clock."""
+    clock = trace.header.clock
+    speedup = clock.get("speedup")
+    if clock.get("epoch_us") == 0 or not isinstance(speedup, int | float):
+        return ROUNDED_S
+    return SLACK_WALL_S * speedup
+
+
+def mission_s(timestamp_us: int, header: Header) -> float | None:
+    """When the agent's clock showed this; None if its header does not tell."""
+    clock = header.clock
+    told = [clock.get("epoch_us"), clock.get("offset_s", 0), clock.get("drift", 0)]
+    epoch_us, offset_s, drift = (float(part) if isinstance(part, int | float) else None for part in told)
+    if epoch_us is None or offset_s is None or drift is None or drift <= -1:
+        return None
+    return ((timestamp_us - epoch_us) / MICROSECONDS - offset_s) / (1 + drift)

@@ -1,0 +1,92 @@
+"""What run.json says of an agent against its trace: its lives, and what it counted itself."""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+
+from harness.archive.record import AgentRecord, HandlerRuns
+from harness.archive.traces import Trace
+from harness.checker.evidence import Evidence
+from harness.checker.records.clocks import slack_s
+from harness.checker.records.contradiction import Contradiction, of_agent
+from harness.checker.replay import Life
+
+ROUNDED_S = 5e-4
+"""run.json has milliseconds."""
+
+
+def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    for agent_id, trace in evidence.traces.items():
+        recorded = evidence.recorded(agent_id)
+        if recorded is None or trace.problem:
+            continue
+        lives = evidence.lives[agent_id]
+        yield from _lives(agent_id, recorded, lives)
+        yield from _handler_runs(agent_id, recorded, trace, lives)
+        yield from _counted(agent_id, recorded, trace, lives)
+        if trace.cut_off and recorded.outcome == "exported":
+            yield of_agent(agent_id, "its trace ends in half a line, and the agent ended by itself", short=True)
+
+
+def _lives(agent_id: int, recorded: AgentRecord, lives: list[Life]) -> Iterator[Contradiction]:
+    expected = 1 + recorded.restarts + recorded.reboots
+    if len(lives) != expected:
+        detail = f"its trace has {_count(len(lives), 'header')}, and by run.json it began {_count(expected, 'time')}"
+        yield of_agent(agent_id, detail, short=len(lives) < expected)
+
+
+def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]) -> Iterator[Contradiction]:
+    """As many as it counted have a line, of those that ran until it was asked."""
+    if len(recorded.handler_runs) != len(lives):
+        return  # of agents that count none, and where lives are lacking anyway
+    slack = ROUNDED_S + slack_s(trace)
+    for life, counted in zip(lives, recorded.handler_runs, strict=True):
+        if counted is None:
+            continue
+        at_least, at_most = _lines_by(life, counted, slack)
+        if not at_least <= counted.counted <= at_most:
+            lines = at_most if counted.counted > at_most else at_least
+            detail = (
+                f"it had counted {_count(counted.counted, 'handler run')} at {counted.until_s:g} s, and its trace has "
+                f"{_count(lines, 'line')} of them"
+            )
+            yield of_agent(agent_id, detail, "1", short=counted.counted > at_most)
+
+
+def _lines_by(life: Life, counted: HandlerRuns, slack: float) -> tuple[int, int]:
+    """How many lines there are, at least and at most, of what had run when the agent was asked."""
+    from_s, until_s = counted.from_s - slack, counted.until_s + slack
+    return (
+        bisect_left(life.runs, from_s, key=lambda run: run.t),
+        bisect_right(life.runs, until_s, key=lambda run: run.t),
+    )
+
+
+def _counted(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]) -> Iterator[Contradiction]:
+    sent = sum(life.sent for life in lives)
+    if recorded.messages_sent is not None and recorded.messages_sent != sent:
+        detail = f"by run.json it sent {_count(recorded.messages_sent, 'message')}, and by its trace {sent}"
+        yield of_agent(agent_id, detail, "1")
+    if recorded.reconciles is not None:
+        begun = sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in trace.runs)
+        if recorded.reconciles != begun:
+            detail = f"by run.json it began {_count(recorded.reconciles, 'reconcile')}, and by its trace {begun}"
+            yield of_agent(agent_id, detail)
+    if recorded.chain_changed_at_s is not None:
+        changed_at_s = _chain_changed_at(lives[-1])
+        if abs(recorded.chain_changed_at_s - changed_at_s) > ROUNDED_S + slack_s(trace):
+            detail = (
+                f"by run.json its chain changed last at {recorded.chain_changed_at_s:g} s, and by its trace at "
+                f"{changed_at_s:g} s"
+            )
+            yield of_agent(agent_id, detail)
+
+
+def _chain_changed_at(life: Life) -> float:
+    for run in reversed(life.runs):
+        if any(operation.startswith("chain") for operation, _ in run.changes):
+            return run.t
+    return 0.0
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if number != 1 else ''}"
