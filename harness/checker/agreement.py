@@ -8,6 +8,9 @@ differing agent that began after the others' chains had stopped changing. Else t
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import agents
 
+REASONS_TOLD = 3
+"""Of more agents nobody reads why they had no chance."""
+
 
 def why_unknown(evidence: Evidence) -> str | None:
     """Why equal or unequal exports say nothing about the whole system; None if all of it is there and idle."""
@@ -17,7 +20,7 @@ def why_unknown(evidence: Evidence) -> str | None:
         return f"there is no export of {agents(evidence.missing)}"
     busy = [agent_id for agent_id, export in evidence.exports.items() if not export.idle]
     if busy:
-        return f"{agents(busy)} had not finished"
+        return f"{agents(busy)} {'was' if len(busy) == 1 else 'were'} not idle at the end"
     return None
 
 
@@ -28,15 +31,33 @@ def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
     since = evidence.connected_since_s
     if since is None:
         return f"the system was not fully connected: {evidence.network_at_end or 'its conditions are not on record'}"
-    untraced = differing - set(evidence.traces)
+    untraced = (differing | set(evidence.exports)) - set(evidence.traces)
     if untraced:
-        return f"there is no trace of {agents(untraced)} to tell whether they had the chance to reconcile"
-    if not had_a_chance(evidence, differing):
         return (
-            f"{agents(differing)} differ{'s' if len(differing) == 1 else ''} by blocks after which neither a vote nor "
-            "a reconcile took place"
+            f"there is no trace of {agents(untraced)} to tell whether {agents(differing)} had the chance to reconcile"
         )
+    if short := sorted(evidence.examination.short):
+        return f"the trace of {agents(short)} is not whole, and does not tell whether there was a chance to reconcile"
+    if not had_a_chance(evidence, differing):
+        without = sorted(differing)
+        more = len(without) - REASONS_TOLD
+        told = [_why_none(evidence, since, agent_id) for agent_id in without[:REASONS_TOLD]]
+        return "; ".join([*told, *([f"{more} more had no chance either"] if more > 0 else [])])
     return None
+
+
+def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
+    """Why this agent, whose trace is there, has had no chance."""
+    changed = {peer: trace.chain_changed_at() for peer, trace in evidence.traces.items() if peer != agent_id}
+    peer = max(changed, key=lambda peer: changed[peer], default=agent_id)
+    when = "the system became fully connected"
+    if changed.get(peer, 0.0) > since:
+        since, when = changed[peer], f"the chain of agent {peer} changed last"
+    proposed = [run.t for run in evidence.traces[agent_id].runs if run.branch == "proposed" and run.t >= since]
+    sentence = f"agent {agent_id} completed no reconcile that began after {since:g} s, when {when}, "
+    return sentence + (
+        f"and none came of the vote at {proposed[-1]:g} s" if proposed else "and proposed no block since"
+    )
 
 
 def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:

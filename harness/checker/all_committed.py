@@ -23,12 +23,12 @@ def check(evidence: Evidence) -> Judgement:
         return Judgement(NAME, "holds", f"all {len(completed)} completed blocks are in every chain{but}")
     no_chance = why_no_chance(evidence, set(lacking))
     if no_chance:
-        lack = sum(map(len, lacking.values()))
+        lack, first = sum(map(len, lacking.values())), lacking[min(lacking)][0]
         return Judgement(
             NAME,
             "not applicable",
             f"{agents(set(lacking))} lack{'s' if len(lacking) == 1 else ''} {lack} cop{'y' if lack == 1 else 'ies'} "
-            f"of completed blocks; {no_chance}",
+            f"of completed blocks, {evidence.name(first)} the first; {no_chance}",
         )
     findings = [
         Finding(

@@ -14,7 +14,9 @@ def check(evidence: Evidence) -> Judgement:
         return Judgement(NAME, "not applicable", "there is no export to look at")
     busy = [agent_id for agent_id, export in evidence.exports.items() if not export.idle]
     if busy:
-        return Judgement(NAME, "not applicable", f"{agents(busy)} never became idle, so it cannot be judged")
+        return Judgement(
+            NAME, "not applicable", f"{agents(busy)} {'was' if len(busy) == 1 else 'were'} not idle at the end"
+        )
     if evidence.missing:
         return Judgement(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
     looked = "at the end and after every traced step" if evidence.traces else "at the end"

@@ -23,7 +23,9 @@ def check(evidence: Evidence) -> Judgement:
     differing = {agent_id for agent_id, chain in chains.items() if chain != most_common}
     no_chance = why_no_chance(evidence, differing)
     if no_chance:
-        return Judgement(NAME, "not applicable", f"{len(holders)} distinct chains; {no_chance}")
+        shared = common_prefix([*holders])
+        which = f"{len(holders)} distinct chains, which share {shared} block{'s' if shared != 1 else ''}"
+        return Judgement(NAME, "not applicable", f"{which}; {no_chance}")
     findings = []
     for agent_id in sorted(had_a_chance(evidence, differing)):
         chain = chains[agent_id]

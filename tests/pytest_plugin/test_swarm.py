@@ -204,7 +204,9 @@ def test_a_failing_assert_shows_the_verdict_and_where_the_report_is(pytester: py
     """)
     result = run(pytester)
     result.assert_outcomes(failed=1)
-    reason = "not applicable: 2 distinct chains; the system was not fully connected: *partition 1 | 2 3 4 5"
+    reason = (
+        "not applicable: 2 distinct chains, which share * the system was not fully connected: *partition 1 | 2 3 4 5"
+    )
     result.stdout.fnmatch_lines(
         [f"E * where False = <characteristic 6, one uniform chain: {reason}>.holds", "*- Captured ucp call -*"]
     )
