@@ -243,6 +243,7 @@ class JudgedRecord(_Model):
 
     schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
     roster: list[int]
+    outcome: Literal["running", "completed", "interrupted", "failed"] = "running"
     network: list[NetworkState] = []
     faults: list[Fault] = []
     final_reconcile: FinalReconcile | None = None
@@ -262,7 +263,6 @@ class RunRecord(JudgedRecord):
     versions: dict[str, str]
     started_at: str
     wall_s: float | None = None
-    outcome: Literal["running", "completed", "interrupted", "failed"] = "running"
     outcome_detail: str | None = None
     settled: bool = False
     vehicles: dict[str, dict[str, Any]] = {}

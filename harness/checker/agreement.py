@@ -5,8 +5,20 @@ So a difference is a violation only where full connectivity is on record, and si
 differing agent that began after the others' chains had stopped changing. Else the characteristics do not apply.
 """
 
+from harness.checker import cycles
 from harness.checker.evidence import Evidence
-from harness.checker.judgement import agents
+from harness.checker.judgement import Judgement, agents
+
+
+def never(name: str, evidence: Evidence) -> Judgement | None:
+    """Violated, where everybody is there and hears everybody, and yet some are shown never to finish; else None.
+
+    `harness.checker.liveness` has the evidence.
+    """
+    cycle = evidence.cycle
+    if cycle is None or evidence.connected_since_s is None or evidence.missing or evidence.paused_at_end:
+        return None
+    return Judgement(name, "violated", f"fully connected, and yet {cycles.in_words(cycle)}")
 
 REASONS_TOLD = 3
 """Of more agents nobody reads why they had no chance."""

@@ -1,6 +1,6 @@
 """Characteristic 5: in a fully connected system every completed block is in every living agent's chain, eventually."""
 
-from harness.checker.agreement import had_a_chance, why_no_chance, why_unknown
+from harness.checker.agreement import had_a_chance, never, why_no_chance, why_unknown
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
 
@@ -8,6 +8,8 @@ NAME = "all committed everywhere"
 
 
 def check(evidence: Evidence) -> Judgement:
+    if never_agrees := never(NAME, evidence):
+        return never_agrees
     unknown = why_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)

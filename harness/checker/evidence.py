@@ -11,8 +11,9 @@ from pydantic import BaseModel, ConfigDict
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
-from harness.archive.record import AgentRecord, JudgedRecord
+from harness.archive.record import AgentRecord, Cycle, JudgedRecord
 from harness.archive.traces import Trace
+from harness.checker.cycles import cycle_of
 from harness.checker.replay import Life, replay
 
 if TYPE_CHECKING:
@@ -147,6 +148,23 @@ class Evidence:
                     return True
                 since = None
         return since is not None and since <= until_s
+
+    @property
+    def paused_at_end(self) -> list[int]:
+        """Agents that stand still at the end of the run."""
+        end_s = self.ended_at_s
+        return [agent_id for agent_id in self.exports if end_s is not None and self.was_paused(agent_id, end_s, end_s)]
+
+    @property
+    def busy(self) -> list[int]:
+        """Agents that are not idle at the end, and do not stand still."""
+        still = self.paused_at_end
+        return [agent_id for agent_id, export in self.exports.items() if not export.idle and agent_id not in still]
+
+    @cached_property
+    def cycle(self) -> Cycle | None:
+        """What the busy agents go round in, if it is shown that they never finish."""
+        return cycle_of(self)
 
     @property
     def ended_at_s(self) -> float | None:

@@ -25,7 +25,7 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
         "distinct_chains": distinct,
         "copies_min": min(per_block, default=None),
         "copies_mean": round(sum(per_block) / len(per_block), 3) if per_block else None,
-        "uniform_at_s": _chains_changed_at(evidence) if distinct == 1 else None,
+        "uniform_at_s": uniform_at_s(evidence),
         "reconciles": _of_all_agents(evidence, "reconciles"),
         "messages": messages,
         "bytes": _of_all_agents(evidence, "bytes_sent"),
@@ -56,10 +56,21 @@ def _of_all_agents(evidence: Evidence, counter: str) -> int | None:
     return None
 
 
-def _chains_changed_at(evidence: Evidence) -> float | None:
-    """When the last agent's chain last changed."""
-    agents = evidence.record.agents.values() if evidence.record else ()
-    recorded = [agent.chain_changed_at_s for agent in agents if agent.chain_changed_at_s is not None]
-    if recorded:
-        return max(recorded)
-    return max((round(trace.chain_changed_at(), 3) for trace in evidence.traces.values()), default=None)
+def uniform_at_s(evidence: Evidence) -> float | None:
+    """When the chains became what they all are in the end, in mission seconds; None if they differ, or nothing tells.
+
+    That is when the last of them changed last.
+    """
+    if len({export.chain_of_block_hashes for export in evidence.exports.values()}) != 1:
+        return None
+    recorded = evidence.record.agents if evidence.record else {}
+    last_s = 0.0
+    for agent_id in evidence.exports:
+        agent, trace = recorded.get(str(agent_id)), evidence.traces.get(agent_id)
+        if agent is not None and agent.chain_changed_at_s is not None:
+            last_s = max(last_s, agent.chain_changed_at_s)
+        elif trace is not None:
+            last_s = max(last_s, round(trace.chain_changed_at(), 3))
+        else:
+            return None
+    return last_s

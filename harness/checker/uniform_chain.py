@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from harness.checker.agreement import had_a_chance, why_no_chance, why_unknown
+from harness.checker.agreement import had_a_chance, never, why_no_chance, why_unknown
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, violated
 
@@ -10,6 +10,8 @@ NAME = "one uniform chain"
 
 
 def check(evidence: Evidence) -> Judgement:
+    if never_agrees := never(NAME, evidence):
+        return never_agrees
     unknown = why_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)

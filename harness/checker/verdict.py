@@ -4,7 +4,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from harness.checker import all_committed, distributed, genuine, idle_committed, records, single_copy, uniform_chain
+from harness.checker import (
+    all_committed,
+    distributed,
+    genuine,
+    idle_committed,
+    liveness,
+    records,
+    single_copy,
+    uniform_chain,
+)
 from harness.checker.evidence import Evidence
 from harness.checker.figures import figures
 from harness.checker.judgement import Judgement
@@ -19,7 +28,7 @@ CHECKS = {
     "6": uniform_chain.check,
 }
 
-BESIDE: dict[str, Callable[[Evidence], Judgement]] = {"records": records.check}
+BESIDE: dict[str, Callable[[Evidence], Judgement]] = {"records": records.check, "liveness": liveness.check}
 """Judgements that are not of the thesis, by their keys: see `harness.scenario.verdicts`."""
 
 

@@ -6,12 +6,14 @@ An agent that waits longer than its own timers say, waits for what will never ha
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from harness.archive.traces import Trace
-from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from ucp.trace import HandlerRun
+
+if TYPE_CHECKING:
+    from harness.checker.evidence import Evidence
 
 SLACK_WALL_S = 1.0
 """How late a loaded machine may run a timer before it counts as not run, in wall seconds."""
@@ -41,6 +43,7 @@ VOTE_STEPS = frozenset(("process_next_deque_block", "vote_timer_expiration"))
 STEPS = RECONCILE_STEPS | VOTE_STEPS
 VOTE_TIMERS = ("vote_timeout_s",)
 RECONCILE_TIMERS = ("phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s")
+ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
 
 
 @dataclass(slots=True)
@@ -58,10 +61,10 @@ class _Wait:
         return Finding(agent_id, f"{where}: {self.what} within {self.longest:g} s")
 
 
-def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
+def waited_too_long(evidence: "Evidence") -> Iterator[Finding]:
     """Every wait that lasted longer than the agent's own timers, while it was not paused."""
     for agent_id, trace in evidence.traces.items():
-        vote_s, reconcile_s = _longest(trace, VOTE_TIMERS), _longest(trace, RECONCILE_TIMERS)
+        vote_s, reconcile_s = longest(trace, VOTE_TIMERS), longest(trace, RECONCILE_TIMERS)
         for life in trace.lives():
             vote = _Wait("a vote began and did not end", vote_s)
             reconcile = _Wait("a reconcile did not go on", reconcile_s)
@@ -71,7 +74,7 @@ def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _in_life(
-    evidence: Evidence, agent_id: int, life: Iterator[tuple[int, HandlerRun]], vote: _Wait, reconcile: _Wait
+    evidence: "Evidence", agent_id: int, life: Iterator[tuple[int, HandlerRun]], vote: _Wait, reconcile: _Wait
 ) -> Iterator[Finding]:
     for line, run in life:
         step = run.handler in STEPS
@@ -87,7 +90,7 @@ def _in_life(
             reconcile.line, reconcile.since = line, run.t
 
 
-def _overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) -> Iterator[Finding]:
+def _overdue(evidence: "Evidence", agent_id: int, now: float, *waits: _Wait) -> Iterator[Finding]:
     for wait in waits:
         if now > wait.since + wait.longest:
             if not evidence.was_paused(agent_id, wait.since, now):
@@ -95,7 +98,7 @@ def _overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) -> It
             wait.since = math.inf
 
 
-def _longest(trace: Trace, timers: tuple[str, ...]) -> float:
+def longest(trace: Trace, timers: tuple[str, ...]) -> float:
     """The longest of these timers in mission seconds, with slack for the machine; infinity if that is not known."""
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):

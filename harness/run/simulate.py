@@ -106,6 +106,7 @@ class InMemory:
         record = JudgedRecord.model_validate(
             {
                 "roster": simulation.roster,
+                "outcome": simulation.played.outcome,
                 "network": simulation.played.network,
                 "final_reconcile": simulation.played.final_reconcile,
                 "cycle": simulation.played.cycle,

@@ -1,0 +1,207 @@
+"""What agents that never finish go round in: as virtual time has shown it, or as it shows in their traces.
+
+A trace shows a cycle where it ends in the same handler runs several times in a row, each time with the same chain and
+as many blocks aside; and a standstill where an agent that is not idle has run nothing for longer than its timers take.
+Agents that only have a lot left to do are in neither: their chains change.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from harness.archive.record import Cycle, CycleStep, CycleWait
+from harness.archive.traces import Trace
+from harness.checker.judgement import MAX_EVIDENCE, Finding, agents
+from harness.checker.waiting import ALL_TIMERS, longest
+from ucp.trace import HandlerRun
+
+if TYPE_CHECKING:
+    from harness.checker.evidence import Evidence
+
+SEVERAL = 5
+"""So often in a row is no coincidence."""
+LAST_RUNS = 20_000
+"""In so many handler runs of an agent, its last, a cycle is looked for."""
+COUNTED = {
+    "receive_phase_1_response": ("yes", "no"),
+    "receive_response_next_in_sequence": ("new candidate", "counted"),
+}
+"""Handler of an answer in a reconcile -> the branches in which the answer counts."""
+ASKS = ("reconcile_phase_1", "reconcile_phase_2")
+MAX_NAMED = 10
+PERIOD_TOLERANCE_S = 0.01
+
+
+def cycle_of(evidence: "Evidence") -> Cycle | None:
+    """What agents that are not idle at the end go round in; None if that is not shown."""
+    busy = evidence.busy
+    if not busy:
+        return None
+    recorded = evidence.record.cycle if evidence.record else None
+    traced = _in_traces(evidence, busy, times=2 if recorded else SEVERAL)
+    if recorded is None or traced is None:
+        return recorded or traced
+    if recorded.period_s is None or traced.period_s is None:
+        return recorded
+    if abs(traced.period_s - recorded.period_s) > PERIOD_TOLERANCE_S:
+        return recorded
+    return recorded.model_copy(
+        update={"since_s": traced.since_s, "periods": traced.periods, "steps": traced.steps, "waits": traced.waits}
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """One agent's part: its runs, once round, since when it goes round, and how often it has."""
+
+    runs: list[HandlerRun]
+    since_s: float
+    period_s: float
+    times: int
+
+
+def _in_traces(evidence: "Evidence", busy: Sequence[int], times: int) -> Cycle | None:
+    rounds: dict[int, _Round] = {}
+    since_s, ended_at_s, connected_s = 0.0, evidence.ended_at_s, evidence.connected_since_s
+    if ended_at_s is None or connected_s is None:
+        return None
+    for agent_id, trace in evidence.traces.items():
+        runs = _own_runs(trace)
+        if agent_id not in busy or not runs:
+            since_s = max(since_s, trace.chain_changed_at())
+        elif runs[-1].t + longest(trace, ALL_TIMERS) < ended_at_s:
+            since_s = max(since_s, runs[-1].t)
+        elif found := _round(runs, times):
+            rounds[agent_id] = found
+            since_s = max(since_s, found.since_s)
+        else:
+            return None
+    if not set(busy) <= set(evidence.traces):
+        return None
+    if not rounds:
+        return Cycle(since_s=since_s, agents=list(busy))
+    period_s = max(each.period_s for each in rounds.values())
+    seen = min(int((each.runs[-1].t - max(since_s, connected_s)) / each.period_s + 1e-6) for each in rounds.values())
+    if seen < times - 1:
+        return None
+    begin_s = min(each.runs[0].t for each in rounds.values())
+    return Cycle(
+        since_s=round(since_s, 3),
+        period_s=round(period_s, 3),
+        periods=seen,
+        agents=list(busy),
+        steps=sorted(
+            (
+                CycleStep(agent_id=agent_id, after_s=round(run.t - begin_s, 3), handler=run.handler, branch=run.branch)
+                for agent_id, each in rounds.items()
+                for run in each.runs
+            ),
+            key=lambda step: step.after_s,
+        ),
+        waits=list(_waits(evidence, rounds, period_s)),
+    )
+
+
+def _own_runs(trace: Trace) -> list[HandlerRun]:
+    """The last runs that timers made or that changed something, in the agent's last life."""
+    start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
+    return [run for run in trace.runs[start:] if "message" not in run.trigger or run.changes]
+
+
+def _round(runs: Sequence[HandlerRun], times: int) -> _Round | None:
+    """The shortest round in which `runs` end so many times in a row."""
+    keys = [_key(run) for run in reversed(runs)]
+    for length, matching in enumerate(_matches(keys)):
+        if length and length + matching >= times * length:
+            going_round = length + matching
+            period_s = runs[-1].t - runs[-1 - length].t
+            if period_s > 0:
+                return _Round(list(runs[-length:]), runs[-going_round].t, period_s, going_round // length)
+    return None
+
+
+def _key(run: HandlerRun) -> tuple[object, ...]:
+    state = run.state
+    return run.handler, run.branch, state.top, state.chain, state.deque, state.stack, state.reconciling
+
+
+def _matches(keys: Sequence[object]) -> list[int]:
+    """For each place how many keys from there on are those from the first on (the Z-function)."""
+    matching = [0] * len(keys)
+    left = right = 0
+    for place in range(1, len(keys)):
+        length = min(right - place, matching[place - left]) if place < right else 0
+        while place + length < len(keys) and keys[length] == keys[place + length]:
+            length += 1
+        matching[place] = length
+        if place + length > right:
+            left, right = place, place + length
+    return matching
+
+
+def _waits(evidence: "Evidence", rounds: dict[int, _Round], period_s: float) -> Iterator[CycleWait]:
+    """Whom each agent asks in its reconciles without ever counting an answer, in the last round."""
+    for agent_id, each in rounds.items():
+        if not any(run.handler in ASKS for run in each.runs):
+            continue
+        heard = set()
+        for run in reversed(evidence.traces[agent_id].runs):
+            if run.t < each.runs[-1].t - period_s:
+                break
+            if run.branch in COUNTED.get(run.handler, ()):
+                heard.add(run.trigger["from"])
+        if silent := set(evidence.exports) - heard - {agent_id}:
+            yield CycleWait(agent_id=agent_id, for_agents=sorted(silent))
+
+
+# In words
+
+
+def in_words(cycle: Cycle) -> str:
+    """Who goes round since when, what shows it, and who waits for whom."""
+    who, since, many = named(cycle.agents), f"since {cycle.since_s:.0f} s", len(cycle.agents) > 1
+    if cycle.period_s is None:
+        return f"{who} hang{'' if many else 's'} {since}: not idle, and no timer runs that would end that"
+    every = f"every {cycle.period_s:.4g} s"
+    shown = (
+        f"the global state recurs {every}, and nothing is left to chance"
+        if cycle.proven
+        else f"the same handler runs follow each other {every}, {cycle.periods} times in a row"
+    )
+    waits = "".join(f"; {wait}" for wait in _waits_in_words(cycle.waits))
+    return f"{who} go{'' if many else 'es'} round in circles {since}: {shown}{waits}"
+
+
+def _waits_in_words(waits: Sequence[CycleWait]) -> Iterator[str]:
+    askers = {wait.agent_id for wait in waits}
+    if len(askers) > 1 and all(set(wait.for_agents) == askers - {wait.agent_id} for wait in waits):
+        yield f"{named(askers)} ask each other in vain, for whoever reconciles answers nobody"
+        return
+    by_whom: dict[tuple[int, ...], list[int]] = defaultdict(list)
+    for wait in waits:
+        by_whom[tuple(wait.for_agents)].append(wait.agent_id)
+    for silent, waiting in by_whom.items():
+        yield f"{named(waiting)} ask{'s' if len(waiting) == 1 else ''} {named(silent)} in vain"
+
+
+def named(ids: Collection[int]) -> str:
+    """Which agents, or how many if that would be a long list."""
+    return agents(tuple(ids)) if len(ids) <= MAX_NAMED else f"{len(ids)} agents"
+
+
+def findings(cycle: Cycle) -> list[Finding]:
+    """What each agent runs in one round."""
+    return [Finding(agent_id, _round_in_words(cycle, agent_id)) for agent_id in cycle.agents[:MAX_EVIDENCE]]
+
+
+def _round_in_words(cycle: Cycle, agent_id: int) -> str:
+    steps = [step for step in cycle.steps if step.agent_id == agent_id]
+    if not steps or cycle.period_s is None:
+        return f"not idle, and has run nothing since {cycle.since_s:.0f} s"
+    words, at_s = "", steps[0].after_s
+    for step in steps:
+        later = f", {step.after_s - at_s:.3g} s later " if step.after_s - at_s >= PERIOD_TOLERANCE_S else ", "
+        words += (later if words else "") + step.handler + (f" ({step.branch})" if step.branch else "")
+        at_s = step.after_s
+    return f"{words}; {cycle.period_s - at_s + steps[0].after_s:.3g} s later it begins anew"
