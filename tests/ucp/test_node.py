@@ -174,6 +174,17 @@ def test_an_agent_has_the_quirks_of_its_mission_until_it_is_told_others(director
         agent.process.communicate()
 
 
+def test_a_quirk_makes_the_agent_wrong_until_it_is_taken_away(agent: AgentUnderTest) -> None:
+    agent.start()
+    assert agent.ask("quirk", name="never_reconcile", value=True)["never_reconcile"] is True
+    agent.ask("reconcile")
+    agent.wait_for(lambda: agent.ask("status")["handled"] == 1)
+    assert agent.ask("status")["reconciles"] == 0
+    agent.ask("quirk", name="never_reconcile", value=False)
+    agent.ask("reconcile")
+    agent.wait_for(lambda: agent.ask("status")["reconciles"] == 1)
+
+
 @pytest.mark.parametrize(
     ("command", "arguments", "sentence"),
     [
@@ -181,6 +192,8 @@ def test_an_agent_has_the_quirks_of_its_mission_until_it_is_told_others(director
         ("start", {"epoch_us": "now"}, "epoch_us"),
         ("reconcile", {}, "has not started"),
         ("quirk", {"name": "ignore_commit", "value": 7}, "probability"),
+        ("quirk", {"name": "never_reconcile", "value": 1}, "never_reconcile is true or false"),
+        ("quirk", {"name": "never_reconciles" * 1000, "value": True}, "the nearest are never_reconcile"),
     ],
 )
 def test_a_command_that_cannot_be_carried_out_is_answered_with_a_sentence(
@@ -226,6 +239,8 @@ def test_a_port_in_use_is_one_sentence_and_status_2(agent: AgentUnderTest, tmp_p
         ({"settings": {"vote_timeout_s": "x"}}, "`settings`"),
         ({"events": {"source": "dice"}}, "random, mavlink or none"),
         ({"quirks": {"ignore_commit": 2}}, "`quirks`"),
+        ({"quirks": {"hide_commit": True}}, "`quirks`: unknown quirk 'hide_commit': of the"),
+        ({"quirks": ["hide_commits"]}, "`quirks` must be a JSON object"),
         ({"initial_data": "!"}, "not base64"),
         ({"store": 7}, "`store` must be the path of a file"),
     ],

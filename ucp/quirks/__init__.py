@@ -33,10 +33,14 @@ QUIRKS: dict[str, Quirk] = {
 }
 """All quirks by name, in the order of their Algorithms."""
 
+MAX_NAME = 40
+"""More of a wrong name is not shown."""
+
 
 def check_quirk(name: str, value: object) -> None:
     """Raises ValueError: which quirks there are, or what the value may be."""
     if name not in QUIRKS:
+        name = name[:MAX_NAME]
         near = ", ".join(get_close_matches(name, QUIRKS, cutoff=0.0))
         raise ValueError(f"unknown quirk {name!r}: of the {len(QUIRKS)} in ucp/quirks the nearest are {near}")
     QUIRKS[name].check(value)
