@@ -20,6 +20,7 @@ def never(name: str, evidence: Evidence) -> Judgement | None:
         return None
     return Judgement(name, "violated", f"fully connected, and yet {cycles.in_words(cycle)}")
 
+
 REASONS_TOLD = 3
 """Of more agents nobody reads why they had no chance."""
 
