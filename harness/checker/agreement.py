@@ -18,7 +18,7 @@ def never(name: str, evidence: Evidence) -> Judgement | None:
     cycle = evidence.cycle
     if cycle is None or evidence.connected_since_s is None or evidence.missing or evidence.paused_at_end:
         return None
-    return Judgement(name, "violated", f"fully connected, and yet {cycles.in_words(cycle)}")
+    return Judgement(name, "violated", f"fully connected, and yet {cycles.in_short(cycle)}")
 
 
 REASONS_TOLD = 3

@@ -158,19 +158,24 @@ def _waits(evidence: "Evidence", rounds: dict[int, _Round], period_s: float) -> 
 # In words
 
 
+def in_short(cycle: Cycle) -> str:
+    """Who never finishes, and since when."""
+    many = len(cycle.agents) > 1
+    goes = f"go{'' if many else 'es'} round in circles" if cycle.period_s is not None else f"hang{'' if many else 's'}"
+    return f"{named(cycle.agents)} {goes} since {cycle.since_s:.0f} s"
+
+
 def in_words(cycle: Cycle) -> str:
     """Who goes round since when, what shows it, and who waits for whom."""
-    who, since, many = named(cycle.agents), f"since {cycle.since_s:.0f} s", len(cycle.agents) > 1
     if cycle.period_s is None:
-        return f"{who} hang{'' if many else 's'} {since}: not idle, and no timer runs that would end that"
+        return f"{in_short(cycle)}: not idle, and no timer runs that would end that"
     every = f"every {cycle.period_s:.4g} s"
     shown = (
         f"the global state recurs {every}, and nothing is left to chance"
         if cycle.proven
         else f"the same handler runs follow each other {every}, {cycle.periods} times in a row"
     )
-    waits = "".join(f"; {wait}" for wait in _waits_in_words(cycle.waits))
-    return f"{who} go{'' if many else 'es'} round in circles {since}: {shown}{waits}"
+    return "; ".join([f"{in_short(cycle)}: {shown}", *_waits_in_words(cycle.waits)])
 
 
 def _waits_in_words(waits: Sequence[CycleWait]) -> Iterator[str]:
@@ -191,17 +196,23 @@ def named(ids: Collection[int]) -> str:
 
 
 def findings(cycle: Cycle) -> list[Finding]:
-    """What each agent runs in one round."""
-    return [Finding(agent_id, _round_in_words(cycle, agent_id)) for agent_id in cycle.agents[:MAX_EVIDENCE]]
+    """What agents run in one round; of those that run the same the first stands for all."""
+    alike: dict[str, list[int]] = defaultdict(list)
+    for agent_id in cycle.agents:
+        alike[_round_in_words(cycle, agent_id)].append(agent_id)
+    return [
+        Finding(first, f"{f'as {named(others)}, ' if others else ''}{runs}")
+        for runs, (first, *others) in list(alike.items())[:MAX_EVIDENCE]
+    ]
 
 
 def _round_in_words(cycle: Cycle, agent_id: int) -> str:
     steps = [step for step in cycle.steps if step.agent_id == agent_id]
     if not steps or cycle.period_s is None:
         return f"not idle, and has run nothing since {cycle.since_s:.0f} s"
-    words, at_s = "", steps[0].after_s
-    for step in steps:
+    words, at_s = "runs ", steps[0].after_s
+    for count, step in enumerate(steps):
         later = f", {step.after_s - at_s:.3g} s later " if step.after_s - at_s >= PERIOD_TOLERANCE_S else ", "
-        words += (later if words else "") + step.handler + (f" ({step.branch})" if step.branch else "")
+        words += (later if count else "") + step.handler + (f" ({step.branch})" if step.branch else "")
         at_s = step.after_s
     return f"{words}; {cycle.period_s - at_s + steps[0].after_s:.3g} s later it begins anew"

@@ -46,19 +46,23 @@ def test_a_swarm_in_step_never_finishes_and_violates_5_and_6(tracing: bool) -> N
     assert liveness(run).verdict == "never finishes"
     for said in ("the global state recurs every 15 s", "agents 1, 2, 3, 4 and 5 ask each other in vain"):
         assert said in liveness(run).reason
-        assert said in run.result.characteristics["5"].reason
+    for number in ("5", "6"):
+        reason = run.result.characteristics[number].reason
+        assert re.fullmatch(r"fully connected, and yet agents 1, 2, 3, 4 and 5 go round in circles since \d+ s", reason)
     assert {"5", "6", "liveness"} == set(run.result.bad)
-    assert [finding.agent_id for finding in liveness(run).evidence] == [1, 2, 3, 4, 5]
-    assert all("vote_timer_expiration" in finding.detail for finding in liveness(run).evidence)
+    (finding,) = liveness(run).evidence
+    assert finding.agent_id == 1
+    assert finding.detail.startswith("as agents 2, 3, 4 and 5, runs ")
+    assert "vote_timer_expiration" in finding.detail
 
 
 def test_traces_tell_which_handlers_follow_each_other_and_since_when() -> None:
     run = simulate(in_step(), seed=1, tracing=True)
     assert "since 11 s" in liveness(run).reason, "the first reconcile in step, long before anybody looked"
     assert liveness(run).evidence[0].detail == (
-        "reconcile_phase_1_timer_expiration (no response), reconcile_finalize (done), process_next_deque_block"
-        " (proposed), 10 s later vote_timer_expiration (not approved), reconcile_begin (begun), reconcile_phase_1"
-        " (asked); 5 s later it begins anew"
+        "as agents 2, 3, 4 and 5, runs reconcile_phase_1_timer_expiration (no response), reconcile_finalize (done),"
+        " process_next_deque_block (proposed), 10 s later vote_timer_expiration (not approved), reconcile_begin (begun)"
+        ", reconcile_phase_1 (asked); 5 s later it begins anew"
     )
 
 

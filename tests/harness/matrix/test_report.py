@@ -95,7 +95,7 @@ def test_the_runs_of_a_cell_begin_with_those_that_went_wrong() -> None:
     assert bad.rows[1].verdicts == [*"✓✓✗✓✓✓", *3 * ["\u2013"]]
     assert bad.rows[1].figures[bad.figures.index("mutual chain")] == "20"
     assert bad.command == "ucp-harness run cells/loss-0.5-agents-5.yaml --backend sim --seed 3"
-    assert bad.runs == "4 runs, 1 violated a characteristic, 1 failed"
+    assert bad.runs == "4 runs, 1 judged bad, 1 failed"
 
 
 def test_a_run_that_was_kept_leads_to_its_report(tmp_path: Path) -> None:
