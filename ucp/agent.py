@@ -66,9 +66,7 @@ from ucp.messages import (
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import StoredState
-from ucp.trace import HandlerRun, State
-
-Trigger = dict[str, int | str]
+from ucp.trace import Dropped, Entry, HandlerRun, State, Tally, Trigger, in_base64
 
 ON_MESSAGE: dict[type[Message], EventHandler[Any]] = {
     BlockAddRequest: commit.receive_request_add_block,
@@ -139,7 +137,7 @@ class Agent:
         self.state: AgentState = self._core
         self._others = self.roster - {agent_id}
         self._tracing = tracing
-        self._trace: list[HandlerRun] = []
+        self._trace: list[Entry] = []
         self._traced_state = self._state_now()
         self.replace_handlers(handlers)
 
@@ -157,28 +155,33 @@ class Agent:
         try:
             sender, sequence, message = decode(data)
         except MalformedDatagramError as malformed:
-            self.dropped[malformed.reason] += 1
+            self._drop(now, malformed.reason, in_base64(data))
             return
-        self.receive_message(sender, sequence, message, now)
+        self.receive_message(sender, sequence, message, now, in_base64(data))
 
-    def receive_message(self, sender: int, sequence: int, message: Message, now: float) -> None:
-        """Handle a decoded message, if it is another agent's on the roster and carries only the roster's blocks."""
+    def receive_message(
+        self, sender: int, sequence: int, message: Message, now: float, datagram: str | None = None
+    ) -> None:
+        """Handle a decoded message, if it is another agent's on the roster and carries only the roster's blocks.
+
+        `datagram` is what it was decoded from, in base64, for the trace.
+        """
         if sender not in self._others:
-            self.dropped["own sender" if sender == self.agent_id else "sender not on the roster"] += 1
-            return
-        if type(message) in CARRY_A_BLOCK and message.block.agent_id not in self.roster:  # type: ignore[union-attr]
-            self.dropped["block not of the roster"] += 1
-            return
-        self.received[message.NAME] += 1
-        trigger: Trigger = {"message": message.NAME, "from": sender, "seq": sequence}
-        self._handle(now, trigger, self._on_message[type(message)], sender, message)
+            self._drop(now, "own sender" if sender == self.agent_id else "sender not on the roster", datagram)
+        elif type(message) in CARRY_A_BLOCK and message.block.agent_id not in self.roster:  # type: ignore[union-attr]
+            self._drop(now, "block not of the roster", datagram)
+        else:
+            self.received[message.NAME] += 1
+            trigger: Trigger = {"message": message.NAME, "from": sender, "seq": sequence}
+            self._handle(now, trigger, self._on_message[type(message)], sender, message, came=datagram)
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
         """Log an event. Raises ValueError if it is larger than the mission's largest event."""
         largest = self.state.settings.max_event_bytes
         if len(event.encode()) > largest:
             raise ValueError(f"an event of {len(event.encode())} bytes is more than max_event_bytes {largest}")
-        self._handle(now, {"event": event.event_id}, self._on_local_event["Build Data Block"], event)
+        came = in_base64(event.encode()) if self._tracing else None
+        self._handle(now, {"event": event.event_id}, self._on_local_event["Build Data Block"], event, came=came)
 
     def next_timer(self) -> float | None:
         """When `handle_timer` has something to do next, in mission seconds; None if no timer runs."""
@@ -231,7 +234,8 @@ class Agent:
             core.push_onto_deque(block)
         for block in found.stack:
             core.push_onto_stack(block)
-        self._handle(now, {"boot": len(core.chain)}, self._on_local_event["Reconcile Finalize"])
+        came = in_base64(found.encode()) if self._tracing else None
+        self._handle(now, {"boot": len(core.chain)}, self._on_local_event["Reconcile Finalize"], came=came)
 
     def begin_reconcile(self, now: float) -> None:
         """Reconcile because the operator asks (a final reconcile at the depot, Section 5.1)."""
@@ -246,35 +250,48 @@ class Agent:
         """What to broadcast, in order; empties the outbox."""
         return [encode(self.agent_id, sequence, message) for sequence, message in self.messages_to_send()]
 
-    def trace(self) -> list[HandlerRun]:
-        """The handler runs since the last call, in order."""
+    def trace(self) -> list[Entry]:
+        """The handler runs and dropped datagrams since the last call, in order."""
         trace, self._trace = self._trace, []
         return trace
 
     # How a handler runs
 
-    def _handle(self, now: float, trigger: Trigger, handler: EventHandler[Any], *inputs: object) -> None:
-        """Run a handler, and then those that it triggered, in order."""
+    def _drop(self, now: float, reason: str, datagram: str | None) -> None:
+        """What came is not for any handler."""
+        self.dropped[reason] += 1
+        if self._tracing:
+            self._trace.append(Dropped(now, reason, datagram or ""))
+
+    def _handle(
+        self, now: float, trigger: Trigger, handler: EventHandler[Any], *inputs: object, came: str | None = None
+    ) -> None:
+        """Run a handler, and then those that it triggered, in order. `came` is the trace's `input`."""
         core = self._core
         core.now = now
         while True:
             core.running = handler
             branch = handler.run(core, *inputs)
             if self._tracing:
-                self._trace_run(trigger, handler, branch)
+                self._trace_run(trigger, came, handler, branch)
             if not core.triggered:
                 return
             event, by = core.triggered.popleft()
-            handler, trigger, inputs = self._on_local_event[event], {"local": by}, ()
+            handler, trigger, inputs, came = self._on_local_event[event], {"local": by}, (), None
 
-    def _trace_run(self, trigger: Trigger, handler: EventHandler[Any], branch: str) -> None:
+    def _trace_run(self, trigger: Trigger, came: str | None, handler: EventHandler[Any], branch: str) -> None:
         core, state = self._core, self._traced_state
         if core.changes or state.reconciling != core.reconcile_in_progress or state.idle != core.idle:
             state = self._traced_state = self._state_now()
-        self._trace.append(
-            HandlerRun(core.now, handler.name, handler.algorithm, trigger, branch, core.changes, core.announced, state)
+        run = HandlerRun(
+            core.now, handler.name, handler.algorithm, trigger, branch, core.changes, core.announced, state, came
         )
         core.changes, core.announced = [], []
+        if handler.tally is not None:
+            run.tally = _tally(getattr(core, handler.tally))
+        if core.started:
+            run.started, core.started = core.started, {}
+        self._trace.append(run)
 
     def _state_now(self) -> State:
         state = self.state
@@ -286,3 +303,11 @@ class Agent:
             state.idle,
             state.chain.top_chain_hash.hex(),
         )
+
+
+def _tally(counted: dict[str, int] | dict[bytes, list[int]]) -> Tally:
+    """As a trace has it."""
+    return {
+        key if isinstance(key, str) else key.hex(): count if isinstance(count, int) else list(count)
+        for key, count in counted.items()
+    }

@@ -34,6 +34,7 @@ def build_data_block(core: Core, event: LoggableEvent) -> str:
     "proposed",
     sends=(BlockAddRequest,),
     starts=("voting",),
+    tally="vote_count",
 )
 def process_next_deque_block(core: Core) -> str:
     """Algorithm 2, Process Next Deque Block: propose the front of the deque to the local UVS."""
@@ -63,7 +64,9 @@ def receive_request_add_block(core: Core, sender: int, message: BlockAddRequest)
     return "approve" if approve else "disapprove"
 
 
-@event_handler(4, "no vote running", "another block", "another round", "counted already", "yes", "no")
+@event_handler(
+    4, "no vote running", "another block", "another round", "counted already", "yes", "no", tally="vote_count"
+)
 def receive_vote_add_block(core: Core, sender: int, message: BlockAddResponse) -> str:
     """Algorithm 4, Receive Vote Add Block: tally a vote, once per responder and round (Section 4.1)."""
     if not core.voting_timer.active or core.candidate_block is None:

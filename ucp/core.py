@@ -8,18 +8,18 @@ from typing import Any
 
 from ucp.block import Block
 from ucp.handler import EventHandler, LocalEvent
-from ucp.messages import Message, block_named
+from ucp.messages import Message, block_named, encode
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.timers import Timer
-from ucp.trace import Sent
+from ucp.trace import Sent, in_base64
 
 
 class Core(AgentState):
     """The state, what handlers do to it, and what has come of that since the agent last took it away.
 
-    `outbox` has (sequence, message) to broadcast; `changes` and `announced`, kept only while `tracing`, are the parts
-    of a trace line of the same meaning.
+    `outbox` has (sequence, message) to broadcast; `changes`, `announced` and `started`, kept only while `tracing`, are
+    what the running handler changed, sent and started, as a line of the trace says it.
     """
 
     running: EventHandler[Any]
@@ -30,6 +30,7 @@ class Core(AgentState):
         self.outbox: list[tuple[int, Message]] = []
         self.changes: list[tuple[str, str]] = []
         self.announced: list[Sent] = []
+        self.started: dict[str, float] = {}
         self._tracing = tracing
         self._sequence = 0
 
@@ -45,13 +46,17 @@ class Core(AgentState):
         self.sent[message.NAME] += 1
         if self._tracing:
             block_hash = block_named(message)
-            self.announced.append(Sent(message.NAME, self._sequence, block_hash.hex() if block_hash else None))
+            datagram = in_base64(encode(self.agent_id, self._sequence, message))
+            about = block_hash.hex() if block_hash else None
+            self.announced.append(Sent(message.NAME, self._sequence, about, datagram))
         self._sequence += 1
 
     def start(self, timer: Timer, duration_s: float) -> None:
         """Let `timer` count down from now, in mission seconds."""
         assert timer.name in self.running.starts, f"{self.running.name} does not declare that it starts {timer.name}"
         timer.start(self.now, duration_s)
+        if self._tracing:
+            self.started[timer.name] = duration_s
 
     def complete(self, block: Block) -> None:
         """A block of our own is full: push it onto the back of the deque."""

@@ -36,6 +36,8 @@ class EventHandler(Generic[P]):
     sends: tuple[type[Message], ...]
     starts: tuple[str, ...]
     triggers: tuple[LocalEvent, ...]
+    tally: str | None = None
+    """Name of the part of the state that it counts in."""
 
     @property
     def title(self) -> str:
@@ -51,13 +53,14 @@ def event_handler(
     sends: tuple[type[Message], ...] = (),
     starts: tuple[str, ...] = (),
     triggers: tuple[LocalEvent, ...] = (),
+    tally: str | None = None,
 ) -> Callable[[Callable[P, str]], EventHandler[P]]:
     """Declare a function to be the handler of Algorithm `algorithm`, and the most that it does.
 
-    `branches` are those that it returns; `starts` names timers.
+    `branches` are those that it returns; `starts` names timers, `tally` what of the state it counts in.
     """
 
     def declare(run: Callable[P, str]) -> EventHandler[P]:
-        return EventHandler(run.__name__, run, algorithm, branches, sends, starts, triggers)
+        return EventHandler(run.__name__, run, algorithm, branches, sends, starts, triggers, tally)
 
     return declare

@@ -29,7 +29,7 @@ from ucp.mission import Mission, MissionError, load_mission
 from ucp.quirks import check_quirk, wrong_handlers
 from ucp.store import Store, StoreError
 from ucp.telemetry import TelemetryEvents, follow
-from ucp.trace import HandlerRun, header_line
+from ucp.trace import Commanded, Entry, HandlerRun, header_line
 
 MAX_READ_BYTES = 65536
 DATAGRAMS_PER_TURN = 64
@@ -141,9 +141,7 @@ class Node:
         What it has is on disk, and what it sends on record, before anybody hears of it: it can be killed in between.
         """
         feed(self.clock.now())
-        runs = self.agent.trace()
-        self.handled += len(runs)
-        self._keep(runs)
+        self._keep(self.agent.trace())
         for datagram in self.agent.datagrams_to_send():
             try:
                 self._socket.sendto(datagram, (self.mission.network.broadcast, self.mission.network.port))
@@ -159,13 +157,15 @@ class Node:
             delay = self.clock.wall_s(deadline - self.clock.now())
             self._timer = asyncio.get_running_loop().call_later(max(0.0, delay), self._handle_timer)
 
-    def _keep(self, runs: list[HandlerRun]) -> None:
+    def _keep(self, entries: list[Entry]) -> None:
+        runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
+        self.handled += len(runs)
         if self._store is not None and self._store.problem is None:
             self._store.write([change for run in runs for change in run.changes])
             if self._store.problem:
                 log.error("the store ends here: %s", self._store.problem)
         if self._trace.problem is None:
-            self._trace.write("".join(run.to_line() for run in runs))
+            self._trace.write("".join(entry.to_line() for entry in entries))
             if self._trace.problem:
                 log.error("the trace ends here: %s", self._trace.problem)
 
@@ -179,6 +179,7 @@ class Node:
             header_line(
                 self.mission.agent_id,
                 list(self.mission.roster),
+                self.mission.initial_data,
                 dataclasses.asdict(self.mission.settings),
                 {"epoch_us": epoch_us, "speedup": self.mission.speedup},
             )
@@ -257,9 +258,11 @@ class Node:
 
     def _stop_events(self, request: dict[str, Any]) -> dict[str, Any]:
         self._stop_source()
+        self._take_down_command(request)
         return {}
 
     def _export_command(self, request: dict[str, Any]) -> dict[str, Any]:
+        self._take_down_command(request)
         try:
             return {"path": str(self.export())}
         except OSError as error:
@@ -275,7 +278,13 @@ class Node:
             raise CommandError(str(error)) from None
         self.mission.quirks[name] = value
         self.agent.replace_handlers(wrong_handlers(self.mission.quirks, self._lots))
+        self._take_down_command(request)
         return self.mission.quirks
+
+    def _take_down_command(self, request: dict[str, Any]) -> None:
+        """Commands that trigger no handler are in the trace, too; of before the mission it has nothing."""
+        if self.clock.running:
+            self._keep([Commanded(self.clock.now(), str(request.get("command")), request)])
 
     def _reconcile(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.clock.running:

@@ -32,7 +32,7 @@ def reconcile_begin(core: Core) -> str:
     return "begun"
 
 
-@event_handler(8, "asked", sends=(ChainContainQuery,), starts=("phase one",))
+@event_handler(8, "asked", sends=(ChainContainQuery,), starts=("phase one",), tally="reconcile_vote_count")
 def reconcile_phase_1(core: Core) -> str:
     """Algorithm 8, Reconcile Phase 1: ask who contains our top chain hash."""
     core.reconcile_vote_count = {"yes": 0, "no": 0}
@@ -52,7 +52,7 @@ def receive_request_chain_contain(core: Core, sender: int, message: ChainContain
     return "yes" if contained else "no"
 
 
-@event_handler(10, "not in phase 1", "another chain", "counted already", "yes", "no")
+@event_handler(10, "not in phase 1", "another chain", "counted already", "yes", "no", tally="reconcile_vote_count")
 def receive_phase_1_response(core: Core, sender: int, message: ChainContainResponse) -> str:
     """Algorithm 10, Receive Phase 1 Response: tally, once per responder and query (Section 4.1)."""
     if not core.phase_one_timer.active:
@@ -95,7 +95,9 @@ def reconcile_phase_1_timer_expiration(core: Core) -> str:
     return "contained"
 
 
-@event_handler(12, "asked", sends=(ChainHashSuccessorQuery,), starts=("phase two",))
+@event_handler(
+    12, "asked", sends=(ChainHashSuccessorQuery,), starts=("phase two",), tally="reconcile_response_dictionary"
+)
 def reconcile_phase_2(core: Core) -> str:
     """Algorithm 12, Reconcile Phase 2: ask which block follows the mutual block."""
     core.reconcile_response_dictionary.clear()
@@ -132,7 +134,15 @@ def receive_request_next_in_sequence(core: Core, sender: int, message: ChainHash
     return "successor"
 
 
-@event_handler(14, "not in phase 2", "another chain", "counted already", "new candidate", "counted")
+@event_handler(
+    14,
+    "not in phase 2",
+    "another chain",
+    "counted already",
+    "new candidate",
+    "counted",
+    tally="reconcile_response_dictionary",
+)
 def receive_response_next_in_sequence(core: Core, sender: int, message: NextInSequenceResponse) -> str:
     """Algorithm 14, Receive Response Next in Sequence: one dictionary of candidate -> [count, timestamp]."""
     if not core.phase_two_timer.active:

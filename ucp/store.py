@@ -56,6 +56,10 @@ class StoredState:
         yield from self.deque
         yield from self.stack
 
+    def encode(self) -> bytes:
+        """The blocks' data, the chain's first, then the deque's and the stack's, a length (u16) before each."""
+        return b"".join(len(data).to_bytes(2, "big") + data for data in (block.block_data() for block in self.blocks()))
+
     def _change(self, operation: str, block: Block) -> None:
         """Make a change of a trace."""
         match operation:

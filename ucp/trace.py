@@ -1,24 +1,33 @@
-"""What an agent tells about itself: one record for every handler run, written as one line of JSON.
+"""What an agent tells about itself: a line of JSON for every handler run, and for all else that reached it.
 
-`changes` is complete: whoever replays it has the contents of chain, deque and reconcile stack after every step.
+It suffices to run the agent again: every input is there in full, also the datagrams that were dropped. `changes` is
+complete: whoever replays it has the contents of chain, deque and reconcile stack after every step.
 """
 
+import base64
 import json
 from dataclasses import dataclass
 from typing import Any
 
-SCHEMA = "ucp-trace/1"
+SCHEMA = "ucp-trace/2"
 
 _encode = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
+
+Trigger = dict[str, int | str]
+Tally = dict[str, int | list[int]]
 
 
 @dataclass(slots=True)
 class Sent:
-    """A message broadcast; `block` is the hash of the block that it is about, if it is about one."""
+    """A message broadcast; `block` is the hash of the block that it is about, if it is about one.
+
+    `datagram` is all of it in base64; None in a trace of version 1, which does not have it.
+    """
 
     message: str
     seq: int
     block: str | None = None
+    datagram: str | None = None
 
 
 @dataclass(slots=True)
@@ -42,16 +51,24 @@ class HandlerRun:
         {"operator": command}, or {"boot": blocks in the chain that was found on disk}.
     changes: (operation, block hash); operations are `complete`, and `chain`, `deque`, `stack` with + or -.
     state: what holds after the run.
+    input: what came with the trigger, in base64: the datagram as it was received; the event as a block has it; the
+        blocks that were found on disk, in the order in which `changes` names them, a length (u16) before each.
+    tally: what the handler counts in, after the run: {"yes": n, "no": n}, or of Algorithms 12 and 14
+        {block hash, or "" for Is Top Of Chain: [count, timestamp in microseconds]}.
+    started: timers that the run started, and their durations in mission seconds.
     """
 
     t: float
     handler: str
     algorithm: int
-    trigger: dict[str, int | str]
+    trigger: Trigger
     branch: str
     changes: list[tuple[str, str]]
     sent: list[Sent]
     state: State
+    input: str | None = None
+    tally: Tally | None = None
+    started: dict[str, float] | None = None
 
     def to_line(self) -> str:
         state = self.state
@@ -60,9 +77,15 @@ class HandlerRun:
             "handler": self.handler,
             "algorithm": self.algorithm,
             "trigger": self.trigger,
+            "input": self.input,
             "branch": self.branch,
             "changes": self.changes,
-            "sent": [{"message": sent.message, "seq": sent.seq, "block": sent.block} for sent in self.sent],
+            "sent": [
+                {"message": sent.message, "seq": sent.seq, "block": sent.block, "datagram": sent.datagram}
+                for sent in self.sent
+            ],
+            "tally": self.tally,
+            "started": self.started,
             "state": {
                 "chain": state.chain,
                 "deque": state.deque,
@@ -72,10 +95,54 @@ class HandlerRun:
                 "top": state.top,
             },
         }
+        for key in ("input", "tally", "started"):
+            if record[key] is None:
+                del record[key]
         return _encode(record) + "\n"
 
 
-def header_line(agent_id: int, roster: list[int], settings: dict[str, Any], clock: dict[str, Any]) -> str:
+@dataclass(slots=True)
+class Dropped:
+    """A datagram that no handler was given, and why; `datagram` is all of it in base64."""
+
+    t: float
+    dropped: str
+    datagram: str
+
+    def to_line(self) -> str:
+        return _encode({"t": round(self.t, 6), "dropped": self.dropped, "datagram": self.datagram}) + "\n"
+
+
+@dataclass(slots=True)
+class Commanded:
+    """A command that an agent was given that triggers no handler, with all that came with it."""
+
+    t: float
+    command: str
+    request: dict[str, Any]
+
+    def to_line(self) -> str:
+        return _encode({"t": round(self.t, 6), "command": self.command, "request": self.request}) + "\n"
+
+
+Entry = HandlerRun | Dropped | Commanded
+"""What a line of a trace says, but for the first."""
+
+
+def header_line(
+    agent_id: int, roster: list[int], initial_data: bytes, settings: dict[str, Any], clock: dict[str, Any]
+) -> str:
     """The first line of a trace: which agent, in which mission, with which settings and clock."""
-    header = {"schema": SCHEMA, "agent_id": agent_id, "roster": roster, "settings": settings, "clock": clock}
+    header = {
+        "schema": SCHEMA,
+        "agent_id": agent_id,
+        "roster": roster,
+        "initial_data": in_base64(initial_data),
+        "settings": settings,
+        "clock": clock,
+    }
     return _encode(header) + "\n"
+
+
+def in_base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

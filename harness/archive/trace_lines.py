@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar
 
 from pydantic import TypeAdapter
 
-from harness.archive.traces import HANDLER_RUN, HEADER, MAX_LINE_BYTES
+from harness.archive.traces import ASIDE, HANDLER_RUN, HEADER, MAX_LINE_BYTES
 from harness.errors import RunDirectoryError
 from ucp.trace import HandlerRun
 
@@ -38,8 +38,10 @@ def read_lines(path: Path) -> Iterator[Line]:
                 number += 1
                 if not text.endswith(b"\n") and len(text) < MAX_LINE_BYTES:
                     break
-                if life and b'"schema"' not in text:
+                if life and b'"handler"' in text:
                     yield Line(path, number, life, text)
+                elif life and b'"schema"' not in text:
+                    _validated(ASIDE, path, number, text)
                 else:
                     _validated(HEADER, path, number, text)
                     life += 1

@@ -1,61 +1,88 @@
-"""Reading traces (`ucp-trace/1`): every handler run of one agent, with the blocks that it held after each.
+"""Reading traces (`ucp-trace/2`, and `/1`): every handler run of one agent, with the blocks that it held after each.
 
 A trace that ends in half a line is that of a killed agent, and is read up to there. Anything else that is not a trace
 is told in `problem`, and what came before it still counts.
 """
 
 import re
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, islice, pairwise
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
-from ucp.trace import HandlerRun
+from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 
 SUFFIX = ".trace.jsonl"
 MAX_LINE_BYTES = 1024 * 1024
 PLACES = ("chain", "deque", "stack")
 
 
-class Header(BaseModel):
-    model_config = ConfigDict(extra="ignore")
+Version = Literal["ucp-trace/1", "ucp-trace/2"]
 
+
+class Header(BaseModel):
+    """`initial_data` is in base64; None in version 1, which has no inputs in full either."""
+
+    model_config = ConfigDict(extra="ignore", populate_by_name=True)
+
+    schema_: Version = Field(default="ucp-trace/1", alias="schema")
     agent_id: int
     roster: list[int]
     settings: dict[str, Any]
     clock: dict[str, Any]
+    initial_data: str | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> "Header":
+        if self.has_inputs and self.initial_data is None:
+            raise ValueError("initial_data is missing")
+        return self
+
+    @property
+    def has_inputs(self) -> bool:
+        """Whether the trace has all that reached the agent in full."""
+        return self.schema_ != "ucp-trace/1"
 
 
 class _VersionedHeader(Header):
-    schema_: Literal["ucp-trace/1"] = Field(alias="schema")
+    schema_: Version = Field(alias="schema")
 
 
 _ONLY_TAKES_IN = re.compile(
     rb"""
     \{"t":(?!0\d)\d{1,6}(?:\.\d+)?,"handler":"receive_\w+","algorithm":(?!0)\d{1,2},
-    "trigger":\{"message":"[\w ]+","from":(?!0)\d{1,5},"seq":(?!0\d)\d{1,9}\},"branch":"[\w ]*","changes":\[\],
-    "sent":\[(?:\{"message":"[\w ]+","seq":(?!0\d)\d{1,9},"block":(?:null|"[0-9a-f]*")\}(?:,(?!\]))?)*\],
+    "trigger":\{"message":"[\w ]+","from":(?!0)\d{1,5},"seq":(?!0\d)\d{1,9}\},(?:"input":"[\w+/=]*",)?
+    "branch":"[\w ]*","changes":\[\],
+    "sent":\[(?:\{"message":"[\w ]+","seq":(?!0\d)\d{1,9},"block":(?:null|"[0-9a-f]*")
+    (?:,"datagram":"[\w+/=]*")?\}(?:,(?!\]))?)*\],
+    (?:"tally":\{(?:"(?:yes|no)":(?!0\d)\d{1,9}(?:,(?!\}))?|"[0-9a-f]*":\[(?!0\d)\d{1,9},(?!0\d)\d{1,20}\](?:,(?!\}))?)*\},)?
     "state":\{"chain":(?!0\d)\d{1,9},"deque":(?!0\d)\d{1,9},"stack":(?!0\d)\d{1,9},
     "reconciling":(?:true|false),"idle":(?:true|false),"top":"[0-9a-f]*"\}\}\n""",
     re.VERBOSE,
 )
 """A line as agents write it whose handler took a message in, and nothing changed. Whatever else fits is as sound."""
 
-HEADER = TypeAdapter(_VersionedHeader)
+HEADER: TypeAdapter[Header] = TypeAdapter(_VersionedHeader)
 HANDLER_RUN = TypeAdapter(HandlerRun)
+ASIDE = TypeAdapter(Dropped | Commanded)
 
 
 @dataclass
 class Trace:
-    """`runs` of all lives of the agent; those with index n >= starts[k] are of life k + 2, after the kth restart."""
+    """`runs` of all lives of the agent; those with index n >= starts[k] are of life k + 2, after the kth restart.
+
+    `asides` are the lines of other things, each with the number of runs that stand before it.
+    """
 
     header: Header
     runs: list[HandlerRun] = field(default_factory=list)
     starts: list[int] = field(default_factory=list)
+    asides: list[tuple[int, Dropped | Commanded]] = field(default_factory=list)
     problem: str | None = None
     cut_off: bool = False
     """Whether it ends in half a line, which is not read."""
@@ -64,7 +91,24 @@ class Trace:
         """Each life of the agent: its runs, with their lines, which count from 1. A life begins with a header line."""
         bounds = [0, *self.starts, len(self.runs)]
         for life, (start, end) in enumerate(pairwise(bounds), 1):
-            yield enumerate(islice(self.runs, start, end), start + life + 1)
+            yield self._numbered(start, end, life)
+
+    def _numbered(self, start: int, end: int, life: int) -> Iterator[tuple[int, HandlerRun]]:
+        if not self.asides:
+            return enumerate(islice(self.runs, start, end), start + life + 1)
+        before = [position for position, _ in self.asides]
+        return (
+            (number + life + 1 + bisect_right(before, number), run)
+            for number, run in enumerate(islice(self.runs, start, end), start)
+        )
+
+    def extend(self, entries: Iterable[Entry]) -> None:
+        """These lines follow."""
+        for entry in entries:
+            if isinstance(entry, HandlerRun):
+                self.runs.append(entry)
+            else:
+                self.asides.append((len(self.runs), entry))
 
     def skimmed(self) -> "Trace":
         """The trace without the handler runs that only took a message in; lines are then not counted by `lives`."""
@@ -74,6 +118,7 @@ class Trace:
             self,
             runs=[run for run, keep in zip(self.runs, kept, strict=True) if keep],
             starts=[before[start] for start in self.starts],
+            asides=[(before[position], aside) for position, aside in self.asides],
         )
 
     def completed(self) -> list[str]:
@@ -163,8 +208,10 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                 try:
                     if trace is None:
                         trace = Trace(HEADER.validate_json(line))
-                    elif b'"schema"' not in line:
+                    elif b'"handler"' in line:
                         trace.runs.append(HANDLER_RUN.validate_json(line))
+                    elif b'"schema"' not in line:
+                        trace.asides.append((len(trace.runs), ASIDE.validate_json(line)))
                     else:
                         if HEADER.validate_json(line).agent_id != trace.header.agent_id:
                             raise ValueError("another agent's header")

@@ -18,7 +18,7 @@ from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import RandomDraws
 from ucp.messages import CommitBlock, Message, block_named
-from ucp.trace import HandlerRun
+from ucp.trace import Entry, HandlerRun
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +76,11 @@ class _Recorder(InMemory):
         self._last_of[agent_id] = len(self.events)
         self.events.append(Logged(at_s, agent_id, data_bytes, completes=False))
 
-    def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
-        super().write(agent_id, runs)
-        for run in runs:
+    def write(self, agent_id: int, entries: list[Entry]) -> None:
+        super().write(agent_id, entries)
+        for run in entries:
+            if not isinstance(run, HandlerRun):
+                continue
             if run.handler == "build_data_block" and run.branch == "full":
                 last = self.events[self._last_of[agent_id]]
                 self.events[self._last_of[agent_id]] = Logged(last.at_s, last.agent, last.bytes, completes=True)

@@ -21,7 +21,7 @@ from harness.play.simulation.on_disk import header
 from harness.play.simulation.virtual_time import VirtualTime
 from harness.scenario import Scenario
 from netem.radio import Place
-from ucp.trace import HandlerRun
+from ucp.trace import SCHEMA, Entry, in_base64
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,11 @@ def _without_waiting(story: Coroutine[Any, Any, None]) -> None:
     raise AssertionError("virtual time waits for nothing")
 
 
+def _header(life: Incarnation) -> Header:
+    named = header(life)
+    return Header(**{**named, "schema": SCHEMA, "initial_data": in_base64(named["initial_data"])})
+
+
 class InMemory:
     """Keeps everything as the checker wants it."""
 
@@ -77,15 +82,15 @@ class InMemory:
             return
         trace = self._traces.get(life.agent.agent_id)
         if trace is None:
-            self._traces[life.agent.agent_id] = Trace(Header.model_validate(header(life)))
+            self._traces[life.agent.agent_id] = Trace(_header(life))
         else:
             trace.starts.append(len(trace.runs))
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         """The block that it becomes part of has it."""
 
-    def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
-        self._traces[agent_id].runs += runs
+    def write(self, agent_id: int, entries: list[Entry]) -> None:
+        self._traces[agent_id].extend(entries)
 
     def changed(self, record: dict[str, Any]) -> None:
         """The run's record has it."""

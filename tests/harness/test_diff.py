@@ -168,7 +168,7 @@ def test_keys_are_told_innermost_and_lists_of_another_length_whole() -> None:
         (lambda b: trace(b).unlink(), "2.trace.jsonl: cannot be read (No such file or directory), and runs are"),
         (lambda b: trace(b).write_text(""), "2.trace.jsonl: it is empty"),
         (lambda b: trace(b).write_text(trace(b).read_text() + "{}\n"), "is damaged, or of another version of traces"),
-        (lambda b: edit_lines(trace(b), lambda lines: lines[0].update(schema="ucp-trace/2")), "line 1 is damaged, or"),
+        (lambda b: edit_lines(trace(b), lambda lines: lines[0].update(schema="ucp-trace/3")), "line 1 is damaged, or"),
         (
             lambda b: edit(b / "run.json", lambda it: it.update(roster=[1, 2])),
             "A has agents 1\u20133, and B has 1, 2: compare runs of the same agents",

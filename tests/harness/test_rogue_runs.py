@@ -173,7 +173,7 @@ def test_it_is_on_the_air_as_well_across_a_partition_and_is_nobody_there(tmp_pat
         step
         for agent, trace in finished_traces(tmp_path / "run").items()
         for step in trace
-        if step["t"] > 200 and (agent in (1, 2)) != (step["trigger"].get("from", agent) in (1, 2))
+        if step["t"] > 200 and (agent in (1, 2)) != (step.get("trigger", {}).get("from", agent) in (1, 2))
     ]
     assert {step["trigger"]["seq"] >= 2**31 for step in across} == {True}
 

@@ -1,5 +1,6 @@
 """What holds after every step, whatever the radio, the clock and the neighbours do."""
 
+import base64
 import pickle
 from random import Random
 
@@ -13,6 +14,7 @@ from ucp.block import Block, next_chain_hash
 from ucp.messages import CommitBlock, Message, decode, encode
 from ucp.quirks import wrong_handlers
 from ucp.store import StoredState
+from ucp.trace import Dropped
 
 
 def state_of(agent: Agent) -> bytes:
@@ -40,6 +42,7 @@ def test_hostile_input_is_counted_and_dropped_and_changes_nothing(datagrams: lis
     agent = air.agents[1]
     if reconciling:
         agent.begin_reconcile(0.0)
+    agent.trace()
     before = state_of(agent)
     acceptable = 0
     for datagram in datagrams:
@@ -53,6 +56,9 @@ def test_hostile_input_is_counted_and_dropped_and_changes_nothing(datagrams: lis
         agent.receive_datagram(datagram, 1.0)
     assert sum(agent.dropped.values()) == len(datagrams)
     assert not agent.received
+    assert [entry.datagram for entry in agent.trace() if isinstance(entry, Dropped)] == [
+        base64.b64encode(datagram).decode() for datagram in datagrams
+    ]
     assert state_of(agent) == before
 
 

@@ -18,9 +18,10 @@ from heapq import heappop, heappush
 from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
 from netem.medium import Medium, RandomDraws
 from ucp.interest import ANSWERED, ASKED, MATTERS, ONLY_COUNTED, STILL_ASKED, Question
-from ucp.messages import BlockAddResponse, Message
+from ucp.messages import BlockAddResponse, Message, encode
 from ucp.settings import Settings
 from ucp.state import AgentState
+from ucp.trace import in_base64
 
 NEVER = float("inf")
 SWEEP_EVERY = 1000
@@ -38,6 +39,14 @@ class InFlight:
     sent_at: float
     rank: int
     lots: RandomDraws
+    _datagram: str | None = None
+
+    @property
+    def datagram(self) -> str:
+        """In base64."""
+        if self._datagram is None:
+            self._datagram = in_base64(encode(self.sender, self.sequence, self.message))
+        return self._datagram
 
     def __lt__(self, other: object) -> bool:
         return False  # of two copies that arrive at one agent in one instant either is the first

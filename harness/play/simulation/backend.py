@@ -32,7 +32,7 @@ from ucp.interest import ONLY_COUNTED
 from ucp.messages import datagram_bytes
 from ucp.quirks import in_force, wrong_handlers
 from ucp.store import StoredState
-from ucp.trace import HandlerRun
+from ucp.trace import Entry, HandlerRun
 
 if TYPE_CHECKING:
     from harness.play.simulation.rogue import VirtualRogue
@@ -56,7 +56,7 @@ class Recorder(Protocol):
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         """An agent is about to log an event with so much data."""
 
-    def write(self, agent_id: int, runs: list[HandlerRun]) -> None: ...
+    def write(self, agent_id: int, entries: list[Entry]) -> None: ...
 
     def changed(self, record: dict[str, Any]) -> None:
         """A change of the network, or a fault of agents, was made."""
@@ -382,7 +382,7 @@ class Simulation:
         if isinstance(what, InFlight):
             agent, sender, message = life.agent, what.sender, what.message
             if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent.state, sender, message)):
-                agent.receive_message(sender, what.sequence, message, self._local(life))
+                agent.receive_message(sender, what.sequence, message, self._local(life), self._text(what))
                 if self._tracing or self._deliver_all or agent.state.reconcile_in_progress:
                     self._after(number, life)
                 else:
@@ -420,7 +420,7 @@ class Simulation:
             if answer.matters(agent.state, answer.sender, answer.message):
                 at = max(at, life.resumed_at)
                 local = max(agent.state.now, self._local(life, at))
-                agent.receive_message(answer.sender, answer.sequence, answer.message, local)
+                agent.receive_message(answer.sender, answer.sequence, answer.message, local, self._text(answer))
                 if self._tracing:
                     self._take_down(life, at)
 
@@ -448,12 +448,16 @@ class Simulation:
             if self._rogue is not None:
                 self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
 
+    def _text(self, flight: InFlight) -> str | None:
+        """Its datagram, as traces have it, if there are any."""
+        return flight.datagram if self._tracing else None
+
     def _take_down(self, life: Incarnation, mission_s: float) -> None:
-        runs = life.agent.trace()
-        life.handler_runs += len(runs)
-        for run in runs:
-            run.t = mission_s
-        self._recorder.write(life.agent.agent_id, runs)
+        entries = life.agent.trace()
+        for entry in entries:
+            entry.t = mission_s
+            life.handler_runs += isinstance(entry, HandlerRun)
+        self._recorder.write(life.agent.agent_id, entries)
 
     # An agent's life
 

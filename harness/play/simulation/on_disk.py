@@ -9,7 +9,7 @@ from harness.play.simulation.backend import Incarnation, Simulation
 from netem.radio import Place
 from ucp.export import export_chain
 from ucp.files import TraceFile, write_json_atomically
-from ucp.trace import HandlerRun, header_line
+from ucp.trace import Entry, header_line
 
 
 class OnDisk:
@@ -30,8 +30,8 @@ class OnDisk:
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         """The block that it becomes part of has it."""
 
-    def write(self, agent_id: int, runs: list[HandlerRun]) -> None:
-        self._traces[agent_id].write("".join([run.to_line() for run in runs]))
+    def write(self, agent_id: int, entries: list[Entry]) -> None:
+        self._traces[agent_id].write("".join([entry.to_line() for entry in entries]))
 
     def changed(self, record: dict[str, Any]) -> None:
         self._rundir.append_network(record)
@@ -68,6 +68,7 @@ def header(life: Incarnation) -> dict[str, Any]:
     return {
         "agent_id": agent.agent_id,
         "roster": sorted(agent.roster),
+        "initial_data": agent.state.chain.inception.block_data,
         "settings": dataclasses.asdict(agent.state.settings),
         "clock": clock,
     }
