@@ -1,6 +1,6 @@
 """What run.json says: the record of one run, schema `ucp-run/1`. Keys are added, never removed or renamed."""
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -93,7 +93,7 @@ class CycleWait(_Model):
     """An agent asks in each reconcile of the cycle, and these never answer."""
 
     agent_id: int
-    for_agents: list[int]
+    for_agents: Annotated[list[int], Field(min_length=1)]
 
 
 class Cycle(_Model):
@@ -104,11 +104,13 @@ class Cycle(_Model):
     row.
     """
 
+    model_config = ConfigDict(allow_inf_nan=False)
+
     since_s: float
     period_s: float | None = None
     periods: int | None = None
     proven: bool = False
-    agents: list[int]
+    agents: Annotated[list[int], Field(min_length=1)]
     """Those that are not idle."""
     steps: list[CycleStep] = []
     """One period, in order."""
@@ -248,7 +250,7 @@ class JudgedRecord(_Model):
     faults: list[Fault] = []
     final_reconcile: FinalReconcile | None = None
     cycle: Cycle | None = None
-    """In virtual time, where the run stopped because the agents were seen never to finish."""
+    """Where agents were shown never to finish; if `proven`, the run stopped there."""
     mission_s: float | None = None
     agents: dict[str, AgentRecord] = {}
 

@@ -39,6 +39,8 @@ def cycle_of(evidence: "Evidence") -> Cycle | None:
     if not busy:
         return None
     recorded = evidence.record.cycle if evidence.record else None
+    if recorded is not None and not recorded.proven:
+        recorded = None  # that was found in the traces, where it must be found again
     traced = _in_traces(evidence, busy, times=2 if recorded else SEVERAL)
     if recorded is None or traced is None:
         return recorded or traced

@@ -19,7 +19,7 @@ from harness.archive.replication import replication_of
 from harness.archive.result import listing, number
 from harness.present import words
 from harness.present.colours import Ink
-from harness.report import facts, timeline_charts, timeline_lanes
+from harness.report import facts, timeline_charts, timeline_cycle, timeline_lanes
 from harness.report.map_parts import divisions
 from harness.report.source import ReportSource
 from harness.report.timeline_lanes import OUTCOMES
@@ -93,7 +93,10 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
         picture.lane_height,
         picture.drawing,
         picture.legend,
-        timeline_charts.draw(replication_of(traces, faults), faults, shades, end_s),
+        [
+            *filter(None, [timeline_cycle.row(left.result, end_s)]),
+            *timeline_charts.draw(replication_of(traces, faults), faults, shades, end_s),
+        ],
         axis(end_s),
         messages,
         _table(course.votes, lambda vote: _vote_row(vote, names)),

@@ -118,7 +118,8 @@ class Recording:
         result, survived = checker.check(evidence), survival(evidence)
         wall_s = time.monotonic() - self._started
         rogue = account(self._record.scenario, archive)
-        self._update(**result.to_json(), survival=survived, rogue=rogue, wall_s=round(wall_s, 1))
+        cycle = evidence.cycle.model_dump() if evidence.cycle else None
+        self._update(**result.to_json(), cycle=cycle, survival=survived, rogue=rogue, wall_s=round(wall_s, 1))
         archive.forget_record()
         try:
             page = report.write_report(archive)

@@ -20,6 +20,7 @@ from harness.report import timeline, timeline_charts, timeline_lanes, write_repo
 from harness.run.run import run
 from tests.harness.report.runs import write_run
 from tests.harness.report.test_page import HOSTILE, Reader
+from tests.harness.test_recurrence import in_step
 from tests.harness.virtual import scenario
 
 AGENTS = range(1, 6)
@@ -217,3 +218,35 @@ def test_a_file_that_is_no_trace_is_said_where_there_is_nothing_to_draw(tmp_path
 def test_template_style_and_script_are_in_the_package() -> None:
     shipped = {entry.name for entry in resources.files("harness.report").iterdir()}
     assert {"timeline.html.j2", "timeline.css", "timeline.js"} <= shipped
+
+
+def test_a_swarm_that_goes_round_in_circles_has_a_bracket_for_each_round(tmp_path: Path) -> None:
+    directory = run(in_step(), 1, tmp_path / "run", Silent(), backend="sim").directory
+    page = html_of(directory)
+    assert page.count('class="round"') == 13, (
+        "twelve whole rounds from 11 s to 191 s, and one that the run's end cuts off"
+    )
+    assert "every 15 s since 11 s" in page
+    assert "agent 1, as agents 2, 3, 4 and 5, runs reconcile_phase_1_timer_expiration (no response)" in page
+    assert "goes round" in page
+
+
+def test_a_swarm_that_finishes_has_no_brackets(troubled: Path) -> None:
+    assert 'class="round"' not in html_of(troubled)
+
+
+@pytest.mark.parametrize(
+    "cycle",
+    [
+        {"since_s": 1e308, "period_s": 1e-300, "agents": [1]},
+        {"since_s": -5, "period_s": -1, "agents": [1]},
+        {"since_s": "<script>", "agents": []},
+        {"since_s": 0, "agents": []},
+        [],
+        7,
+    ],
+)
+def test_a_cycle_that_cannot_be_is_drawn_as_far_as_it_can(tmp_path: Path, cycle: Any) -> None:
+    page = html_of(run_with(tmp_path, a_line(20.0, "build_data_block", "full"), result={"cycle": cycle}))
+    assert page.count('class="round"') <= 400
+    assert "<script>" not in page.partition("</head>")[2].partition("<script")[0]
