@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from harness.checker import Result
+from harness.gc_pause import gc_paused
 from harness.run.simulate import simulate
 from harness.run.sweep import Failed, sweep
 from harness.scenario import Scenario
@@ -12,6 +13,7 @@ Judge = Callable[[Scenario, int], Result]
 """Plays a scenario with a seed, and judges it."""
 
 
+@gc_paused()
 def simulated(scenario: Scenario, seed: int) -> Result:
     """With traces, so that all six characteristics are judged."""
     return simulate(scenario, seed, tracing=True).result

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from harness.checker import Result
 from harness.errors import VIOLATED, HarnessError, InterruptedRunError
+from harness.gc_pause import gc_paused
 from harness.matrix.cell import Run
 from harness.matrix.model import Matrix, Point, Task
 from harness.play.backends import BACKENDS
@@ -24,6 +25,7 @@ class RunFailedError(HarnessError):
     exit_status = VIOLATED
 
 
+@gc_paused()
 def simulated(scenario: Scenario, seed: int) -> Result:
     """Without traces, which cost more than the run: characteristic 1 is then not judged, 2 and 3 only at the end."""
     from harness.run.simulate import simulate

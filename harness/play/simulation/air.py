@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
+from typing import Literal
 
 from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
 from netem.medium import Medium, RandomDraws
@@ -52,12 +53,16 @@ class InFlight:
         return False  # of two copies that arrive at one agent in one instant either is the first
 
 
+About = Literal["vote", "reconcile"]
+"""What an agent's question is about: it can have one of each."""
+
+
 @dataclass(slots=True, eq=False)
 class _Topic:
-    """What anybody says to one question, by sender in the order in which it was sent, and who asks."""
+    """What anybody says to one question, by sender in the order in which it was sent, and the numbers of who asks."""
 
     answers: dict[int, list[InFlight]] = field(default_factory=dict)
-    askers: dict[int, "_Asked"] = field(default_factory=dict)
+    askers: set[int] = field(default_factory=set)
     said: int = 0
     """How many answers there are."""
     quiet_at: float = 0.0
@@ -70,7 +75,7 @@ class _Asked:
 
     question: Question
     topic: _Topic
-    since: "Place"
+    since: "Happening"
     heard: set[int] = field(default_factory=set)
     heard_of: int = 0
     """How many answers there were when it was last told of them."""
@@ -79,9 +84,6 @@ class _Asked:
     first: tuple[float, int] = (NEVER, 0)
     """When the first answer of all arrives, and its rank, where no other is wanted."""
 
-
-Place = tuple[float, int, int]
-"""(mission seconds, rank, number of the agent): where something stands in the order."""
 
 Logged = tuple[int, int, bytes]
 """An event that an agent is about to log: in which of its lives (0: whichever it is), event ID, data."""
@@ -115,9 +117,11 @@ class VirtualAir:
         """When the agent with this number was started; it does not hear what was sent before."""
         self.paused_at: dict[int, float] = {}
         """Since when the agents are paused that are; what has come since waits for them."""
+        self.asked_by: list[dict[About, _Asked]] = [{} for _ in roster]
+        """What the agent with this number waits to hear."""
         self.quiet_at = 0.0
         """Nothing that was broadcast so far arrives later."""
-        self.place: Place = (0.0, 0, 0)
+        self.place: Happening = (0.0, 0, 0, None)
         """Where in the order the world stands."""
         self._roster = roster
         self._settings = settings
@@ -127,7 +131,6 @@ class VirtualAir:
         self._coming: list[Happening] = []
         self._rank = 0
         self._topics: dict[Question, _Topic] = defaultdict(_Topic)
-        self._asked_by: list[dict[bool, _Asked]] = [{} for _ in roster]
         self._swept_at = 0
         self._waiting: dict[str, list[tuple[InFlight, int]]] = defaultdict(list)
         self._named: dict[str, float] = {}
@@ -137,10 +140,10 @@ class VirtualAir:
         coming = self._coming
         while coming and coming[0][0] <= mission_s:
             happening = heappop(coming)
-            self.place = happening[:3]
+            self.place = happening
             yield happening
         self._rank += 1
-        self.place = (mission_s, self._rank, 0)
+        self.place = (mission_s, self._rank, 0, None)
 
     def expect(self, at: float, number: int, what: Logged | None) -> None:
         """The agent's timer ends, or it logs an event, at `at`."""
@@ -165,16 +168,17 @@ class VirtualAir:
         lots = self._medium.draw(number, now, data_bytes)
         kind = type(message)
         flight = InFlight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots)
-        if kind in ASKED and not self._deliver_all:
-            self._ask(number, ASKED[kind](message, self._settings))
         if now + lots.latest > self.quiet_at:
             self.quiet_at = now + lots.latest
+        answered = None if self._deliver_all else ANSWERED.get(kind)
+        if answered is None and kind in ASKED and not self._deliver_all:
+            self._ask(number, ASKED[kind](message, self._settings))
         if self._script.listens and self._scripted(now, number, flight):
             return
-        if self._deliver_all or kind not in ANSWERED:
+        if answered is None:
             self._deliver(flight)
         else:
-            self._answer(ANSWERED[kind](message), flight, number)
+            self._answer(answered(message), flight, number)
 
     def _deliver(self, flight: InFlight) -> None:
         """Let it arrive at everybody but those who will certainly not answer."""
@@ -193,8 +197,8 @@ class VirtualAir:
         Those that have come since it asked: of each agent the first.
         """
         heard = []
-        now, rank, _ = self.place
-        for asked in self._asked_by[number].values():
+        now, rank, _, _ = self.place
+        for asked in self.asked_by[number].values():
             topic = asked.topic
             if asked.question[0] not in ONLY_COUNTED or (topic.said == asked.heard_of and now < asked.next_at):
                 continue
@@ -215,28 +219,30 @@ class VirtualAir:
 
     def no_longer_asked(self, number: int, state: AgentState) -> None:
         """A timer of the agent has ended, and with it a question."""
-        asked_by = self._asked_by[number]
-        for of_vote, asked in list(asked_by.items()):
+        asked_by = self.asked_by[number]
+        for about, asked in list(asked_by.items()):
             if not STILL_ASKED[asked.question[0]](state):
-                del asked_by[of_vote], asked.topic.askers[number]
+                del asked_by[about]
+                asked.topic.askers.remove(number)
 
     def is_gone(self, number: int) -> None:
         """The agent has been killed."""
-        for asked in self._asked_by[number].values():
-            del asked.topic.askers[number]
-        self._asked_by[number].clear()
+        for asked in self.asked_by[number].values():
+            asked.topic.askers.remove(number)
+        self.asked_by[number].clear()
         self.paused_at.pop(number, None)
         self.busy_until[number] = 0.0
 
     def _ask(self, number: int, question: Question) -> None:
         """From now on the agent waits for answers: also for those to others that have not arrived yet."""
-        asked_by = self._asked_by[number]
-        of_vote = question[0] is BlockAddResponse
-        before = asked_by.get(of_vote)
+        asked_by = self.asked_by[number]
+        about: About = "vote" if question[0] is BlockAddResponse else "reconcile"
+        before = asked_by.get(about)
         if before is not None:
-            del before.topic.askers[number]
+            before.topic.askers.remove(number)
         topic = self._topics[question]
-        asked = asked_by[of_vote] = topic.askers[number] = _Asked(question, topic, self.place)
+        topic.askers.add(number)
+        asked = asked_by[about] = _Asked(question, topic, self.place)
         if question[0] not in ONLY_COUNTED:
             for flights in topic.answers.values():
                 self._arrive_first(flights, number, asked)
@@ -252,8 +258,8 @@ class VirtualAir:
         else:
             flights.append(flight)
         if question[0] not in ONLY_COUNTED:
-            for receiver, asked in topic.askers.items():
-                self._arrive_first((flight,), receiver, asked)
+            for receiver in topic.askers:
+                self._arrive_first((flight,), receiver, self.asked_by[receiver]["reconcile"])
         if flight.rank - self._swept_at > SWEEP_EVERY:
             self._sweep(flight)
 
@@ -265,9 +271,11 @@ class VirtualAir:
             asked.first = at, rank
             heappush(self._coming, (at, rank, receiver, flight))
 
-    def _first(self, flights: Iterable[InFlight], receiver: int, since: Place) -> tuple[float, int, InFlight] | None:
+    def _first(
+        self, flights: Iterable[InFlight], receiver: int, since: Happening
+    ) -> tuple[float, int, InFlight] | None:
         """(mission seconds, rank, flight) of the flight that arrives first after `since`."""
-        since_s, since_rank, _ = since
+        since_s, since_rank, _, _ = since
         born_at = self.born_at[receiver]
         soonest, latest = self._medium.soonest, self._medium.latest
         first_at, first = NEVER, None

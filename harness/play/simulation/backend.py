@@ -97,6 +97,23 @@ class Incarnation:
     ended_at: float | None = None
 
 
+class BlockNames:
+    """What people call the blocks of `roster`, whose agents have had these `lives` up to now."""
+
+    def __init__(self, roster: Sequence[int], lives: Sequence[Sequence[Incarnation]]) -> None:
+        self._roster = roster
+        self._lives = lives
+        self._names: dict[bytes, str] = {}
+
+    def of(self, block_hash: bytes) -> str | None:
+        """`<agent>.<ordinal>` of a block that an agent has completed."""
+        if block_hash not in self._names:
+            for agent_id, lives in zip(self._roster, self._lives, strict=True):
+                completed = dict.fromkeys(block for life in lives for block in life.agent.state.completed)
+                self._names.update((block, f"{agent_id}.{count}") for count, block in enumerate(completed, 1))
+        return self._names.get(block_hash)
+
+
 class Simulation:
     """A swarm in virtual time; see `harness.play.mission.Swarm`. Agents are numbered in the roster's order.
 
@@ -141,8 +158,7 @@ class Simulation:
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
         self._moves_at = NEVER
         self._medium = Medium(self.roster, seed)
-        self._block_names: dict[bytes, str] = {}
-        self._script = fate_script(scenario.fates, self.roster, self._block_name)
+        self._script = fate_script(scenario.fates, self.roster, BlockNames(self.roster, self._lives).of)
         self._air = air(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
         self._rogue = self._rogue_node() if scenario.rogue else None
         self._recurrence: Recurrence | None = None
@@ -346,14 +362,6 @@ class Simulation:
         at_s = self._now if life.ended_at is None else life.ended_at
         return {"counted": life.handler_runs, "from_s": round(at_s, 3), "until_s": round(at_s, 3)}
 
-    def _block_name(self, block_hash: bytes) -> str | None:
-        """`<agent>.<ordinal>` of a block that an agent has completed."""
-        if block_hash not in self._block_names:
-            for agent_id, lives in zip(self.roster, self._lives, strict=True):
-                completed = dict.fromkeys(block for life in lives for block in life.agent.state.completed)
-                self._block_names.update((block, f"{agent_id}.{count}") for count, block in enumerate(completed, 1))
-        return self._block_names.get(block_hash)
-
     # What happens
 
     def _run(self, until: float) -> None:
@@ -377,26 +385,30 @@ class Simulation:
                 life.waiting.append(happening)
 
     def _happen(self, number: int, life: Incarnation, what: InFlight | Logged | RogueDatagram | None) -> None:
-        if self._tracing or (isinstance(what, InFlight) and type(what.message) in ONLY_COUNTED):
-            self._hear(number, life)
+        agent = life.agent
         if isinstance(what, InFlight):
-            agent, sender, message = life.agent, what.sender, what.message
+            sender, message = what.sender, what.message
+            if type(message) in ONLY_COUNTED:
+                self._hear(number, life)
             if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent.state, sender, message)):
+                if self._tracing:
+                    self._hear(number, life)
                 agent.receive_message(sender, what.sequence, message, self._local(life), self._text(what))
-                if self._tracing or self._deliver_all or agent.state.reconcile_in_progress:
-                    self._after(number, life)
-                else:
-                    self._say(number, life)  # of the right handlers of messages only a reconcile's touch timers
+                self._say(number, life)
+                if self._deliver_all or agent.state.reconcile_in_progress:
+                    self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
         elif what is None:
             self._timer_ends(number, life)
         elif isinstance(what, RogueDatagram):
             self._hear(number, life)
-            life.agent.receive_datagram(what.datagram, self._local(life))
+            agent.receive_datagram(what.datagram, self._local(life))
             self._after(number, life)
         elif self._generating and what[0] in (ANY_LIFE, len(self._lives[number])):
+            if self._tracing:
+                self._hear(number, life)
             _, event_id, data = what
-            self._recorder.logged(self._now, life.agent.agent_id, len(data))
-            life.agent.add_event(LoggableEvent(self.timestamp_us(life), event_id, data), self._local(life))
+            self._recorder.logged(self._now, agent.agent_id, len(data))
+            agent.add_event(LoggableEvent(self.timestamp_us(life), event_id, data), self._local(life))
             self._expect_event(number, life)
             self._after(number, life)
 
@@ -412,8 +424,11 @@ class Simulation:
         self._after(number, life)
 
     def _hear(self, number: int, life: Incarnation) -> None:
-        """Tell the agent of the answers that have come and that it only tallies: before anybody looks at the tally."""
-        if life.waiting is not None:
+        """Tell the agent of the answers that have come and that it only tallies.
+
+        Before anybody looks at the tally; and in a trace everything stands in its order.
+        """
+        if life.waiting is not None or not self._air.asked_by[number]:
             return
         agent = life.agent
         for at, _, answer in self._air.hear(number):
@@ -426,10 +441,24 @@ class Simulation:
 
     def _after(self, number: int, life: Incarnation) -> None:
         """Do what the agent says after an input: send, trace, and wait for its next timer."""
-        agent = life.agent
         self._say(number, life)
+        self._wait(number, life)
+
+    def _say(self, number: int, life: Incarnation) -> None:
+        """Send what the agent has to say, and take down what it has done."""
+        agent = life.agent
+        for sequence, message in agent.messages_to_send():
+            data_bytes = datagram_bytes(message)
+            life.bytes_sent += data_bytes
+            self._air.broadcast(self._now, number, sequence, message, data_bytes)
+            if self._rogue is not None:
+                self._rogue.hears(agent.agent_id, sequence, message, self._now)
         if self._tracing:
             self._take_down(life, self._now)
+
+    def _wait(self, number: int, life: Incarnation) -> None:
+        """Wait for the agent's next timer."""
+        agent = life.agent
         soonest = agent.next_timer()
         deadline = None if soonest is None else max(self._now, _mission_time(life, soonest))
         if deadline != life.deadline:
@@ -438,15 +467,6 @@ class Simulation:
                 self._air.expect(deadline, number, None)
         busy_until = agent.answers_nobody_until()
         self._air.busy_until[number] = 0.0 if busy_until is None else _mission_time(life, busy_until)
-
-    def _say(self, number: int, life: Incarnation) -> None:
-        """Send what the agent has to say."""
-        for sequence, message in life.agent.messages_to_send():
-            data_bytes = datagram_bytes(message)
-            life.bytes_sent += data_bytes
-            self._air.broadcast(self._now, number, sequence, message, data_bytes)
-            if self._rogue is not None:
-                self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
 
     def _text(self, flight: InFlight) -> str | None:
         """Its datagram, as traces have it, if there are any."""
@@ -531,7 +551,7 @@ class Simulation:
         place = self._air.place
         for happening in waiting:
             if isinstance(happening[3], InFlight | RogueDatagram):
-                self._air.place = happening[:3]
+                self._air.place = happening
                 self._happen(number, life, happening[3])
         self._air.place = place
         del self._air.paused_at[number]
