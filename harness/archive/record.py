@@ -90,10 +90,12 @@ class CycleStep(_Model):
 
 
 class CycleWait(_Model):
-    """An agent asks in each reconcile of the cycle, and these never answer."""
+    """An agent asks in each reconcile of the cycle, and these never answer; those refuse its blocks."""
 
     agent_id: int
-    for_agents: Annotated[list[int], Field(min_length=1)]
+    for_agents: list[int] = []
+    refused_by: list[int] = []
+    """Empty, too, where that was not traced."""
 
 
 class Cycle(_Model):

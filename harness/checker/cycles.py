@@ -6,7 +6,7 @@ Agents that only have a lot left to do are in neither: their chains change.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,9 +28,12 @@ COUNTED = {
     "receive_response_next_in_sequence": ("new candidate", "counted"),
 }
 """Handler of an answer in a reconcile -> the branches in which the answer counts."""
+REFUSED = ("receive_vote_add_block", "no")
 ASKS = ("reconcile_phase_1", "reconcile_phase_2")
 MAX_NAMED = 10
 PERIOD_TOLERANCE_S = 0.01
+SHORTEST_PAUSE_S = 0.05
+"""What follows sooner follows at once, for people."""
 
 
 def cycle_of(evidence: "Evidence") -> Cycle | None:
@@ -41,16 +44,23 @@ def cycle_of(evidence: "Evidence") -> Cycle | None:
     recorded = evidence.record.cycle if evidence.record else None
     if recorded is not None and not recorded.proven:
         recorded = None  # that was found in the traces, where it must be found again
+    if recorded is not None and recorded.period_s is None:
+        return recorded.model_copy(update={"since_s": _last_ran_s(evidence, recorded)})
     traced = _in_traces(evidence, busy, times=2 if recorded else SEVERAL)
-    if recorded is None or traced is None:
+    if recorded is None or traced is None or recorded.period_s is None or traced.period_s is None:
         return recorded or traced
-    if recorded.period_s is None or traced.period_s is None:
-        return recorded
     if abs(traced.period_s - recorded.period_s) > PERIOD_TOLERANCE_S:
         return recorded
     return recorded.model_copy(
         update={"since_s": traced.since_s, "periods": traced.periods, "steps": traced.steps, "waits": traced.waits}
     )
+
+
+def _last_ran_s(evidence: "Evidence", standstill: Cycle) -> float:
+    """When the last of the agents that hang ran anything of its own."""
+    traces = [evidence.traces.get(agent_id) for agent_id in standstill.agents]
+    ran_at = [runs[-1].t for trace in traces if trace is not None and (runs := _own_runs(trace))]
+    return max(ran_at) if len(ran_at) == len(traces) else standstill.since_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,18 +153,20 @@ def _matches(keys: Sequence[object]) -> list[int]:
 
 
 def _waits(evidence: "Evidence", rounds: dict[int, _Round], period_s: float) -> Iterator[CycleWait]:
-    """Whom each agent asks in its reconciles without ever counting an answer, in the last round."""
+    """Whom each agent asks in its reconciles without ever counting an answer, and who refuses it, in the last round."""
     for agent_id, each in rounds.items():
-        if not any(run.handler in ASKS for run in each.runs):
-            continue
-        heard = set()
+        heard, refused_by = set[int](), set[int]()
         for run in reversed(evidence.traces[agent_id].runs):
             if run.t < each.runs[-1].t - period_s:
                 break
             if run.branch in COUNTED.get(run.handler, ()):
-                heard.add(run.trigger["from"])
-        if silent := set(evidence.exports) - heard - {agent_id}:
-            yield CycleWait(agent_id=agent_id, for_agents=sorted(silent))
+                heard.add(int(run.trigger["from"]))
+            elif (run.handler, run.branch) == REFUSED:
+                refused_by.add(int(run.trigger["from"]))
+        asks = any(run.handler in ASKS for run in each.runs)
+        silent = set(evidence.exports) - heard - {agent_id} if asks else set()
+        if silent or refused_by:
+            yield CycleWait(agent_id=agent_id, for_agents=sorted(silent), refused_by=sorted(refused_by))
 
 
 # In words
@@ -181,15 +193,30 @@ def in_words(cycle: Cycle) -> str:
 
 
 def _waits_in_words(waits: Sequence[CycleWait]) -> Iterator[str]:
-    askers = {wait.agent_id for wait in waits}
-    if len(askers) > 1 and all(set(wait.for_agents) == askers - {wait.agent_id} for wait in waits):
-        yield f"{named(askers)} ask each other in vain, for whoever reconciles answers nobody"
-        return
-    by_whom: dict[tuple[int, ...], list[int]] = defaultdict(list)
-    for wait in waits:
-        by_whom[tuple(wait.for_agents)].append(wait.agent_id)
-    for silent, waiting in by_whom.items():
-        yield f"{named(waiting)} ask{'s' if len(waiting) == 1 else ''} {named(silent)} in vain"
+    silent = {wait.agent_id: tuple(wait.for_agents) for wait in waits if wait.for_agents}
+    refused_by = {wait.agent_id: tuple(wait.refused_by) for wait in waits if wait.refused_by}
+    if _each_other(silent):
+        yield f"{named(silent)} ask each other in vain, for whoever reconciles answers nobody"
+    else:
+        for peers, alike in _alike(silent):
+            yield f"{named(alike)} ask{'s' if len(alike) == 1 else ''} {named(peers)} in vain"
+    if _each_other(refused_by):
+        yield f"{named(refused_by)} refuse each other's blocks"
+    else:
+        for peers, alike in _alike(refused_by):
+            yield f"{named(peers)} refuse{'s' if len(peers) == 1 else ''} the blocks of {named(alike)}"
+
+
+def _each_other(peers: Mapping[int, tuple[int, ...]]) -> bool:
+    return len(peers) > 1 and all(set(whom) == set(peers) - {agent_id} for agent_id, whom in peers.items())
+
+
+def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ...], list[int]]]:
+    """Peers, and the agents that all have these."""
+    alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
+    for agent_id, whom in peers.items():
+        alike[whom].append(agent_id)
+    yield from alike.items()
 
 
 def named(ids: Collection[int]) -> str:
@@ -209,12 +236,21 @@ def findings(cycle: Cycle) -> list[Finding]:
 
 
 def _round_in_words(cycle: Cycle, agent_id: int) -> str:
+    """From what follows the longest pause on, so that those that do the same one after another are told alike."""
     steps = [step for step in cycle.steps if step.agent_id == agent_id]
     if not steps or cycle.period_s is None:
         return f"not idle, and has run nothing since {cycle.since_s:.0f} s"
-    words, at_s = "runs ", steps[0].after_s
-    for count, step in enumerate(steps):
-        later = f", {step.after_s - at_s:.3g} s later " if step.after_s - at_s >= PERIOD_TOLERANCE_S else ", "
-        words += (later if count else "") + step.handler + (f" ({step.branch})" if step.branch else "")
-        at_s = step.after_s
-    return f"{words}; {cycle.period_s - at_s + steps[0].after_s:.3g} s later it begins anew"
+    before = [steps[-1].after_s - cycle.period_s, *(step.after_s for step in steps[:-1])]
+    pauses = [step.after_s - at_s for step, at_s in zip(steps, before, strict=True)]
+    first = pauses.index(max(pauses))
+    words = "runs "
+    for number in range(first, first + len(steps)):
+        step, pause_s = steps[number % len(steps)], pauses[number % len(steps)]
+        if number > first:
+            words += f", {_pause(pause_s)} later " if pause_s >= SHORTEST_PAUSE_S else ", "
+        words += step.handler + (f" ({step.branch})" if step.branch else "")
+    return f"{words}; {_pause(pauses[first])} later it begins anew"
+
+
+def _pause(pause_s: float) -> str:
+    return f"{pause_s:.0f} s" if pause_s >= 2 else f"{pause_s:.1f} s"

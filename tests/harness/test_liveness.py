@@ -1,7 +1,9 @@
 """Liveness: a swarm becomes idle, or it is shown never to, or it is said how long it would still have needed."""
 
+import json
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,8 +13,10 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import Judgement
 from harness.play.simulation.backend import Simulation
 from harness.run.simulate import Simulated, simulate
+from tests.harness.command import harness, write_scenario
 from tests.harness.test_recurrence import in_step
 from tests.harness.virtual import scenario
+from ucp.quirks import CRASHED
 
 
 def liveness(simulated: Simulated) -> Judgement:
@@ -59,10 +63,11 @@ def test_a_swarm_in_step_never_finishes_and_violates_5_and_6(tracing: bool) -> N
 def test_traces_tell_which_handlers_follow_each_other_and_since_when() -> None:
     run = simulate(in_step(), seed=1, tracing=True)
     assert "since 11 s" in liveness(run).reason, "the first reconcile in step, long before anybody looked"
+    assert liveness(run).reason.endswith("; agents 1, 2, 3, 4 and 5 refuse each other's blocks")
     assert liveness(run).evidence[0].detail == (
-        "as agents 2, 3, 4 and 5, runs reconcile_phase_1_timer_expiration (no response), reconcile_finalize (done),"
-        " process_next_deque_block (proposed), 10 s later vote_timer_expiration (not approved), reconcile_begin (begun)"
-        ", reconcile_phase_1 (asked); 5 s later it begins anew"
+        "as agents 2, 3, 4 and 5, runs vote_timer_expiration (not approved), reconcile_begin (begun), reconcile_phase_1"
+        " (asked), 5 s later reconcile_phase_1_timer_expiration (no response), reconcile_finalize (done),"
+        " process_next_deque_block (proposed); 10 s later it begins anew"
     )
 
 
@@ -125,6 +130,20 @@ def test_an_agent_that_hangs_never_finishes() -> None:
     assert all("no timer runs that would end that" in verdict.reason for verdict in hang)
 
 
+def test_traces_tell_since_when_an_agent_hangs() -> None:
+    hanging = scenario(agents=4, duration_s=900, network={"loss": 0.3}, quirks={"crash_on_tie": True})
+    for seed in range(10):
+        run = simulate(hanging, seed, tracing=True)
+        cycle = run.evidence.cycle
+        if cycle is not None:
+            tied_at = {
+                agent_id: next(line.t for line in trace.runs if line.branch.endswith(CRASHED))
+                for agent_id, trace in run.evidence.traces.items()
+                if agent_id in cycle.agents
+            }
+            assert max(tied_at.values()) <= cycle.since_s <= run.played.mission_s
+
+
 def test_where_there_was_no_looking_nothing_is_said() -> None:
     evidence = simulate(scenario(agents=3, duration_s=600), seed=1).evidence
     for outcome in ("running", "interrupted", "failed"):
@@ -153,3 +172,29 @@ def test_time_until_uniform_is_known_of_every_run_that_ends_with_one_chain() -> 
         assert uniform_at_s == traced.result.figures["uniform_at_s"]
         assert uniform_at_s == max(round(trace.chain_changed_at(), 3) for trace in traced.evidence.traces.values())
     assert simulate(in_step(blocks=1), seed=1).result.figures["uniform_at_s"] is None
+
+
+@pytest.mark.lab
+def test_processes_that_go_round_are_found_by_their_traces(tmp_path: Path) -> None:
+    """None approves of anything, so that every vote ends in a reconcile, and every reconcile in the same vote."""
+    refusing = write_scenario(
+        tmp_path,
+        agents=2,
+        duration_s=60,
+        speedup=40,
+        vehicles={"kind": "none"},
+        events={"source": "random", "mean_s": 4},
+        quirks={"disapprove_everything": True},
+        settle={"limit_s": 200},
+    )
+    done = harness("run", refusing, "--seed", 3, "--out", tmp_path / "run")
+    assert done.returncode == 1, done.stdout + done.stderr
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["liveness"]["verdict"] == "never finishes"
+    assert re.search(
+        r"the same handler runs follow each other every 20[.\d]* s, \d+ times in a row", record["liveness"]["reason"]
+    )
+    assert re.search("refuses? (each other's blocks|the blocks of)", record["liveness"]["reason"])
+    assert not record["cycle"]["proven"]
+    assert record["cycle"]["periods"] >= 5
+    assert (tmp_path / "run" / "report.html").read_text().count('class="round"') >= 5

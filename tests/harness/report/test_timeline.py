@@ -227,7 +227,7 @@ def test_a_swarm_that_goes_round_in_circles_has_a_bracket_for_each_round(tmp_pat
         "twelve whole rounds from 11 s to 191 s, and one that the run's end cuts off"
     )
     assert "every 15 s since 11 s" in page
-    assert "agent 1, as agents 2, 3, 4 and 5, runs reconcile_phase_1_timer_expiration (no response)" in page
+    assert "agent 1, as agents 2, 3, 4 and 5, runs vote_timer_expiration (not approved)" in page
     assert "goes round" in page
 
 
