@@ -61,8 +61,7 @@ class Medium:
         self._vehicles = tuple(vehicles)
         self._seed = seed
         self._words = [_Words(self._stream("loss", sender), self._stream("latency", sender)) for sender in vehicles]
-        concerns = ("duplication", "reordering", "corruption")
-        self._rare = [tuple(self._stream(concern, sender) for concern in concerns) for sender in vehicles]
+        self._rare: dict[int, tuple[Random, ...]] = {}  # by sender, where the air was ever not plain
         self._links: list[list[_Link]] = [[] for _ in vehicles]  # of each sender, to all; none where the air is plain
         self.soonest = LATENCY.mean_s
         self.latest = LATENCY.mean_s
@@ -109,6 +108,9 @@ class Medium:
             return _PlainAir(links, hears, self._words[number])
         before: Sequence[_Link | None] = self._links[number] or [None] * len(links)
         self._links[number] = [_Link(link, earlier) for link, earlier in zip(links, before, strict=True)]
+        if number not in self._rare:
+            concerns = ("duplication", "reordering", "corruption")
+            self._rare[number] = tuple(self._stream(concern, sender) for concern in concerns)
         return _AnyAir(self._links[number], hears, self._words[number], self._rare[number])
 
     def _stream(self, concern: str, sender: int) -> Random:

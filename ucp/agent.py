@@ -38,6 +38,7 @@ Whatever the radio delivers, the agent counts what is not a well-formed message 
 `dropped`, and nothing else happens.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any
@@ -66,6 +67,7 @@ from ucp.messages import (
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import StoredState
+from ucp.timers import Timer
 from ucp.trace import Dropped, Entry, HandlerRun, State, Tally, Trigger, in_base64
 
 ON_MESSAGE: dict[type[Message], EventHandler[Any]] = {
@@ -178,18 +180,24 @@ class Agent:
     def add_event(self, event: LoggableEvent, now: float) -> None:
         """Log an event. Raises ValueError if it is larger than the mission's largest event."""
         largest = self.state.settings.max_event_bytes
-        if len(event.encode()) > largest:
-            raise ValueError(f"an event of {len(event.encode())} bytes is more than max_event_bytes {largest}")
-        came = in_base64(event.encode()) if self._tracing else None
+        encoded = event.encode()
+        if len(encoded) > largest:
+            raise ValueError(f"an event of {len(encoded)} bytes is more than max_event_bytes {largest}")
+        came = in_base64(encoded) if self._tracing else None
         self._handle(now, {"event": event.event_id}, self._on_local_event["Build Data Block"], event, came=came)
 
     def next_timer(self) -> float | None:
         """When `handle_timer` has something to do next, in mission seconds; None if no timer runs."""
-        soonest = None
+        timer = self._soonest()
+        return None if timer is None else timer.deadline
+
+    def _soonest(self) -> Timer | None:
+        """The timer that ends next."""
+        soonest, ends = None, math.inf
         for timer in self.state.timers:
             deadline = timer.deadline
-            if deadline is not None and (soonest is None or deadline < soonest):
-                soonest = deadline
+            if deadline is not None and deadline < ends:
+                soonest, ends = timer, deadline
         return soonest
 
     def answers_nobody_until(self) -> float | None:
@@ -205,11 +213,7 @@ class Agent:
 
     def handle_timer(self, now: float) -> None:
         """Run the handlers of all timers that have expired at `now`, the earliest first."""
-        while True:
-            expired = [timer for timer in self.state.timers if timer.deadline is not None and timer.deadline <= now]
-            if not expired:
-                return
-            timer = min(expired, key=lambda timer: timer.deadline or 0.0)
+        while (timer := self._soonest()) is not None and timer.deadline is not None and timer.deadline <= now:
             timer.stop()
             self._handle(now, {"timer": timer.name}, self._on_timer[timer.name])
 

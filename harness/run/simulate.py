@@ -42,15 +42,15 @@ def simulate(scenario: Scenario, seed: int, *, tracing: bool = False, deliver_al
     return simulate_in_memory(InMemory(tracing), scenario, seed, deliver_all=deliver_all)
 
 
+@gc_paused()
 def simulate_in_memory(memory: "InMemory", scenario: Scenario, seed: int, **options: Any) -> Simulated:
     """As `simulate`; `memory` keeps the run, and `options` are the simulation's."""
     VirtualTime().refuse(scenario)
-    with gc_paused():
-        simulation = Simulation(scenario, seed, memory, **options)
-        _without_waiting(mission.play(simulation, scenario))
-        simulation.end()
-        evidence = memory.evidence(simulation)
-        return Simulated(simulation.played, evidence, checker.check(evidence))
+    simulation = Simulation(scenario, seed, memory, **options)
+    _without_waiting(mission.play(simulation, scenario))
+    simulation.end()
+    evidence = memory.evidence(simulation)
+    return Simulated(simulation.played, evidence, checker.check(evidence))
 
 
 def _without_waiting(story: Coroutine[Any, Any, None]) -> None:

@@ -19,10 +19,9 @@ from typing import Literal
 from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
 from netem.medium import Medium, RandomDraws
 from ucp.interest import ANSWERED, ASKED, MATTERS, ONLY_COUNTED, STILL_ASKED, Question
-from ucp.messages import BlockAddResponse, Message, encode
+from ucp.messages import BlockAddResponse, Message
 from ucp.settings import Settings
 from ucp.state import AgentState
-from ucp.trace import in_base64
 
 NEVER = float("inf")
 SWEEP_EVERY = 1000
@@ -40,14 +39,8 @@ class InFlight:
     sent_at: float
     rank: int
     lots: RandomDraws
-    _datagram: str | None = None
-
-    @property
-    def datagram(self) -> str:
-        """In base64."""
-        if self._datagram is None:
-            self._datagram = in_base64(encode(self.sender, self.sequence, self.message))
-        return self._datagram
+    datagram: str | None
+    """In base64, if there are traces to have it."""
 
     def __lt__(self, other: object) -> bool:
         return False  # of two copies that arrive at one agent in one instant either is the first
@@ -162,12 +155,14 @@ class VirtualAir:
         for number in numbers:
             heappush(self._coming, (at, self._rank, number, stray))
 
-    def broadcast(self, now: float, number: int, sequence: int, message: Message, data_bytes: int) -> None:
+    def broadcast(
+        self, now: float, number: int, sequence: int, message: Message, data_bytes: int, datagram: str | None = None
+    ) -> None:
         """The agent with this number sends `message`, in a datagram with so many bytes of data."""
         self._rank += 1
         lots = self._medium.draw(number, now, data_bytes)
         kind = type(message)
-        flight = InFlight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots)
+        flight = InFlight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots, datagram)
         if now + lots.latest > self.quiet_at:
             self.quiet_at = now + lots.latest
         answered = None if self._deliver_all else ANSWERED.get(kind)

@@ -9,6 +9,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from random import Random
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -393,7 +394,7 @@ class Simulation:
             if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent.state, sender, message)):
                 if self._tracing:
                     self._hear(number, life)
-                agent.receive_message(sender, what.sequence, message, self._local(life), self._text(what))
+                agent.receive_message(sender, what.sequence, message, self._local(life), what.datagram)
                 self._say(number, life)
                 if self._deliver_all or agent.state.reconcile_in_progress:
                     self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
@@ -435,7 +436,7 @@ class Simulation:
             if answer.matters(agent.state, answer.sender, answer.message):
                 at = max(at, life.resumed_at)
                 local = max(agent.state.now, self._local(life, at))
-                agent.receive_message(answer.sender, answer.sequence, answer.message, local, self._text(answer))
+                agent.receive_message(answer.sender, answer.sequence, answer.message, local, answer.datagram)
                 if self._tracing:
                     self._take_down(life, at)
 
@@ -447,14 +448,14 @@ class Simulation:
     def _say(self, number: int, life: Incarnation) -> None:
         """Send what the agent has to say, and take down what it has done."""
         agent = life.agent
-        for sequence, message in agent.messages_to_send():
+        messages = agent.messages_to_send()
+        in_trace = self._take_down(life, self._now) if self._tracing else repeat(None, len(messages))
+        for (sequence, message), datagram in zip(messages, in_trace, strict=True):
             data_bytes = datagram_bytes(message)
             life.bytes_sent += data_bytes
-            self._air.broadcast(self._now, number, sequence, message, data_bytes)
+            self._air.broadcast(self._now, number, sequence, message, data_bytes, datagram)
             if self._rogue is not None:
                 self._rogue.hears(agent.agent_id, sequence, message, self._now)
-        if self._tracing:
-            self._take_down(life, self._now)
 
     def _wait(self, number: int, life: Incarnation) -> None:
         """Wait for the agent's next timer."""
@@ -468,16 +469,17 @@ class Simulation:
         busy_until = agent.answers_nobody_until()
         self._air.busy_until[number] = 0.0 if busy_until is None else _mission_time(life, busy_until)
 
-    def _text(self, flight: InFlight) -> str | None:
-        """Its datagram, as traces have it, if there are any."""
-        return flight.datagram if self._tracing else None
-
-    def _take_down(self, life: Incarnation, mission_s: float) -> None:
+    def _take_down(self, life: Incarnation, mission_s: float) -> list[str | None]:
+        """Write what the agent has done into its trace; the datagrams that it sent, as the trace has them."""
         entries = life.agent.trace()
+        datagrams = []
         for entry in entries:
             entry.t = mission_s
-            life.handler_runs += isinstance(entry, HandlerRun)
+            if isinstance(entry, HandlerRun):
+                life.handler_runs += 1
+                datagrams += [sent.datagram for sent in entry.sent]
         self._recorder.write(life.agent.agent_id, entries)
+        return datagrams
 
     # An agent's life
 

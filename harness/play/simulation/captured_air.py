@@ -65,9 +65,11 @@ class CapturedAir(VirtualAir):
                 self._capture.take_down(at, number, frame, outbound=False)
             yield happening
 
-    def broadcast(self, now: float, number: int, sequence: int, message: Message, data_bytes: int) -> None:
+    def broadcast(
+        self, now: float, number: int, sequence: int, message: Message, data_bytes: int, datagram: str | None = None
+    ) -> None:
         self._capture.take_down(now, number, _frame(self._roster[number], sequence, message), outbound=True)
-        super().broadcast(now, number, sequence, message, data_bytes)
+        super().broadcast(now, number, sequence, message, data_bytes, datagram)
 
 
 @lru_cache(FRAMES_KEPT)
