@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pydantic import BaseModel, ConfigDict
 
 from harness.backend_names import BackendName
-from harness.matrix.estimate import Estimate
+from harness.matrix.estimate import Estimate, estimate_share
 from harness.matrix.metrics import BEFORE_FINAL_RECONCILE, METRICS
 from harness.matrix.model import Point, Task
 from harness.scenario.verdicts import JUDGED, Verdict, kind_of
@@ -50,6 +50,13 @@ class Cell(Placed):
     estimates: dict[str, Estimate]
     verdicts: dict[str, dict[Verdict, int]]
     violated: dict[str, list[int]]
+
+    @property
+    def finished(self) -> Estimate:
+        """The share of the runs whose swarm finished, of those that tell."""
+        told = self.verdicts.get("liveness", {})
+        finished = told.get("finished", 0)
+        return estimate_share(finished, finished + told.get("not finished", 0) + told.get("never finishes", 0))
 
 
 def sum_up(point: Point, runs: Sequence[Run]) -> Cell:

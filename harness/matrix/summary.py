@@ -9,6 +9,7 @@ from harness.matrix.table import (
     axes,
     explanation,
     improvements,
+    say_finished,
     say_interval,
     say_mean,
     troubles_of_all,
@@ -48,7 +49,7 @@ def verdict(record: MatrixRecord) -> str:
 
 def _table(record: MatrixRecord) -> Iterator[str]:
     named = axes(record.matrix)
-    headers = [*named, "runs", *(metric.label for metric in METRICS), "violated", "failed"]
+    headers = [*named, "runs", *(metric.label for metric in METRICS), "finished", "violated", "failed"]
     yield row(headers)
     yield row(["--:"] * len(headers))
     for cell in record.cells:
@@ -63,5 +64,6 @@ def _figures(cell: Cell) -> Iterator[str]:
 
 
 def _bad(cell: Cell) -> Iterator[str]:
+    yield say_finished(cell)
     for number in (violated(cell), cell.failed):
         yield f"**{number}**" if number else "0"

@@ -32,12 +32,14 @@ def render(record: MatrixRecord) -> RenderableType:
 
 def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
     table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim")
-    for header in ("loss", "runs", *(metric.label for metric in METRICS), "vio-\nlated"):
+    liveness = ["fin-\nished"] if any(cell.finished.n for cell in cells) else []
+    for header in ("loss", "runs", *(metric.label for metric in METRICS), *liveness, "vio-\nlated"):
         table.add_column(header.replace(" ", "\n", 1), justify="right", vertical="bottom", no_wrap=True)
     for cell in cells:
         estimates = [(metric, cell.estimates[metric.name]) for metric in METRICS]
         means = (Text(say_mean(metric, estimate)) for metric, estimate in estimates)
-        table.add_row(words.percent(cell.loss), str(cell.runs), *means, _violated(cell))
+        finished = [_finished(cell)] if liveness else []
+        table.add_row(words.percent(cell.loss), str(cell.runs), *means, *finished, _violated(cell))
         if len(record.matrix.seed_list) > 1:
             table.add_row("", "", *(Text(say_interval(*pair), style="dim") for pair in estimates))
     return table
@@ -153,6 +155,16 @@ def _say_change(change: Change) -> str:
     metric = BY_NAME[change.metric]
     became = "worse" if change.worse else "better"
     return f"{metric.label} {became}: {say(metric, change.now)}, was {say(metric, change.before)}"
+
+
+def say_finished(cell: Cell) -> str:
+    """The share of runs whose swarm finished."""
+    share = cell.finished.mean
+    return "\u2013" if share is None else f"{round(100 * share)}\u00a0%"
+
+
+def _finished(cell: Cell) -> Text:
+    return Text(say_finished(cell), style="green" if cell.finished.mean in (None, 1.0) else "bold red")
 
 
 def _violated(cell: Cell) -> Text:

@@ -18,8 +18,10 @@ MEANINGS = {
     "messages_per_block": "Messages that all agents sent for each block.",
     "uniform_before_final_reconcile": "Share of the runs that the mission left with one uniform chain.",
     "mutual_share_before_final_reconcile": "Share of a run\u2019s blocks that the mission left in all chains.",
+    "finished": "Share of the runs whose agents became idle once no more events came.",
     "violated": "Share of the runs that violated a characteristic.",
 }
+_FINISHED = Metric("finished", "finished", figure("finished"), "share of runs")
 _VIOLATED = Metric("violated", "violated", figure("violated"), "share of runs")
 
 
@@ -34,11 +36,15 @@ class Figure:
     def of(self, cell: Cell) -> Estimate:
         if self.metric is _VIOLATED:
             return estimate_share(violated(cell), cell.runs - cell.failed)
+        if self.metric is _FINISHED:
+            return cell.finished
         return cell.estimates.get(self.metric.name, Estimate(n=0))
 
 
 def known(cells: Iterable[Cell]) -> list[Figure]:
     """Those that a run told, first what the mission left; the violated at least."""
+    cells = list(cells)
     names = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
     metrics = [metric for metric in BEFORE_FINAL_RECONCILE + METRICS if metric.name in names]
-    return [Figure(metric) for metric in (*metrics, _VIOLATED)]
+    judged = [_FINISHED] if any(cell.finished.n for cell in cells) else []
+    return [Figure(metric) for metric in (*metrics, *judged, _VIOLATED)]

@@ -1,17 +1,22 @@
 """summary.md, junit.xml, table and picture, also with several numbers of agents and backends."""
 
 import csv
+import io
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 from rich.console import Console
 
 from harness.checker import Result
+from harness.checker.judgement import Judgement
 from harness.matrix import Finished, outputs, table
 from harness.matrix.junit import to_junit
 from harness.matrix.picture import PANELS, draw
+from harness.matrix.report.figures import known
 from harness.matrix.summary import to_markdown
 from harness.scenario import Scenario
+from harness.scenario.verdicts import Verdict
 from tests.harness.matrix.stub import judge, matrix, played
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -97,3 +102,27 @@ def test_several_agents_are_told_apart_everywhere(tmp_path: Path) -> None:
     texts = [element.text for element in drawing.iter(f"{SVG}text")]
     assert texts.index("3 agents") < texts.index("10 agents")
     assert all(texts.count(panel.title) == 2 for panel in PANELS)
+
+
+def test_how_many_swarms_finished_is_a_column() -> None:
+    def endless(scenario: Scenario, seed: int) -> Result:
+        judged = judge(scenario, seed)
+        verdict: Verdict = "never finishes" if scenario.network.loss and seed > 1 else "finished"
+        return replace(judged, beside={"liveness": Judgement("liveness", verdict, "")})
+
+    finished = played(matrix(), 1, endless)
+    lines = to_markdown(finished.record).splitlines()
+    header, _, well, bad = (line.split("|") for line in lines if line.startswith("|"))
+    column = [cell.strip() for cell in header].index("finished")
+    assert [well[column].strip(), bad[column].strip()] == ["100\u00a0%", "25\u00a0%"]
+    shown = Console(width=100, record=True, file=io.StringIO())
+    shown.print(table.render(finished.record))
+    text = shown.export_text()
+    assert "fin-" in text and "25\u00a0%" in text
+    assert [figure.of(finished.record.cells[1]).mean for figure in known(finished.record.cells)][-2] == 0.25
+
+
+def test_a_column_that_nothing_tells_of_is_left_out() -> None:
+    shown = Console(width=100, record=True, file=io.StringIO())
+    shown.print(table.render(played(matrix(), 1, judge).record))
+    assert "fin-" not in shown.export_text()
