@@ -198,6 +198,14 @@ def lost_last_commit(run: Simulated, seed: int) -> None:
     assert reconciles(run) == 0
 
 
+def in_step(run: Simulated, seed: int) -> None:
+    assert run.result.bad == ("5", "6", "liveness")
+    cycle = run.evidence.cycle
+    assert cycle is not None and cycle.proven
+    assert (cycle.since_s, cycle.period_s) == (11.0, 15.0)
+    assert run.played.mission_s < 300
+
+
 def rogue(run: Simulated, seed: int) -> None:
     violated = {number: one for number, one in run.result.characteristics.items() if one.verdict == "violated"}
     assert set(violated) == {"1", "4"}
@@ -235,10 +243,13 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         large_divergence,
         split_rejoin,
         lost_last_commit,
+        in_step,
         rogue,
     )
 }
 
+
+BAD = ("rogue", "in_step")
 
 RECONCILED = [name for name in CLAIMS if name != "rogue" and load_scenario(SCENARIOS / f"{name}.yaml").final_reconcile]
 
@@ -251,8 +262,8 @@ def test_every_scenario_of_the_library_claims_something() -> None:
 @pytest.mark.parametrize("name", CLAIMS)
 def test_a_scenario_shows_what_it_says(name: str, seed: int) -> None:
     run = played(name, seed)
-    assert run.played.settled
-    assert bool(run.result.bad) == (name == "rogue")
+    assert run.played.settled == (name != "in_step")
+    assert bool(run.result.bad) == (name in BAD)
     assert not run.played.unmatched_fates
     CLAIMS[name](run, seed)
 
@@ -266,6 +277,7 @@ def test_a_scenario_is_what_it_expects_of_itself(name: str, seed: int) -> None:
     assert expect.figures
     for number, found in run.result.characteristics.items():
         assert expect.as_expected(number, found.verdict)
+    assert expect.as_expected("liveness", run.result.beside["liveness"].verdict)
     assert not list(expect.out_of_range(run.result.figures))
 
 
