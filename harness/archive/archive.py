@@ -30,12 +30,14 @@ from harness.archive.jsonlines import JsonLines, Record
 from harness.archive.record import JudgedRecord
 from harness.archive.result import DamagedResultError, agent_ids, listing, mapping, read_result, roster_of
 from harness.archive.trace_lines import Line, read_lines
-from harness.archive.traces import SUFFIX, Trace, read_trace
+from harness.archive.traces import SUFFIX, Trace, read_trace, why_none
 from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
 from harness.errors import RunDirectoryError
 
 LARGE_BYTES = 16 * 1024 * 1024
 """Traces that are larger together are read without what only took a message in, if that is enough."""
+MAX_TRACE_BYTES = 256 * 1024 * 1024
+"""Of 50 agents that hear everything, each fills about a tenth of it in 20 minutes."""
 
 
 class RunArchive:
@@ -117,8 +119,12 @@ class RunArchive:
     @cached_property
     def before_final_reconcile(self) -> dict[int, Export]:
         """The exports that a final reconcile found, by agent; none if there was no such thing."""
+        return self._before_final_reconcile.by_agent
+
+    @cached_property
+    def _before_final_reconcile(self) -> Exports:
         runs = dict.fromkeys(path.parent.parent for path in self._export_files)
-        return read_exports(path for run in runs for path in export_paths(run / BEFORE_FINAL_RECONCILE)).by_agent
+        return read_exports(path for run in runs for path in export_paths(run / BEFORE_FINAL_RECONCILE))
 
     @cached_property
     def traces(self) -> dict[int, Trace]:
@@ -148,9 +154,14 @@ class RunArchive:
         skim = self._skim and self.large
         of_the_run = roster_of(self.result)  # none where nothing says who flew, as of exports from the field
         for path in self._trace_files:
+            if path.is_file() and path.stat().st_size > MAX_TRACE_BYTES:
+                problems.append(
+                    f"{path}: larger than {MAX_TRACE_BYTES} bytes, which no mission's trace is; it is left out"
+                )
+                continue
             trace = read_trace(path, skim=skim)
             if trace is None:
-                problems.append(f"{path}: not a trace; it is left out")
+                problems.append(f"{path}: {why_none(path)}; it is left out")
                 continue
             agent_id = trace.header.agent_id
             if agent_id in traces or (of_the_run and agent_id not in of_the_run):
@@ -182,13 +193,19 @@ class RunArchive:
         """What a rogue node sent, each datagram as `model`."""
         return JsonLines(self._in_directory(ROGUE_FILE), model)
 
+    def conditions(self, model: type[Record]) -> list[Record] | None:
+        """What was taken down of network and faults, each change as `model`; None if there is no such file."""
+        path = self._in_directory(NETWORK_FILE)
+        return [*JsonLines(path, model)] if path is not None and path.is_file() else None
+
     # What is wrong
 
     @property
     def problems(self) -> list[str]:
         """A sentence that names the file for each that cannot be used, or not wholly."""
         record = [str(self.record_error)] if self.record_error else []
-        return [*record, *self._read_traces[1], *self.exports.errors]
+        before = self._before_final_reconcile.errors
+        return [*record, *self._read_traces[1], *self.exports.errors, *before]
 
     @property
     def gaps(self) -> list[str]:

@@ -24,7 +24,8 @@ RUN_FILE = "run.json"
 SUFFIX = ".chain.json"
 BEFORE_FINAL_RECONCILE = "before_final_reconcile"
 """Directory in a run's with the exports as the mission left them."""
-MAX_EXPORT_BYTES = 256 * 1024 * 1024
+MAX_EXPORT_BYTES = 64 * 1024 * 1024
+"""Some 35,000 blocks."""
 
 Hash = Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * HASH_BYTES}}}$")]
 AgentId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]

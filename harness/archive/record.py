@@ -255,6 +255,9 @@ class JudgedRecord(_Model):
     """Where agents were shown never to finish; if `proven`, the run stopped there."""
     mission_s: float | None = None
     agents: dict[str, AgentRecord] = {}
+    engine: str | None = None
+    counters: dict[str, Any] | None = None
+    """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
 
 
 class RunRecord(JudgedRecord):
@@ -263,7 +266,6 @@ class RunRecord(JudgedRecord):
     scenario: Scenario
     seed: int
     backend: BackendName
-    engine: str | None = None
     versions: dict[str, str]
     started_at: str
     wall_s: float | None = None
@@ -272,8 +274,6 @@ class RunRecord(JudgedRecord):
     vehicles: dict[str, dict[str, Any]] = {}
     unmatched_fates: list[str] = []
     """A sentence for each scripted fate that decided nothing, and each injection that sent nothing."""
-    counters: dict[str, Any] | None = None
-    """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
     capture: dict[str, CapturedFrames] | None = None
     """Of each vehicle, if captures were asked for and came to their end."""
     characteristics: dict[str, JudgedCharacteristic] = {}

@@ -12,7 +12,7 @@ from typing import Any
 from harness.errors import RunDirectoryError
 
 SCHEMA = "ucp-run/1"
-MAX_BYTES = 256 * 1024 * 1024
+MAX_BYTES = 64 * 1024 * 1024
 
 
 class DamagedResultError(RunDirectoryError):

@@ -4,6 +4,7 @@ A trace that ends in half a line is that of a killed agent, and is read up to th
 is told in `problem`, and what came before it still counts.
 """
 
+import json
 import re
 from bisect import bisect_right
 from collections import Counter
@@ -11,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, islice, pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
@@ -186,6 +187,21 @@ def only_takes_in(run: HandlerRun) -> bool:
     return not run.changes and run.handler.startswith("receive_")
 
 
+def why_none(path: Path) -> str:
+    """What is wrong with a file that does not even begin as a trace."""
+    try:
+        with path.open("rb") as file:
+            header = json.loads(file.readline(MAX_LINE_BYTES))
+    except OSError as error:
+        return f"cannot be read: {error.strerror}"
+    except (ValueError, RecursionError):
+        return "not a trace"
+    schema = header.get("schema") if isinstance(header, dict) else None
+    if not isinstance(schema, str) or schema in get_args(Version):
+        return "not a trace"
+    return f"its schema is {schema[:40]!r}, and this version reads {' and '.join(map(repr, get_args(Version)))}"
+
+
 def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
     """The trace in `path`; None if there is none, or it does not even begin as one.
 
@@ -213,8 +229,9 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                     elif b'"schema"' not in line:
                         trace.asides.append((len(trace.runs), ASIDE.validate_json(line)))
                     else:
-                        if HEADER.validate_json(line).agent_id != trace.header.agent_id:
-                            raise ValueError("another agent's header")
+                        if HEADER.validate_json(line) != trace.header:
+                            trace.problem = f"line {number} is the header of another agent, or of another run"
+                            break
                         trace.starts.append(len(trace.runs))
                 except ValueError:
                     if trace is not None:

@@ -15,12 +15,15 @@ from harness.archive.record import AgentRecord, Cycle, JudgedRecord
 from harness.archive.traces import Trace
 from harness.checker.cycles import cycle_of
 from harness.checker.replay import Life, replay
+from harness.errors import RunDirectoryError
+from harness.packets.files import DIRECTORY, Captures, capture_files, read_captures
+from ucp.trace import Sent
 
 if TYPE_CHECKING:
     from harness.checker.records import Examination
 
-Sending = tuple[tuple[float, str | None], ...]
-"""When an agent sent messages of one type with the same sequence number, one in each life, and about which block."""
+Sending = tuple[tuple[float, Sent], ...]
+"""What an agent sent when with one type and sequence number: one message in each of its lives, at most."""
 Sendings = dict[Any, dict[Any, Sending]]
 """Of an agent, by type and sequence number."""
 
@@ -34,6 +37,17 @@ class InjectedDatagram(BaseModel):
     sender: int | None = None
     sequence: int | None = None
     count: int | None = None
+
+
+class Condition(BaseModel):
+    """A line of `network.jsonl`: a change of the network, or a fault of agents."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    at_s: float
+    what: str
+    detail: str | None = None
+    fully_connected: bool | None = None
 
 
 @dataclass
@@ -71,6 +85,9 @@ class Evidence:
     errors: list[str] = field(default_factory=list)
     before_final_reconcile: dict[int, Export] = field(default_factory=dict)
     injected: InjectedMessages = field(default_factory=InjectedMessages)
+    conditions: list[Condition] | None = None
+    """What was taken down of network and faults as it was made; None if nothing was."""
+    captures: Captures | None = None
 
     def __post_init__(self) -> None:
         self.names = name_blocks(self.exports)
@@ -96,7 +113,7 @@ class Evidence:
             for run in trace.runs:
                 for message in run.sent:
                     of_type = of_agent[message.message]
-                    of_type[message.seq] = (*of_type.get(message.seq, ()), (run.t, message.block))
+                    of_type[message.seq] = (*of_type.get(message.seq, ()), (run.t, message))
             sendings[agent_id] = dict(of_agent)
         return sendings
 
@@ -204,5 +221,22 @@ def gather(archive: RunArchive) -> Evidence:
         problems[0] += "; the exports are checked without it"
     injected = InjectedMessages().take_down(archive.injected(InjectedDatagram))
     return Evidence(
-        archive.exports.by_agent, archive.traces, archive.record, problems, archive.before_final_reconcile, injected
+        archive.exports.by_agent,
+        archive.traces,
+        archive.record,
+        problems,
+        archive.before_final_reconcile,
+        injected,
+        archive.conditions(Condition),
+        _captures(archive),
     )
+
+
+def _captures(archive: RunArchive) -> Captures | None:
+    """What the vehicles of a run captured; None if they did not."""
+    if archive.directory is None or not (archive.directory / DIRECTORY).is_dir():
+        return None
+    try:
+        return read_captures(capture_files([archive.directory]))
+    except RunDirectoryError:
+        return None

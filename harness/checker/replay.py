@@ -5,6 +5,7 @@ One pass over each trace, for all who judge what an agent held at which step.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice, pairwise
 
 from harness.archive.history import LATEST_S
 from harness.archive.traces import Trace
@@ -35,7 +36,9 @@ class Life:
     `chain` is oldest first, `deque` front first, `stack` top last; all are block hashes.
     """
 
-    header_line: int
+    trace: Trace
+    number: int
+    """From 0."""
     runs: list[HandlerRun]
     chain: list[str] = field(default_factory=list)
     deque: list[str] = field(default_factory=list)
@@ -56,28 +59,25 @@ class Life:
     back_in_time: list[Sight] = field(default_factory=list)
     out_of_sequence: list[Sight] = field(default_factory=list)
 
-    @property
-    def last_line(self) -> int:
-        return self.header_line + len(self.runs)
+    def numbered(self) -> Iterator[tuple[int, HandlerRun]]:
+        """Its runs with their lines."""
+        return next(islice(self.trace.lives(), self.number, None))
 
 
 def replay(trace: Trace, inception: str | None) -> list[Life]:
     """Each life of the agent. `inception` is the mission's chain hash CH_0; None if nobody knows it."""
-    return [_replayed(header_line, runs, inception) for header_line, runs in _lives(trace)]
-
-
-def _lives(trace: Trace) -> Iterator[tuple[int, list[HandlerRun]]]:
     bounds = [0, *trace.starts, len(trace.runs)]
-    for number, start in enumerate(bounds[:-1]):
-        yield start + number + 1, trace.runs[start : bounds[number + 1]]
+    return [
+        _replayed(Life(trace, number, trace.runs[start:end]), inception)
+        for number, (start, end) in enumerate(pairwise(bounds))
+    ]
 
 
-def _replayed(header_line: int, runs: list[HandlerRun], inception: str | None) -> Life:
-    life = Life(header_line, runs)
+def _replayed(life: Life, inception: str | None) -> Life:
     holds = _Holds(life, inception)
     checked: State | None = None
     reconciling, compared, now, sequence = False, True, 0.0, 0
-    for line, run in enumerate(runs, header_line + 1):
+    for line, run in life.numbered():
         state = run.state
         if run.changes:
             holds.change(line, run)

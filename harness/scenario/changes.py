@@ -15,6 +15,8 @@ from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkCondi
 
 RANGE = "range"
 """What a change of the network is called that flight has made, not the scenario."""
+NO_MORE_FATES = "no more fates"
+"""What it is called in a record that the last scripted fate has decided: nobody did anything then."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[
     since = round(at_s + 0.001, 3)  # what is sent in the same instant is meant too
     before = [{**state, "fully_connected": False} for state in network if state["at_s"] < since]
     after = [state for state in network if state["at_s"] >= since]
-    again = {"at_s": since, "what": "no more fates", "fully_connected": network[len(before) - 1]["fully_connected"]}
+    again = {"at_s": since, "what": NO_MORE_FATES, "fully_connected": network[len(before) - 1]["fully_connected"]}
     return [*before, {**before[-1], **again}, *after]
 
 

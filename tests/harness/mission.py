@@ -33,9 +33,9 @@ def write_exports(air: Air, directory: Path, traces: bool = True) -> list[Path]:
         paths.append(directory / f"{agent_id}.chain.json")
         paths[-1].write_text(json.dumps(export_chain(agent.state, round(air.now * 1e6))))
         if traces:
-            header = header_line(
-                agent_id, sorted(agent.roster), {"vote_timeout_s": 10.0}, {"epoch_us": 0, "speedup": 1.0}
-            )
+            initial_data = agent.state.chain.inception.block_data
+            clock = {"epoch_us": 0, "speedup": 1.0}
+            header = header_line(agent_id, sorted(agent.roster), initial_data, {"vote_timeout_s": 10.0}, clock)
             lines = "".join(run.to_line() for run in air.runs[agent_id])
             (directory / f"{agent_id}.trace.jsonl").write_text(header + lines)
     return paths

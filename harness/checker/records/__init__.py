@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
-from harness.checker.records import at_export, completed, counters, headers, messages, within
+from harness.checker.records import air, at_export, completed, conditions, counters, headers, messages, within
 from harness.checker.records.contradiction import Contradiction
 
 NAME = "every record"
@@ -22,6 +22,9 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     at_export.compare,
     completed.compare,
     messages.compare,
+    conditions.compare,
+    air.compare_counters,
+    air.compare_captures,
 )
 
 

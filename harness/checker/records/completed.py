@@ -6,9 +6,6 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import Contradiction
 
-WHOLE = frozenset(("exported", "killed"))
-"""Outcomes of agents of which all that they completed is in their export or in the record."""
-
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     for agent_id, lives in evidence.lives.items():
@@ -23,7 +20,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
             if untraced:
                 detail = f"{source} says that it completed {_named(evidence, untraced)}, and its trace does not"
                 yield _of_block(evidence, agent_id, detail, untraced[0], short=True)
-        if recorded is not None and recorded.outcome in WHOLE:
+        if recorded is not None and (recorded.outcome == "killed" or (recorded.outcome == "exported" and export)):
             told = {*exported, *before}
             if untold := [block for block in traced if block not in told]:
                 detail = f"its trace says that it completed {_named(evidence, untold)}, and its export does not"

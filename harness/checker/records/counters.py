@@ -1,6 +1,7 @@
 """What run.json says of an agent against its trace: its lives, and what it counted itself."""
 
 from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Iterator
 
 from harness.archive.record import AgentRecord, HandlerRuns
@@ -9,6 +10,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.records.clocks import slack_s
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.checker.replay import Life
+from ucp.trace import Dropped
 
 ROUNDED_S = 5e-4
 """run.json has milliseconds."""
@@ -23,6 +25,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         yield from _lives(agent_id, recorded, lives)
         yield from _handler_runs(agent_id, recorded, trace, lives)
         yield from _counted(agent_id, recorded, trace, lives)
+        yield from _dropped(agent_id, recorded, trace)
         if trace.cut_off and recorded.outcome == "exported":
             yield of_agent(agent_id, "its trace ends in half a line, and the agent ended by itself", short=True)
 
@@ -79,6 +82,17 @@ def _counted(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Lif
                 f"{changed_at_s:g} s"
             )
             yield of_agent(agent_id, detail)
+
+
+def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Contradiction]:
+    """What it counted as dropped has a line; it may have dropped more since it was asked."""
+    if recorded.dropped is None or not trace.header.has_inputs:
+        return
+    traced = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, Dropped))
+    for reason, count in recorded.dropped.items():
+        if traced[reason] < count:
+            detail = f"by run.json it dropped {_count(count, 'datagram')} ({reason}), and by its trace {traced[reason]}"
+            yield of_agent(agent_id, detail, short=True)
 
 
 def _chain_changed_at(life: Life) -> float:

@@ -5,20 +5,31 @@ from collections.abc import Iterator
 from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
 
-CLOCK = {"epoch_us": "mission second 0", "speedup": "speedup"}
+WORDS = {"epoch_us": "mission second 0", "initial_data": "the inception block's data"}
+MAX_VALUE = 40
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     first: dict[str, tuple[object, str]] = {}
     if evidence.record is not None:
         first["roster"] = sorted(evidence.record.roster), "run.json"
+    for agent_id, export in evidence.exports.items():
+        first.setdefault("initial_data", (export.inception.block_data, f"the export of agent {agent_id}"))
     for agent_id, trace in evidence.traces.items():
         header = trace.header
         told: dict[str, object] = {"roster": sorted(header.roster)}
         told |= {f"settings.{name}": value for name, value in header.settings.items()}
-        told |= {name: header.clock.get(name) for name in CLOCK}
+        told |= {name: header.clock.get(name) for name in ("epoch_us", "speedup")}
+        if header.initial_data is not None:
+            told["initial_data"] = header.initial_data
         for name, value in told.items():
             common, source = first.setdefault(name, (value, f"the trace of agent {agent_id}"))
             if value != common:
-                what = CLOCK.get(name, name)
-                yield of_agent(agent_id, f"its trace begins with {what} {value}, and {source} with {common}")
+                what = WORDS.get(name, name)
+                detail = f"its trace says that {what} is {_short(value)}, and {source} that it is {_short(common)}"
+                yield of_agent(agent_id, detail)
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= MAX_VALUE else f"{text[:MAX_VALUE]}..."

@@ -40,6 +40,7 @@ def _between_lives(evidence: Evidence, agent_id: int, lives: list[Life]) -> Iter
     for life in lives:
         if life.runs and life.runs[0].t < now - slack:
             what = f"a life begins at {life.runs[0].t:g} s, before the one before it has ended, at {now:g} s"
-            sight = Sight(life.header_line + 1, life.runs[0], what)
+            line, run = next(life.numbered())
+            sight = Sight(line, run, what)
             yield Contradiction(finding(evidence, agent_id, sight))
         now = life.runs[-1].t if life.runs else now
