@@ -128,6 +128,17 @@ class _Air(Protocol):
     def draw(self, now: float, data_bytes: int) -> RandomDraws: ...
 
 
+_Way = tuple[int, float, float]
+"""From a sender to a receiver: the lot below which all are lost, the least delay, and how much longer for each lot."""
+
+_NO_WAY: _Way = (_WORD, 0.0, 0.0)
+
+
+def _way(link: LinkConditions) -> _Way:
+    delay = link.delay or LATENCY
+    return round(link.independent_loss * _WORD), delay.mean_s - delay.jitter_s, 2 * delay.jitter_s / _WORD
+
+
 def _is_plain(link: LinkConditions) -> bool:
     """One lot each for loss and latency is all that it takes."""
     uniform = link.delay is None or link.delay.distribution == "uniform"
@@ -138,14 +149,12 @@ class _PlainAir:
     """Independent loss and uniform latency: a word of 32 bits each for every receiver."""
 
     def __init__(self, links: list[LinkConditions], hears: list[bool], words: _Words) -> None:
-        delays = [link.delay or LATENCY for link in links]
         self.receivers = len(links)
-        self.hears = hears
-        self.lost_below = [round(link.independent_loss * _WORD) for link in links]
-        self.certain = all(lost in (0, _WORD) for lost, heard in zip(self.lost_below, hears, strict=True) if heard)
-        self.soonest = [delay.mean_s - delay.jitter_s for delay in delays]
-        self.soonest_of_all = min(self.soonest)
-        self.per_lot = [2 * delay.jitter_s / _WORD for delay in delays]
+        self.ways = [_way(link) if heard else _NO_WAY for link, heard in zip(links, hears, strict=True)]
+        self.reached = [(receiver, *way) for receiver, way in enumerate(self.ways) if way != _NO_WAY]
+        self.certain = all(lost_below in (0, _WORD) for _, lost_below, _, _ in self.reached)
+        delays = [link.delay or LATENCY for link in links]
+        self.soonest_of_all = min(delay.mean_s - delay.jitter_s for delay in delays)
         self.latest = max(delay.mean_s + delay.jitter_s for delay in delays)
         self._words = words
 
@@ -171,21 +180,18 @@ class _PlainDraws:
         self.latest = latest
 
     def copies_to(self, receiver: int) -> tuple[float, ...]:
-        air = self._air
+        lost_below, soonest, per_lot = self._air.ways[receiver]
         word = self._at + receiver
-        if self._loss[word] < air.lost_below[receiver] or not air.hears[receiver]:
+        if self._loss[word] < lost_below:
             return ()
-        return (air.soonest[receiver] + self._latency[word] * air.per_lot[receiver],)
+        return (soonest + self._latency[word] * per_lot,)
 
     def to_all(self) -> list[tuple[int, float]]:
-        air = self._air
-        words = slice(self._at, self._at + air.receivers)
-        loss, latency = self._loss[words], self._latency[words]
-        each = zip(air.hears, loss, air.lost_below, air.soonest, latency, air.per_lot, strict=True)
+        at, loss, latency = self._at, self._loss, self._latency
         return [
-            (receiver, soonest + word * per_lot)
-            for receiver, (hears, lot, lost_below, soonest, word, per_lot) in enumerate(each)
-            if lot >= lost_below and hears
+            (receiver, soonest + latency[at + receiver] * per_lot)
+            for receiver, lost_below, soonest, per_lot in self._air.reached
+            if loss[at + receiver] >= lost_below
         ]
 
 

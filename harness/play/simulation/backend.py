@@ -9,7 +9,6 @@ import dataclasses
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import repeat
 from random import Random
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -414,8 +413,7 @@ class Simulation:
             self._after(number, life)
 
     def _timer_ends(self, number: int, life: Incarnation) -> None:
-        soonest = life.agent.next_timer()
-        if soonest is None or life.deadline is None or life.deadline > self._now:
+        if life.deadline is None or life.deadline > self._now or (soonest := life.agent.next_timer()) is None:
             return  # it was stopped, or started anew, since it was expected to end now
         self._hear(number, life)
         if self._recurrence is not None:
@@ -431,11 +429,11 @@ class Simulation:
         """
         if life.waiting is not None or not self._air.asked_by[number]:
             return
-        agent = life.agent
+        agent, state = life.agent, life.agent.state
         for at, _, answer in self._air.hear(number):
-            if answer.matters(agent.state, answer.sender, answer.message):
+            if answer.matters(state, answer.sender, answer.message):
                 at = max(at, life.resumed_at)
-                local = max(agent.state.now, self._local(life, at))
+                local = max(state.now, self._local(life, at))
                 agent.receive_message(answer.sender, answer.sequence, answer.message, local, answer.datagram)
                 if self._tracing:
                     self._take_down(life, at)
@@ -449,10 +447,11 @@ class Simulation:
         """Send what the agent has to say, and take down what it has done."""
         agent = life.agent
         messages = agent.messages_to_send()
-        in_trace = self._take_down(life, self._now) if self._tracing else repeat(None, len(messages))
-        for (sequence, message), datagram in zip(messages, in_trace, strict=True):
+        in_trace = iter(self._take_down(life, self._now)) if self._tracing else None
+        for sequence, message in messages:
             data_bytes = datagram_bytes(message)
             life.bytes_sent += data_bytes
+            datagram = next(in_trace) if in_trace else None
             self._air.broadcast(self._now, number, sequence, message, data_bytes, datagram)
             if self._rogue is not None:
                 self._rogue.hears(agent.agent_id, sequence, message, self._now)
