@@ -28,6 +28,8 @@ COUNTED = {
     "receive_response_next_in_sequence": ("new candidate", "counted"),
 }
 """Handler of an answer in a reconcile -> the branches in which the answer counts."""
+ALREADY = "already in progress"
+"""Branch of Algorithm 7 in an agent that reconciles as it is."""
 REFUSED = ("receive_vote_add_block", "no")
 ASKS = ("reconcile_phase_1", "reconcile_phase_2")
 MAX_NAMED = 10
@@ -116,9 +118,10 @@ def _in_traces(evidence: "Evidence", busy: Sequence[int], times: int) -> Cycle |
 
 
 def _own_runs(trace: Trace) -> list[HandlerRun]:
-    """The last runs that timers made or that changed something, in the agent's last life."""
+    """The last runs with which the agent went on or that changed something, in its last life."""
     start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
-    return [run for run in trace.runs[start:] if "message" not in run.trigger or run.changes]
+    runs = (run for run in trace.runs[start:] if "message" not in run.trigger or run.changes)
+    return [run for run in runs if run.branch != ALREADY]
 
 
 def _round(runs: Sequence[HandlerRun], times: int) -> _Round | None:
@@ -239,7 +242,7 @@ def _round_in_words(cycle: Cycle, agent_id: int) -> str:
     """From what follows the longest pause on, so that those that do the same one after another are told alike."""
     steps = [step for step in cycle.steps if step.agent_id == agent_id]
     if not steps or cycle.period_s is None:
-        return f"not idle, and has run nothing since {cycle.since_s:.0f} s"
+        return f"not idle, and has done nothing since {cycle.since_s:.0f} s"
     before = [steps[-1].after_s - cycle.period_s, *(step.after_s for step in steps[:-1])]
     pauses = [step.after_s - at_s for step, at_s in zip(steps, before, strict=True)]
     first = pauses.index(max(pauses))

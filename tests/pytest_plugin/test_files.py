@@ -62,9 +62,10 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
             "*_ tie.yaml::sim-seed1 _*",
             "characteristic 1, distributed: violated: *",
             "    agent 1: *a reconcile did not go on within*",
+            "liveness: never finishes: agent 1 hangs since 42 s: not idle, and no timer runs that would end that",
             "report: *",
             "*_ expected.yaml::sim-seed1 _*",
-            "characteristic 5, all committed everywhere: not applicable: *",
+            "characteristic 5, all committed everywhere: violated: fully connected, and yet agent 1 hangs since 42 s",
             "    expected: holds",
         ]
     )
