@@ -1,0 +1,116 @@
+"""How fast runs in virtual time are beside another revision: `python -m benchmarks.against 60cd154 [--rounds 15]`.
+
+The revision is checked out beside, and both play the same seeds in turn, each in a process of its own: believe the
+ratios, of the same round, of this revision's processor time to the other's. Below 1 is faster. `--large` also plays 50
+agents, and the thesis's matrix as `ucp-harness matrix` does, with 200 seeds on one core; that takes minutes.
+
+The scenario is 20 minutes at 15 % loss with a final reconcile. A run is judged as far as that revision does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from benchmarks.rounds import Spread, show
+
+ROOT = Path(__file__).resolve().parent.parent
+PLAYER = Path(__file__).with_name("played_by.py")
+
+SMALL = {
+    "5 agents, untraced": ("untraced 5", "untraced 5"),
+    "5 agents, traced": ("traced 5", "traced 5"),
+    "5 agents, traced beside untraced": ("untraced 5", "traced 5"),
+    "a seed of explore": ("explore", "explore"),
+}
+LARGE = {
+    "50 agents, untraced": ("untraced 50", "untraced 50"),
+    "50 agents, traced": ("traced 50", "traced 50"),
+    "a run of the matrix": ("matrix", "matrix"),
+}
+"""What a row compares: what the other revision plays, and what this one does."""
+
+
+class Player:
+    """A process that plays with the code in `root`."""
+
+    def __init__(self, root: Path) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, PLAYER],
+            env={**os.environ, "PYTHONPATH": str(root)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def seconds(self, what: str, seed: int) -> float:
+        """Processor time of each run."""
+        assert self._process.stdin and self._process.stdout, "they are pipes"
+        self._process.stdin.write(f"{what}/{seed}\n")
+        self._process.stdin.flush()
+        answer = self._process.stdout.readline()
+        if not answer:
+            sys.exit(f"the process that plays {what} has ended; it says why above")
+        return float(answer)
+
+    def close(self) -> None:
+        self._process.communicate()
+
+
+@contextmanager
+def checked_out(revision: str) -> Iterator[Path]:
+    """A directory with this revision of the project, for a while."""
+    with tempfile.TemporaryDirectory() as directory:
+        tree = Path(directory) / "tree"
+        git = ("git", "-C", str(ROOT), "worktree")
+        if subprocess.run([*git, "add", "--quiet", "--detach", tree, revision], check=False).returncode:
+            sys.exit(f"git cannot check out {revision!r}: name a commit of this project, such as HEAD~10")
+        try:
+            yield tree
+        finally:
+            subprocess.run([*git, "remove", "--force", tree], check=True)
+
+
+def row(name: str, plays: tuple[str, str], other: Player, this: Player, rounds: int) -> dict[str, Any]:
+    played_before, played_now = plays
+    before, now = [], []
+    for seed in range(1, rounds + 1):
+        before.append(other.seconds(played_before, seed))
+        now.append(this.seconds(played_now, seed))
+    return {
+        "what": name,
+        "then, ms": Spread.of(1000 * seconds for seconds in before),
+        "now, ms": Spread.of(1000 * seconds for seconds in now),
+        "now, per second": f"{1 / Spread.of(now).median:.1f}",
+        "ratio": Spread.of_ratios(now, before),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("revision", help="the other one, as git names it")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--large", action="store_true", help="also 50 agents and the matrix, for one round each")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    with checked_out(arguments.revision) as tree, ExitStack() as players:
+        other, this = Player(tree), Player(ROOT)
+        players.callback(other.close)
+        players.callback(this.close)
+        for player in (other, this):
+            player.seconds("explore", 0)  # and with it whatever is done once
+        rows = [row(name, plays, other, this, arguments.rounds) for name, plays in SMALL.items()]
+        if arguments.large:
+            rows += [row(name, plays, other, this, 1) for name, plays in LARGE.items()]
+    show(rows, {"then, ms": ".1f", "now, ms": ".1f", "ratio": ".2f"}, arguments.json)
+
+
+if __name__ == "__main__":
+    main()
