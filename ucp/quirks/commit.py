@@ -32,8 +32,12 @@ def complete_and_wait(good: Helper, core: Core, event: LocalEvent) -> None:
 @quirk(2)
 def propose_during_vote(good: Handler, core: Core) -> str:
     """The agent proposes again while its vote runs."""
+    deadline = core.voting_timer.deadline
     core.voting_timer.stop()
-    return good(core)
+    branch = good(core)
+    if branch != "proposed":
+        core.voting_timer.deadline = deadline
+    return branch
 
 
 @quirk(2)
