@@ -40,7 +40,7 @@ Whatever the radio delivers, the agent counts what is not a well-formed message 
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from typing import Any
 
 from ucp import commit, reconcile
@@ -137,7 +137,6 @@ class Agent:
         self.dropped: Counter[str] = Counter()
         self._core = Core(agent_id, initial_data, settings or Settings(), tracing=tracing)
         self.state: AgentState = self._core
-        self._others = self.roster - {agent_id}
         self._tracing = tracing
         self._trace: list[Entry] = []
         self._traced_state = self._state_now()
@@ -168,14 +167,12 @@ class Agent:
 
         `datagram` is what it was decoded from, in base64, for the trace.
         """
-        if sender not in self._others:
-            self._drop(now, "own sender" if sender == self.agent_id else "sender not on the roster", datagram)
-        elif type(message) in CARRY_A_BLOCK and message.block.agent_id not in self.roster:  # type: ignore[union-attr]
-            self._drop(now, "block not of the roster", datagram)
-        else:
-            self.received[message.NAME] += 1
-            trigger: Trigger = {"message": message.NAME, "from": sender, "seq": sequence}
-            self._handle(now, trigger, self._on_message[type(message)], sender, message, came=datagram)
+        if reason := why_not_handled(self.agent_id, self.roster, sender, message):
+            self._drop(now, reason, datagram)
+            return
+        self.received[message.NAME] += 1
+        trigger: Trigger = {"message": message.NAME, "from": sender, "seq": sequence}
+        self._handle(now, trigger, self._on_message[type(message)], sender, message, came=datagram)
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
         """Log an event. Raises ValueError if it is larger than the mission's largest event."""
@@ -225,19 +222,7 @@ class Agent:
         """
         core = self._core
         core.now = now
-        core.reconcile_in_progress = True
-        core.completed.extend(found.completed)
-        if self._tracing:
-            core.changes.extend(("complete", block_hash.hex()) for block_hash in found.completed)
-        for block in found.blocks():
-            if block.agent_id == self.agent_id:
-                core.newest_block_timestamp_us = max(core.newest_block_timestamp_us, block.timestamp_us)
-        for block in found.chain:
-            core.commit(block)
-        for block in found.deque:
-            core.push_onto_deque(block)
-        for block in found.stack:
-            core.push_onto_stack(block)
+        core.restore(found.completed, found.chain, found.deque, found.stack)
         came = in_base64(found.encode()) if self._tracing else None
         self._handle(now, {"boot": len(core.chain)}, self._on_local_event["Reconcile Finalize"], came=came)
 
@@ -291,8 +276,7 @@ class Agent:
             core.now, handler.name, handler.algorithm, trigger, branch, core.changes, core.announced, state, came
         )
         core.changes, core.announced = [], []
-        if handler.tally is not None:
-            run.tally = _tally(getattr(core, handler.tally))
+        run.tally = tally_of(core, handler)
         if core.started:
             run.started, core.started = core.started, {}
         self._trace.append(run)
@@ -309,8 +293,22 @@ class Agent:
         )
 
 
-def _tally(counted: dict[str, int] | dict[bytes, list[int]]) -> Tally:
-    """As a trace has it."""
+def why_not_handled(agent_id: int, roster: Container[int], sender: int, message: Message) -> str | None:
+    """Why the agent drops a well-formed message; None if it handles it: it is another's, and of the roster's blocks."""
+    if sender == agent_id:
+        return "own sender"
+    if sender not in roster:
+        return "sender not on the roster"
+    if type(message) in CARRY_A_BLOCK and message.block.agent_id not in roster:  # type: ignore[union-attr]
+        return "block not of the roster"
+    return None
+
+
+def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
+    """What the handler counts in, as a trace has it; None if it counts nothing."""
+    if handler.tally is None:
+        return None
+    counted: dict[str, int] | dict[bytes, list[int]] = getattr(core, handler.tally)
     return {
         key if isinstance(key, str) else key.hex(): count if isinstance(count, int) else list(count)
         for key, count in counted.items()

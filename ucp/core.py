@@ -4,6 +4,7 @@ An agent has two faces. `ucp.agent` is the one that whoever drives it sees; this
 handler is held to what it has declared: to send, start or trigger anything else is an error of the handler.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 from ucp.block import Block
@@ -57,6 +58,25 @@ class Core(AgentState):
         timer.start(self.now, duration_s)
         if self._tracing:
             self.started[timer.name] = duration_s
+
+    def restore(
+        self, completed: Iterable[bytes], chain: Iterable[Block], deque: Iterable[Block], stack: Iterable[Block]
+    ) -> None:
+        """Hold what an agent held that lost its power, and end the reconcile that it may have been in."""
+        self.reconcile_in_progress = True
+        for block_hash in completed:
+            self.completed.append(block_hash)
+            if self._tracing:
+                self.changes.append(("complete", block_hash.hex()))
+        for block in chain:
+            self.commit(block)
+        for block in deque:
+            self.push_onto_deque(block)
+        for block in stack:
+            self.push_onto_stack(block)
+        for block in (*self.chain, *self.blocks_to_be_committed, *self.reconcile_stack):
+            if block.agent_id == self.agent_id:
+                self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
 
     def complete(self, block: Block) -> None:
         """A block of our own is full: push it onto the back of the deque."""

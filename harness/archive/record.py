@@ -23,6 +23,8 @@ class Evidence(_Model):
     detail: str
     block: str | None
     block_hash: str | None
+    handler: str | None = None
+    """The event handler that did it, if one did."""
 
 
 class JudgedCharacteristic(_Model):

@@ -103,6 +103,11 @@ class Trace:
             for number, run in enumerate(islice(self.runs, start, end), start)
         )
 
+    def numbered_asides(self) -> Iterator[tuple[int, Dropped | Commanded]]:
+        """The lines of other things, with their numbers."""
+        for count, (position, aside) in enumerate(self.asides, 1):
+            yield position + 1 + bisect_right(self.starts, position) + count, aside
+
     def extend(self, entries: Iterable[Entry]) -> None:
         """These lines follow."""
         for entry in entries:

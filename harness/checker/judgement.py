@@ -20,6 +20,8 @@ class Finding:
     detail: str
     block: str | None = None
     block_hash: str | None = None
+    handler: str | None = None
+    """Which of the 20 did it, if one did."""
 
 
 @dataclass(frozen=True)

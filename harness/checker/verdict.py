@@ -12,6 +12,7 @@ from harness.checker import (
     liveness,
     records,
     single_copy,
+    steps,
     uniform_chain,
 )
 from harness.checker.evidence import Evidence
@@ -28,7 +29,11 @@ CHECKS = {
     "6": uniform_chain.check,
 }
 
-BESIDE: dict[str, Callable[[Evidence], Judgement]] = {"records": records.check, "liveness": liveness.check}
+BESIDE: dict[str, Callable[[Evidence], Judgement]] = {
+    "steps": steps.check,
+    "records": records.check,
+    "liveness": liveness.check,
+}
 """Judgements that are not of the thesis, by their keys: see `harness.scenario.verdicts`."""
 
 

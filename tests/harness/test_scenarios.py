@@ -249,7 +249,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
 }
 
 
-BAD = ("rogue", "in_step")
+BAD = ("rogue", "in_step", "missed_commit")
 
 RECONCILED = [name for name in CLAIMS if name != "rogue" and load_scenario(SCENARIOS / f"{name}.yaml").final_reconcile]
 

@@ -175,7 +175,11 @@ def test_a_violation_fails_the_test_with_its_evidence_and_its_report(pytester: p
 
 
 def test_a_violation_that_is_expected_passes_and_one_that_does_not_come_fails(pytester: pytest.Pytester) -> None:
-    expect = {"characteristics": {1: "violated", 5: "violated", 6: "violated"}, "liveness": "never finishes"}
+    expect = {
+        "characteristics": {1: "violated", 5: "violated", 6: "violated"},
+        "steps": "deviates",
+        "liveness": "never finishes",
+    }
     pytester.makepyfile(f"""
     import pytest
 

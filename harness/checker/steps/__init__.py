@@ -1,0 +1,118 @@
+"""The step judge: did every agent do at every step what the 20 algorithms say?
+
+The record of each agent is fed, step by step, into the reference core (`ucp.core`, with the handlers of `ucp.commit`
+and `ucp.reconcile`), and what the agent did is held against what that does: branch, changes, messages, timers, tallies
+and state. So an agent in any language is judged, by its record alone. An agent that goes on after a difference is
+compared again from its own state, so that one mistake is one finding.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+
+from harness.archive.traces import Trace
+from harness.checker.evidence import Evidence
+from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
+from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.follower import Follower
+from harness.checker.steps.inputs import Blocks, decoded
+from harness.checker.steps.mission import ImpossibleMissionError, Mission, mission_of
+from ucp.agent import HANDLERS, ON_MESSAGE, why_not_handled
+from ucp.messages import MalformedDatagramError
+from ucp.trace import Dropped
+
+NAME = "every step"
+
+
+def check(evidence: Evidence) -> Judgement:
+    blocks = Blocks(block for export in evidence.exports.values() for block in export.blocks())
+    deviations: list[Deviation] = []
+    steps, unjudged, lost = 0, dict[int, str](), list[str]()
+    for agent_id, trace in evidence.traces.items():
+        if not trace.header.has_inputs:
+            unjudged[agent_id] = "the trace is of ucp-trace/1, which lacks what the agent received"
+            continue
+        try:
+            mission = mission_of(trace.header)
+        except ImpossibleMissionError as error:
+            deviations.append(Deviation(agent_id, 1, 0.0, None, str(error)))
+            continue
+        followers = _followers(evidence, trace, mission, blocks)
+        deviations += _follow(evidence, agent_id, trace, followers)
+        deviations += _wrongly_dropped(trace, mission)
+        lost += [follower.lost for follower in followers if follower.lost]
+        steps += len(trace.runs)
+    if deviations:
+        return _deviates(evidence, deviations, steps, lost)
+    for agent_id in sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):
+        unjudged[agent_id] = "there is no trace"
+    unjudged |= {agent_id: f"the trace is not whole: {why}" for agent_id, why in evidence.examination.short.items()}
+    if unjudged or not evidence.traces:
+        return Judgement(NAME, "not applicable", _why(unjudged))
+    return Judgement(NAME, "as specified", f"{steps} handler runs, each as Algorithms 1 to 20 say")
+
+
+def _why(unjudged: dict[int, str]) -> str:
+    if not unjudged:
+        return "no traces: exports do not show steps"
+    by_reason: dict[str, list[int]] = {}
+    for agent_id, why in sorted(unjudged.items()):
+        by_reason.setdefault(why, []).append(agent_id)
+    return "; ".join(f"of {agents(ids)} {why}" for why, ids in by_reason.items())
+
+
+def _followers(evidence: Evidence, trace: Trace, mission: Mission, blocks: Blocks) -> list[Follower]:
+    """One for each life."""
+
+    def was_paused(since: float, until: float) -> bool:
+        return evidence.was_paused(mission.agent_id, since, until)
+
+    told = {"tally": any(run.tally for run in trace.runs), "started": any(run.started for run in trace.runs)}
+    tells = frozenset(key for key, is_told in told.items() if is_told)
+    return [Follower(mission, tells, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
+
+
+def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> Iterator[Deviation]:
+    """Where the agent's steps differ, in order."""
+    for follower, life in zip(followers, trace.lives(), strict=True):
+        for line, run in life:
+            yield from follower.follow(line, run)
+    if agent_id in evidence.exports and not trace.cut_off and not trace.problem:
+        yield from followers[-1].end(evidence.ended_at_s)
+
+
+def _wrongly_dropped(trace: Trace, mission: Mission) -> Iterator[Deviation]:
+    """Datagrams that a handler should have been given."""
+    for line, aside in trace.numbered_asides():
+        if not isinstance(aside, Dropped):
+            continue
+        try:
+            sender, _, message = decoded(aside.datagram)
+        except MalformedDatagramError:
+            continue
+        if why_not_handled(mission.agent_id, mission.roster, sender, message) is None:
+            said = f"it was not given a {message.NAME} of agent {sender}, which was dropped as {aside.dropped[:60]!r}"
+            yield Deviation(mission.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, said)
+
+
+def _deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:
+    deviations.sort(key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
+    first_of: dict[tuple[int, str | None], Deviation] = {}
+    for deviation in deviations:
+        first_of.setdefault((deviation.agent_id, deviation.handler), deviation)
+    counts = Counter((deviation.agent_id, deviation.handler) for deviation in deviations)
+    findings = []
+    for (agent_id, handler), deviation in first_of.items():
+        more = counts[agent_id, handler] - 1
+        again = f"; {times(more)} more later" if more else ""
+        findings.append(Finding(agent_id, f"{deviation.sentence(evidence.name)}{again}", handler=handler))
+    by_handler = Counter(deviation.handler for deviation in deviations).most_common()
+    reason = f"{len(deviations)} of {steps} handler runs differ, the first in {_title(deviations[0].handler)}"
+    if len(by_handler) > 1:
+        reason += f"; by handler: {', '.join(f'{_title(handler)} {count}' for handler, count in by_handler)}"
+    return Judgement(NAME, "deviates", "; ".join([reason, *lost]), findings[:MAX_EVIDENCE])
+
+
+def _title(handler: str | None) -> str:
+    """ "Algorithm 5, vote_timer_expiration"."""
+    known = HANDLERS.get(handler or "")
+    return f"Algorithm {known.algorithm}, {known.name}" if known else "what is no handler"

@@ -1,0 +1,136 @@
+"""A step that differs from the reference's, in words: what the agent did, and what it should have done."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from harness.checker.steps.inputs import decoded
+from ucp.agent import HANDLERS
+from ucp.messages import MalformedDatagramError
+from ucp.trace import HandlerRun, Sent, Tally
+
+NameOf = Callable[[str], str]
+"""Name of a block for people, by its hash."""
+
+SHOWN = 3
+"""More changes or messages of one step are counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """`did` and `should` complete "it ..." and "should have ..."; or `said` is all that there is to say."""
+
+    agent_id: int
+    line: int
+    t: float
+    handler: str | None
+    said: str = ""
+    run: HandlerRun | None = None
+    expected: HandlerRun | None = None
+
+    def sentence(self, name: NameOf) -> str:
+        known = HANDLERS.get(self.handler or "")
+        handler = f"Algorithm {known.algorithm}, {known.name}: " if known else ""
+        where = f"trace line {self.line}, t={self.t:g} s: {handler}"
+        if self.run is None or self.expected is None:
+            return where + self.said
+        did, should = zip(*differences(self.run, self.expected, name), strict=True)
+        return f"{where}it {_and(did)}; it should have {_and(should)}"
+
+
+def differences(run: HandlerRun, expected: HandlerRun, name: NameOf) -> Iterator[tuple[str, str]]:
+    """(what it did, what it should have done) of all that differs."""
+    if run.branch != expected.branch:
+        yield f"took the branch '{run.branch[:60]}'", f"taken '{expected.branch}'"
+    as_changed = run.changes == expected.changes
+    if not as_changed:
+        yield _changes(run.changes, name), _changes(expected.changes, name)
+    if run.sent != expected.sent:
+        yield _sent(run.sent, expected.sent, name), _sent(expected.sent, run.sent, name)
+    if (run.started or {}) != (expected.started or {}):
+        yield _started(run.started or {}), _started(expected.started or {})
+    if run.tally != expected.tally:
+        yield f"counted {_tally(run.tally or {}, name)}", f"counted {_tally(expected.tally or {}, name)}"
+    ours, theirs = expected.state, run.state
+    for what in ("chain", "deque", "stack"):
+        if as_changed and getattr(ours, what) != getattr(theirs, what):
+            yield f"had {getattr(theirs, what)} blocks in its {what}", f"had {getattr(ours, what)}"
+    if ours.reconciling != theirs.reconciling:
+        yield _was(theirs.reconciling, "reconciling"), _been(ours.reconciling, "reconciling")
+    if ours.idle != theirs.idle:
+        yield _was(theirs.idle, "idle"), _been(ours.idle, "idle")
+    if as_changed and ours.top != theirs.top:
+        yield f"had the top chain hash {theirs.top[:12]}", f"had {ours.top[:12]}"
+
+
+def _changes(changes: Sequence[tuple[str, str]], name: NameOf) -> str:
+    if not changes:
+        return "changed nothing"
+    words = [f"{operation} {name(block)}" for operation, block in changes[:SHOWN]]
+    return f"changed {', '.join(words)}{_more(changes)}"
+
+
+def _sent(sent: Sequence[Sent], others: Sequence[Sent], name: NameOf) -> str:
+    if not sent:
+        return "sent nothing"
+    return f"sent {', '.join(_message(message, others, name) for message in sent[:SHOWN])}{_more(sent)}"
+
+
+def _message(message: Sent, others: Sequence[Sent], name: NameOf) -> str:
+    about = f" about block {name(message.block)}" if message.block else ""
+    words = f"{message.message[:60]}{about}"
+    alike = [other for other in others if (other.message, other.block) == (message.message, message.block)]
+    if any(other.seq != message.seq for other in alike):
+        words += f" with sequence number {message.seq}"
+    elif alike and all(other.datagram != message.datagram for other in alike):
+        words += f" saying {_content(message, name)}"
+    return words
+
+
+def _content(message: Sent, name: NameOf) -> str:
+    """What tells it from a message of the same type about the same block."""
+    try:
+        content = decoded(message.datagram or "")[2]
+    except MalformedDatagramError as malformed:
+        return f"what is no message ({malformed.reason})"
+    values = []
+    for field in type(content).WIRE:
+        value = getattr(content, field)
+        if isinstance(value, bytes):
+            values.append(f"{field} {value.hex()[:12]}")
+        elif isinstance(value, int | None):
+            values.append(f"{field} {value}")
+    return ", ".join(values)
+
+
+def _started(started: dict[str, float]) -> str:
+    if not started:
+        return "started no timer"
+    return "started " + ", ".join(f"the {timer[:60]} timer for {duration:g} s" for timer, duration in started.items())
+
+
+def _tally(tally: Tally, name: NameOf) -> str:
+    if not tally:
+        return "nothing"
+    words = []
+    for key, count in list(tally.items())[:SHOWN]:
+        if key in ("yes", "no"):
+            words.append(f"{key} {count}")
+        else:
+            words.append(f"{name(key) if key else 'Is Top Of Chain'} {count}")
+    return ", ".join(words) + _more(list(tally))
+
+
+def _was(is_so: bool, what: str) -> str:
+    return f"was {what}" if is_so else f"was not {what}"
+
+
+def _been(is_so: bool, what: str) -> str:
+    return f"been {what}" if is_so else f"been not {what}"
+
+
+def _more(things: Sequence[object]) -> str:
+    return f" and {len(things) - SHOWN} more" if len(things) > SHOWN else ""
+
+
+def _and(phrases: Sequence[str]) -> str:
+    return phrases[0] if len(phrases) == 1 else f"{', '.join(phrases[:-1])} and {phrases[-1]}"

@@ -1,0 +1,292 @@
+"""Following one life of an agent: the reference core is given what the agent was given, a handler at a time."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, stored_blocks
+from harness.checker.steps.mission import Mission
+from harness.checker.steps.reference import ReferenceCore
+from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of, why_not_handled
+from ucp.block import Block
+from ucp.events import MalformedEventsError
+from ucp.handler import EventHandler
+from ucp.messages import MalformedDatagramError
+from ucp.trace import HandlerRun, State
+
+EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
+
+COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted"))
+"""Branches that begin a tally, or count in it; after others it may be what it likes."""
+
+Paused = Callable[[float, float], bool]
+"""Whether the agent stood still at any time between two mission seconds."""
+
+
+class NotHandledError(Exception):
+    """The reference would not have run this handler now: what the agent did, completing "it ..."."""
+
+
+class Follower:
+    """Holds the handler runs of one life of an agent against what the reference does.
+
+    `tells` names what the agent's trace has of what may be left out: `tally`, `started`.
+    """
+
+    def __init__(self, mission: Mission, tells: frozenset[str], blocks: Blocks, was_paused: Paused) -> None:
+        self.lost: str | None = None
+        """Why, and after which line, the agent cannot be followed any further."""
+        self._mission = mission
+        self._tells = tells
+        self._blocks = blocks
+        self._was_paused = was_paused
+        self._core = ReferenceCore(mission.agent_id, mission.initial_data, mission.settings)
+        self._timers = {timer.name: timer for timer in self._core.timers}
+        self._ran: dict[str, tuple[int, float]] = {}
+        """Handlers that have run since the last input: trace line, mission second."""
+        self._adopted = False
+        """Since the last input the agent was found to differ: what it has triggered since is its own affair."""
+        self._began = False
+        self._top, self._top_hex = b"", ""
+
+    def follow(self, line: int, run: HandlerRun) -> Iterator[Deviation]:
+        """Where this run, or what should have come before it, differs from the reference."""
+        if self.lost is not None:
+            return
+        core = self._core
+        local = run.trigger.get("local")
+        if core.triggered or local is not None:
+            yield from self._triggered(line, run, local)
+        now = self._mission.local(run.t)
+        if local is None:
+            self._ran.clear()
+            self._adopted = False
+            yield from self._overdue(line, run.t, now)
+        self._ran[run.handler] = line, run.t
+        core.now = now
+        before = core.before()
+        try:
+            handler, inputs = self._input(run, now)
+            core.running = handler
+            branch = handler.run(core, *inputs)
+        except NotHandledError as error:
+            yield self._deviation(line, run.t, run.handler, f"it {error}")
+        except (AssertionError, ValueError, KeyError, IndexError):  # the agent is where no agent comes to
+            yield self._deviation(line, run.t, run.handler, "it ran in a state in which the protocol does not run it")
+        else:
+            if not self._differs(run, handler, branch):
+                if core.changes or core.announced or core.started:
+                    core.step_is_over()
+                self._began = True
+                return
+            expected = self._expected(run, handler, branch)
+            yield Deviation(self._mission.agent_id, line, run.t, run.handler, run=run, expected=expected)
+        self._began = True
+        self._adopt(line, run, before)
+
+    def end(self, at_s: float | None) -> Iterator[Deviation]:
+        """What should have come by the end of the run, at `at_s`, of an agent that was there to the end."""
+        if self.lost is not None:
+            return
+        yield from self._not_run()
+        if at_s is not None:
+            line = max((line for line, _ in self._ran.values()), default=1)
+            yield from self._overdue(line, at_s, self._mission.local(at_s))
+
+    # What should have come before
+
+    def _triggered(self, line: int, run: HandlerRun, local: int | str | None) -> Iterator[Deviation]:
+        """Handlers run that were triggered, and no others."""
+        triggered = self._core.triggered
+        if self._adopted:
+            triggered.clear()
+            return
+        if local is None:
+            yield from self._not_run()
+            return
+        asked, event = str(local), EVENT_OF.get(run.handler, "what is no local event")
+        if triggered:
+            expected, by = triggered[0]
+            if ON_LOCAL_EVENT[expected].name == run.handler and by == asked:
+                triggered.popleft()
+                return
+            said = f"it triggered {event}, and should have triggered {expected}"
+            if by != asked:
+                said = f"it said to be triggered by {asked[:60]}, and was by {by}"
+        else:
+            by = asked if asked in self._ran else run.handler
+            said = f"it triggered {event}, and should have triggered nothing"
+            if by == run.handler:
+                said = "it ran without having been triggered"
+        at_line, at_s = self._ran.get(by, (line, run.t))
+        yield self._deviation(at_line, at_s, by, said)
+        triggered.clear()
+        self._adopted = True
+
+    def _not_run(self) -> Iterator[Deviation]:
+        """What was triggered has not run, and the next input has come."""
+        triggered = self._core.triggered
+        if triggered and not self._adopted:
+            event, by = triggered[0]
+            yield self._deviation(*self._ran[by], by, f"it triggered nothing, and should have triggered {event}")
+        triggered.clear()
+
+    def _overdue(self, line: int, at_s: float, now: float) -> Iterator[Deviation]:
+        """Timers that ended long ago, and whose handlers have not run."""
+        late = now - self._mission.late_s
+        for timer in self._core.timers:
+            if timer.deadline is not None and timer.deadline < late:
+                ended_s = at_s - (now - timer.deadline) / self._mission.rate
+                if not self._was_paused(ended_s, at_s):
+                    said = f"it had not run by then, and the {timer.name} timer ended at t={ended_s:g} s"
+                    yield self._deviation(line, at_s, ON_TIMER[timer.name].name, said)
+                    timer.stop()
+
+    # What came
+
+    def _input(self, run: HandlerRun, now: float) -> tuple[EventHandler[Any], tuple[Any, ...]]:
+        """The handler that this runs, and what it is given. Raises NotHandledError."""
+        match run.trigger:
+            case {"local": _}:
+                handler, inputs = HANDLERS.get(run.handler), ()
+                if run.handler not in EVENT_OF:
+                    raise NotHandledError("ran for a local event, which is no such event's handler")
+                if self._adopted:
+                    self._core.go_along(run)
+            case {"message": str(name), "from": int(sender), "seq": int(sequence)}:
+                handler, inputs = self._message(run.input, name, sender, sequence)
+            case {"timer": str(name)}:
+                handler, inputs = self._timer(name, now), ()
+            case {"event": int(event_id)}:
+                handler, inputs = ON_LOCAL_EVENT["Build Data Block"], self._event(run.input, event_id)
+            case {"operator": "reconcile"}:
+                handler, inputs = ON_LOCAL_EVENT["Reconcile Begin"], ()
+            case {"boot": _}:
+                self._boot(run)
+                handler, inputs = ON_LOCAL_EVENT["Reconcile Finalize"], ()
+            case _:
+                raise NotHandledError("ran without a trigger that there is")
+        assert handler is not None
+        if (handler.name, handler.algorithm) != (run.handler, run.algorithm):
+            raise NotHandledError(
+                f"ran as Algorithm {run.algorithm}; what came is for Algorithm {handler.algorithm}, {handler.name}"
+            )
+        return handler, inputs
+
+    def _message(
+        self, datagram: str | None, name: str, sender: int, sequence: int
+    ) -> tuple[EventHandler[Any], tuple[Any, ...]]:
+        try:
+            sent_by, number, message = decoded(datagram or "")
+        except MalformedDatagramError as malformed:
+            raise NotHandledError(f"handled a datagram that is to be dropped: {malformed.reason}") from None
+        self._blocks.add_from(message)
+        if reason := why_not_handled(self._mission.agent_id, self._mission.roster, sent_by, message):
+            raise NotHandledError(f"handled a datagram that is to be dropped: {reason}")
+        if (message.NAME, sent_by, number) != (name, sender, sequence):
+            raise NotHandledError(
+                f"said to have got {name[:60]} {sequence} from agent {sender}, "
+                f"and the datagram is {message.NAME} {number} from agent {sent_by}"
+            )
+        return ON_MESSAGE[type(message)], (sent_by, message)
+
+    def _timer(self, name: str, now: float) -> EventHandler[Any]:
+        timer = self._timers.get(name)
+        if timer is None or timer.deadline is None:
+            raise NotHandledError(f"ran as the {name[:60]} timer ended, which was not running")
+        early = timer.deadline - now
+        timer.stop()
+        if early > self._mission.early_s:
+            raise NotHandledError(f"ran {early:.3g} s before the {name} timer ended")
+        return ON_TIMER[name]
+
+    def _event(self, record: str | None, event_id: int) -> tuple[Any, ...]:
+        try:
+            event = event_of(record or "")
+        except MalformedEventsError as malformed:
+            raise NotHandledError(f"logged what is no event: {malformed}") from None
+        if event.event_id != event_id:
+            raise NotHandledError(f"said to have logged event {event_id}, and what it logged is {event.event_id}")
+        if len(event.encode()) > (largest := self._mission.settings.max_event_bytes):
+            raise NotHandledError(
+                f"logged an event of {len(event.encode())} bytes, more than max_event_bytes {largest}"
+            )
+        return (event,)
+
+    def _boot(self, run: HandlerRun) -> None:
+        """What was found is there before the handler runs: as its changes say, with the blocks of its input."""
+        if self._began:
+            raise NotHandledError("booted, which is only possible before anything else")
+        try:
+            found = list(stored_blocks(run.input or ""))
+        except ValueError:
+            raise NotHandledError("booted from a store that is none") from None
+        places: dict[str, list[Block]] = {"chain+": [], "deque+": [], "stack+": []}
+        changes = iter(run.changes)
+        completed = []
+        for operation, block_hash in changes:
+            if operation == "complete":
+                completed.append(bytes.fromhex(block_hash))
+                continue
+            if not found or operation not in places:
+                break
+            block = found.pop(0)
+            self._blocks.add(block)
+            places[operation].append(block)
+            if not found:
+                break
+        self._core.restore(completed, *places.values())
+
+    # Whether it is as it should be
+
+    def _differs(self, run: HandlerRun, handler: EventHandler[Any], branch: str) -> bool:
+        core = self._core
+        if run.branch != branch or run.changes != core.changes or run.sent != core.announced:
+            return True
+        if "started" in self._tells and (run.started or {}) != core.started:
+            return True
+        if branch in COUNTING and "tally" in self._tells and run.tally != tally_of(core, handler):
+            return True
+        state = run.state
+        return (
+            state.top != self._top_in_hex()
+            or state.chain != len(core.chain)
+            or state.deque != len(core.blocks_to_be_committed)
+            or state.stack != len(core.reconcile_stack)
+            or state.reconciling != core.reconcile_in_progress
+            or state.idle != core.idle
+        )
+
+    def _top_in_hex(self) -> str:
+        top = self._core.chain.top_chain_hash
+        if top is not self._top:
+            self._top, self._top_hex = top, top.hex()
+        return self._top_hex
+
+    def _expected(self, run: HandlerRun, handler: EventHandler[Any], branch: str) -> HandlerRun:
+        core = self._core
+        state = State(
+            len(core.chain),
+            len(core.blocks_to_be_committed),
+            len(core.reconcile_stack),
+            core.reconcile_in_progress,
+            core.idle,
+            self._top_in_hex(),
+        )
+        changes, sent = list(core.changes), list(core.announced)
+        expected = HandlerRun(run.t, handler.name, handler.algorithm, run.trigger, branch, changes, sent, state)
+        expected.started = dict(core.started) if "started" in self._tells else run.started
+        expected.tally = tally_of(core, handler) if branch in COUNTING and "tally" in self._tells else run.tally
+        return expected
+
+    def _adopt(self, line: int, run: HandlerRun, before: Any) -> None:
+        """Go on from the agent's own state."""
+        self._adopted = True
+        try:
+            self._core.undo(before)
+            self._core.adopt(run, self._blocks)
+        except NotOnRecordError as error:
+            self.lost = f"after trace line {line} agent {self._mission.agent_id} cannot be followed: {error}"
+
+    def _deviation(self, line: int, at_s: float, handler: str, said: str) -> Deviation:
+        return Deviation(self._mission.agent_id, line, at_s, handler, said)

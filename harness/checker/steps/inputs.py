@@ -1,0 +1,80 @@
+"""What reached an agent, out of its record: what is there of it, decoded."""
+
+import base64
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+
+from harness.archive.exports import ExportedBlock
+from ucp.block import BLOCK_HEADER, Block
+from ucp.events import LoggableEvent, MalformedEventsError, decode_event
+from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError, Message, decode
+
+KEPT = 4096
+"""A datagram reaches many agents: so many are kept decoded."""
+
+LENGTH_BYTES = 2
+
+
+class NotOnRecordError(Exception):
+    """What would be needed to go on is not in the records: one sentence."""
+
+
+@lru_cache(KEPT)
+def decoded(datagram: str) -> tuple[int, int, Message]:
+    """(sender, sequence, message) of a datagram in base64. Raises MalformedDatagramError."""
+    try:
+        data = base64.b64decode(datagram, validate=True)
+    except ValueError:
+        raise MalformedDatagramError("not base64") from None
+    return decode(data)
+
+
+def event_of(record: str) -> LoggableEvent:
+    """An event in base64, as a block has it. Raises MalformedEventsError."""
+    try:
+        data = base64.b64decode(record, validate=True)
+    except ValueError:
+        raise MalformedEventsError("the event is not base64") from None
+    event, end = decode_event(data, 0)
+    if end != len(data):
+        raise MalformedEventsError("there is more than an event")
+    return event
+
+
+def stored_blocks(record: str) -> Iterator[Block]:
+    """The blocks of a store, each after its length. Raises ValueError."""
+    data = base64.b64decode(record, validate=True)
+    offset = 0
+    while offset < len(data):
+        end = offset + LENGTH_BYTES + int.from_bytes(data[offset : offset + LENGTH_BYTES], "big")
+        block = data[offset + LENGTH_BYTES : end]
+        if len(block) <= BLOCK_HEADER.size or end > len(data):
+            raise ValueError("the store is cut off")
+        agent_id, timestamp_us = BLOCK_HEADER.unpack_from(block)
+        yield Block(agent_id, timestamp_us, block[BLOCK_HEADER.size :])
+        offset = end
+
+
+class Blocks:
+    """Blocks by hash, wherever on record: in an export, or in a message that an agent received or sent."""
+
+    def __init__(self, exported: Iterable[ExportedBlock]) -> None:
+        self._exported = {block.block_hash: block for block in exported}
+        self._blocks: dict[str, Block] = {}
+
+    def add(self, block: Block) -> None:
+        self._blocks[block.block_hash.hex()] = block
+
+    def add_from(self, message: Message) -> None:
+        if isinstance(message, CommitBlock | BlockResponse):
+            self.add(message.block)
+
+    def get(self, block_hash: str) -> Block:
+        """Raises NotOnRecordError."""
+        block = self._blocks.get(block_hash)
+        if block is None and (exported := self._exported.get(block_hash)) is not None:
+            block = Block(exported.agent_id, exported.timestamp_us, exported.event_bytes)
+        if block is None or block.block_hash.hex() != block_hash:
+            raise NotOnRecordError(f"no record has the data of block {block_hash[:12]}")
+        self._blocks[block_hash] = block
+        return block

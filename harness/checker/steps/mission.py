@@ -1,0 +1,68 @@
+"""What the first line of a trace says of the agent's mission, checked."""
+
+import base64
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+from harness.archive.traces import Header
+from harness.checker.waiting import SLACK_WALL_S
+from ucp.settings import Settings
+
+EARLY_WALL_S = 0.001
+"""How early a timer may end, in wall seconds: an agent reads its clock more than once."""
+ROUNDING_S = 2e-6
+"""Traces have times to the microsecond."""
+
+_SETTINGS = {setting.name for setting in fields(Settings)}
+
+
+class ImpossibleMissionError(Exception):
+    """No agent can have these settings, or this clock: a sentence."""
+
+
+@dataclass(frozen=True)
+class Mission:
+    """`early_s` and `late_s` are how far from its end a timer may be handled, in mission seconds."""
+
+    agent_id: int
+    roster: frozenset[int]
+    initial_data: bytes
+    settings: Settings
+    offset_s: float
+    rate: float
+    early_s: float
+    late_s: float
+
+    def local(self, mission_s: float) -> float:
+        """What the agent's clock shows at `mission_s`."""
+        return self.offset_s + self.rate * mission_s
+
+
+def mission_of(header: Header) -> Mission:
+    """Raises ImpossibleMissionError."""
+    try:
+        initial_data = base64.b64decode(header.initial_data or "", validate=True)
+        settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
+    except (ValueError, TypeError) as error:
+        raise ImpossibleMissionError(f"its trace begins with settings that cannot be: {error}") from None
+    speedup, drift = _clock(header, "speedup", 1.0), _clock(header, "drift", 0.0)
+    if speedup <= 0 or drift <= -1:
+        raise ImpossibleMissionError("its trace begins with a clock that cannot be")
+    return Mission(
+        header.agent_id,
+        frozenset(header.roster),
+        initial_data,
+        settings,
+        _clock(header, "offset_s", 0.0),
+        1 + drift,
+        EARLY_WALL_S * speedup + ROUNDING_S,
+        SLACK_WALL_S * speedup,
+    )
+
+
+def _clock(header: Header, key: str, default: float) -> float:
+    value: Any = header.clock.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ImpossibleMissionError(f"its trace begins with a clock that cannot be: {key} {str(value)[:20]}")
+    return float(value)

@@ -1,0 +1,218 @@
+"""The reference core of the step judge: it can also be put into the state that an agent says it is in."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded
+from ucp.block import HASH_BYTES, Block
+from ucp.core import Core
+from ucp.messages import (
+    BlockAddRequest,
+    ChainContainQuery,
+    ChainHashSuccessorQuery,
+    MalformedDatagramError,
+    Message,
+    RequestForBlock,
+)
+from ucp.settings import Settings
+from ucp.timers import Timer
+from ucp.trace import HandlerRun, Sent
+
+
+class Before(NamedTuple):
+    """Of the state before a step what its changes do not tell."""
+
+    stack: list[Block] | None
+    current_block: bytes
+    phase_three_ends: float | None
+
+
+class ReferenceCore(Core):
+    """A step begins with `before`; `undo` takes it back, and `adopt` makes the agent's own instead."""
+
+    def __init__(self, agent_id: int, initial_data: bytes, settings: Settings) -> None:
+        super().__init__(agent_id, initial_data, settings)
+        self._moved: dict[str, Block] = {}
+        """Every block that has ever been anywhere here, by hash."""
+
+    def _changed(self, operation: str, block: Block) -> None:
+        block_hash = block.block_hash.hex()
+        self._moved[block_hash] = block
+        self.changes.append((operation, block_hash))
+
+    def before(self) -> Before:
+        stack = list(self.reconcile_stack) if self.reconcile_stack else None
+        return Before(stack, bytes(self.current_block), self.phase_three_timer.deadline)
+
+    def step_is_over(self) -> None:
+        """What has come of it is not wanted any more."""
+        if self.changes:
+            self.changes = []
+        if self.announced:
+            self.announced = []
+            self.outbox.clear()
+        if self.started:
+            self.started = {}
+
+    def go_along(self, run: HandlerRun) -> None:
+        """It has differed, and runs this by itself: which block it is after says what it does."""
+        if run.handler == "reconcile_phase_3":
+            hashes = [block_hash for operation, block_hash in run.changes if operation == "chain+"]
+            hashes += [sent.block for sent in run.sent if sent.block is not None]
+            if hashes and len(hashes[0]) == 2 * HASH_BYTES:
+                self.majority_response_block_hash = bytes.fromhex(hashes[0])
+
+    def undo(self, before: Before) -> None:
+        """Take back what the step did to blocks and timers; what it tallied, `adopt` overrides."""
+        for operation, block_hash in reversed(self.changes):
+            match operation:
+                case "complete":
+                    self.completed.pop()
+                case "chain+":
+                    self.chain.pop()
+                case "chain-":
+                    self.chain.append(self._moved[block_hash])
+                case "deque+":
+                    self.blocks_to_be_committed.pop()
+                case "deque-":
+                    self.blocks_to_be_committed.appendleft(self._moved[block_hash])
+                case "stack+":
+                    self.reconcile_stack.pop()
+        self.reconcile_stack[:] = before.stack or ()
+        self.current_block[:] = before.current_block
+        for timer in self.timers:
+            if timer.name in self.started:
+                timer.stop()
+        self.phase_three_timer.deadline = before.phase_three_ends
+        self._sequence -= len(self.announced)
+        self.step_is_over()
+
+    def adopt(self, run: HandlerRun, blocks: Blocks) -> None:
+        """Be in the state that the agent says it is in after `run`. Raises NotOnRecordError if that cannot be."""
+        for operation, block_hash in run.changes:
+            self._adopt_change(operation, self._moved.get(block_hash) or blocks.get(block_hash))
+        if run.handler == "build_data_block" and run.changes:
+            self.current_block.clear()
+        self._held_aside = {block.block_hash for block in (*self.blocks_to_be_committed, *self.reconcile_stack)}
+        state = run.state
+        held = len(self.chain), len(self.blocks_to_be_committed), len(self.reconcile_stack)
+        if held != (state.chain, state.deque, state.stack):
+            raise NotOnRecordError("it does not hold what its changes come to")
+        self._adopt_top(state.top)
+        self.reconcile_in_progress = state.reconciling
+        self.triggered.clear()
+        self._adopt_sent(run.sent)
+        self._adopt_timers(run)
+        self._adopt_tally(run)
+        self.step_is_over()
+
+    def _adopt_change(self, operation: str, block: Block) -> None:
+        try:
+            match operation:
+                case "complete":
+                    self.completed.append(block.block_hash)
+                    self.newest_block_timestamp_us = block.timestamp_us
+                case "chain+":
+                    self.chain.append(block)
+                case "chain-":
+                    if self.chain.pop() != block:
+                        raise NotOnRecordError("it took a block off its chain that was not on top")
+                case "deque+":
+                    self.blocks_to_be_committed.append(block)
+                case "deque-":
+                    self.blocks_to_be_committed.remove(block)
+                case "stack+":
+                    self.reconcile_stack.append(block)
+                case "stack-":
+                    self.reconcile_stack.remove(block)
+                case _:
+                    raise NotOnRecordError(f"there is no change {operation[:20]!r}")
+        except (ValueError, IndexError):
+            raise NotOnRecordError(
+                f"its change {operation} {block.block_hash.hex()[:12]} is one that no agent can make"
+            ) from None
+
+    def _adopt_top(self, top: str) -> None:
+        if self.chain.top_chain_hash.hex() != top:
+            try:
+                chain_hash = bytes.fromhex(top)
+            except ValueError:
+                chain_hash = b""
+            if len(chain_hash) != HASH_BYTES:
+                raise NotOnRecordError("its top chain hash is none")
+            self.chain.top_chain_hash = chain_hash
+
+    def _adopt_sent(self, sent: Iterable[Sent]) -> None:
+        """What it asked for says what it waits for."""
+        for announced in sent:
+            self._sequence = announced.seq + 1
+            try:
+                message = decoded(announced.datagram or "")[2]
+            except MalformedDatagramError:
+                continue
+            if timer := self._asked(message):
+                timer.start(self.now, self._duration(timer))
+
+    def _asked(self, message: Message) -> Timer | None:
+        """Wait for the answers to `message`; the timer that then runs, if it is a question."""
+        match message:
+            case BlockAddRequest():
+                waiting = (*self.blocks_to_be_committed, *self.reconcile_stack, *self.chain)
+                named = (block for block in waiting if block.block_hash == message.block_hash)
+                self.candidate_block = next(named, None)
+                self.top_chain_hash_at_initiation = self.chain.top_chain_hash
+                self.vote_count = {"yes": 1, "no": 0}
+                self.voters.clear()
+                return self.voting_timer
+            case ChainContainQuery():
+                self.reconcile_vote_count = {"yes": 0, "no": 0}
+                self.reconcile_responders.clear()
+                return self.phase_one_timer
+            case ChainHashSuccessorQuery():
+                self.reconcile_response_dictionary.clear()
+                self.reconcile_responders.clear()
+                return self.phase_two_timer
+            case RequestForBlock():
+                self.majority_response_block_hash = message.block_hash
+                return self.phase_three_timer
+        return None
+
+    def _duration(self, timer: Timer) -> float:
+        return {
+            "voting": self.settings.vote_timeout_s,
+            "phase one": self.settings.phase1_timeout_s,
+            "phase two": self.settings.phase2_timeout_s,
+            "phase three": self.settings.phase3_timeout_s,
+            "finalize gap": self.settings.finalize_gap_s,
+        }[timer.name]
+
+    def _adopt_timers(self, run: HandlerRun) -> None:
+        for timer in self.timers:
+            if (duration := (run.started or {}).get(timer.name)) is not None:
+                timer.start(self.now, duration)
+        if run.branch == "recommitted, more to come" and not run.started:
+            self.finalize_timer.start(self.now, self.settings.finalize_gap_s)
+        if run.handler == "receive_response_block_for_hash" and run.changes:
+            self.phase_three_timer.stop()
+        for timer in self.timers:
+            if run.state.idle or (timer is not self.voting_timer and not run.state.reconciling):
+                timer.stop()
+
+    def _adopt_tally(self, run: HandlerRun) -> None:
+        if run.tally is None:
+            return
+        votes = {key: count for key, count in run.tally.items() if key in ("yes", "no") and isinstance(count, int)}
+        match run.algorithm:
+            case 2 | 4 if len(votes) == 2:
+                self.vote_count = votes
+            case 8 | 10 if len(votes) == 2:
+                self.reconcile_vote_count = votes
+            case 12 | 14:
+                try:
+                    self.reconcile_response_dictionary = {
+                        bytes.fromhex(candidate): [int(number) for number in counted]
+                        for candidate, counted in run.tally.items()
+                        if isinstance(counted, list) and len(counted) == 2
+                    }
+                except ValueError:
+                    raise NotOnRecordError("its candidates are no block hashes") from None

@@ -1,0 +1,247 @@
+"""The step judge: each step of each agent against the reference core."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from harness.archive.traces import HANDLER_RUN, Header, Trace
+from harness.checker import Evidence, steps
+from harness.checker.judgement import Judgement
+from harness.run.simulate import simulate
+from tests.harness.virtual import scenario
+from ucp.agent import HANDLERS
+from ucp.trace import Dropped, HandlerRun
+
+LOSSY = {"network": {"loss": 0.25}, "duration_s": 600}
+
+
+@pytest.fixture(scope="module")
+def honest() -> Evidence:
+    return simulate(scenario(**LOSSY), 1, tracing=True).evidence
+
+
+def with_traces(evidence: Evidence, traces: dict[int, Trace]) -> Evidence:
+    return Evidence(evidence.exports, traces, evidence.record)
+
+
+def edited(evidence: Evidence, agent: int, change: Callable[[list[HandlerRun]], Any]) -> Evidence:
+    """The evidence with another trace of this agent."""
+    runs = [HANDLER_RUN.validate_json(run.to_line()) for run in evidence.traces[agent].runs]
+    change(runs)
+    return with_traces(evidence, {**evidence.traces, agent: dataclasses.replace(evidence.traces[agent], runs=runs)})
+
+
+def judged(**keys: Any) -> Judgement:
+    return simulate(scenario(**keys), 1, tracing=True).result.beside["steps"]
+
+
+def first_run(runs: list[HandlerRun], handler: str, branch: str = "") -> HandlerRun:
+    return next(run for run in runs if run.handler == handler and branch in ("", run.branch))
+
+
+def proposal(runs: list[HandlerRun]) -> HandlerRun:
+    return first_run(runs, "process_next_deque_block", "proposed")
+
+
+def expiry(runs: list[HandlerRun]) -> HandlerRun:
+    return first_run(runs, "vote_timer_expiration")
+
+
+def commit(runs: list[HandlerRun]) -> HandlerRun:
+    return first_run(runs, "receive_commit_block")
+
+
+def without_expiry(runs: list[HandlerRun]) -> None:
+    """Nothing of all that the first end of a vote had for a consequence."""
+    position = runs.index(expiry(runs))
+    del runs[position]
+    while "local" in runs[position].trigger:
+        del runs[position]
+
+
+def test_the_reference_does_what_the_reference_does(honest: Evidence) -> None:
+    judgement = steps.check(honest)
+    assert judgement.verdict == "as specified"
+    assert judgement.reason.startswith(f"{sum(len(trace.runs) for trace in honest.traces.values())} handler runs")
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"clocks": {2: {"offset_s": -2, "drift": 0.01}, 3: {"offset_s": 5, "drift": -0.01}}},
+        {"settings": {"phase1_tie": "pop", "phase2_tie": "block", "vote_names_chain": True, "finalize_gap_s": 0}},
+        {"settings": {"changed_before_tally": True, "vote_timeout_s": 3, "max_block_bytes": 300}},
+        {"timeline": [{"at_s": 200, "reboot": [2], "down_s": 30, "disk": "kept"}, {"at_s": 250, "kill": [3]}]},
+        {"timeline": [{"at_s": 200, "kill": [2]}, {"at_s": 300, "restart": [2]}]},
+        {"timeline": [{"at_s": 200, "pause": [4]}, {"at_s": 300, "resume": [4]}]},
+        {"network": {"loss": 0.1, "duplicate": 0.3, "reorder": 0.2, "delay": 0.5}},
+    ],
+    ids=["clocks", "readings", "timers", "reboot", "restart", "pause", "netem"],
+)
+def test_what_an_agent_may_choose_or_suffer_is_no_finding(keys: dict[str, Any]) -> None:
+    judgement = judged(**{**LOSSY, **keys})
+    assert judgement.verdict == "as specified", judgement
+
+
+@pytest.mark.parametrize(
+    ("quirk", "handler", "sentence"),
+    [
+        ("crash_on_tie", "reconcile_phase_2_timer_expiration", "it took the branch 'crashed by quirk'"),
+        ("early_phase3_expiry", "reconcile_phase_3", "started the phase three timer for 0 s; it should have started"),
+        ("stale_chain_hash", "receive_response_block_for_hash", "it had the top chain hash "),
+        ("commit_whatever_the_vote", "vote_timer_expiration", "it should have taken 'not approved'"),
+        ("hide_commits", "vote_timer_expiration", "it sent nothing; it should have sent Commit Block about block "),
+        ("approve_everything", "receive_request_add_block", "saying approve True"),
+        ("commit_without_succession", "receive_commit_block", "it should have taken 'does not succeed'"),
+        ("wrong_event", "receive_response_block_for_hash", "it triggered Reconcile Phase 1, and should have triggered"),
+        ("give_up_unfinished", "reconcile_phase_3_timer_expiration", "it triggered nothing, and should have triggered"),
+    ],
+)
+def test_a_wrong_agent_is_named_by_what_it_did_first(quirk: str, handler: str, sentence: str) -> None:
+    judgement = judged(network={"loss": 0.3}, duration_s=1200, quirks={quirk: True})
+    assert judgement.verdict == "deviates"
+    assert judgement.evidence[0].handler == handler
+    assert f"Algorithm {HANDLERS[handler].algorithm}, {handler}" in judgement.evidence[0].detail
+    assert sentence in judgement.evidence[0].detail
+
+
+def test_one_mistake_is_one_finding(honest: Evidence) -> None:
+    def disapprove_once(runs: list[HandlerRun]) -> None:
+        first_run(runs, "receive_request_add_block", "approve").branch = "disapprove"
+
+    judgement = steps.check(edited(honest, 2, disapprove_once))
+    assert judgement.reason.startswith("1 of ")
+    (finding,) = judgement.evidence
+    assert finding.agent_id == 2
+    assert "it took the branch 'disapprove'; it should have taken 'approve'" in finding.detail
+
+
+def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) -> None:
+    """It says to have committed nothing, and all that follows is said of a shorter chain: that is one mistake, too."""
+    simulated = simulate(scenario(**LOSSY, quirks={"ignore_commit": 0.1}), 1, tracing=True)
+    ignored = sum(
+        run.branch == "ignored by quirk" for trace in simulated.evidence.traces.values() for run in trace.runs
+    )
+    judgement = simulated.result.beside["steps"]
+    assert ignored > 1
+    assert judgement.reason.startswith(f"{ignored} of ")
+    assert {finding.handler for finding in judgement.evidence} == {"receive_commit_block"}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda runs: runs.remove(proposal(runs)), "it triggered nothing, and should have triggered Process Next"),
+        (lambda runs: runs.remove(expiry(runs)), "it ran without having been triggered"),
+        (lambda runs: without_expiry(runs), "it had not run by then, and the voting timer ended at t="),
+        (lambda runs: setattr(expiry(runs), "algorithm", 4), "it ran as Algorithm 4; what came is for Algorithm 5"),
+        (lambda runs: setattr(expiry(runs), "t", expiry(runs).t - 3), "s before the voting timer ended"),
+        (lambda runs: expiry(runs).trigger.update(timer="x"), "it ran as the x timer ended, which was not running"),
+        (lambda runs: expiry(runs).trigger.clear(), "it ran without a trigger that there is"),
+        (lambda runs: first_run(runs, "build_data_block").trigger.update(event=255), "said to have logged event 255"),
+        (lambda runs: commit(runs).trigger.update(seq=77), "it said to have got Commit Block 77 from agent"),
+        (lambda runs: setattr(commit(runs), "input", "!"), "a datagram that is to be dropped: not base64"),
+        (lambda runs: setattr(commit(runs), "input", None), "a datagram that is to be dropped: truncated"),
+        (lambda runs: proposal(runs).sent.clear(), "it sent nothing; it should have sent"),
+        (lambda runs: setattr(proposal(runs).sent[0], "seq", 9), "with sequence number 9"),
+        (lambda runs: runs.insert(9, HANDLER_RUN.validate_json(runs[9].to_line())), "; it should have "),
+    ],
+)
+def test_what_a_record_lacks_or_has_too_much_of_is_found(
+    honest: Evidence, change: Callable[[list[HandlerRun]], Any], sentence: str
+) -> None:
+    judgement = steps.check(edited(honest, 4, change))
+    assert judgement.verdict == "deviates"
+    assert any(sentence in finding.detail for finding in judgement.evidence), judgement.evidence
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_line_that_says_something_else_is_found(honest: Evidence, data: st.DataObject) -> None:
+    agent = data.draw(st.sampled_from(sorted(honest.traces)))
+    number = data.draw(st.integers(0, len(honest.traces[agent].runs) - 1))
+    document = json.loads(honest.traces[agent].runs[number].to_line())
+    keys = {"branch": "no such branch", "algorithm": 21, "handler": "no_handler", "state": None, "changes": None}
+    key = data.draw(st.sampled_from(sorted(keys)))
+    if key == "state":
+        part = data.draw(st.sampled_from(["chain", "deque", "stack", "top"]))
+        document["state"][part] = "00" * 32 if part == "top" else document["state"][part] + 1
+    elif key == "changes":
+        document["changes"] = [*document["changes"], ["chain+", "00" * 32]]
+    else:
+        document[key] = keys[key]
+    changed = edited(honest, agent, lambda runs: runs.__setitem__(number, HANDLER_RUN.validate_python(document)))
+    judgement = steps.check(changed)
+    assert judgement.verdict == "deviates"
+    assert any(finding.agent_id == agent for finding in judgement.evidence)
+
+
+def test_a_datagram_that_was_dropped_and_is_good_is_found(honest: Evidence) -> None:
+    trace = honest.traces[3]
+    request = first_run(trace.runs, "receive_request_add_block")
+    assert request.input is not None
+    asides = [(1, Dropped(1.0, "wrong length", request.input)), (1, Dropped(1.0, "truncated", "AAAA"))]
+    judgement = steps.check(with_traces(honest, {**honest.traces, 3: dataclasses.replace(trace, asides=asides)}))
+    (finding,) = judgement.evidence
+    assert "trace line 3" in finding.detail
+    assert "it was not given a Block Add Request of agent" in finding.detail
+
+
+def test_an_agent_need_not_tell_what_it_counts_and_which_timers_it_starts(honest: Evidence) -> None:
+    def silent(runs: list[HandlerRun]) -> None:
+        for run in runs:
+            run.tally = run.started = None
+
+    assert steps.check(edited(honest, 1, silent)).verdict == "as specified"
+
+
+def test_who_tells_which_timers_it_starts_is_found_when_it_starts_none(honest: Evidence) -> None:
+    def start_nothing(runs: list[HandlerRun]) -> None:
+        first_run(runs, "process_next_deque_block", "proposed").started = None
+
+    judgement = steps.check(edited(honest, 1, start_nothing))
+    assert "it started no timer; it should have started the voting timer for 10 s" in judgement.evidence[0].detail
+
+
+def test_of_a_trace_of_the_first_version_steps_are_not_judged(honest: Evidence) -> None:
+    header = Header.model_validate(honest.traces[2].header.model_dump() | {"schema": "ucp-trace/1"})
+    old = dataclasses.replace(honest.traces[2], header=header)
+    judgement = steps.check(with_traces(honest, {**honest.traces, 2: old}))
+    assert judgement.verdict == "not applicable"
+    assert judgement.reason == "of agent 2 the trace is of ucp-trace/1, which lacks what the agent received"
+
+
+def test_without_a_trace_of_everybody_steps_are_not_as_specified(honest: Evidence) -> None:
+    assert steps.check(with_traces(honest, {})).verdict == "not applicable"
+    some = {agent: trace for agent, trace in honest.traces.items() if agent != 5}
+    judgement = steps.check(with_traces(honest, some))
+    assert (judgement.verdict, judgement.reason) == ("not applicable", "of agent 5 there is no trace")
+
+
+def test_a_mission_that_cannot_be_is_told(honest: Evidence) -> None:
+    trace = honest.traces[1]
+    for part, told in (
+        ({"settings": {"vote_timeout_s": -1}}, "settings that cannot be"),
+        ({"clock": {"speedup": 0}}, "clock"),
+    ):
+        header = trace.header.model_copy(update=part)
+        judgement = steps.check(with_traces(honest, {**honest.traces, 1: dataclasses.replace(trace, header=header)}))
+        assert judgement.verdict == "deviates"
+        assert told in judgement.evidence[0].detail
+
+
+def test_an_agent_that_holds_what_nobody_can_know_is_followed_no_further(honest: Evidence) -> None:
+    def conjure(runs: list[HandlerRun]) -> None:
+        runs[3].changes.append(("chain+", "ab" * 32))
+        runs[3].state.chain += 1
+
+    judgement = steps.check(edited(honest, 1, conjure))
+    assert (
+        "after trace line 5 agent 1 cannot be followed: no record has the data of block abababababab"
+        in judgement.reason
+    )
