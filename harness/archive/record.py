@@ -122,7 +122,10 @@ class Cycle(_Model):
 
 
 class HandlerRuns(_Model):
-    """How many handler runs an agent had counted by a moment between `from_s` and `until_s`, in one life."""
+    """How many handler runs an agent had counted in one life, by a moment between `from_s` and `until_s`.
+
+    They are the same if it told its own mission time with it.
+    """
 
     counted: int
     from_s: float

@@ -38,7 +38,7 @@ def check(evidence: Evidence) -> Judgement:
                     untraced.add(sender)
                     continue
                 wrong = _wrong_trigger(run, ran, sent)
-                if wrong:
+                if wrong and not (isinstance(sender, int) and evidence.traces[sender].problem):
                     findings.append(Finding(agent_id, f"trace line {line}, t={run.t:g} s: {run.handler} {wrong}"))
     findings += waited_too_long(evidence)
     if findings:

@@ -48,6 +48,10 @@ class Condition(BaseModel):
     what: str
     detail: str | None = None
     fully_connected: bool | None = None
+    agents: list[int] | None = None
+    disk: str | None = None
+    counters: dict[str, Any] | None = None
+    """What the kernel had counted at the end."""
 
 
 @dataclass

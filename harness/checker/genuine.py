@@ -1,6 +1,7 @@
 """Characteristic 4: every block was made by the agent of the mission that it names, and is as it was made."""
 
 import base64
+from dataclasses import replace
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
@@ -38,6 +39,9 @@ def check(evidence: Evidence) -> Judgement:
             else:
                 continue
             findings.append(Finding(agent_id, detail, name, block.block_hash))
+    for agent_id, export in evidence.before_final_reconcile.items():
+        edited = _hashes_that_do_not_recompute(agent_id, export, evidence, recomputed)
+        findings += [replace(finding, detail=f"{finding.detail}, before the final reconcile") for finding in edited]
     if findings:
         return violated(NAME, "a block is not what an agent of this mission made", findings)
     if not evidence.exports:

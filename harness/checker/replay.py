@@ -14,6 +14,8 @@ from ucp.trace import HandlerRun, State
 
 BEGINS_OR_ENDS_A_RECONCILE = frozenset(("reconcile_begin", "reconcile_finalize"))
 
+COMPLETES = "build_data_block"
+
 
 @dataclass(frozen=True, slots=True)
 class Sight:
@@ -136,6 +138,8 @@ class _Holds:
                 if impossible := self._take(operation[:-1], place, block):
                     life.impossible.append(Sight(line, run, impossible, block))
             else:
+                if run.handler == COMPLETES and block not in self._completed:
+                    life.impossible.append(Sight(line, run, "a block that it has not completed joins the deque", block))
                 self._put(operation[:-1], place, block)
                 if self._copies[block] > 1:
                     life.second_copies.append(Sight(line, run, "", block))

@@ -69,7 +69,8 @@ def waited_too_long(evidence: "Evidence") -> Iterator[Finding]:
             vote = _Wait("a vote began and did not end", vote_s)
             reconcile = _Wait("a reconcile did not go on", reconcile_s)
             yield from _in_life(evidence, agent_id, life, vote, reconcile)
-        if agent_id in evidence.exports and evidence.ended_at_s is not None:
+        whole = agent_id in evidence.exports and not trace.problem
+        if whole and evidence.ended_at_s is not None:
             yield from _overdue(evidence, agent_id, evidence.ended_at_s, vote, reconcile)
 
 

@@ -29,6 +29,7 @@ class Status(BaseModel):
     top_chain_hash: str
     handled: int
     bytes_sent: int
+    mission_s: float | None = None
     dropped: dict[str, int] = {}
     send_failures: int | None = None
     trace_problem: str | None = None

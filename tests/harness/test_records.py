@@ -1,12 +1,17 @@
 """Records that were edited, cut, doubled or mixed are never green; those of an honest run never contradict."""
 
+import base64
 import json
+import os
 import shutil
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from harness.archive.archive import RunArchive
 from harness.checker import Result, check, gather
@@ -193,3 +198,139 @@ def test_the_export_before_the_final_reconcile_is_what_the_trace_had_led_to(dire
     result = judged(directory)
     assert contradicted(result) == ["6"]
     assert "before the final reconcile" in said(result)
+
+
+def test_a_message_is_heard_with_the_content_that_it_was_sent_with(directory: Path) -> None:
+    def turn_a_vote(lines: list[Document]) -> None:
+        vote = next(line for line in lines[1:] if line.get("trigger", {}).get("message") == "Block Add Response")
+        datagram = bytearray(base64.b64decode(vote["input"]))
+        datagram[14] ^= 1
+        vote["input"] = base64.b64encode(datagram).decode()
+
+    edit_lines(trace(directory, 1), turn_a_vote)
+    result = judged(directory)
+    assert contradicted(result) == ["1"]
+    assert "with another content than it was sent with" in said(result)
+
+
+def test_run_json_and_network_jsonl_tell_the_same(directory: Path) -> None:
+    edit(directory / "run.json", lambda record: record["network"][0].update(fully_connected=True))
+    assert "run.json says, and network.jsonl does not: start at 0 s" in said(judged(directory))
+
+
+def test_a_fault_that_is_left_out_is_missed(directory: Path) -> None:
+    edit(directory / "run.json", lambda record: record["faults"].pop(0))
+    assert "network.jsonl says, and run.json does not: reboot at 150 s" in said(judged(directory))
+
+
+def test_traces_of_two_runs_do_not_mix(directory: Path, tmp_path: Path) -> None:
+    asked = scenario(agents=3, duration_s=300, events={"source": "random", "mean_s": 5})
+    other = run(asked, 4, tmp_path / "other", Silent(), backend="sim").directory
+    shutil.copy(trace(other, 2), trace(directory, 2))
+    result = judged(directory)
+    assert "1" in contradicted(result)
+    assert "its trace says that the inception block's data is" in said(result)
+
+
+def test_a_trace_that_goes_on_with_that_of_another_run_is_read_up_to_there(directory: Path, tmp_path: Path) -> None:
+    asked = scenario(agents=3, duration_s=100)
+    other = run(asked, 4, tmp_path / "other", Silent(), backend="sim").directory
+    lines = len(trace(directory, 2).read_bytes().splitlines())
+    with trace(directory, 2).open("ab") as file:
+        file.write(trace(other, 2).read_bytes())
+    result = judged(directory)
+    (error,) = result.errors
+    assert f"line {lines + 1} is the header of another agent, or of another run" in error
+    assert not [number for number in "123" if result.characteristics[number].verdict == "holds"]
+
+
+def test_a_trace_of_a_newer_version_says_so(directory: Path) -> None:
+    edit_lines(trace(directory, 2), lambda lines: lines[0].update(schema="ucp-trace/9"))
+    (error,) = judged(directory).errors
+    assert "its schema is 'ucp-trace/9', and this version reads 'ucp-trace/1' and 'ucp-trace/2'" in error
+
+
+def test_a_trace_of_an_agent_that_is_not_on_the_roster_is_left_out(directory: Path) -> None:
+    shutil.copy(trace(directory, 2), trace(directory, 9))
+    edit_lines(trace(directory, 9), lambda lines: [line.update(agent_id=9) for line in lines if "schema" in line])
+    (error,) = judged(directory).errors
+    assert "of an agent that is not of this run" in error
+
+
+@pytest.mark.parametrize("name", ["agents/2.trace.jsonl", "agents/2.chain.json", "before_final_reconcile/2.chain.json"])
+def test_a_file_of_a_gigabyte_is_not_read(directory: Path, name: str) -> None:
+    os.truncate(directory / name, 1 << 30)
+    tracemalloc.start()
+    (error,) = judged(directory).errors
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert f"{name}: larger than" in error
+    assert peak < 64 << 20
+
+
+def test_captures_show_what_was_sent_and_heard(tmp_path: Path) -> None:
+    asked = scenario(agents=3, duration_s=200, capture=True, events={"source": "random", "mean_s": 5})
+    directory = run(asked, 1, tmp_path / "run", Silent(), backend="sim").directory
+    assert judged(directory).beside["records"].verdict == "agree"
+    (directory / "run.json").unlink()  # which knows how much was sent
+
+    def leave_out_a_vote(lines: list[Document]) -> None:
+        lines.remove(
+            next(line for line in reversed(lines[1:]) if line["trigger"].get("message") == "Block Add Request")
+        )
+
+    edit_lines(trace(directory, 1), leave_out_a_vote)
+    assert "its vehicle's capture saw a message leave that its trace does not tell of" in said(judged(directory))
+
+
+LISTS = st.sampled_from(["take one out", "double one", "swap two"])
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_no_block_can_be_moved_in_any_record(
+    whole: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    """Of what agents held, completed, heard and sent nothing can be taken out, doubled or swapped unseen."""
+    directory = tmp_path_factory.mktemp("edited") / "run"
+    shutil.copytree(whole, directory)
+    agent = data.draw(st.sampled_from([1, 2, 3]))
+    kind = data.draw(st.sampled_from(["export", "before", "trace", "changes"]))
+    if kind in ("export", "before"):
+        path = (
+            export(directory, agent)
+            if kind == "export"
+            else directory / "before_final_reconcile" / f"{agent}.chain.json"
+        )
+        document = json.loads(path.read_text())
+        place = data.draw(st.sampled_from(["chain", "completed"]))
+        document[place] = disordered(data, document[place])
+        hash_anew(document)
+        path.write_text(json.dumps(document))
+    else:
+        path = trace(directory, agent)
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        if kind == "trace":
+            lines = disordered(data, lines)
+        else:
+            line = data.draw(st.sampled_from([line for line in lines if len(line.get("changes", ())) > 0]))
+            line["changes"] = disordered(data, line["changes"])
+        path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
+    result = judged(directory)
+    assert result.bad or result.errors
+    shutil.rmtree(directory.parent)
+
+
+def disordered(data: st.DataObject, entries: list[Any]) -> list[Any]:
+    """With one taken out, one doubled, or two that differ swapped."""
+    how = data.draw(LISTS)
+    number = data.draw(st.integers(0, len(entries) - 1))
+    if how == "double one":
+        return [*entries[:number], entries[number], *entries[number:]]
+    others = [other for other, entry in enumerate(entries) if entry != entries[number]]
+    if how == "take one out" or not others:
+        return [*entries[:number], *entries[number + 1 :]]
+    other = data.draw(st.sampled_from(others))
+    swapped = list(entries)
+    swapped[number], swapped[other] = entries[other], entries[number]
+    return swapped

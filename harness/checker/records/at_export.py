@@ -37,12 +37,21 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         elif state not in _states_when(export, trace):
             yield _otherwise(agent_id, "its export", state, _last_state(lives, export), short=True)
     for agent_id, export in evidence.before_final_reconcile.items():
-        trace = evidence.traces.get(agent_id)
-        if trace is None or trace.problem:
-            continue
-        states = _states_when(export, trace)
-        if states and _state(export) not in states:
-            yield _otherwise(agent_id, "its export before the final reconcile", _state(export), states[-1])
+        yield from _before_final_reconcile(evidence, agent_id, export)
+
+
+def _before_final_reconcile(evidence: Evidence, agent_id: int, export: Export) -> Iterator[Contradiction]:
+    what = "its export before the final reconcile"
+    if evidence.roster is not None and agent_id not in evidence.roster:
+        yield of_agent(agent_id, f"{what} is of no agent of this run")
+    trace = evidence.traces.get(agent_id)
+    if trace is None or trace.problem:
+        return
+    states = _states_when(export, trace)
+    if states and _state(export) not in states:
+        yield _otherwise(agent_id, what, _state(export), states[-1])
+    elif export.completed not in _completed_when(export, evidence.lives[agent_id]):
+        yield of_agent(agent_id, f"{what} names other blocks that it had completed than its trace", "5")
 
 
 def _state(export: Export) -> State:
@@ -67,6 +76,15 @@ def _states_when(export: Export, trace: Trace) -> list[State]:
     if first == 0 or any(first <= start <= behind for start in trace.starts):
         states.insert(0, State(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash))
     return states
+
+
+def _completed_when(export: Export, lives: list[Life]) -> list[list[str]]:
+    """What each life of the agent had completed when it was exported."""
+    at_s = mission_s(export.exported_at_us, lives[0].trace.header)
+    if at_s is None:
+        return [export.completed]
+    by_then = [[run for run in life.runs if run.changes and run.t <= at_s + ROUNDED_S] for life in lives]
+    return [[block for run in runs for operation, block in run.changes if operation == "complete"] for runs in by_then]
 
 
 def _last_state(lives: list[Life], export: Export) -> State:

@@ -8,11 +8,15 @@ ROUNDED_S = 2e-6
 """Traces have microseconds."""
 
 
+def in_virtual_time(trace: Trace) -> bool:
+    """Where mission second 0 is the Unix epoch."""
+    return trace.header.clock.get("epoch_us") == 0
+
+
 def slack_s(trace: Trace) -> float:
     """Two processes on one machine do not start their clocks in the same instant; virtual time has one clock."""
-    clock = trace.header.clock
-    speedup = clock.get("speedup")
-    if clock.get("epoch_us") == 0 or not isinstance(speedup, int | float):
+    speedup = trace.header.clock.get("speedup")
+    if in_virtual_time(trace) or not isinstance(speedup, int | float):
         return ROUNDED_S
     return SLACK_WALL_S * speedup
 

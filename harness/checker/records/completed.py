@@ -1,16 +1,19 @@
 """What an agent completed: by its trace, by its export, and by the run's record of the lives that left no export."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import Contradiction
+from harness.checker.replay import Life
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     for agent_id, lives in evidence.lives.items():
         if evidence.traces[agent_id].problem:
             continue
+        yield from _over_brown_outs(evidence, agent_id, lives)
         traced = dict.fromkeys(block for life in lives for block in life.completed)
         export, recorded = evidence.exports.get(agent_id), evidence.recorded(agent_id)
         exported = export.completed if export else []
@@ -28,6 +31,18 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         if export is not None and _out_of_order(exported, lives[-1].completed):
             detail = "its export names the blocks that it completed in another order than its trace"
             yield _of_block(evidence, agent_id, detail, exported[0])
+
+
+def _over_brown_outs(evidence: Evidence, agent_id: int, lives: list[Life]) -> Iterator[Contradiction]:
+    """What it had completed is found on its disk; it may have been killed over a line that its trace lacks."""
+    for before, after in pairwise(lives):
+        if not after.runs or "boot" not in after.runs[0].trigger:
+            continue
+        found = [block for operation, block in after.runs[0].changes if operation == "complete"]
+        if found[: len(before.completed)] != before.completed:
+            lost = next((block for block in before.completed if block not in found), before.completed[0])
+            detail = f"at {after.runs[0].t:g} s it goes on with other blocks completed than it had when it went down"
+            yield _of_block(evidence, agent_id, detail, lost)
 
 
 def _out_of_order(exported: list[str], traced: list[str]) -> bool:

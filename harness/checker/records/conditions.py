@@ -3,40 +3,57 @@
 Of what flight changes run.json has only what changed who is connected to whom.
 """
 
+from collections import Counter
 from collections.abc import Iterator
+from itertools import pairwise
 
 from harness.archive.record import Fault, NetworkState
 from harness.checker.evidence import Condition, Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.scenario.changes import NO_MORE_FATES, RANGE
 
-Change = tuple[float, str, str | None, bool | None]
+Change = tuple[float, str, str | None, bool | None, tuple[int, ...], str | None]
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     record, log = evidence.record, evidence.conditions
     if record is None or log is None or record.mission_s is None:
         return
+    of_all = min(record.roster, default=0)
     # While fates are scripted nobody counts as connected, whatever the conditions.
     fated_until = max((state.at_s for state in record.network if state.what == NO_MORE_FATES), default=0.0)
+    network = [state for state in record.network if state.what != NO_MORE_FATES]
+    faults = [fault for fault in record.faults if fault.agents]
+    said = Counter(_change(state, fated_until) for state in network)
+    said.update(_change(fault, fated_until) for fault in faults)
+    taken_down = Counter(_change(condition, fated_until) for condition in log if condition.detail is not None)
+    for change in said - taken_down:
+        yield of_agent(
+            min(change[4], default=of_all), f"run.json says, and network.jsonl does not: {_in_words(change)}"
+        )
+    for change in taken_down - said:
+        if change[1] != RANGE:
+            detail = f"network.jsonl says, and run.json does not: {_in_words(change)}"
+            yield of_agent(min(change[4], default=of_all), detail)
+    for fault in record.faults:
+        if fault.fully_connected is not None and not taken_down[_change(fault, fated_until)]:
+            detail = f"the faults of run.json say, and network.jsonl does not: {_in_words(_change(fault, fated_until))}"
+            yield of_agent(of_all, detail)
+    if any(condition.counters not in (None, record.counters) for condition in log):
+        yield of_agent(of_all, "run.json and network.jsonl say that the kernel counted different things")
+    for earlier, later in pairwise(log):
+        if later.at_s < earlier.at_s:
+            yield of_agent(of_all, f"network.jsonl goes from {earlier.at_s:g} s back to {later.at_s:g} s")
 
-    def key(change: NetworkState | Fault | Condition) -> Change:
-        connected = None if change.at_s < fated_until else change.fully_connected
-        return change.at_s, change.what, change.detail, connected
 
-    said = {key(state): min(record.roster) for state in record.network if state.what != NO_MORE_FATES}
-    said |= {key(fault): min(fault.agents) for fault in record.faults if fault.agents}
-    taken_down = {key(change) for change in log}
-    for change, agent_id in said.items():
-        if change not in taken_down:
-            yield of_agent(agent_id, f"run.json says, and network.jsonl does not: {_in_words(change)}")
-    for condition in log:
-        if condition.detail is not None and condition.what != RANGE and key(condition) not in said:
-            detail = f"network.jsonl says, and run.json does not: {_in_words(key(condition))}"
-            yield of_agent(min(record.roster), detail)
+def _change(entry: NetworkState | Fault | Condition, fated_until: float) -> Change:
+    connected = None if entry.at_s < fated_until else entry.fully_connected
+    if isinstance(entry, NetworkState):
+        return entry.at_s, entry.what, entry.detail, connected, (), None
+    return entry.at_s, entry.what, entry.detail, connected, tuple(entry.agents or ()), entry.disk
 
 
 def _in_words(change: Change) -> str:
-    at_s, what, detail, connected = change
+    at_s, what, detail, connected, *_ = change
     known = "" if connected is None else f", all connected: {'yes' if connected else 'no'}"
     return f"{what} at {at_s:g} s, {detail}{known}"

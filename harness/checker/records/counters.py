@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from harness.archive.record import AgentRecord, HandlerRuns
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
-from harness.checker.records.clocks import slack_s
+from harness.checker.records.clocks import in_virtual_time, slack_s
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.checker.replay import Life
 from ucp.trace import Dropped
@@ -25,6 +25,10 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         yield from _lives(agent_id, recorded, lives)
         yield from _handler_runs(agent_id, recorded, trace, lives)
         yield from _counted(agent_id, recorded, trace, lives)
+        export = evidence.exports.get(agent_id)
+        if export is not None and recorded.outcome == "exported" and recorded.idle not in (None, export.idle):
+            idle, not_idle = ("idle", "not idle") if recorded.idle else ("not idle", "idle")
+            yield of_agent(agent_id, f"by run.json it was {idle} at the end, and by its export {not_idle}")
         yield from _dropped(agent_id, recorded, trace)
         if trace.cut_off and recorded.outcome == "exported":
             yield of_agent(agent_id, "its trace ends in half a line, and the agent ended by itself", short=True)
@@ -39,13 +43,16 @@ def _lives(agent_id: int, recorded: AgentRecord, lives: list[Life]) -> Iterator[
 
 def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]) -> Iterator[Contradiction]:
     """As many as it counted have a line, of those that ran until it was asked."""
+    expected = 1 + recorded.restarts + recorded.reboots
+    if len(recorded.handler_runs) not in (0, expected):
+        counts = _count(len(recorded.handler_runs), "count")
+        yield of_agent(agent_id, f"run.json has {counts} of its handler runs, and it began {_count(expected, 'time')}")
     if len(recorded.handler_runs) != len(lives):
         return  # of agents that count none, and where lives are lacking anyway
-    slack = ROUNDED_S + slack_s(trace)
     for life, counted in zip(lives, recorded.handler_runs, strict=True):
         if counted is None:
             continue
-        at_least, at_most = _lines_by(life, counted, slack)
+        at_least, at_most = _lines_by(life, counted)
         if not at_least <= counted.counted <= at_most:
             lines = at_most if counted.counted > at_most else at_least
             detail = (
@@ -55,20 +62,26 @@ def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: lis
             yield of_agent(agent_id, detail, "1", short=counted.counted > at_most)
 
 
-def _lines_by(life: Life, counted: HandlerRuns, slack: float) -> tuple[int, int]:
+def _lines_by(life: Life, counted: HandlerRuns) -> tuple[int, int]:
     """How many lines there are, at least and at most, of what had run when the agent was asked."""
-    from_s, until_s = counted.from_s - slack, counted.until_s + slack
+    if in_virtual_time(life.trace):
+        return len(life.runs), len(life.runs)
+    slack = ROUNDED_S + (slack_s(life.trace) if counted.from_s < counted.until_s else 0.0)
     return (
-        bisect_left(life.runs, from_s, key=lambda run: run.t),
-        bisect_right(life.runs, until_s, key=lambda run: run.t),
+        bisect_left(life.runs, counted.from_s - slack, key=lambda run: run.t),
+        bisect_right(life.runs, counted.until_s + slack, key=lambda run: run.t),
     )
 
 
 def _counted(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]) -> Iterator[Contradiction]:
+    """What it counted itself over all its lives."""
     sent = sum(life.sent for life in lives)
     if recorded.messages_sent is not None and recorded.messages_sent != sent:
         detail = f"by run.json it sent {_count(recorded.messages_sent, 'message')}, and by its trace {sent}"
         yield of_agent(agent_id, detail, "1")
+    sent_bytes = _bytes_sent(trace) if trace.header.has_inputs else None
+    if sent_bytes is not None and recorded.bytes_sent is not None and recorded.bytes_sent > sent_bytes:
+        yield of_agent(agent_id, f"by run.json it sent {recorded.bytes_sent} bytes, and by its trace {sent_bytes}", "1")
     if recorded.reconciles is not None:
         begun = sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in trace.runs)
         if recorded.reconciles != begun:
@@ -82,6 +95,12 @@ def _counted(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Lif
                 f"{changed_at_s:g} s"
             )
             yield of_agent(agent_id, detail)
+
+
+def _bytes_sent(trace: Trace) -> int:
+    """By the datagrams in base64, four characters of which are three bytes."""
+    datagrams = [message.datagram or "" for run in trace.runs for message in run.sent]
+    return sum(len(datagram) // 4 * 3 - datagram.count("=", -2) for datagram in datagrams)
 
 
 def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Contradiction]:

@@ -63,9 +63,8 @@ class _Incarnation:
     directory: Path
     store: Path
     status: Status | None = None
-    asked_s: float = 0.0
-    answered_s: float = 0.0
-    """When the harness asked for `status`, and had it, in mission seconds."""
+    between_s: tuple[float, float] = (0.0, 0.0)
+    """When it told its status, in mission seconds."""
     killed: bool = False
     """The data that it held is gone."""
     reboot: bool = False
@@ -79,8 +78,8 @@ class _Incarnation:
         """How many it had counted when it was asked last."""
         if self.status is None:
             return None
-        between = {"from_s": round(self.asked_s, 3), "until_s": round(self.answered_s, 3)}
-        return {"counted": self.status.handled, **between}
+        from_s, until_s = self.between_s
+        return {"counted": self.status.handled, "from_s": round(from_s, 3), "until_s": round(until_s, 3)}
 
 
 class AgentProcess:
@@ -252,7 +251,9 @@ class AgentProcess:
             detail = f"does not follow the agent contract: in its status {wrong} is missing or wrong"
             raise self._failed("broken", detail) from None
         life = self._lives[-1]
-        life.status, life.asked_s, life.answered_s = status, asked_s, self._now()
+        life.status = status
+        own_s = status.mission_s
+        life.between_s = (asked_s, self._now()) if own_s is None else (own_s, own_s)
         return status
 
     async def export(self) -> None:
