@@ -96,8 +96,9 @@ def _in_traces(evidence: "Evidence", busy: Sequence[int], times: int) -> Cycle |
     if not rounds:
         return Cycle(since_s=since_s, agents=list(busy))
     period_s = max(each.period_s for each in rounds.values())
-    seen = min(int((each.runs[-1].t - max(since_s, connected_s)) / each.period_s + 1e-6) for each in rounds.values())
-    if seen < times - 1:
+    from_s = max(since_s, connected_s)
+    seen = min(min(each.times, int((each.runs[-1].t - from_s) / each.period_s) + 1) for each in rounds.values())
+    if seen < times:
         return None
     begin_s = min(each.runs[0].t for each in rounds.values())
     return Cycle(
