@@ -19,7 +19,7 @@ from typing import Any
 
 from benchmarks.rounds import Spread, show
 from netem import probe
-from netem.capture import Capture
+from netem.capture import LiveCapture
 from netem.errors import CaptureError
 from netem.lab import Lab, LabError
 
@@ -39,7 +39,7 @@ async def once(vehicles: int, rate: int, packets: int, size: int, folder: Path) 
     captures = folder / f"{rate}-{time.monotonic_ns()}"
     captures.mkdir()
     async with await Lab.open(range(1, vehicles + 1), log=folder / "lab.log") as lab:
-        capture = await Capture.start(lab, captures)
+        capture = await LiveCapture.start(lab, captures)
         await capture.begin(time.time_ns() // 1000, 1)
         seconds = await _broadcast(lab, packets, size, _pause_s(rate), folder)
         counted = (await capture.stop()).values()

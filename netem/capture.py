@@ -1,6 +1,6 @@
 """The capture of a lab as the orchestrator sees it: a pcapng file for each vehicle, of all that its interface saw.
 
-    capture = await Capture.start(lab, folder)
+    capture = await LiveCapture.start(lab, folder)
     await capture.begin(epoch_us, speedup)
     counted = await capture.stop()
 
@@ -41,8 +41,8 @@ def begin_file(folder: Path, vehicle: int, epoch_us: int, speedup: float) -> Pat
     return path
 
 
-class Capture:
-    """Made by `Capture.start` only."""
+class LiveCapture:
+    """Made by `LiveCapture.start` only."""
 
     def __init__(self, vehicles: Sequence[int], folder: Path, process: LabProcess) -> None:
         self._vehicles = vehicles
@@ -52,7 +52,7 @@ class Capture:
         """Processor time that it has cost, once it is stopped."""
 
     @classmethod
-    async def start(cls, lab: Lab, folder: Path, vehicles: Sequence[int] | None = None) -> Capture:
+    async def start(cls, lab: Lab, folder: Path, vehicles: Sequence[int] | None = None) -> LiveCapture:
         """Tap the ports of `vehicles`, or of all in the lab; raises CaptureError.
 
         What crosses them from now on waits in memory.

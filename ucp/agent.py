@@ -68,7 +68,7 @@ from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import StoredState
 from ucp.timers import Timer
-from ucp.trace import Dropped, Entry, HandlerRun, State, Tally, Trigger, in_base64
+from ucp.trace import Dropped, Entry, HandlerRun, StateSummary, Tally, Trigger, in_base64
 
 ON_MESSAGE: dict[type[Message], EventHandler[Any]] = {
     BlockAddRequest: commit.receive_request_add_block,
@@ -281,9 +281,9 @@ class Agent:
             run.started, core.started = core.started, {}
         self._trace.append(run)
 
-    def _state_now(self) -> State:
+    def _state_now(self) -> StateSummary:
         state = self.state
-        return State(
+        return StateSummary(
             len(state.chain),
             len(state.blocks_to_be_committed),
             len(state.reconcile_stack),

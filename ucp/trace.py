@@ -31,7 +31,7 @@ class Sent:
 
 
 @dataclass(slots=True)
-class State:
+class StateSummary:
     """What an agent holds: lengths of chain, deque and reconcile stack, flags, and the top chain hash."""
 
     chain: int
@@ -65,7 +65,7 @@ class HandlerRun:
     branch: str
     changes: list[tuple[str, str]]
     sent: list[Sent]
-    state: State
+    state: StateSummary
     input: str | None = None
     tally: Tally | None = None
     started: dict[str, float] | None = None

@@ -16,7 +16,7 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="ignore", populate_by_name=True)
 
 
-class Evidence(_Model):
+class FindingRecord(_Model):
     """One piece of evidence; `block` is its name for people, such as 4.11."""
 
     agent_id: int
@@ -27,20 +27,20 @@ class Evidence(_Model):
     """The event handler that did it, if one did."""
 
 
-class JudgedCharacteristic(_Model):
+class CharacteristicRecord(_Model):
     name: str
     verdict: CharacteristicVerdict
     reason: str
-    evidence: list[Evidence]
+    evidence: list[FindingRecord]
 
 
-class Judged(_Model):
+class JudgementRecord(_Model):
     """A judgement beside the characteristics."""
 
     name: str
     verdict: Verdict
     reason: str
-    evidence: list[Evidence]
+    evidence: list[FindingRecord]
 
 
 class NetworkState(_Model):
@@ -281,12 +281,12 @@ class RunRecord(JudgedRecord):
     """A sentence for each scripted fate that decided nothing, and each injection that sent nothing."""
     capture: dict[str, CapturedFrames] | None = None
     """Of each vehicle, if captures were asked for and came to their end."""
-    characteristics: dict[str, JudgedCharacteristic] = {}
-    steps: Judged | None = None
+    characteristics: dict[str, CharacteristicRecord] = {}
+    steps: JudgementRecord | None = None
     """Whether every agent did at every step what the algorithms say."""
-    records: Judged | None = None
+    records: JudgementRecord | None = None
     """Whether what two records tell about the same thing agrees."""
-    liveness: Judged | None = None
+    liveness: JudgementRecord | None = None
     """Whether the swarm became idle once no more events came."""
     figures: dict[str, float | int | None] = {}
     survival: Survival | None = None

@@ -55,7 +55,7 @@ class Condition(BaseModel):
 
 
 @dataclass
-class InjectedMessages:
+class RogueTraffic:
     """What a rogue node sent, as far as traces can tell it from what agents sent."""
 
     messages: set[tuple[Any, Any, Any]] = field(default_factory=set)
@@ -63,7 +63,7 @@ class InjectedMessages:
     counted: bool = False
     """There are more, of which only the number is on record."""
 
-    def take_down(self, datagrams: Iterable[InjectedDatagram]) -> "InjectedMessages":
+    def take_down(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
         for datagram in datagrams:
             self.messages.add((datagram.sender, datagram.sequence, datagram.message))
             self.counted |= datagram.count is not None
@@ -88,7 +88,7 @@ class Evidence:
     record: JudgedRecord | None = None
     errors: list[str] = field(default_factory=list)
     before_final_reconcile: dict[int, Export] = field(default_factory=dict)
-    injected: InjectedMessages = field(default_factory=InjectedMessages)
+    injected: RogueTraffic = field(default_factory=RogueTraffic)
     conditions: list[Condition] | None = None
     """What was taken down of network and faults as it was made; None if nothing was."""
     captures: Captures | None = None
@@ -223,7 +223,7 @@ def gather(archive: RunArchive) -> Evidence:
     problems = list(archive.problems)
     if archive.record_error is not None:
         problems[0] += "; the exports are checked without it"
-    injected = InjectedMessages().take_down(archive.injected(InjectedDatagram))
+    injected = RogueTraffic().take_down(archive.injected(InjectedDatagram))
     return Evidence(
         archive.exports.by_agent,
         archive.traces,

@@ -10,7 +10,7 @@ from itertools import islice, pairwise
 from harness.archive.history import LATEST_S
 from harness.archive.traces import Trace
 from ucp.block import HASH_BYTES, next_chain_hash
-from ucp.trace import HandlerRun, State
+from ucp.trace import HandlerRun, StateSummary
 
 BEGINS_OR_ENDS_A_RECONCILE = frozenset(("reconcile_begin", "reconcile_finalize"))
 
@@ -77,7 +77,7 @@ def replay(trace: Trace, inception: str | None) -> list[Life]:
 
 def _replayed(life: Life, inception: str | None) -> Life:
     holds = _Holds(life, inception)
-    checked: State | None = None
+    checked: StateSummary | None = None
     reconciling, compared, now, sequence = False, True, 0.0, 0
     for line, run in life.numbered():
         state = run.state

@@ -12,7 +12,7 @@ from harness.archive.exports import Export, ExportMaker
 from harness.archive.record import JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
-from harness.checker.evidence import InjectedDatagram, InjectedMessages
+from harness.checker.evidence import InjectedDatagram, RogueTraffic
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
@@ -75,7 +75,7 @@ class InMemory:
         self._traces: dict[int, Trace] = {}
         self._maker = ExportMaker()
         self._kept: dict[int, Export] = {}
-        self._injected = InjectedMessages()
+        self._injected = RogueTraffic()
 
     def begin(self, life: Incarnation) -> None:
         if not self.tracing:

@@ -77,7 +77,7 @@ class Duplicate(_Lasting):
         return f"{super().in_words()}, {self.copies} more of each"
 
 
-class Delay(_Lasting):
+class DelayedCopy(_Lasting):
     """For `for_s` whatever matches is sent again `by_s` later."""
 
     by_s: Seconds
@@ -147,11 +147,11 @@ class Flood(_Lasting):
         return f"{super().in_words()}, {self.per_s:g} a second"
 
 
-Injection = Replay | Duplicate | Delay | Corrupt | Forge | Flood
+Injection = Replay | Duplicate | DelayedCopy | Corrupt | Forge | Flood
 MODELS: dict[str, type[Injection]] = {
     "replay": Replay,
     "duplicate": Duplicate,
-    "delay": Delay,
+    "delay": DelayedCopy,
     "corrupt": Corrupt,
     "forge": Forge,
     "flood": Flood,

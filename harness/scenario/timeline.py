@@ -8,7 +8,7 @@ from harness.scenario.faults import ASKED_FOR, Agents, Fault
 from harness.scenario.injection import (
     INJECTIONS,
     Corrupt,
-    Delay,
+    DelayedCopy,
     Duplicate,
     Flood,
     Forge,
@@ -39,7 +39,7 @@ class _Entry(Disturbance):
     heal: Literal[True] | None = None
     replay: Replay | None = None
     duplicate: Duplicate | None = None
-    delay: Delay | None = None
+    delay: DelayedCopy | None = None
     corrupt: Corrupt | None = None
     forge: Forge | None = None
     flood: Flood | None = None

@@ -17,7 +17,7 @@ from harness.scenario import Scenario
 from tests.harness.virtual import scenario
 from ucp.events import RandomEvents
 from ucp.store import StoredState
-from ucp.trace import HandlerRun, State
+from ucp.trace import HandlerRun, StateSummary
 
 
 def faulty(timeline: list[dict[str, Any]], **keys: Any) -> Scenario:
@@ -153,7 +153,9 @@ def test_a_reconcile_that_a_brown_out_ended_gives_no_chance_to_agree() -> None:
 
 
 def run_of(t: float, *, handler: str, algorithm: int, branch: str, reconciling: bool) -> HandlerRun:
-    return HandlerRun(t, handler, algorithm, {}, branch, [], [], State(0, 0, 0, reconciling, not reconciling, ""))
+    return HandlerRun(
+        t, handler, algorithm, {}, branch, [], [], StateSummary(0, 0, 0, reconciling, not reconciling, "")
+    )
 
 
 def test_without_traces_a_restarted_agents_blocks_are_known_all_the_same() -> None:

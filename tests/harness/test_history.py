@@ -18,7 +18,7 @@ from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from tests.harness.virtual import scenario
-from ucp.trace import HandlerRun, Sent, State
+from ucp.trace import HandlerRun, Sent, StateSummary
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 ROUGH: dict[str, Any] = {
@@ -48,7 +48,7 @@ def faults(simulated: Simulated) -> list[Fault]:
 
 
 def a_run(at_s: float, handler: str, branch: str = "", **keys: Any) -> HandlerRun:
-    state = State(0, 0, 0, reconciling=False, idle=True, top="")
+    state = StateSummary(0, 0, 0, reconciling=False, idle=True, top="")
     given = {"trigger": {"event": 1}, "changes": [], "sent": [], **keys}
     return HandlerRun(at_s, handler, 1, branch=branch, state=state, **given)
 

@@ -10,9 +10,9 @@ from harness.archive.traces import Header, Trace
 from harness.checker.injections import account, in_words
 from harness.play.rogue.sequences import forged_sequence
 from tests.harness.virtual import scenario
-from ucp.trace import HandlerRun, State
+from ucp.trace import HandlerRun, StateSummary
 
-STATE = State(0, 0, 0, reconciling=False, idle=True, top="")
+STATE = StateSummary(0, 0, 0, reconciling=False, idle=True, top="")
 TWICE = scenario(timeline=[{"at_s": 20, "replay": {}}, {"at_s": 30, "replay": {}}])
 FLOOD = scenario(timeline=[{"at_s": 20, "flood": {"for_s": 10, "per_s": 1}}])
 

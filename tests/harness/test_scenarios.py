@@ -15,7 +15,7 @@ from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from harness.scenario.changes import RANGE
 from harness.scenario.expect import NUMBERS
-from ucp.trace import State
+from ucp.trace import StateSummary
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 MATRIX = SCENARIOS / "thesis_matrix.yaml"
@@ -64,7 +64,7 @@ def reconciles(run: Simulated, *agents: int) -> int:
     )
 
 
-def state(run: Simulated, agent: int, at_s: float) -> State:
+def state(run: Simulated, agent: int, at_s: float) -> StateSummary:
     """What the agent held just before that mission second."""
     return [step.state for step in run.evidence.traces[agent].runs if step.t < at_s][-1]
 

@@ -4,11 +4,11 @@ import pytest
 
 from harness.archive.traces import Header, Trace
 from harness.checker.timer_lag import ENOUGH, timer_lag
-from ucp.trace import HandlerRun, State
+from ucp.trace import HandlerRun, StateSummary
 
 
 def _run(t: float, handler: str, branch: str, reconciling: bool = False) -> HandlerRun:
-    state = State(chain=0, deque=0, stack=0, reconciling=reconciling, idle=False, top="")
+    state = StateSummary(chain=0, deque=0, stack=0, reconciling=reconciling, idle=False, top="")
     return HandlerRun(t, handler, 1, {}, branch, [], [], state)
 
 

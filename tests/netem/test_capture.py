@@ -11,7 +11,7 @@ import pytest
 from scapy.layers.inet import IP, UDP
 from scapy.layers.l2 import Ether
 
-from netem.capture import Capture
+from netem.capture import LiveCapture
 from netem.conditions import Delay, LinkConditions, NetworkConditions
 from netem.errors import CaptureError
 from netem.lab import Lab
@@ -21,7 +21,7 @@ from tests.netem.conftest import DEADLINE_S, PACKETS, PORT, Air, assert_binomial
 pytestmark = pytest.mark.lab
 
 EVERYONE = "ff:ff:ff:ff:ff:ff"
-Story = Callable[[Air, Capture], Awaitable[None]]
+Story = Callable[[Air, LiveCapture], Awaitable[None]]
 
 
 def capture(vehicles: Sequence[int], folder: Path, story: Story, engine: str | None = None) -> None:
@@ -29,7 +29,7 @@ def capture(vehicles: Sequence[int], folder: Path, story: Story, engine: str | N
 
     async def run() -> None:
         async with await Lab.open(vehicles, engine=engine, log=folder / "lab.log") as lab:  # type: ignore[arg-type]
-            capture = await Capture.start(lab, folder)
+            capture = await LiveCapture.start(lab, folder)
             await capture.begin(time.time_ns() // 1000, 20)
             await story(Air(lab, folder), capture)
 
@@ -53,7 +53,7 @@ def test_at_10_000_packets_a_second_every_frame_is_in_every_file(tmp_path: Path)
     count = 5 * PACKETS
     vehicles = [1, 2, 300, 65535]
 
-    async def story(air: Air, capture: Capture) -> None:
+    async def story(air: Air, capture: LiveCapture) -> None:
         await asyncio.gather(*(air.broadcast(vehicle, count, count * vehicle, 600) for vehicle in (1, 2)))
         assert await capture.stop() == {vehicle: {"received": 2 * count, "dropped": 0} for vehicle in vehicles}
 
@@ -67,7 +67,7 @@ def test_at_10_000_packets_a_second_every_frame_is_in_every_file(tmp_path: Path)
 
 
 def test_what_is_lost_or_cut_off_on_its_way_is_in_its_senders_file_alone(engine: str, tmp_path: Path) -> None:
-    async def story(air: Air, capture: Capture) -> None:
+    async def story(air: Air, capture: LiveCapture) -> None:
         conditions = NetworkConditions(receivers={2: LinkConditions(0.3)}).with_partition([[4]])
         await air.lab.apply(conditions)
         listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in (2, 3, 4)}
@@ -90,7 +90,7 @@ def test_what_is_lost_or_cut_off_on_its_way_is_in_its_senders_file_alone(engine:
 def test_a_frame_is_there_as_often_and_as_late_as_its_receiver_got_it(netem: str, tmp_path: Path) -> None:
     delay_s, count = 0.3, 200
 
-    async def story(air: Air, capture: Capture) -> None:
+    async def story(air: Air, capture: LiveCapture) -> None:
         late, twice = LinkConditions(delay=Delay(delay_s)), LinkConditions(duplicate=1.0)
         await air.lab.apply(NetworkConditions(receivers={2: late, 3: twice}))
         await air.broadcast(1, count)
@@ -109,7 +109,7 @@ def test_a_frame_is_there_as_often_and_as_late_as_its_receiver_got_it(netem: str
 def test_frames_are_whole_with_their_checksums_and_vlan_tags(tmp_path: Path) -> None:
     tagged = "8100600588b5"
 
-    async def story(air: Air, capture: Capture) -> None:
+    async def story(air: Air, capture: LiveCapture) -> None:
         for size in (12, 13, 1472):
             await air.broadcast(258, 3, size=size)
         await air.run(258, "frames", EVERYONE, tagged, "0800")
@@ -133,7 +133,7 @@ def test_frames_are_whole_with_their_checksums_and_vlan_tags(tmp_path: Path) -> 
 def test_a_capture_that_cannot_keep_up_says_how_much_it_lacks(tmp_path: Path) -> None:
     count = 15_000  # of the largest datagrams: more than a ring has room for
 
-    async def story(air: Air, capture: Capture) -> None:
+    async def story(air: Air, capture: LiveCapture) -> None:
         await capture._process.send_signal(signal.SIGSTOP)
         await air.broadcast(1, count, size=1472)
         await capture._process.send_signal(signal.SIGCONT)
@@ -148,7 +148,7 @@ def test_a_capture_that_cannot_keep_up_says_how_much_it_lacks(tmp_path: Path) ->
 
 
 def test_a_capture_that_ends_by_itself_is_an_error_and_leaves_what_it_had(tmp_path: Path) -> None:
-    async def story(air: Air, capture: Capture) -> None:
+    async def story(air: Air, capture: LiveCapture) -> None:
         await air.broadcast(1, 100)
         watched = asyncio.create_task(capture.watch())
 
@@ -171,7 +171,7 @@ def test_a_capture_that_ends_by_itself_is_an_error_and_leaves_what_it_had(tmp_pa
 def test_a_capture_of_a_mission_that_never_began_leaves_no_files(tmp_path: Path) -> None:
     async def story() -> None:
         async with await Lab.open([1, 2], log=tmp_path / "lab.log") as lab:
-            assert await (await Capture.start(lab, tmp_path)).stop() == {}
+            assert await (await LiveCapture.start(lab, tmp_path)).stop() == {}
 
     play(story())
     assert not list(tmp_path.glob("*.pcapng"))
@@ -182,6 +182,6 @@ def test_a_lab_whose_ports_cannot_be_tapped_says_why(tmp_path: Path) -> None:
         async with await Lab.open([1, 2], log=tmp_path / "lab.log") as lab:
             lab.vehicles = (1, 2, 3)
             with pytest.raises(CaptureError, match="The capture of packets failed: No such device"):
-                await Capture.start(lab, tmp_path)
+                await LiveCapture.start(lab, tmp_path)
 
     play(story())

@@ -14,7 +14,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.records.clocks import ROUNDED_S, mission_s
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.checker.replay import Life
-from ucp.trace import State
+from ucp.trace import StateSummary
 
 FIELDS = {
     "chain": "blocks in the chain",
@@ -54,8 +54,8 @@ def _before_final_reconcile(evidence: Evidence, agent_id: int, export: Export) -
         yield of_agent(agent_id, f"{what} names other blocks that it had completed than its trace", "5")
 
 
-def _state(export: Export) -> State:
-    return State(
+def _state(export: Export) -> StateSummary:
+    return StateSummary(
         len(export.chain),
         len(export.blocks_to_be_committed),
         len(export.reconcile_stack),
@@ -65,7 +65,7 @@ def _state(export: Export) -> State:
     )
 
 
-def _states_when(export: Export, trace: Trace) -> list[State]:
+def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
     """The states that the agent may have been in when it was exported: more than one if runs fall into that instant."""
     at_s = mission_s(export.exported_at_us, trace.header)
     if at_s is None:
@@ -74,7 +74,7 @@ def _states_when(export: Export, trace: Trace) -> list[State]:
     behind = bisect_right(trace.runs, at_s + ROUNDED_S, key=lambda run: run.t)
     states = [run.state for run in trace.runs[max(0, first - 1) : behind]]
     if first == 0 or any(first <= start <= behind for start in trace.starts):
-        states.insert(0, State(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash))
+        states.insert(0, StateSummary(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash))
     return states
 
 
@@ -87,12 +87,16 @@ def _completed_when(export: Export, lives: list[Life]) -> list[list[str]]:
     return [[block for run in runs for operation, block in run.changes if operation == "complete"] for runs in by_then]
 
 
-def _last_state(lives: list[Life], export: Export) -> State:
+def _last_state(lives: list[Life], export: Export) -> StateSummary:
     runs = lives[-1].runs
-    return runs[-1].state if runs else State(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash)
+    return (
+        runs[-1].state if runs else StateSummary(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash)
+    )
 
 
-def _otherwise(agent_id: int, what: str, exported: State, traced: State, *, short: bool = False) -> Contradiction:
+def _otherwise(
+    agent_id: int, what: str, exported: StateSummary, traced: StateSummary, *, short: bool = False
+) -> Contradiction:
     differing = [
         (name, f"{FIELDS[name]} {_value(ours)}, not {_value(theirs)}")
         for name, ours, theirs in zip(FIELDS, astuple(exported), astuple(traced), strict=True)

@@ -12,7 +12,7 @@ from ucp.block import Block
 from ucp.events import MalformedEventsError
 from ucp.handler import EventHandler
 from ucp.messages import MalformedDatagramError
-from ucp.trace import HandlerRun, State
+from ucp.trace import HandlerRun, StateSummary
 
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
@@ -265,7 +265,7 @@ class Follower:
 
     def _expected(self, run: HandlerRun, handler: EventHandler[Any], branch: str) -> HandlerRun:
         core = self._core
-        state = State(
+        state = StateSummary(
             len(core.chain),
             len(core.blocks_to_be_committed),
             len(core.reconcile_stack),

@@ -26,7 +26,7 @@ from harness.play.radio_range import TRACK_S, RadioRange
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
 from harness.scenario.faults import Fault
-from netem.capture import Capture
+from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import CaptureError, LabUnavailable, NetemError
@@ -78,7 +78,7 @@ class ProcessRun:
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
         self.agents = [AgentProcess(agent_id, rundir, agent_command, self.clock.now) for agent_id in scenario.roster]
-        self._capture: Capture | None = None
+        self._capture: LiveCapture | None = None
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()
         self._watchers = Watchers()
@@ -136,7 +136,7 @@ class ProcessRun:
         await self._start_agents(self._lab)
         await self.apply(first)
         if self.scenario.capture:
-            self._capture = await Capture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
+            self._capture = await LiveCapture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
             self._watchers.start(self._capture.watch())
         await self._start_clock()
         self._watchers.start(self._poll_agents())

@@ -17,7 +17,7 @@ from typing import Any
 
 from harness.play.rogue import crafted
 from harness.play.rogue.sequences import forged_sequence
-from harness.scenario.injection import Corrupt, Delay, Duplicate, Flood, Forge, Injection, Replay
+from harness.scenario.injection import Corrupt, DelayedCopy, Duplicate, Flood, Forge, Injection, Replay
 from ucp.block import next_chain_hash
 from ucp.clock import MICROSECONDS
 from ucp.messages import (
@@ -150,7 +150,11 @@ class Rogue:
         elif isinstance(injection, Corrupt):
             changed = crafted.corrupted(datagram, injection.bits, self._rng)
             self._send(Injected(window.number, "corrupt", sender, changed))
-        elif isinstance(injection, Delay) and now < window.until - injection.by_s and len(self._waiting) < MAX_WAITING:
+        elif (
+            isinstance(injection, DelayedCopy)
+            and now < window.until - injection.by_s
+            and len(self._waiting) < MAX_WAITING
+        ):
             self.sent[window.number] += 1
             self._made += 1
             copy = Injected(window.number, "delay", sender, datagram)
