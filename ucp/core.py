@@ -9,11 +9,11 @@ from typing import Any
 
 from ucp.block import Block
 from ucp.handler import EventHandler, LocalEvent
-from ucp.messages import Message, block_named, encode
+from ucp.messages import Message
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.timers import Timer
-from ucp.trace import Sent, in_base64
+from ucp.trace import Sent
 
 
 class Core(AgentState):
@@ -46,10 +46,7 @@ class Core(AgentState):
         self.outbox.append((self._sequence, message))
         self.sent[message.NAME] += 1
         if self._tracing:
-            block_hash = block_named(message)
-            datagram = in_base64(encode(self.agent_id, self._sequence, message))
-            about = block_hash.hex() if block_hash else None
-            self.announced.append(Sent(message.NAME, self._sequence, about, datagram))
+            self.announced.append(Sent.of(self.agent_id, self._sequence, message))
         self._sequence += 1
 
     def start(self, timer: Timer, duration_s: float) -> None:

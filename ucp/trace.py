@@ -9,6 +9,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from ucp.messages import Message, block_named, encode
+
 SCHEMA = "ucp-trace/2"
 
 _encode = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
@@ -28,6 +30,12 @@ class Sent:
     seq: int
     block: str | None = None
     datagram: str | None = None
+
+    @classmethod
+    def of(cls, sender: int, sequence: int, message: Message) -> "Sent":
+        block_hash = block_named(message)
+        datagram = in_base64(encode(sender, sequence, message))
+        return cls(message.NAME, sequence, block_hash.hex() if block_hash else None, datagram)
 
 
 @dataclass(slots=True)

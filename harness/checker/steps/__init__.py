@@ -37,7 +37,8 @@ def check(evidence: Evidence) -> Judgement:
             deviations.append(Deviation(agent_id, 1, 0.0, None, str(error)))
             continue
         followers = _followers(evidence, trace, mission, blocks)
-        deviations += _follow(evidence, agent_id, trace, followers)
+        _follow(evidence, agent_id, trace, followers)
+        deviations += [deviation for follower in followers for deviation in follower.deviations]
         deviations += _wrongly_dropped(trace, mission)
         lost += [follower.lost for follower in followers if follower.lost]
         steps += len(trace.runs)
@@ -71,13 +72,13 @@ def _followers(evidence: Evidence, trace: Trace, mission: Mission, blocks: Block
     return [Follower(mission, tells, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
 
 
-def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> Iterator[Deviation]:
-    """Where the agent's steps differ, in order."""
+def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> None:
+    """Take each life of the agent through all of its steps."""
     for follower, life in zip(followers, trace.lives(), strict=True):
         for line, run in life:
-            yield from follower.follow(line, run)
+            follower.follow(line, run)
     if agent_id in evidence.exports and not trace.cut_off and not trace.problem:
-        yield from followers[-1].end(evidence.ended_at_s)
+        followers[-1].end(evidence.ended_at_s)
 
 
 def _wrongly_dropped(trace: Trace, mission: Mission) -> Iterator[Deviation]:

@@ -1,6 +1,6 @@
 """Following one life of an agent: the reference core is given what the agent was given, a handler at a time."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from harness.checker.steps.deviation import Deviation
@@ -11,8 +11,8 @@ from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of, 
 from ucp.block import Block
 from ucp.events import MalformedEventsError
 from ucp.handler import EventHandler
-from ucp.messages import MalformedDatagramError
-from ucp.trace import HandlerRun, StateSummary
+from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError
+from ucp.trace import HandlerRun, StateSummary, Trigger
 
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
@@ -34,6 +34,8 @@ class Follower:
     """
 
     def __init__(self, mission: Mission, tells: frozenset[str], blocks: Blocks, was_paused: Paused) -> None:
+        self.deviations: list[Deviation] = []
+        """Where it differs, in order."""
         self.lost: str | None = None
         """Why, and after which line, the agent cannot be followed any further."""
         self._mission = mission
@@ -49,60 +51,63 @@ class Follower:
         self._began = False
         self._top, self._top_hex = b"", ""
 
-    def follow(self, line: int, run: HandlerRun) -> Iterator[Deviation]:
-        """Where this run, or what should have come before it, differs from the reference."""
+    def follow(self, line: int, run: HandlerRun) -> None:
+        """See where this run, or what should have come before it, differs from the reference."""
         if self.lost is not None:
             return
         core = self._core
         local = run.trigger.get("local")
         if core.triggered or local is not None:
-            yield from self._triggered(line, run, local)
+            self._triggered(line, run, local)
         now = self._mission.local(run.t)
         if local is None:
             self._ran.clear()
             self._adopted = False
-            yield from self._overdue(line, run.t, now)
+            late = now - self._mission.late_s
+            for timer in core.timers:
+                if timer.deadline is not None and timer.deadline < late:
+                    self._overdue(line, run.t, now)
         self._ran[run.handler] = line, run.t
         core.now = now
-        before = core.before()
+        before = core.before(run)
         try:
             handler, inputs = self._input(run, now)
             core.running = handler
             branch = handler.run(core, *inputs)
         except NotHandledError as error:
-            yield self._deviation(line, run.t, run.handler, f"it {error}")
+            self._differ(line, run.t, run.handler, f"it {error}")
         except (AssertionError, ValueError, KeyError, IndexError):  # the agent is where no agent comes to
-            yield self._deviation(line, run.t, run.handler, "it ran in a state in which the protocol does not run it")
+            self._differ(line, run.t, run.handler, "it ran in a state in which the protocol does not run it")
         else:
+            self._began = True
             if not self._differs(run, handler, branch):
-                if core.changes or core.announced or core.started:
-                    core.step_is_over()
-                self._began = True
+                core.step_is_over()
                 return
             expected = self._expected(run, handler, branch)
-            yield Deviation(self._mission.agent_id, line, run.t, run.handler, run=run, expected=expected)
+            deviation = Deviation(self._mission.agent_id, line, run.t, run.handler, run=run, expected=expected)
+            self.deviations.append(deviation)
         self._began = True
         self._adopt(line, run, before)
 
-    def end(self, at_s: float | None) -> Iterator[Deviation]:
-        """What should have come by the end of the run, at `at_s`, of an agent that was there to the end."""
+    def end(self, at_s: float | None) -> None:
+        """See what should have come by the end of the run, at `at_s`, of an agent that was there to the end."""
         if self.lost is not None:
             return
-        yield from self._not_run()
+        self._not_run()
         if at_s is not None:
             line = max((line for line, _ in self._ran.values()), default=1)
-            yield from self._overdue(line, at_s, self._mission.local(at_s))
+            self._overdue(line, at_s, self._mission.local(at_s))
 
     # What should have come before
 
-    def _triggered(self, line: int, run: HandlerRun, local: int | str | None) -> Iterator[Deviation]:
+    def _triggered(self, line: int, run: HandlerRun, local: int | str | None) -> None:
         """Handlers run that were triggered, and no others."""
         triggered = self._core.triggered
         if self._adopted:
             triggered.clear()
             return
         if local is None:
-            yield from self._not_run()
+            self._not_run()
             return
         asked, event = str(local), EVENT_OF.get(run.handler, "what is no local event")
         if triggered:
@@ -119,19 +124,19 @@ class Follower:
             if by == run.handler:
                 said = "it ran without having been triggered"
         at_line, at_s = self._ran.get(by, (line, run.t))
-        yield self._deviation(at_line, at_s, by, said)
+        self._differ(at_line, at_s, by, said)
         triggered.clear()
         self._adopted = True
 
-    def _not_run(self) -> Iterator[Deviation]:
+    def _not_run(self) -> None:
         """What was triggered has not run, and the next input has come."""
         triggered = self._core.triggered
         if triggered and not self._adopted:
             event, by = triggered[0]
-            yield self._deviation(*self._ran[by], by, f"it triggered nothing, and should have triggered {event}")
+            self._differ(*self._ran[by], by, f"it triggered nothing, and should have triggered {event}")
         triggered.clear()
 
-    def _overdue(self, line: int, at_s: float, now: float) -> Iterator[Deviation]:
+    def _overdue(self, line: int, at_s: float, now: float) -> None:
         """Timers that ended long ago, and whose handlers have not run."""
         late = now - self._mission.late_s
         for timer in self._core.timers:
@@ -139,56 +144,58 @@ class Follower:
                 ended_s = at_s - (now - timer.deadline) / self._mission.rate
                 if not self._was_paused(ended_s, at_s):
                     said = f"it had not run by then, and the {timer.name} timer ended at t={ended_s:g} s"
-                    yield self._deviation(line, at_s, ON_TIMER[timer.name].name, said)
+                    self._differ(line, at_s, ON_TIMER[timer.name].name, said)
                     timer.stop()
 
     # What came
 
     def _input(self, run: HandlerRun, now: float) -> tuple[EventHandler[Any], tuple[Any, ...]]:
         """The handler that this runs, and what it is given. Raises NotHandledError."""
-        match run.trigger:
-            case {"local": _}:
-                handler, inputs = HANDLERS.get(run.handler), ()
-                if run.handler not in EVENT_OF:
-                    raise NotHandledError("ran for a local event, which is no such event's handler")
-                if self._adopted:
-                    self._core.go_along(run)
-            case {"message": str(name), "from": int(sender), "seq": int(sequence)}:
-                handler, inputs = self._message(run.input, name, sender, sequence)
-            case {"timer": str(name)}:
-                handler, inputs = self._timer(name, now), ()
-            case {"event": int(event_id)}:
-                handler, inputs = ON_LOCAL_EVENT["Build Data Block"], self._event(run.input, event_id)
-            case {"operator": "reconcile"}:
-                handler, inputs = ON_LOCAL_EVENT["Reconcile Begin"], ()
-            case {"boot": _}:
-                self._boot(run)
-                handler, inputs = ON_LOCAL_EVENT["Reconcile Finalize"], ()
-            case _:
-                raise NotHandledError("ran without a trigger that there is")
-        assert handler is not None
-        if (handler.name, handler.algorithm) != (run.handler, run.algorithm):
+        trigger = run.trigger
+        if "message" in trigger:
+            handler, inputs = self._message(run.input, trigger)
+        elif "local" in trigger:
+            handler, inputs = self._local(run), ()
+        elif "timer" in trigger:
+            handler, inputs = self._timer(str(trigger["timer"]), now), ()
+        elif "event" in trigger:
+            handler, inputs = ON_LOCAL_EVENT["Build Data Block"], self._event(run.input, trigger["event"])
+        elif trigger.get("operator") == "reconcile":
+            handler, inputs = ON_LOCAL_EVENT["Reconcile Begin"], ()
+        elif "boot" in trigger:
+            self._boot(run)
+            handler, inputs = ON_LOCAL_EVENT["Reconcile Finalize"], ()
+        else:
+            raise NotHandledError("ran without a trigger that there is")
+        if handler.name != run.handler or handler.algorithm != run.algorithm:
             raise NotHandledError(
                 f"ran as Algorithm {run.algorithm}; what came is for Algorithm {handler.algorithm}, {handler.name}"
             )
         return handler, inputs
 
-    def _message(
-        self, datagram: str | None, name: str, sender: int, sequence: int
-    ) -> tuple[EventHandler[Any], tuple[Any, ...]]:
+    def _local(self, run: HandlerRun) -> EventHandler[Any]:
+        if run.handler not in EVENT_OF:
+            raise NotHandledError("ran for a local event, which is no such event's handler")
+        if self._adopted:
+            self._core.go_along(run)
+        return HANDLERS[run.handler]
+
+    def _message(self, datagram: str | None, trigger: Trigger) -> tuple[EventHandler[Any], tuple[Any, ...]]:
         try:
-            sent_by, number, message = decoded(datagram or "")
+            sender, sequence, message = decoded(datagram or "")
         except MalformedDatagramError as malformed:
             raise NotHandledError(f"handled a datagram that is to be dropped: {malformed.reason}") from None
-        self._blocks.add_from(message)
-        if reason := why_not_handled(self._mission.agent_id, self._mission.roster, sent_by, message):
+        if type(message) in CARRY_A_BLOCK:
+            self._blocks.add_from(message)
+        if reason := why_not_handled(self._mission.agent_id, self._mission.roster, sender, message):
             raise NotHandledError(f"handled a datagram that is to be dropped: {reason}")
-        if (message.NAME, sent_by, number) != (name, sender, sequence):
+        told = trigger["message"], trigger.get("from"), trigger.get("seq")
+        if told != (message.NAME, sender, sequence):
             raise NotHandledError(
-                f"said to have got {name[:60]} {sequence} from agent {sender}, "
-                f"and the datagram is {message.NAME} {number} from agent {sent_by}"
+                f"said to have got {str(told[0])[:60]} {told[2]} from agent {told[1]}, "
+                f"and the datagram is {message.NAME} {sequence} from agent {sender}"
             )
-        return ON_MESSAGE[type(message)], (sent_by, message)
+        return ON_MESSAGE[type(message)], (sender, message)
 
     def _timer(self, name: str, now: float) -> EventHandler[Any]:
         timer = self._timers.get(name)
@@ -200,7 +207,7 @@ class Follower:
             raise NotHandledError(f"ran {early:.3g} s before the {name} timer ended")
         return ON_TIMER[name]
 
-    def _event(self, record: str | None, event_id: int) -> tuple[Any, ...]:
+    def _event(self, record: str | None, event_id: int | str) -> tuple[Any, ...]:
         try:
             event = event_of(record or "")
         except MalformedEventsError as malformed:
@@ -241,7 +248,9 @@ class Follower:
 
     def _differs(self, run: HandlerRun, handler: EventHandler[Any], branch: str) -> bool:
         core = self._core
-        if run.branch != branch or run.changes != core.changes or run.sent != core.announced:
+        if run.branch != branch or run.changes != core.changes:
+            return True
+        if (run.sent or core.outbox) and not core.has_sent(run.sent):
             return True
         if "started" in self._tells and (run.started or {}) != core.started:
             return True
@@ -273,7 +282,7 @@ class Follower:
             core.idle,
             self._top_in_hex(),
         )
-        changes, sent = list(core.changes), list(core.announced)
+        changes, sent = list(core.changes), core.sent_in_full()
         expected = HandlerRun(run.t, handler.name, handler.algorithm, run.trigger, branch, changes, sent, state)
         expected.started = dict(core.started) if "started" in self._tells else run.started
         expected.tally = tally_of(core, handler) if branch in COUNTING and "tally" in self._tells else run.tally
@@ -288,5 +297,5 @@ class Follower:
         except NotOnRecordError as error:
             self.lost = f"after trace line {line} agent {self._mission.agent_id} cannot be followed: {error}"
 
-    def _deviation(self, line: int, at_s: float, handler: str, said: str) -> Deviation:
-        return Deviation(self._mission.agent_id, line, at_s, handler, said)
+    def _differ(self, line: int, at_s: float, handler: str, said: str) -> None:
+        self.deviations.append(Deviation(self._mission.agent_id, line, at_s, handler, said))

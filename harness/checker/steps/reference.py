@@ -1,6 +1,6 @@
 """The reference core of the step judge: it can also be put into the state that an agent says it is in."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded
@@ -13,6 +13,7 @@ from ucp.messages import (
     MalformedDatagramError,
     Message,
     RequestForBlock,
+    block_named,
 )
 from ucp.settings import Settings
 from ucp.timers import Timer
@@ -23,7 +24,8 @@ class Before(NamedTuple):
     """Of the state before a step what its changes do not tell."""
 
     stack: list[Block] | None
-    current_block: bytes
+    current_block: bytes | None
+    """Only of a step that logs an event."""
     phase_three_ends: float | None
 
 
@@ -40,19 +42,44 @@ class ReferenceCore(Core):
         self._moved[block_hash] = block
         self.changes.append((operation, block_hash))
 
-    def before(self) -> Before:
+    def before(self, run: HandlerRun) -> Before:
         stack = list(self.reconcile_stack) if self.reconcile_stack else None
-        return Before(stack, bytes(self.current_block), self.phase_three_timer.deadline)
+        current_block = bytes(self.current_block) if run.handler == "build_data_block" else None
+        return Before(stack, current_block, self.phase_three_timer.deadline)
 
     def step_is_over(self) -> None:
         """What has come of it is not wanted any more."""
         if self.changes:
             self.changes = []
-        if self.announced:
-            self.announced = []
-            self.outbox.clear()
+        if self.outbox:
+            self.outbox = []
         if self.started:
             self.started = {}
+
+    def send(self, message: Message) -> None:
+        """As any core does, but for the record, which is made when it is wanted."""
+        self.outbox.append((self._sequence, message))
+        self._sequence += 1
+
+    def has_sent(self, sent: Sequence[Sent]) -> bool:
+        """Whether these are the messages that the step has sent."""
+        if len(sent) != len(self.outbox):
+            return False
+        for told, (sequence, message) in zip(sent, self.outbox, strict=True):
+            try:
+                sender, number, content = decoded(told.datagram or "")
+            except MalformedDatagramError:
+                return False
+            if content != message or (sender, number) != (self.agent_id, sequence):
+                return False
+            about = block_named(message)
+            if (told.message, told.seq, told.block) != (message.NAME, sequence, about.hex() if about else None):
+                return False
+        return True
+
+    def sent_in_full(self) -> list[Sent]:
+        """What the step has sent, as a trace says it."""
+        return [Sent.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
         """It has differed, and runs this by itself: which block it is after says what it does."""
@@ -79,12 +106,13 @@ class ReferenceCore(Core):
                 case "stack+":
                     self.reconcile_stack.pop()
         self.reconcile_stack[:] = before.stack or ()
-        self.current_block[:] = before.current_block
+        if before.current_block is not None:
+            self.current_block[:] = before.current_block
         for timer in self.timers:
             if timer.name in self.started:
                 timer.stop()
         self.phase_three_timer.deadline = before.phase_three_ends
-        self._sequence -= len(self.announced)
+        self._sequence -= len(self.outbox)
         self.step_is_over()
 
     def adopt(self, run: HandlerRun, blocks: Blocks) -> None:
