@@ -50,7 +50,7 @@ def test_a_run_that_was_killed_says_so_and_what_is_missing(tmp_path: Path) -> No
 
 
 def test_hostile_words_make_no_markup_and_no_long_text(tmp_path: Path) -> None:
-    hostile = "<img src=x> | [away](javascript:x) **loud** `code`\n\n# title " * 1000
+    hostile = "<img src=x> | [away](javascript:x) **loud** `code`\n\n# title " * 300
     faults = [{"at_s": number, "what": hostile, "detail": hostile} for number in range(500)]
     judged = {"1": {"name": hostile, "verdict": "violated", "reason": hostile, "evidence": [hostile] * 500}}
     changes = {
