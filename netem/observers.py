@@ -94,7 +94,7 @@ async def _observe(engine: EngineName, study: Study, packets: int, pause_s: floa
             await lab.apply(study.conditions)
             listeners = {vehicle: await _Program.start(lab, folder, vehicle, "receive", _PORT) for vehicle in vehicles}
             for listener in listeners.values():
-                await listener.said("ready")
+                await listener.wait_for("ready")
             senders = {}
             for sender, own in numbers.items():
                 stream = (_PORT, packets, own.start, lab.broadcast, DATA_BYTES, pause_s)
@@ -124,12 +124,12 @@ async def _observe(engine: EngineName, study: Study, packets: int, pause_s: floa
 
 def check(
     study: Study,
-    said: Mapping[int, Mapping[str, Any]],
+    reports: Mapping[int, Mapping[str, Any]],
     came: Mapping[tuple[int, int], Sequence[Arrival]],
     counted: Applied,
 ) -> None:
     """Raises DisturbedError if the machine itself lost packets; of corrupted ones nobody can say who lost them."""
-    for vehicle, report in said.items():
+    for vehicle, report in reports.items():
         links = [link for link in came if link[1] == vehicle]
         if report["overflow"]:
             raise DisturbedError(f"The receive buffer of vehicle {vehicle} overflowed; {_TRY_AGAIN}")
@@ -176,7 +176,7 @@ class _Program:
         process = await lab.spawn(vehicle, argv, cwd=folder, env=environment, stdout=output, stderr=output)
         return cls(process, output)
 
-    async def said(self, word: str) -> None:
+    async def wait_for(self, word: str) -> None:
         """Wait until it says that, or ends."""
         while word not in self._output.read_text() and self._process.returncode is None:
             await asyncio.sleep(0.01)

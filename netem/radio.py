@@ -108,9 +108,9 @@ class LogDistance:
 def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], float]:
     """The loss between each two vehicles, in whole steps; those that lose nothing to the radio are left out."""
     losses: dict[frozenset[int], float] = {}
-    for one, other in combinations(places, 2):
-        if lost := round(radio.loss(places[one].distance_m(places[other])) * STEPS) / STEPS:
-            losses[frozenset((one, other))] = lost
+    for first, second in combinations(places, 2):
+        if lost := round(radio.loss(places[first].distance_m(places[second])) * STEPS) / STEPS:
+            losses[frozenset((first, second))] = lost
     return losses
 
 
@@ -144,10 +144,10 @@ def components(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> tupl
     return tuple(sorted(groups, key=lambda group: (-len(group), min(group))))
 
 
-def _both_ways(conditions: NetworkConditions, one: int, other: int) -> bool:
-    if conditions.is_cut(one, other):
+def _both_ways(conditions: NetworkConditions, first: int, second: int) -> bool:
+    if conditions.is_cut(first, second):
         return False
-    return not (_is_dead(conditions.link(one, other)) or _is_dead(conditions.link(other, one)))
+    return not (_is_dead(conditions.link(first, second)) or _is_dead(conditions.link(second, first)))
 
 
 def _is_dead(link: LinkConditions) -> bool:

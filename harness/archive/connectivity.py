@@ -78,7 +78,7 @@ class _Network:
     def __init__(self, vehicles: Collection[int]) -> None:
         self.vehicles = tuple(sorted(vehicles))
         self.lost: set[int] = set()
-        self._pairs = {f"{one}-{other}": (one, other) for one, other in combinations(self.vehicles, 2)}
+        self._pairs = {f"{low}-{high}": (low, high) for low, high in combinations(self.vehicles, 2)}
         self._out_of_range: set[Pair] = set()
         self._cut_off: set[Pair] = set()
 
@@ -102,20 +102,20 @@ class _Network:
     def components(self) -> Components:
         left = set(self.vehicles) - self.lost
         reaches = {vehicle: left - {vehicle} for vehicle in left}
-        for one, other in self.cut:
-            if one in left and other in left:
-                reaches[one].discard(other)
-                reaches[other].discard(one)
-        found = []
+        for low, high in self.cut:
+            if low in left and high in left:
+                reaches[low].discard(high)
+                reaches[high].discard(low)
+        groups = []
         while left:
             reached: set[int] = set()
             ahead = {min(left)}
             while ahead:
                 reached |= ahead
                 ahead = set().union(*(reaches[vehicle] for vehicle in ahead)) - reached
-            found.append(frozenset(reached))
+            groups.append(frozenset(reached))
             left -= reached
-        return tuple(sorted(found, key=lambda group: (-len(group), min(group))))
+        return tuple(sorted(groups, key=lambda group: (-len(group), min(group))))
 
 
 def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectivity:

@@ -250,10 +250,10 @@ def export_files(paths: Iterable[Path]) -> list[Path]:
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            found = export_paths(path)
-            if not found and not (path / RUN_FILE).exists():
+            exports = export_paths(path)
+            if not exports and not (path / RUN_FILE).exists():
                 raise RunDirectoryError(f"{path}: neither a run directory nor a directory with *{SUFFIX} files")
-            files += found
+            files += exports
         elif path.exists():
             files.append(path)
         else:

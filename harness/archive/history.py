@@ -134,21 +134,21 @@ def history_of(traces: Mapping[int, Trace], faults: Iterable[Fault], end_s: floa
         if fault.kind.ends_a_life:
             for agent in fault.agents or ():
                 falls[agent].append(fault.at_s)
-    found = History([], [], [], [], [] if whole else None)
+    history = History([], [], [], [], [] if whole else None)
     for agent, trace in sorted(traces.items()):
         every = [runs for runs in lives(trace) if runs]
         for runs, later in zip_longest(every, every[1:]):
             known = [at_s for at_s in falls[agent] if at_s >= runs[-1].t]
-            _Incarnation(agent, found).follow(runs, min([*known, later[0].t if later else end_s]))
-    return replace(found, messages=_messages(traces)) if whole else found
+            _Incarnation(agent, history).follow(runs, min([*known, later[0].t if later else end_s]))
+    return replace(history, messages=_messages(traces)) if whole else history
 
 
 class _Incarnation:
     """An agent between its start and its end, while its trace is read."""
 
-    def __init__(self, agent: int, found: History) -> None:
+    def __init__(self, agent: int, history: History) -> None:
         self._agent = agent
-        self._found = found
+        self._history = history
         self._vote: tuple[str, float] | None = None
         self._reconcile: tuple[str, float] | None = None
         self._phase: tuple[PhaseName, float, int] | None = None
@@ -167,7 +167,7 @@ class _Incarnation:
                 self._reconcile = REASONS.get(str(by[1]), "asked by the operator"), run.t
             elif self._reconcile is not None:
                 self._go_on(run)
-            self._found.commits.extend(
+            self._history.commits.extend(
                 Commit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
                 for operation, block in run.changes
                 if operation == "chain+"
@@ -179,13 +179,13 @@ class _Incarnation:
     def _end_vote(self, at_s: float, outcome: str) -> None:
         if self._vote is not None:
             block, since_s = self._vote
-            self._found.votes.append(Vote(self._agent, block, since_s, max(at_s, since_s), outcome))
+            self._history.votes.append(Vote(self._agent, block, since_s, max(at_s, since_s), outcome))
             self._vote = None
 
     def _go_on(self, run: HandlerRun) -> None:
         """A step of the reconcile that is under way."""
         if run.branch.startswith("tie:"):
-            self._found.ties.append(Tie(self._agent, run.t, run.branch))
+            self._history.ties.append(Tie(self._agent, run.t, run.branch))
         if run.handler == "reconcile_finalize" and run.branch == "done":
             self._end_reconcile(run.t, done=True)
         elif name := PHASES.get(run.handler):
@@ -207,7 +207,7 @@ class _Incarnation:
         if self._reconcile is not None:
             reason, since_s = self._reconcile
             ended_s = max(at_s, since_s)
-            self._found.reconciles.append(Reconcile(self._agent, since_s, ended_s, reason, self._phases, done))
+            self._history.reconciles.append(Reconcile(self._agent, since_s, ended_s, reason, self._phases, done))
         self._reconcile, self._phases = None, []
 
 
@@ -217,8 +217,8 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
             if in_time(run):
-                for one in run.sent:
-                    sent[agent, one.seq].append(Message(agent, run.t, one.message, one.block))
+                for broadcast in run.sent:
+                    sent[agent, broadcast.seq].append(Message(agent, run.t, broadcast.message, broadcast.block))
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
             of_this_number = sent.get((run.trigger.get("from"), run.trigger.get("seq")))

@@ -56,10 +56,10 @@ class JsonLines(Generic[Record]):
 
     def problems(self) -> list[str]:
         """A sentence, for people, on each thing that was wrong with what was read."""
-        said = []
+        troubles = []
         if self._left_out:
             lines = "1 line is" if self._left_out == 1 else f"{self._left_out} lines are"
-            said.append(f"{lines} left out, damaged or of no meaning")
+            troubles.append(f"{lines} left out, damaged or of no meaning")
         if self._trouble:
-            said.append(self._trouble)
-        return [f"{self._path.name if self._path else ''}: {trouble}" for trouble in said]
+            troubles.append(self._trouble)
+        return [f"{self._path.name if self._path else ''}: {trouble}" for trouble in troubles]

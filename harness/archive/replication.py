@@ -39,7 +39,7 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[Fault]) -> list
             steps += [(run.t, life, agent, run) for run in runs if run.changes]
     steps.sort(key=lambda step: step[:3])
     chains = _Chains(traces)
-    found = [chains.replication(0.0)]
+    states = [chains.replication(0.0)]
     for number, (at_s, life, agent, step) in enumerate(steps):
         if isinstance(step, Fault):
             chains.suffer(agent, step)
@@ -47,11 +47,11 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[Fault]) -> list
             chains.play(agent, life, step)
         if number + 1 == len(steps) or steps[number + 1][0] > at_s:
             now = chains.replication(at_s)
-            if found[-1].at_s == at_s:
-                found[-1] = now
-            elif replace(now, at_s=found[-1].at_s) != found[-1]:
-                found.append(now)
-    return found
+            if states[-1].at_s == at_s:
+                states[-1] = now
+            elif replace(now, at_s=states[-1].at_s) != states[-1]:
+                states.append(now)
+    return states
 
 
 class _Chains:

@@ -61,14 +61,14 @@ class _Line(BaseModel):
 def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
     """The tracks of those of `vehicles` that have any. A line that names another vehicle means nothing."""
     lines = JsonLines(path, _Line)
-    found: dict[int, list[Fix]] = {}
+    fixes: dict[int, list[Fix]] = {}
     known = set(vehicles)
     for line in lines:
         if not line.places.keys() <= known:
             lines.leave_out()
             continue
         for vehicle, (north_m, east_m, _) in line.places.items():
-            found.setdefault(vehicle, []).append(Fix(line.at_s, north_m, east_m))
-    for track in found.values():
+            fixes.setdefault(vehicle, []).append(Fix(line.at_s, north_m, east_m))
+    for track in fixes.values():
         track.sort(key=attrgetter("at_s"))
-    return Tracks(dict(sorted(found.items())), lines.problems())
+    return Tracks(dict(sorted(fixes.items())), lines.problems())

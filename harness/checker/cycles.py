@@ -86,9 +86,9 @@ def _in_traces(evidence: "Evidence", busy: Sequence[int], times: int) -> Cycle |
             since_s = max(since_s, trace.chain_changed_at())
         elif runs[-1].t + longest(trace, ALL_TIMERS) < ended_at_s:
             since_s = max(since_s, runs[-1].t)
-        elif found := _round(runs, times):
-            rounds[agent_id] = found
-            since_s = max(since_s, found.since_s)
+        elif going_round := _round(runs, times):
+            rounds[agent_id] = going_round
+            since_s = max(since_s, going_round.since_s)
         else:
             return None
     if not set(busy) <= set(evidence.traces):

@@ -82,16 +82,16 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
     ]
 
 
-def in_words(one: RogueInjection) -> str:
+def in_words(injection: RogueInjection) -> str:
     """One line for people."""
-    branches = sum((Counter(of.handled) for of in one.messages), Counter()).most_common()
+    branches = sum((Counter(of.handled) for of in injection.messages), Counter()).most_common()
     done = [f"{branch} {count}" for branch, count in branches[:BRANCHES_NAMED]]
     if len(branches) > BRANCHES_NAMED:
         done.append(f"and {sum(count for _, count in branches[BRANCHES_NAMED:])} more")
-    of_them = [f"{sum(one.refused.values())} of them malformed"] if one.refused else []
-    of_them += [f"{one.untraced} not told from their originals"] if one.untraced else []
-    counts = "; ".join([f"{one.sent} sent", *of_them, *([", ".join(done)] if done else [])])
-    return f"{one.what} at {one.at_s:g} s, {one.detail}: {counts}"
+    of_them = [f"{sum(injection.refused.values())} of them malformed"] if injection.refused else []
+    of_them += [f"{injection.untraced} not told from their originals"] if injection.untraced else []
+    counts = "; ".join([f"{injection.sent} sent", *of_them, *([", ".join(done)] if done else [])])
+    return f"{injection.what} at {injection.at_s:g} s, {injection.detail}: {counts}"
 
 
 def done_with(messages: InjectedMessages) -> str:

@@ -45,10 +45,10 @@ class Explored:
 
 @dataclass(frozen=True)
 class Watcher:
-    """What is told meanwhile. `step` gets the number of runs so far, and the size in words."""
+    """What is told meanwhile. `on_step` gets the number of runs so far, and the size in words."""
 
-    found: Callable[[Violation], None] = field(default=lambda violation: None)
-    step: Callable[[int, str], None] = field(default=lambda runs, words: None)
+    on_violation: Callable[[Violation], None] = field(default=lambda violation: None)
+    on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
     shown: bool = False
 
 
@@ -74,7 +74,7 @@ def explore(
     if searched.violation is None:
         return explored
     seed, key = searched.violation.seed, searched.violation.keys[0]
-    watcher.found(searched.violation)
+    watcher.on_violation(searched.violation)
 
     def still(candidate: Scenario) -> bool:
         return key in judge(candidate, seed).bad
@@ -88,7 +88,7 @@ def explore(
         still,
         jobs=jobs,
         max_runs=max_runs,
-        adopted=lambda shrinker: watcher.step(shrinker.runs, size(shrinker.best)),
+        adopted=lambda shrinker: watcher.on_step(shrinker.runs, size(shrinker.best)),
     )
     how = "and nothing more could be left out"
     first = size(original)

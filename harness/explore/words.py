@@ -22,11 +22,11 @@ def watching(console: Console) -> Iterator[Watcher]:
     every_s = REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S
     last = 0.0
 
-    def found(violation: Violation) -> None:
+    def on_violation(violation: Violation) -> None:
         words = " and ".join(BAD_IN_WORDS[key] for key in violation.keys)
         console.print(f"seed {violation.seed}: {words}; shrinking", highlight=False)
 
-    def step(runs: int, words: str) -> None:
+    def on_step(runs: int, words: str) -> None:
         nonlocal last
         if time.monotonic() - last >= every_s:
             last = time.monotonic()
@@ -37,7 +37,7 @@ def watching(console: Console) -> Iterator[Watcher]:
                 console.print(f"{words} after {runs} runs", highlight=False, soft_wrap=True)
 
     try:
-        yield Watcher(found, step, shown=True)
+        yield Watcher(on_violation, on_step, shown=True)
     finally:
         if console.is_terminal:
             console.file.write(CLEAR_LINE)

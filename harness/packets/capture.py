@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, ValidationError
 from harness.archive.exports import AgentId
 from harness.packets.datagram import NotUcpError, unwrap
 from harness.packets.pcap import INBOUND, OUTBOUND, CaptureFile, Frame
-from harness.packets.said import Said, summarize
+from harness.packets.summary import MessageSummary, summarize
 from ucp.block import MAX_AGENT_ID
 from ucp.messages import MalformedDatagramError, decode
 
@@ -41,12 +41,12 @@ class Datagram:
     A place is the number of the capture and the frame's direction, in one number.
     """
 
-    __slots__ = ("said", "seen", "sender", "sequence")
+    __slots__ = ("seen", "sender", "sequence", "summary")
 
-    def __init__(self, sender: int, sequence: int, said: Said) -> None:
+    def __init__(self, sender: int, sequence: int, summary: MessageSummary) -> None:
         self.sender = sender
         self.sequence = sequence
-        self.said = said
+        self.summary = summary
         self.seen = array("q")
 
     def sightings(self) -> Iterable[tuple[int, int, int]]:

@@ -138,12 +138,12 @@ def _capture(capture: Capture, clock: Clock) -> CaptureRecord:
 
 
 def _datagram(transmission: Transmission, exchanges: Exchanges, names: Names) -> DatagramRecord:
-    summary = transmission.said
+    summary = transmission.summary
     answers = [
         AnswerRecord(
             by=answer.by,
             outcome=answer.outcome,
-            answer=answer.response.said.answer if answer.response else None,
+            answer=answer.response.summary.answer if answer.response else None,
             response=answer.response.number if answer.response else None,
         )
         for answer in exchanges.answers(transmission)

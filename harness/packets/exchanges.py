@@ -61,13 +61,13 @@ def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission
     reached: dict[tuple[Name, Subject], list[_Asked]] = {}
     sent: dict[tuple[Name, Subject], list[Transmission]] = {}
     for transmission in transmissions:
-        if subject := transmission.said.asks:
+        if subject := transmission.summary.asks:
             asked.setdefault(subject, []).append((transmission.at_s, transmission.number))
             for reception in transmission.received:
                 arrivals = [(reception.at_s, transmission.number)] * reception.copies
                 arrivals[-1] = reception.last_s, transmission.number
                 reached.setdefault((reception.by, subject), []).extend(arrivals)
-        elif (subject := transmission.said.answers) and transmission.origin != "forged":
+        elif (subject := transmission.summary.answers) and transmission.origin != "forged":
             sent.setdefault((transmission.sender, subject), []).append(transmission)
     for (name, subject), responses in sent.items():
         # Where it is not known what reached the responder, all that others asked may have.

@@ -73,7 +73,7 @@ class Names:
                     self._top_of[bytes.fromhex(block.chain_hash)] = bytes.fromhex(block.block_hash)
 
     def _learn(self, transmission: Transmission, known: bool) -> None:
-        summary = transmission.said
+        summary = transmission.summary
         if summary.block_hash is not None:
             self._spoken_of.add(summary.block_hash)
         if transmission.origin == "forged":

@@ -42,6 +42,6 @@ class Selection:
     def _fits(self, transmission: Transmission) -> bool:
         return (
             (self.sender is None or transmission.sender == self.sender)
-            and (self.message is None or transmission.said.message.lower() == self.message.lower())
+            and (self.message is None or transmission.summary.message.lower() == self.message.lower())
             and (self.between_s is None or self.between_s[0] <= transmission.at_s <= self.between_s[1])
         )

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from harness.packets.exchanges import Exchanges
-from harness.packets.said import CARRY_A_BLOCK
+from harness.packets.summary import CARRY_A_BLOCK
 from harness.packets.transmissions import Transmission
 
 
@@ -19,8 +19,8 @@ def story(block_hash: bytes, transmissions: Iterable[Transmission], exchanges: E
     """All that is about the block, in the order of sending; answers are with what they answer."""
     answer_numbers: set[int] = set()
     for transmission in transmissions:
-        answers = [answer for answer in exchanges.responses(transmission) if answer.said.block_hash == block_hash]
-        if (transmission.said.block_hash == block_hash and transmission.number not in answer_numbers) or answers:
+        answers = [answer for answer in exchanges.responses(transmission) if answer.summary.block_hash == block_hash]
+        if (transmission.summary.block_hash == block_hash and transmission.number not in answer_numbers) or answers:
             answer_numbers.update(answer.number for answer in answers)
             yield Chapter(transmission, answers)
 
@@ -37,7 +37,7 @@ def carried_to(chapters: Iterable[Chapter]) -> dict[int, float]:
     """Vehicle -> the mission second at which the block itself first reached it."""
     first: dict[int, float] = {}
     for transmission in in_order(chapters):
-        if transmission.said.message in CARRY_A_BLOCK:
+        if transmission.summary.message in CARRY_A_BLOCK:
             for reception in transmission.received:
                 if isinstance(reception.by, int):
                     first[reception.by] = min(reception.at_s, first.get(reception.by, reception.at_s))

@@ -7,8 +7,8 @@ from harness.packets.capture import Name
 from harness.packets.exchanges import Answer, Exchanges, Outcome
 from harness.packets.files import Captures
 from harness.packets.names import Names
-from harness.packets.said import Said
 from harness.packets.story import Chapter, carried_to
+from harness.packets.summary import MessageSummary
 from harness.packets.transmissions import Transmission
 from harness.present.words import moment
 from ucp.messages import (
@@ -38,7 +38,7 @@ class Wording:
 
     def transmission(self, transmission: Transmission) -> str:
         """When, who, what, and who received it."""
-        what = f"{transmission.said.message:<26}  {self.said(transmission.said):<46}"
+        what = f"{transmission.summary.message:<26}  {self.in_words(transmission.summary):<46}"
         parts = [f"{transmission.at_s:>12.3f}  {transmission.sender:>5}  {what}  -> {_receivers(transmission)}"]
         if transmission.lost_by:
             parts.append(self._paint(f"lost by {_list(transmission.lost_by)}"))
@@ -56,7 +56,7 @@ class Wording:
             parts.append(f"seen by others: {transmission.sender} was not captured")
         return "  ".join(parts)
 
-    def said(self, summary: Said) -> str:
+    def in_words(self, summary: MessageSummary) -> str:
         block = "" if summary.block_hash is None else f"block {self._names.block(summary.block_hash)}"
         chain = "" if summary.chain_hash is None else f"chain {self._names.chain(summary.chain_hash)}"
         match summary.message:
@@ -87,7 +87,7 @@ class Wording:
     def _outcome(self, answer: Answer) -> str:
         if answer.response is None:
             return self._paint(answer.outcome) if answer.outcome == "request lost" else answer.outcome
-        summary = answer.response.said
+        summary = answer.response.summary
         word = str(summary.answer)
         if summary.answer == "block" and summary.block_hash is not None:
             word = f"block {self._names.block(summary.block_hash)}"
@@ -111,7 +111,7 @@ def lines(
     """Each transmission; below a request, what came of it at each vehicle, or at `answers_of` alone."""
     for transmission in transmissions:
         yield wording.transmission(transmission)
-        if transmission.said.asks:
+        if transmission.summary.asks:
             wanted = [answer for answer in exchanges.answers(transmission) if answers_of in (None, answer.by)]
             if wanted:
                 yield f"{_INDENT}   {wording.answers(wanted)}"
@@ -123,7 +123,7 @@ def life(chapters: Sequence[Chapter], exchanges: Exchanges, wording: Wording) ->
         yield wording.transmission(chapter.begins)
         for answer in chapter.answers:
             yield f"    {wording.transmission(answer)}"
-        if chapter.begins.said.asks:
+        if chapter.begins.summary.asks:
             missing = [answer for answer in exchanges.answers(chapter.begins) if answer.outcome != "answered"]
             if missing:
                 yield f"{_INDENT}   {wording.answers(missing)}"

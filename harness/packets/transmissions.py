@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 from harness.packets.capture import Capture, Datagram, Name
 from harness.packets.files import Captures, Clock
 from harness.packets.pcap import OUTBOUND
-from harness.packets.said import Said
+from harness.packets.summary import MessageSummary
 
 Origin = Literal["captured", "inferred", "forged"]
 """Seen leaving its sender; or its sender was not captured then, and `at_s` is when it first reached somebody; or not
@@ -39,7 +39,7 @@ class Transmission(NamedTuple):
     at_s: float
     sender: int
     sequence: int
-    said: Said
+    summary: MessageSummary
     origin: Origin
     seen_leaving: Name | None
     received: tuple[Reception, ...]
@@ -114,7 +114,7 @@ def _of(
             at_s=clock.seconds(time_ns),
             sender=datagram.sender,
             sequence=datagram.sequence,
-            said=datagram.said,
+            summary=datagram.summary,
             origin=_origin(datagram.sender, seen_leaving, listeners.would_have_seen_leave(datagram.sender, time_ns)),
             seen_leaving=seen_leaving,
             received=tuple(

@@ -54,8 +54,8 @@ class RunOutcome:
             self.faults.append(change)
 
 
-def _same_connections(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return all(one[key] == other[key] for key in ("what", "detail", "fully_connected"))
+def _same_connections(now: dict[str, Any], before: dict[str, Any]) -> bool:
+    return all(now[key] == before[key] for key in ("what", "detail", "fully_connected"))
 
 
 class Swarm(Protocol):

@@ -44,9 +44,9 @@ def ramp(first: Rgb, last: Rgb, steps: int) -> list[Ink]:
     return [Ink(fill, fill, _text_on(fill)) for fill in fills]
 
 
-def contrast(one: str, other: str) -> float:
+def contrast(first: str, second: str) -> float:
     """The contrast ratio of WCAG 2, 1 to 21."""
-    dark, light = sorted((_luminance(one), _luminance(other)))
+    dark, light = sorted((_luminance(first), _luminance(second)))
     return (light + 0.05) / (dark + 0.05)
 
 

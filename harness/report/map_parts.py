@@ -135,17 +135,17 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
     return dict(sorted((number if number >= 0 else next(free), part) for number, part in numbers.items()))
 
 
-def longest(found: Sequence[Division], end_s: float, most: int) -> list[Division]:
+def longest(divided: Sequence[Division], end_s: float, most: int) -> list[Division]:
     """The first, and those of the others that lasted longest; each then lasts until the next that is left."""
-    if len(found) <= most:
-        return list(found)
-    ends = [*(division.at_s for division in found[1:]), end_s]
-    by_length = sorted(range(1, len(found)), key=lambda at: found[at].at_s - ends[at])
-    return [found[at] for at in sorted([0, *by_length[: most - 1]])]
+    if len(divided) <= most:
+        return list(divided)
+    ends = [*(division.at_s for division in divided[1:]), end_s]
+    by_length = sorted(range(1, len(divided)), key=lambda at: divided[at].at_s - ends[at])
+    return [divided[at] for at in sorted([0, *by_length[: most - 1]])]
 
 
 def lives(
-    vehicle: int, tracks: Tracks, network: Connectivity, found: Sequence[Division], end_s: float
+    vehicle: int, tracks: Tracks, network: Connectivity, divided: Sequence[Division], end_s: float
 ) -> Iterator[Life]:
     """The ways of a vehicle, and of those that took its place after it was lost."""
     wreck: Fix | None = None
@@ -155,7 +155,7 @@ def lives(
             del flown[0]
         if flown:
             end = tracks.at(vehicle, until_s)
-            yield Life(vehicle, list(_stretches(vehicle, [*flown, end], found)), lost)
+            yield Life(vehicle, list(_stretches(vehicle, [*flown, end], divided)), lost)
             wreck = end
 
 

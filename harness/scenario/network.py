@@ -89,7 +89,7 @@ class Difference(Model):
     rate: Rate | None = None
     limit: Limit | None = None
 
-    def said(self) -> dict[str, Any]:
+    def given(self) -> dict[str, Any]:
         """The keys that are given."""
         return {key: value for key in KEYS if (value := getattr(self, key)) is not None}
 
@@ -122,7 +122,7 @@ class Link(Difference):
 
 Where = None | int | tuple[int, int]
 """Of whom something is said: of all, of what one vehicle hears, or of a link, from sender to receiver."""
-Said = dict[Where, dict[str, Any]]
+NetworkValues = dict[Where, dict[str, Any]]
 """A network, or what changes of it: whose keys have which values."""
 
 
@@ -138,9 +138,9 @@ class NetworkLayer(Difference):
             raise ValueError(f"needs at least one of {', '.join(f'`{key}`' for key in type(self).model_fields)}")
         return self
 
-    def whole(self) -> Said:
+    def whole(self) -> NetworkValues:
         """Raises ConditionsError if it says something twice."""
-        return {None: self.said(), **_said_of(self.receivers, self.links)}
+        return {None: self.given(), **_values_of(self.receivers, self.links)}
 
     def named(self) -> Iterator[tuple[str, int]]:
         """Every vehicle that is named, with the key that names it."""
@@ -160,10 +160,10 @@ class Disturbance(Model):
             raise ValueError("`loss` and `network.loss` are the same thing: leave one of them out")
         return self
 
-    def said(self) -> Said:
+    def changes(self) -> NetworkValues:
         """What it changes of the network, partitions apart."""
-        changes: Said = self.network.whole() if self.network else {}
-        return changes if self.loss is None else laid_over(changes, {None: {"loss": self.loss}})
+        values: NetworkValues = self.network.whole() if self.network else {}
+        return values if self.loss is None else laid_over(values, {None: {"loss": self.loss}})
 
     @property
     def groups(self) -> tuple[frozenset[int], ...]:
@@ -202,9 +202,9 @@ class NetworkModel(Model):
         """Every vehicle that is named, with the key that names it."""
         return _named(self.receivers, self.links)
 
-    def whole(self) -> Said:
+    def whole(self) -> NetworkValues:
         """Raises ConditionsError if it says something twice."""
-        return {None: {key: getattr(self, key) for key in KEYS}, **_said_of(self.receivers, self.links)}
+        return {None: {key: getattr(self, key) for key in KEYS}, **_values_of(self.receivers, self.links)}
 
     def conditions(self, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
         """The conditions that these words mean; raises ConditionsError if they contradict each other."""
@@ -218,10 +218,10 @@ def _named(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Iterator
         yield from ((f"links.{index}.to", vehicle) for vehicle in link.to)
 
 
-def _said_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Said:
-    differences: Said = {vehicle: receiver.said() for vehicle, receiver in receivers.items()}
+def _values_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> NetworkValues:
+    differences: NetworkValues = {vehicle: receiver.given() for vehicle, receiver in receivers.items()}
     for index, link in enumerate(links):
-        keys = link.said()
+        keys = link.given()
         for sender, receiver in link.pairs():
             if sender == receiver:
                 raise ConditionsError(f"links.{index}: a link from vehicle {sender} to itself carries nothing")
@@ -231,7 +231,7 @@ def _said_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Said:
     return differences
 
 
-def laid_over(network: Said, layer: Said) -> Said:
+def laid_over(network: NetworkValues, layer: NetworkValues) -> NetworkValues:
     """What the layer says counts, of whomever it says it; what it does not say stays."""
     return {where: network.get(where, {}) | layer.get(where, {}) for where in (*network, *layer)}
 
@@ -243,7 +243,7 @@ def of_whom(where: Where) -> str:
     return f" from {where[0]} to {where[1]}" if isinstance(where, tuple) else f" to {where}"
 
 
-def conditions_of(network: Said, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
+def conditions_of(network: NetworkValues, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
     """The conditions that a whole network comes to; raises ConditionsError if its keys contradict each other."""
     for_all = network[None]
     conditions: dict[Where, LinkConditions] = {}

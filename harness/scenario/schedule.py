@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from harness.scenario.model import Instant, Model, Probability, Seconds, VehicleId
-from harness.scenario.network import DelaySeconds, Disturbance, NetworkLayer, Said, Where, laid_over, of_whom
+from harness.scenario.network import DelaySeconds, Disturbance, NetworkLayer, NetworkValues, Where, laid_over, of_whom
 
 MAX_STEPS = 10_000
 """More changes than this are a mistake, or another scenario."""
@@ -33,7 +33,7 @@ Pairs = frozenset[tuple[int, int]]
 class Layer:
     """What a schedule makes of the network for a while; nothing: it leaves it alone."""
 
-    said: Said = field(default_factory=dict)
+    values: NetworkValues = field(default_factory=dict)
     partition: tuple[frozenset[int], ...] = ()
     cut: Pairs = frozenset()
     """Directed pairs, sender and receiver, between which nothing passes."""
@@ -67,11 +67,11 @@ class Ramp(Model):
                     raise ValueError(f"{key}{of_whom(where)} is {value!r}: a ramp goes from one number to another")
         return self
 
-    def _ends(self) -> tuple[Said, Said]:
+    def _ends(self) -> tuple[NetworkValues, NetworkValues]:
         """What `network` is at first, and in the end."""
         return (self.network[0].whole(), self.network[1].whole()) if self.network else ({}, {})
 
-    def at(self, share: float) -> Said:
+    def at(self, share: float) -> NetworkValues:
         """What it has come to after this share of it."""
         short = {key: ends for key in ("loss", "delay") if (ends := getattr(self, key)) is not None}
         first, last = (
@@ -84,7 +84,7 @@ class Ramp(Model):
         }
 
 
-def _values(end: Said) -> Iterator[tuple[Where, str, Any]]:
+def _values(end: NetworkValues) -> Iterator[tuple[Where, str, Any]]:
     return ((where, key, value) for where, keys in end.items() for key, value in keys.items())
 
 
@@ -102,9 +102,9 @@ class Repeated(Disturbance):
             raise ValueError("`delay` and `network.delay` are the same thing: leave one of them out")
         return self
 
-    def said(self) -> Said:
-        changes = super().said()
-        return changes if self.delay is None else laid_over(changes, {None: {"delay": self.delay}})
+    def changes(self) -> NetworkValues:
+        values = super().changes()
+        return values if self.delay is None else laid_over(values, {None: {"delay": self.delay}})
 
 
 Nemesis = Literal["halves", "isolate", "majorities ring", "bridge", "flapping"]
@@ -172,7 +172,7 @@ class Schedule(Model):
 
     def _layer(self, roster: Sequence[int], rng: Random) -> Layer:
         if self.repeat is not None:
-            return Layer(self.repeat.said(), self.repeat.groups)
+            return Layer(self.repeat.changes(), self.repeat.groups)
         assert self.nemesis is not None, "a schedule is one of three"
         return NEMESES[self.nemesis](rng.sample(list(roster), len(roster)))
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
-from harness.scenario.network import NetworkModel, Said, Where, conditions_of, laid_over, of_whom
+from harness.scenario.network import NetworkModel, NetworkValues, Where, conditions_of, laid_over, of_whom
 from harness.scenario.schedule import UNTOUCHED, Layer, Schedule
 from harness.scenario.timeline import TimelineEntry
 from netem.conditions import NetworkConditions
@@ -26,7 +26,7 @@ class Network:
     """The network as it stands."""
 
     roster: tuple[int, ...]
-    said: Said
+    lasting: NetworkValues
     """What lasts: of the scenario, and of its timeline up to now."""
     layers: list[Layer]
     """What each schedule makes of it."""
@@ -36,12 +36,12 @@ class Network:
 
     def uncut(self) -> NetworkConditions:
         """The conditions that there would be without partitions and cuts. Raises ConditionsError."""
-        network = self.said
+        network = self.lasting
         for entry in self.passing:
-            network = laid_over(network, entry.said())
+            network = laid_over(network, entry.changes())
         for layer in self.layers:
-            if layer.said:
-                network = laid_over(network, layer.said)
+            if layer.values:
+                network = laid_over(network, layer.values)
         return conditions_of(network)
 
     def conditions(self) -> NetworkConditions:
@@ -69,7 +69,7 @@ class Network:
         elif entry.disturbs in (PARTITION, "heal"):
             self.partition = entry.groups
         else:
-            self.said = laid_over(self.said, entry.said())
+            self.lasting = laid_over(self.lasting, entry.changes())
 
 
 @dataclass(frozen=True)
@@ -145,4 +145,4 @@ def _changed(entry: TimelineEntry) -> Iterator[tuple[Where, str]]:
     if entry.disturbs in (PARTITION, "heal"):
         yield None, "the partition"
     elif entry.disturbs:
-        yield from ((where, key) for where, keys in entry.said().items() for key in keys)
+        yield from ((where, key) for where, keys in entry.changes().items() for key in keys)

@@ -126,7 +126,7 @@ def test_a_request_shows_who_answered_and_why_others_did_not(tmp_path: Path) -> 
         (4, "no answer"),
         (5, "request lost"),
     ]
-    assert [answer.response and answer.response.said.answer for answer in answers] == [
+    assert [answer.response and answer.response.summary.answer for answer in answers] == [
         "approve",
         "disapprove",
         None,
@@ -329,13 +329,13 @@ def test_the_story_of_a_block_has_all_that_is_about_it(flown: tuple[Air, Capture
     chapters = list(story(block_hash, found, Exchanges(found)))
     told = [one.number for chapter in chapters for one in (chapter.begins, *chapter.answers)]
     assert len(told) == len(set(told))
-    assert set(told) >= {one.number for one in found if one.said.block_hash == block_hash}
-    assert chapters[0].begins.said.message == BlockAddRequest.NAME
-    assert {answer.said.message for answer in chapters[0].answers} == {BlockAddResponse.NAME}
+    assert set(told) >= {one.number for one in found if one.summary.block_hash == block_hash}
+    assert chapters[0].begins.summary.message == BlockAddRequest.NAME
+    assert {answer.summary.message for answer in chapters[0].answers} == {BlockAddResponse.NAME}
     carriers = [
         one
         for one in found
-        if one.said.block_hash == block_hash and one.said.message in ("Commit Block", "Block Response")
+        if one.summary.block_hash == block_hash and one.summary.message in ("Commit Block", "Block Response")
     ]
     assert set(carried_to(chapters)) == {name for one in carriers for name in one.reached}
 
@@ -343,7 +343,7 @@ def test_the_story_of_a_block_has_all_that_is_about_it(flown: tuple[Air, Capture
 def test_without_exports_blocks_are_named_by_the_order_of_proposals(run_dir: Path) -> None:
     found = join(read(run_dir))
     with_exports, alone = Names(found, runs_of([run_dir])), Names(found, [])
-    proposed = {one.said.block_hash for one in found if one.said.message == BlockAddRequest.NAME}
+    proposed = {one.summary.block_hash for one in found if one.summary.message == BlockAddRequest.NAME}
     assert len(proposed) > 5
     for block_hash in proposed:
         assert block_hash is not None
@@ -368,7 +368,9 @@ def test_a_selection_is_by_sender_receiver_message_and_time(run_dir: Path) -> No
     found = join(captures)
     selection = Selection(sender=2, receiver=3, message="commit block", between_s=(100, 500))
     selected = list(selection.of(found, captures))
-    whole = [one for one in found if one.sender == 2 and one.said.message == "Commit Block" and 100 <= one.at_s <= 500]
+    whole = [
+        one for one in found if one.sender == 2 and one.summary.message == "Commit Block" and 100 <= one.at_s <= 500
+    ]
     assert [one.number for one in selected] == [one.number for one in whole]
     assert selected
     assert [one.lost_by for one in selected] == [(3,) if 3 in one.lost_by else () for one in whole]

@@ -50,10 +50,10 @@ def cross_examine(evidence: Evidence) -> Examination:
 
 def check(evidence: Evidence) -> Judgement:
     examination = evidence.examination
-    found = [contradiction.finding for contradiction in examination.contradictions]
-    if found:
-        reason = f"{times(len(found))}: what two records tell about the same thing does not agree"
-        return Judgement(NAME, "contradict", reason, found[:MAX_EVIDENCE])
+    findings = [contradiction.finding for contradiction in examination.contradictions]
+    if findings:
+        reason = f"{times(len(findings))}: what two records tell about the same thing does not agree"
+        return Judgement(NAME, "contradict", reason, findings[:MAX_EVIDENCE])
     if not evidence.traces:
         return Judgement(NAME, "not applicable", "there are no traces to hold against the exports")
     if untraced := sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):

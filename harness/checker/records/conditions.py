@@ -24,14 +24,14 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     fated_until = max((state.at_s for state in record.network if state.what == NO_MORE_FATES), default=0.0)
     network = [state for state in record.network if state.what != NO_MORE_FATES]
     faults = [fault for fault in record.faults if fault.agents]
-    said = Counter(_change(state, fated_until) for state in network)
-    said.update(_change(fault, fated_until) for fault in faults)
+    recorded = Counter(_change(state, fated_until) for state in network)
+    recorded.update(_change(fault, fated_until) for fault in faults)
     taken_down = Counter(_change(condition, fated_until) for condition in log if condition.detail is not None)
-    for change in said - taken_down:
+    for change in recorded - taken_down:
         yield of_agent(
             min(change[4], default=of_all), f"run.json says, and network.jsonl does not: {_in_words(change)}"
         )
-    for change in taken_down - said:
+    for change in taken_down - recorded:
         if change[1] != RANGE:
             detail = f"network.jsonl says, and run.json does not: {_in_words(change)}"
             yield of_agent(min(change[4], default=of_all), detail)

@@ -63,8 +63,10 @@ class RogueProcess:
         roster = list(scenario.roster)
         await self._ask("start", epoch_us=epoch_us, speedup=scenario.speedup, roster=roster, seed=self._seed)
 
-    async def inject(self, one: Injected) -> None:
-        await self._ask("inject", what=one.what, number=one.number, injection=one.injection.model_dump(mode="json"))
+    async def inject(self, injected: Injected) -> None:
+        await self._ask(
+            "inject", what=injected.what, number=injected.number, injection=injected.injection.model_dump(mode="json")
+        )
 
     async def watch(self) -> None:
         """Raises MachineError when the process ends."""

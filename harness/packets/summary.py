@@ -27,7 +27,7 @@ CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 TOP_OF_CHAIN = "top of chain"
 
 
-class Said(NamedTuple):
+class MessageSummary(NamedTuple):
     """`message` is its name; `answer` what a response answers: approve, disapprove, yes, no, top of chain, block."""
 
     message: str
@@ -51,21 +51,21 @@ class Said(NamedTuple):
         return self.chain_hash if self.message == NextInSequenceResponse.NAME else self.block_hash or self.chain_hash
 
 
-def summarize(message: Message) -> Said:
+def summarize(message: Message) -> MessageSummary:
     match message:
         case BlockAddRequest(block_hash, chain_hash):
-            return Said(message.NAME, block_hash, chain_hash)
+            return MessageSummary(message.NAME, block_hash, chain_hash)
         case BlockAddResponse(block_hash, approve, chain_hash):
-            return Said(message.NAME, block_hash, chain_hash, "approve" if approve else "disapprove")
+            return MessageSummary(message.NAME, block_hash, chain_hash, "approve" if approve else "disapprove")
         case CommitBlock(block, chain_hash):
-            return Said(message.NAME, block.block_hash, chain_hash)
+            return MessageSummary(message.NAME, block.block_hash, chain_hash)
         case ChainContainQuery(chain_hash) | ChainHashSuccessorQuery(chain_hash):
-            return Said(message.NAME, None, chain_hash)
+            return MessageSummary(message.NAME, None, chain_hash)
         case ChainContainResponse(chain_hash, contained):
-            return Said(message.NAME, None, chain_hash, "yes" if contained else "no")
+            return MessageSummary(message.NAME, None, chain_hash, "yes" if contained else "no")
         case NextInSequenceResponse(chain_hash, block_hash, _):
-            return Said(message.NAME, block_hash, chain_hash, "block" if block_hash else TOP_OF_CHAIN)
+            return MessageSummary(message.NAME, block_hash, chain_hash, "block" if block_hash else TOP_OF_CHAIN)
         case RequestForBlock(block_hash):
-            return Said(message.NAME, block_hash, None)
+            return MessageSummary(message.NAME, block_hash, None)
         case BlockResponse(block):
-            return Said(message.NAME, block.block_hash, None, "block")
+            return MessageSummary(message.NAME, block.block_hash, None, "block")
