@@ -72,7 +72,8 @@ def _needed(evidence: Evidence) -> str:
     if not any(at_s > evidence.ended_at_s - 30 * minutes for at_s in committed_at):
         return f"{blocks}, and none was in the last {minutes / 2:.1f} minutes: nothing tells whether they ever would be"
     rate = sum(at_s > last_completed_s for at_s in committed_at) / minutes
-    return f"{blocks}, at {rate:.2g} a minute: at this rate that would have taken {waiting / rate:.0f} minutes more"
+    more = max(1, round(waiting / rate))
+    return f"{blocks}, at {rate:.2g} a minute: that would have taken {more} minute{'s' if more > 1 else ''} more"
 
 
 def _left_to_do(evidence: Evidence, agent_id: int) -> str:
