@@ -39,14 +39,14 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
 
 
 def _of_all_agents(evidence: Evidence, counter: str) -> int | None:
-    """The sum of a counter that the run's record has of every agent; else what the traces have; else None."""
+    """The sum of a counter that the run's record has of every agent; else what whole traces have; else None."""
     agents = evidence.record.agents.values() if evidence.record else ()
     counts: list[int | None] = [getattr(agent, counter) for agent in agents]
     known = [count for count in counts if count is not None]
     if known and len(known) == len(counts):
         return sum(known)
     runs = [run for trace in evidence.traces.values() for run in trace.runs]
-    if not runs:
+    if not runs or evidence.examination.short:
         return None
     match counter:
         case "messages_sent":
@@ -69,7 +69,7 @@ def uniform_at_s(evidence: Evidence) -> float | None:
         agent, trace = recorded.get(str(agent_id)), evidence.traces.get(agent_id)
         if agent is not None and agent.chain_changed_at_s is not None:
             last_s = max(last_s, agent.chain_changed_at_s)
-        elif trace is not None:
+        elif trace is not None and agent_id not in evidence.examination.short:
             last_s = max(last_s, round(trace.chain_changed_at(), 3))
         else:
             return None

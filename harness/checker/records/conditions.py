@@ -41,9 +41,13 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
             yield of_agent(of_all, detail)
     if any(condition.counters not in (None, record.counters) for condition in log):
         yield of_agent(of_all, "run.json and network.jsonl say that the kernel counted different things")
-    for earlier, later in pairwise(log):
-        if later.at_s < earlier.at_s:
-            yield of_agent(of_all, f"network.jsonl goes from {earlier.at_s:g} s back to {later.at_s:g} s")
+    for name, times_s in (
+        ("network.jsonl", [condition.at_s for condition in log]),
+        ("the network of run.json", [state.at_s for state in record.network]),
+    ):
+        for earlier, later in pairwise(times_s):
+            if later < earlier:
+                yield of_agent(of_all, f"{name} goes from {earlier:g} s back to {later:g} s")
 
 
 def _change(entry: NetworkState | Fault | Condition, fated_until: float) -> Change:
