@@ -354,7 +354,7 @@ class Simulation:
             **({"dropped": dict(dropped)} if self._rogue is not None else {}),
             "messages_sent": sum(life.agent.state.sent.total() for life in lives),
             "reconciles": sum(life.agent.state.reconciles for life in lives),
-            "chain_changed_at_s": round(_mission_time(life, life.agent.state.chain_changed_at), 3) if life else None,
+            "chain_changed_at_s": round(_chain_changed_at(life), 3) if life else None,
             **({"handler_runs": [self._handler_runs(life) for life in lives]} if self._tracing else {}),
         }
 
@@ -569,6 +569,12 @@ class Simulation:
         clock = life.clock
         now = self._now if mission_s is None else mission_s
         return now if clock is None else clock.offset_s + (1 + clock.drift) * now
+
+
+def _chain_changed_at(life: Incarnation) -> float:
+    """In mission seconds; 0 if it never did, whatever the agent's clock then showed."""
+    local = life.agent.state.chain_changed_at
+    return _mission_time(life, local) if local else 0.0
 
 
 def _mission_time(life: Incarnation, local: float) -> float:
