@@ -27,10 +27,10 @@ class RunFailedError(HarnessError):
 
 @gc_paused()
 def simulated(scenario: Scenario, seed: int) -> Result:
-    """Without traces, which cost more than the run: characteristic 1 is then not judged, 2 and 3 only at the end."""
+    """With traces, so that all of it is judged, every step, too."""
     from harness.run.simulate import simulate
 
-    return simulate(scenario, seed).result
+    return simulate(scenario, seed, tracing=True).result
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ def test_a_matrix_ends_in_a_table_and_files(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert not sentences(done.stderr)
     assert "Means of 3 runs a cell" in done.stdout
-    assert "Not applicable in any run: characteristic 1." in " ".join(done.stdout.split())
+    assert "Not applicable" not in done.stdout, "every step is judged, too"
     assert str(tmp_path / "out" / "report.html") in done.stdout
     files = {path.name for path in (tmp_path / "out").iterdir()}
     figures = {"results.jsonl", "matrix.json", "matrix.csv", "runs.csv"}
