@@ -82,24 +82,27 @@ def _message(message: Sent, others: Sequence[Sent], name: NameOf) -> str:
     if any(other.seq != message.seq for other in alike):
         words += f" with sequence number {message.seq}"
     elif alike and all(other.datagram != message.datagram for other in alike):
-        words += f" saying {_content(message, name)}"
+        words += f" saying {_content(message, alike[0])}"
     return words
 
 
-def _content(message: Sent, name: NameOf) -> str:
-    """What tells it from a message of the same type about the same block."""
+def _content(message: Sent, other: Sent) -> str:
+    """What tells it from the other, of the same type and about the same block."""
     try:
         content = decoded(message.datagram or "")[2]
     except MalformedDatagramError as malformed:
         return f"what is no message ({malformed.reason})"
+    try:
+        expected: object = decoded(other.datagram or "")[2]
+    except MalformedDatagramError:
+        expected = None
     values = []
     for field in type(content).WIRE:
         value = getattr(content, field)
-        if isinstance(value, bytes):
-            values.append(f"{field} {value.hex()[:12]}")
-        elif isinstance(value, int | None):
-            values.append(f"{field} {value}")
-    return ", ".join(values)
+        if value != getattr(expected, field, None):
+            words = value.hex()[:12] if isinstance(value, bytes) else str(value)[:60]
+            values.append(f"{field.replace('_', ' ')} {words}")
+    return ", ".join(values) or "the same from another sender"
 
 
 def _started(started: dict[str, float]) -> str:
