@@ -28,7 +28,7 @@ def scenario(agents: int) -> Scenario:
 
 def main(arguments: list[str]) -> int:
     rounds = int(arguments[0]) if arguments else 5
-    sys.stdout.write(f"{'agents':>8}{'handler runs':>14}{"a second":>32}{'bytes of a line':>17}\n")
+    sys.stdout.write(f"{'agents':>8}{'handler runs':>14}{'a second':>32}{'bytes of a line':>17}\n")
     for agents in AGENTS:
         evidence = simulate(scenario(agents), 1, tracing=True).evidence
         runs = [run for trace in evidence.traces.values() for run in trace.runs]
