@@ -8,7 +8,7 @@ from harness.archive.block_names import name_blocks
 from harness.checker import Result
 from harness.checker.judgement import Finding, Judgement
 from harness.errors import ScenarioError
-from harness.scenario.verdicts import BESIDE, Verdict
+from harness.scenario.verdicts import BESIDE, Verdict, kind_of
 
 EVIDENCE_SHOWN = 5
 
@@ -34,7 +34,8 @@ class JudgementInTest:
 
     @property
     def holds(self) -> bool:
-        return self.verdict == "holds"
+        """Whether the verdict is the good one: `holds`, `as specified`, `agree` or `finished`."""
+        return kind_of(self.verdict) == "good"
 
     def __repr__(self) -> str:
         return f"<{self.title}: {self.verdict}: {self.reason}>"
@@ -65,6 +66,14 @@ class Findings:
         if characteristic is None:
             raise ScenarioError(f"there is no characteristic {number!r}: they are 1 to 6")
         return JudgementInTest.of(str(number), characteristic)
+
+    def judgement(self, key: str) -> JudgementInTest:
+        """What is judged beside the characteristics. Raises ScenarioError for a key that is none of them."""
+        __tracebackhide__ = True
+        judgement = self.result.beside.get(key)
+        if judgement is None:
+            raise ScenarioError(f"there is no judgement {key!r}: there are {', '.join(BESIDE)}")
+        return JudgementInTest.of(key, judgement)
 
     @property
     def figures(self) -> dict[str, float | int | None]:

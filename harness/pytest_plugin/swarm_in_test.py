@@ -161,6 +161,11 @@ class SwarmInTest:
         __tracebackhide__ = True
         return self._findings().characteristic(number)
 
+    def judgement(self, key: str) -> JudgementInTest:
+        """`steps`, `records` or `liveness`, as things stand."""
+        __tracebackhide__ = True
+        return self._findings().judgement(key)
+
     @property
     def figures(self) -> dict[str, float | int | None]:
         """As in run.json: `mutual_chain`, `distinct_chains`, `reconciles`, ..."""

@@ -251,6 +251,7 @@ def test_the_network_changes_for_a_while_and_a_test_that_ends_waits_for_that(pyt
         ("swarm.restart(2)", "restart: agent 2 is running then, not killed"),
         ("swarm.kill(1, 2, 3, 4, 5)", "the timeline leaves nobody: *"),
         ("swarm.characteristic(7)", "there is no characteristic 7: they are 1 to 6"),
+        ("swarm.judgement('6')", "there is no judgement '6': there are steps, records, liveness"),
         ("swarm.chain(6)", "there is no chain of agent 6: there are those of [[]1, 2, 3, 4, 5[]]"),
         ("swarm.pause(1); swarm.wait_idle(20)", "within 20 mission seconds not every agent has voted and become idle"),
     ],
@@ -303,3 +304,20 @@ def test_an_agent_that_dies_fails_the_sentence_that_it_dies_in(pytester: pytest.
     )
     no_internals(result)
     assert json.loads((report(result).parent / "run.json").read_text())["outcome"] == "failed"
+
+
+def test_steps_and_records_are_judged_in_the_middle_of_a_story(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+    import pytest
+
+    def test_right(swarm):
+        swarm.run_for(200)
+        assert swarm.judgement("steps").holds and swarm.judgement("records").holds
+
+    @pytest.mark.swarm(quirks={"approve_everything": True}, network={"loss": 0.4}, expect={"steps": "deviates"})
+    def test_wrong(swarm):
+        swarm.run_for(600)
+        assert swarm.judgement("steps").verdict == "deviates"
+        assert swarm.judgement("steps").evidence[0].handler == "receive_request_add_block"
+    """)
+    run(pytester).assert_outcomes(passed=2)
