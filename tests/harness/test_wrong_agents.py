@@ -1,0 +1,65 @@
+"""The table of wrong agents is true: each is found, and a part of it made again is the same."""
+
+import pytest
+
+from harness.checker import Result
+from harness.checker.judgement import Finding, Judgement
+from harness.wrong_agents.page import NOTHING, PAGE, first_found, found, row, rows_of
+from harness.wrong_agents.trial import MISSIONS, Trial, judged, play
+from ucp.quirks import QUIRKS
+
+ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
+
+
+def cells(quirk: str) -> list[str]:
+    return [cell.strip() for cell in ROWS[quirk].strip().strip("|").split(" | ")]
+
+
+def test_every_quirk_has_a_row_and_every_row_a_quirk() -> None:
+    assert list(ROWS) == list(QUIRKS), "write it again: python -m harness.wrong_agents.page"
+
+
+def test_nothing_goes_unnoticed() -> None:
+    assert not [quirk for quirk, line in ROWS.items() if NOTHING in line], "a hole: mend the hole"
+
+
+@pytest.mark.parametrize("quirk", QUIRKS)
+def test_what_found_a_quirk_first_finds_it_again(quirk: str) -> None:
+    first = cells(quirk)[-1]
+    seed = int(first.removeprefix("seed ").split(":")[0])
+    assert first_found(seed, found(play(quirk, seed), play(None, seed))) == first
+
+
+def test_what_the_right_agent_is_charged_with_is_no_finding() -> None:
+    assert found(Trial({"5": 60.0, "2": 9.0}, None), Trial({"5": 70.0}, None)) == {"2": 9.0}
+
+
+def test_a_row_says_what_found_it_how_often_how_soon_and_whether_the_right_handler_was_named() -> None:
+    good, other = "vote_timer_expiration", "receive_commit_block"
+    right = {seed: Trial({}, None) for seed in (1, 2, 3, 4)}
+    wrong = {
+        1: Trial({}, None),
+        2: Trial({"steps": 60.0, "2": None}, good),
+        3: Trial({"steps": 180.0, "1": 120.0}, good),
+        4: Trial({"steps": 600.0}, other),
+    }
+    sentence = QUIRKS["hide_commits"].sentence
+    assert row("hide_commits", wrong, right) == (
+        f"| `hide_commits` | 5 | {sentence} | steps (3), 1 (1), 2 (1) | 3 | 2.0 | `{good}` | 2 of 3 "
+        "| seed 2: steps, 2 |\n"
+    )
+    assert NOTHING in row("hide_commits", right, right)
+
+
+def test_a_trial_has_the_time_of_the_earliest_evidence_and_the_handler_that_it_names() -> None:
+    early = Finding(2, "trace line 7, t=12.5 s: it sent nothing", handler="build_data_block")
+    late = Finding(1, "trace line 9, t=90 s: it sent nothing", handler="reconcile_finalize")
+    steps = Judgement("every step", "deviates", "2 times", [early, late])
+    idle = Judgement("idle", "violated", "1 time", [Finding(3, "block 3.1 is in no chain")])
+    result = Result({"1": Judgement("distributed", "holds", ""), "2": idle}, {}, {"steps": steps})
+    assert judged(result) == Trial({"2": None, "steps": 12.5}, "build_data_block")
+
+
+def test_the_missions_are_those_that_the_page_names() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert [mission for mission in MISSIONS if f"[{mission.stem}](" not in page] == []
