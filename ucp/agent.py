@@ -68,7 +68,7 @@ from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import StoredState
 from ucp.timers import Timer
-from ucp.trace import Dropped, Entry, HandlerRun, StateSummary, Tally, Trigger, in_base64
+from ucp.trace import Dropped, Entry, HandlerRun, Recorded, StateSummary, Tally, Trigger, in_base64
 
 ON_MESSAGE: dict[type[Message], EventHandler[Any]] = {
     BlockAddRequest: commit.receive_request_add_block,
@@ -156,16 +156,16 @@ class Agent:
         try:
             sender, sequence, message = decode(data)
         except MalformedDatagramError as malformed:
-            self._drop(now, malformed.reason, in_base64(data))
+            self._drop(now, malformed.reason, Recorded(in_base64(data)))
             return
-        self.receive_message(sender, sequence, message, now, in_base64(data))
+        self.receive_message(sender, sequence, message, now, Recorded(in_base64(data)))
 
     def receive_message(
-        self, sender: int, sequence: int, message: Message, now: float, datagram: str | None = None
+        self, sender: int, sequence: int, message: Message, now: float, datagram: Recorded | None = None
     ) -> None:
         """Handle a decoded message, if it is another agent's on the roster and carries only the roster's blocks.
 
-        `datagram` is what it was decoded from, in base64, for the trace.
+        `datagram` is what it was decoded from, for the trace.
         """
         if reason := why_not_handled(self.agent_id, self.roster, sender, message):
             self._drop(now, reason, datagram)
@@ -177,10 +177,9 @@ class Agent:
     def add_event(self, event: LoggableEvent, now: float) -> None:
         """Log an event. Raises ValueError if it is larger than the mission's largest event."""
         largest = self.state.settings.max_event_bytes
-        encoded = event.encode()
-        if len(encoded) > largest:
-            raise ValueError(f"an event of {len(encoded)} bytes is more than max_event_bytes {largest}")
-        came = in_base64(encoded) if self._tracing else None
+        if event.encoded_bytes > largest:
+            raise ValueError(f"an event of {event.encoded_bytes} bytes is more than max_event_bytes {largest}")
+        came = Recorded(None, event) if self._tracing else None
         self._handle(now, {"event": event.event_id}, self._on_local_event["Build Data Block"], event, came=came)
 
     def next_timer(self) -> float | None:
@@ -223,7 +222,7 @@ class Agent:
         core = self._core
         core.now = now
         core.restore(found.completed, found.chain, found.deque, found.stack)
-        came = in_base64(found.encode()) if self._tracing else None
+        came = Recorded(None, found) if self._tracing else None
         self._handle(now, {"boot": len(core.chain)}, self._on_local_event["Reconcile Finalize"], came=came)
 
     def begin_reconcile(self, now: float) -> None:
@@ -246,14 +245,14 @@ class Agent:
 
     # How a handler runs
 
-    def _drop(self, now: float, reason: str, datagram: str | None) -> None:
+    def _drop(self, now: float, reason: str, datagram: Recorded | None) -> None:
         """What came is not for any handler."""
         self.dropped[reason] += 1
         if self._tracing:
-            self._trace.append(Dropped(now, reason, datagram or ""))
+            self._trace.append(Dropped(now, reason, datagram or Recorded("")))
 
     def _handle(
-        self, now: float, trigger: Trigger, handler: EventHandler[Any], *inputs: object, came: str | None = None
+        self, now: float, trigger: Trigger, handler: EventHandler[Any], *inputs: object, came: Recorded | None = None
     ) -> None:
         """Run a handler, and then those that it triggered, in order. `came` is the trace's `input`."""
         core = self._core
@@ -268,7 +267,7 @@ class Agent:
             event, by = core.triggered.popleft()
             handler, trigger, inputs, came = self._on_local_event[event], {"local": by}, (), None
 
-    def _trace_run(self, trigger: Trigger, came: str | None, handler: EventHandler[Any], branch: str) -> None:
+    def _trace_run(self, trigger: Trigger, came: Recorded | None, handler: EventHandler[Any], branch: str) -> None:
         core, state = self._core, self._traced_state
         if core.changes or state.reconciling != core.reconcile_in_progress or state.idle != core.idle:
             state = self._traced_state = self._state_now()

@@ -35,6 +35,10 @@ class LoggableEvent:
         if not 1 <= self.event_id <= 254:
             raise ValueError(f"event_id {self.event_id} is not in 1..254")
 
+    @property
+    def encoded_bytes(self) -> int:
+        return EVENT_HEADER_BYTES + len(self.data)
+
     def encode(self) -> bytes:
         return _HEADER.pack(self.timestamp_us, self.event_id, len(self.data)) + self.data
 

@@ -13,7 +13,7 @@ A message's WIRE declares its fields as they are sent, and the layers of `ucp.sc
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from ucp.block import BLOCK_HEADER, HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
 from ucp.wire import Fields, Kind, struct_of
@@ -252,6 +252,17 @@ def datagram_bytes(message: Message) -> int:
     return HEADER.size + len(message.body())
 
 
+class Datagram(NamedTuple):
+    """What a datagram says."""
+
+    sender: int
+    sequence: int
+    message: Message
+
+    def encode(self) -> bytes:
+        return encode(*self)
+
+
 def encode(sender: int, sequence: int, message: Message) -> bytes:
     """One datagram, at most MAX_DATAGRAM_BYTES long. `sequence` wraps at 2**32."""
     body = message.body()
@@ -259,8 +270,8 @@ def encode(sender: int, sequence: int, message: Message) -> bytes:
     return HEADER.pack(MAGIC, VERSION, code, sender, sequence & 0xFFFFFFFF, len(body)) + body
 
 
-def decode(datagram: bytes) -> tuple[int, int, Message]:
-    """(sender, sequence, message) of one datagram. Raises MalformedDatagramError for anything else."""
+def decode(datagram: bytes) -> Datagram:
+    """What one datagram says. Raises MalformedDatagramError for anything else."""
     if len(datagram) < HEADER.size:
         raise MalformedDatagramError("truncated")
     if len(datagram) > MAX_DATAGRAM_BYTES:
@@ -277,7 +288,7 @@ def decode(datagram: bytes) -> tuple[int, int, Message]:
     from_body = _FROM_BODY.get(code)
     if from_body is None:
         raise MalformedDatagramError("unknown type")
-    return sender, sequence, from_body(datagram[HEADER.size :])
+    return Datagram(sender, sequence, from_body(datagram[HEADER.size :]))
 
 
 def _hashes(body: bytes, count: int) -> list[bytes]:

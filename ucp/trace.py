@@ -2,14 +2,16 @@
 
 It suffices to run the agent again: every input is there in full, also the datagrams that were dropped. `changes` is
 complete: whoever replays it has the contents of chain, deque and reconcile stack after every step.
+
+A line has datagrams, events and stores in base64. In memory they stay what they were, until somebody wants them so.
 """
 
 import base64
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
-from ucp.messages import Message, block_named, encode
+from ucp.messages import Datagram, Message, block_named
 
 SCHEMA = "ucp-trace/2"
 
@@ -19,22 +21,64 @@ Trigger = dict[str, int | str]
 Tally = dict[str, int | list[int]]
 
 
+class Encodable(Protocol):
+    """A datagram, an event, or a store."""
+
+    def encode(self) -> bytes: ...
+
+
+class Recorded:
+    """Bytes on record: `text` is them in base64, and `content` what they say, None if they were read from a trace.
+
+    Of the same content one will do for all who sent or received it.
+    """
+
+    __slots__ = ("_text", "content")
+
+    def __init__(self, text: str | None = None, content: Encodable | None = None) -> None:
+        """Either is needed."""
+        self._text = text
+        self.content = content
+
+    @property
+    def text(self) -> str:
+        if self._text is None:
+            assert self.content is not None, "a record has a text, or what to make it of"
+            self._text = in_base64(self.content.encode())
+        return self._text
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Recorded) and self.text == other.text)
+
+    def __hash__(self) -> int:
+        return hash(self.text)
+
+    def __repr__(self) -> str:
+        return f"Recorded({self.text!r})"
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
+        """In a line of a trace it is a string."""
+        made = {"type": "no-info", "function": cls}
+        return {"type": "function-after", "function": made, "schema": handler(str)}
+
+
 @dataclass(slots=True)
 class Sent:
     """A message broadcast; `block` is the hash of the block that it is about, if it is about one.
 
-    `datagram` is all of it in base64; None in a trace of version 1, which does not have it.
+    `datagram` is None in a trace of version 1, which does not have it.
     """
 
     message: str
     seq: int
     block: str | None = None
-    datagram: str | None = None
+    datagram: Recorded | None = None
 
     @classmethod
     def of(cls, sender: int, sequence: int, message: Message) -> "Sent":
         block_hash = block_named(message)
-        datagram = in_base64(encode(sender, sequence, message))
+        datagram = Recorded(None, Datagram(sender, sequence, message))
         return cls(message.NAME, sequence, block_hash.hex() if block_hash else None, datagram)
 
 
@@ -59,8 +103,8 @@ class HandlerRun:
         {"operator": command}, or {"boot": blocks in the chain that was found on disk}.
     changes: (operation, block hash); operations are `complete`, and `chain`, `deque`, `stack` with + or -.
     state: what holds after the run.
-    input: what came with the trigger, in base64: the datagram as it was received; the event as a block has it; the
-        blocks that were found on disk, in the order in which `changes` names them, a length (u16) before each.
+    input: what came with the trigger: the datagram as it was received; the event as a block has it; the blocks that
+        were found on disk, in the order in which `changes` names them, a length (u16) before each.
     tally: what the handler counts in, after the run: {"yes": n, "no": n}, or of Algorithms 12 and 14
         {block hash, or "" for Is Top Of Chain: [count, timestamp in microseconds]}.
     started: timers that the run started, and their durations in mission seconds.
@@ -74,7 +118,7 @@ class HandlerRun:
     changes: list[tuple[str, str]]
     sent: list[Sent]
     state: StateSummary
-    input: str | None = None
+    input: Recorded | None = None
     tally: Tally | None = None
     started: dict[str, float] | None = None
 
@@ -85,11 +129,16 @@ class HandlerRun:
             "handler": self.handler,
             "algorithm": self.algorithm,
             "trigger": self.trigger,
-            "input": self.input,
+            "input": self.input and self.input.text,
             "branch": self.branch,
             "changes": self.changes,
             "sent": [
-                {"message": sent.message, "seq": sent.seq, "block": sent.block, "datagram": sent.datagram}
+                {
+                    "message": sent.message,
+                    "seq": sent.seq,
+                    "block": sent.block,
+                    "datagram": sent.datagram and sent.datagram.text,
+                }
                 for sent in self.sent
             ],
             "tally": self.tally,
@@ -111,14 +160,14 @@ class HandlerRun:
 
 @dataclass(slots=True)
 class Dropped:
-    """A datagram that no handler was given, and why; `datagram` is all of it in base64."""
+    """A datagram that no handler was given, and why."""
 
     t: float
     dropped: str
-    datagram: str
+    datagram: Recorded
 
     def to_line(self) -> str:
-        return _encode({"t": round(self.t, 6), "dropped": self.dropped, "datagram": self.datagram}) + "\n"
+        return _encode({"t": round(self.t, 6), "dropped": self.dropped, "datagram": self.datagram.text}) + "\n"
 
 
 @dataclass(slots=True)

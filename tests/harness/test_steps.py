@@ -15,7 +15,7 @@ from harness.checker.judgement import Judgement
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
 from ucp.agent import HANDLERS
-from ucp.trace import Dropped, HandlerRun
+from ucp.trace import Dropped, HandlerRun, Recorded
 
 LOSSY = {"network": {"loss": 0.25}, "duration_s": 600}
 
@@ -145,7 +145,7 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
         (lambda runs: expiry(runs).trigger.clear(), "it ran without a trigger that there is"),
         (lambda runs: first_run(runs, "build_data_block").trigger.update(event=255), "said to have logged event 255"),
         (lambda runs: commit(runs).trigger.update(seq=77), "it said to have got Commit Block 77 from agent"),
-        (lambda runs: setattr(commit(runs), "input", "!"), "a datagram that is to be dropped: not base64"),
+        (lambda runs: setattr(commit(runs), "input", Recorded("!")), "a datagram that is to be dropped: not base64"),
         (lambda runs: setattr(commit(runs), "input", None), "a datagram that is to be dropped: truncated"),
         (lambda runs: proposal(runs).sent.clear(), "it sent nothing; it should have sent"),
         (lambda runs: setattr(proposal(runs).sent[0], "seq", 9), "with sequence number 9"),
@@ -181,11 +181,17 @@ def test_any_line_that_says_something_else_is_found(honest: Evidence, data: st.D
     assert any(finding.agent_id == agent for finding in judgement.evidence)
 
 
+def test_a_run_that_was_never_text_is_as_its_line_says(honest: Evidence) -> None:
+    for trace in honest.traces.values():
+        read = [HANDLER_RUN.validate_json(run.to_line()) for run in trace.runs]
+        assert read == [dataclasses.replace(run, t=round(run.t, 6)) for run in trace.runs]
+
+
 def test_a_datagram_that_was_dropped_and_is_good_is_found(honest: Evidence) -> None:
     trace = honest.traces[3]
     request = first_run(trace.runs, "receive_request_add_block")
     assert request.input is not None
-    asides = [(1, Dropped(1.0, "wrong length", request.input)), (1, Dropped(1.0, "truncated", "AAAA"))]
+    asides = [(1, Dropped(1.0, "wrong length", request.input)), (1, Dropped(1.0, "truncated", Recorded("AAAA")))]
     judgement = steps.check(with_traces(honest, {**honest.traces, 3: dataclasses.replace(trace, asides=asides)}))
     (finding,) = judgement.evidence
     assert "trace line 3" in finding.detail

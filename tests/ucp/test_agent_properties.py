@@ -56,7 +56,7 @@ def test_hostile_input_is_counted_and_dropped_and_changes_nothing(datagrams: lis
         agent.receive_datagram(datagram, 1.0)
     assert sum(agent.dropped.values()) == len(datagrams)
     assert not agent.received
-    assert [entry.datagram for entry in agent.trace() if isinstance(entry, Dropped)] == [
+    assert [entry.datagram.text for entry in agent.trace() if isinstance(entry, Dropped)] == [
         base64.b64encode(datagram).decode() for datagram in datagrams
     ]
     assert state_of(agent) == before

@@ -10,7 +10,8 @@ from harness.checker.evidence import Evidence
 from harness.checker.records.clocks import in_virtual_time, slack_s
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.checker.replay import Life
-from ucp.trace import Dropped
+from ucp.messages import Datagram, datagram_bytes
+from ucp.trace import Dropped, Recorded
 
 ROUNDED_S = 5e-4
 """run.json has milliseconds."""
@@ -98,9 +99,14 @@ def _counted(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Lif
 
 
 def _bytes_sent(trace: Trace) -> int:
-    """By the datagrams in base64, four characters of which are three bytes."""
-    datagrams = [message.datagram or "" for run in trace.runs for message in run.sent]
-    return sum(len(datagram) // 4 * 3 - datagram.count("=", -2) for datagram in datagrams)
+    return sum(_bytes(message.datagram) for run in trace.runs for message in run.sent if message.datagram is not None)
+
+
+def _bytes(datagram: Recorded) -> int:
+    """Of base64 four characters are three bytes."""
+    if isinstance(datagram.content, Datagram):
+        return datagram_bytes(datagram.content.message)
+    return len(datagram.text) // 4 * 3 - datagram.text.count("=", -2)
 
 
 def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Contradiction]:

@@ -8,7 +8,7 @@ from harness.checker.records.contradiction import Contradiction
 from harness.checker.records.within import finding
 from harness.checker.replay import Sight
 from ucp.messages import BlockResponse, CommitBlock
-from ucp.trace import HandlerRun
+from ucp.trace import HandlerRun, Recorded
 
 CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 
@@ -44,7 +44,7 @@ def _unlike(line: int, run: HandlerRun, sent: Sending, earliest_s: float) -> Ite
         yield Sight(line, run, f"took this block from {heard}, which carried another", other), "4"
 
 
-def _as_it_went(datagram: str, sent: Sending) -> bool:
+def _as_it_went(datagram: Recorded, sent: Sending) -> bool:
     return any(message.datagram in (None, datagram) for _, message in sent)
 
 

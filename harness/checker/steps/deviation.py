@@ -89,11 +89,11 @@ def _message(message: Sent, others: Sequence[Sent], name: NameOf) -> str:
 def _content(message: Sent, other: Sent) -> str:
     """What tells it from the other, of the same type and about the same block."""
     try:
-        content = decoded(message.datagram or "")[2]
+        content = decoded(message.datagram).message
     except MalformedDatagramError as malformed:
         return f"what is no message ({malformed.reason})"
     try:
-        expected: object = decoded(other.datagram or "")[2]
+        expected: object = decoded(other.datagram).message
     except MalformedDatagramError:
         expected = None
     values = []

@@ -12,7 +12,7 @@ from ucp.block import Block
 from ucp.events import MalformedEventsError
 from ucp.handler import EventHandler
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError
-from ucp.trace import HandlerRun, StateSummary, Trigger
+from ucp.trace import HandlerRun, Recorded, StateSummary, Trigger
 
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
@@ -180,9 +180,9 @@ class Follower:
             self._core.go_along(run)
         return HANDLERS[run.handler]
 
-    def _message(self, datagram: str | None, trigger: Trigger) -> tuple[EventHandler[Any], tuple[Any, ...]]:
+    def _message(self, datagram: Recorded | None, trigger: Trigger) -> tuple[EventHandler[Any], tuple[Any, ...]]:
         try:
-            sender, sequence, message = decoded(datagram or "")
+            sender, sequence, message = decoded(datagram)
         except MalformedDatagramError as malformed:
             raise NotHandledError(f"handled a datagram that is to be dropped: {malformed.reason}") from None
         if type(message) in CARRY_A_BLOCK:
@@ -207,16 +207,16 @@ class Follower:
             raise NotHandledError(f"ran {early:.3g} s before the {name} timer ended")
         return ON_TIMER[name]
 
-    def _event(self, record: str | None, event_id: int | str) -> tuple[Any, ...]:
+    def _event(self, record: Recorded | None, event_id: int | str) -> tuple[Any, ...]:
         try:
-            event = event_of(record or "")
+            event = event_of(record)
         except MalformedEventsError as malformed:
             raise NotHandledError(f"logged what is no event: {malformed}") from None
         if event.event_id != event_id:
             raise NotHandledError(f"said to have logged event {event_id}, and what it logged is {event.event_id}")
-        if len(event.encode()) > (largest := self._mission.settings.max_event_bytes):
+        if event.encoded_bytes > (largest := self._mission.settings.max_event_bytes):
             raise NotHandledError(
-                f"logged an event of {len(event.encode())} bytes, more than max_event_bytes {largest}"
+                f"logged an event of {event.encoded_bytes} bytes, more than max_event_bytes {largest}"
             )
         return (event,)
 
@@ -225,7 +225,7 @@ class Follower:
         if self._began:
             raise NotHandledError("booted, which is only possible before anything else")
         try:
-            found = list(stored_blocks(run.input or ""))
+            found = list(stored_blocks(run.input))
         except ValueError:
             raise NotHandledError("booted from a store that is none") from None
         places: dict[str, list[Block]] = {"chain+": [], "deque+": [], "stack+": []}

@@ -7,7 +7,9 @@ from functools import lru_cache
 from harness.archive.exports import ExportedBlock
 from ucp.block import BLOCK_HEADER, Block
 from ucp.events import LoggableEvent, MalformedEventsError, decode_event
-from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError, Message, decode
+from ucp.messages import BlockResponse, CommitBlock, Datagram, MalformedDatagramError, Message, decode
+from ucp.store import StoredState
+from ucp.trace import Recorded
 
 KEPT = 4096
 """A datagram reaches many agents: so many are kept decoded."""
@@ -19,20 +21,29 @@ class NotOnRecordError(Exception):
     """What would be needed to go on is not in the records: one sentence."""
 
 
+def decoded(record: Recorded | None) -> Datagram:
+    """What a datagram says. Raises MalformedDatagramError."""
+    if record is None:
+        return _decoded("")
+    content = record.content
+    return content if isinstance(content, Datagram) else _decoded(record.text)
+
+
 @lru_cache(KEPT)
-def decoded(datagram: str) -> tuple[int, int, Message]:
-    """(sender, sequence, message) of a datagram in base64. Raises MalformedDatagramError."""
+def _decoded(text: str) -> Datagram:
     try:
-        data = base64.b64decode(datagram, validate=True)
+        data = base64.b64decode(text, validate=True)
     except ValueError:
         raise MalformedDatagramError("not base64") from None
     return decode(data)
 
 
-def event_of(record: str) -> LoggableEvent:
-    """An event in base64, as a block has it. Raises MalformedEventsError."""
+def event_of(record: Recorded | None) -> LoggableEvent:
+    """An event as a block has it. Raises MalformedEventsError."""
+    if record is not None and isinstance(record.content, LoggableEvent):
+        return record.content
     try:
-        data = base64.b64decode(record, validate=True)
+        data = base64.b64decode(record.text if record else "", validate=True)
     except ValueError:
         raise MalformedEventsError("the event is not base64") from None
     event, end = decode_event(data, 0)
@@ -41,9 +52,12 @@ def event_of(record: str) -> LoggableEvent:
     return event
 
 
-def stored_blocks(record: str) -> Iterator[Block]:
+def stored_blocks(record: Recorded | None) -> Iterator[Block]:
     """The blocks of a store, each after its length. Raises ValueError."""
-    data = base64.b64decode(record, validate=True)
+    if record is not None and isinstance(record.content, StoredState):
+        yield from record.content.blocks()
+        return
+    data = base64.b64decode(record.text if record else "", validate=True)
     offset = 0
     while offset < len(data):
         end = offset + LENGTH_BYTES + int.from_bytes(data[offset : offset + LENGTH_BYTES], "big")

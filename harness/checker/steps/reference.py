@@ -67,7 +67,7 @@ class ReferenceCore(Core):
             return False
         for told, (sequence, message) in zip(sent, self.outbox, strict=True):
             try:
-                sender, number, content = decoded(told.datagram or "")
+                sender, number, content = decoded(told.datagram)
             except MalformedDatagramError:
                 return False
             if content != message or (sender, number) != (self.agent_id, sequence):
@@ -175,7 +175,7 @@ class ReferenceCore(Core):
         for announced in sent:
             self._sequence = announced.seq + 1
             try:
-                message = decoded(announced.datagram or "")[2]
+                message = decoded(announced.datagram).message
             except MalformedDatagramError:
                 continue
             if timer := self._asked(message):

@@ -22,6 +22,7 @@ from ucp.interest import ANSWERED, ASKED, MATTERS, ONLY_COUNTED, STILL_ASKED, Qu
 from ucp.messages import BlockAddResponse, Message
 from ucp.settings import Settings
 from ucp.state import AgentState
+from ucp.trace import Recorded
 
 NEVER = float("inf")
 SWEEP_EVERY = 1000
@@ -39,8 +40,8 @@ class InFlight:
     sent_at: float
     rank: int
     lots: RandomDraws
-    datagram: str | None
-    """In base64, if there are traces to have it."""
+    datagram: Recorded | None
+    """None if there are no traces to have it."""
 
     def __lt__(self, other: object) -> bool:
         return False  # of two copies that arrive at one agent in one instant either is the first
@@ -156,7 +157,13 @@ class VirtualAir:
             heappush(self._coming, (at, self._rank, number, stray))
 
     def broadcast(
-        self, now: float, number: int, sequence: int, message: Message, data_bytes: int, datagram: str | None = None
+        self,
+        now: float,
+        number: int,
+        sequence: int,
+        message: Message,
+        data_bytes: int,
+        datagram: Recorded | None = None,
     ) -> None:
         """The agent with this number sends `message`, in a datagram with so many bytes of data."""
         self._rank += 1

@@ -32,7 +32,7 @@ from ucp.interest import ONLY_COUNTED
 from ucp.messages import datagram_bytes
 from ucp.quirks import in_force, wrong_handlers
 from ucp.store import StoredState
-from ucp.trace import Entry, HandlerRun
+from ucp.trace import Entry, HandlerRun, Recorded
 
 if TYPE_CHECKING:
     from harness.play.simulation.rogue import VirtualRogue
@@ -468,7 +468,7 @@ class Simulation:
         busy_until = agent.answers_nobody_until()
         self._air.busy_until[number] = 0.0 if busy_until is None else _mission_time(life, busy_until)
 
-    def _take_down(self, life: Incarnation, mission_s: float) -> list[str | None]:
+    def _take_down(self, life: Incarnation, mission_s: float) -> list[Recorded | None]:
         """Write what the agent has done into its trace; the datagrams that it sent, as the trace has them."""
         entries = life.agent.trace()
         datagrams = []

@@ -16,6 +16,7 @@ from netem.capture import begin_file
 from netem.frames import udp_broadcast
 from netem.pcapng import PcapngFile
 from ucp.messages import PORT, Message, encode
+from ucp.trace import Recorded
 
 NANOSECONDS = 1_000_000_000
 FRAMES_KEPT = 4096
@@ -66,7 +67,13 @@ class CapturedAir(VirtualAir):
             yield happening
 
     def broadcast(
-        self, now: float, number: int, sequence: int, message: Message, data_bytes: int, datagram: str | None = None
+        self,
+        now: float,
+        number: int,
+        sequence: int,
+        message: Message,
+        data_bytes: int,
+        datagram: Recorded | None = None,
     ) -> None:
         self._capture.take_down(now, number, _frame(self._roster[number], sequence, message), outbound=True)
         super().broadcast(now, number, sequence, message, data_bytes, datagram)
