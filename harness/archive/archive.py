@@ -6,12 +6,10 @@ they should be, `gaps` of what a run that came to its end leaves, and this one h
 """
 
 import os
+import re
 from collections.abc import Collection, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-from pydantic import ValidationError
 
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, read_connectivity
 from harness.archive.directory import ROGUE_FILE
@@ -27,8 +25,8 @@ from harness.archive.exports import (
 )
 from harness.archive.history import in_time
 from harness.archive.jsonlines import JsonLines, Record
-from harness.archive.record import JudgedRecord
-from harness.archive.result import DamagedResultError, agent_ids, listing, mapping, read_result, roster_of
+from harness.archive.record import JudgedRecord, RunRecord
+from harness.archive.record_file import RecordFile, read_record
 from harness.archive.trace_lines import Line, read_lines
 from harness.archive.traces import SUFFIX, Trace, read_trace, why_none
 from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
@@ -38,6 +36,7 @@ LARGE_BYTES = 16 * 1024 * 1024
 """Traces that are larger together are read without what only took a message in, if that is enough."""
 MAX_TRACE_BYTES = 256 * 1024 * 1024
 """Of 50 agents that hear everything, each fills about a tenth of it in 20 minutes."""
+_AGENT_ID = re.compile("[1-9][0-9]{0,4}")
 
 
 class RunArchive:
@@ -60,54 +59,60 @@ class RunArchive:
 
     # What the run says of itself
 
-    @cached_property
-    def result(self) -> dict[str, Any]:
-        """run.json as it stands, empty if it cannot be read; ask by `harness.archive.result`, for it may be edited."""
-        return self._run[0]
+    @property
+    def recorded(self) -> bool:
+        """Whether run.json is there, and anything of it can be read."""
+        return self._record_file[0] is not None
 
-    @cached_property
-    def record(self) -> JudgedRecord | None:
-        """What a judgement needs of run.json; None if that is not there, or damaged."""
-        return self._run[1]
+    @property
+    def record(self) -> RunRecord:
+        """What can be used of run.json; nothing is known where it is missing or damaged."""
+        return self._record_file[0].record if self._record_file[0] else RunRecord()
 
-    @cached_property
+    @property
+    def judged_record(self) -> JudgedRecord | None:
+        """What a judgement needs of run.json; None if it is not there, or not all of that is sound."""
+        return self._record_file[0].judged if self._record_file[0] else None
+
+    @property
     def record_error(self) -> RunDirectoryError | None:
-        """What is wrong with run.json, if it is there and not what it should be."""
-        return self._run[2]
+        """Why nothing of run.json can be read, if it is there."""
+        return self._record_file[1]
+
+    @property
+    def record_problems(self) -> list[str]:
+        """A sentence on each thing that is wrong with run.json, what a judgement needs first."""
+        if self.record_error is not None:
+            return [str(self.record_error)]
+        return self._record_file[0].problems if self._record_file[0] else []
 
     @cached_property
-    def origin(self) -> dict[str, Any]:
-        """The same of the run that the exports come from, even if not its directory was named but files in it."""
+    def origin(self) -> RunRecord:
+        """The record of the run that the exports come from, even if not its directory was named but files in it."""
         if self.directory is not None:
-            return self.result
+            return self.record
         beside = dict.fromkeys(path.parent for file in self._export_files for path in (file.parent, file))
-        return next((RunArchive(path).result for path in beside if (path / RUN_FILE).is_file()), {})
+        return next((RunArchive(path).record for path in beside if (path / RUN_FILE).is_file()), RunRecord())
 
     @cached_property
-    def _run(self) -> tuple[dict[str, Any], JudgedRecord | None, RunDirectoryError | None]:
+    def _record_file(self) -> tuple[RecordFile | None, RunDirectoryError | None]:
         path = self._in_directory(RUN_FILE)
         if path is None or not path.exists():
-            return {}, None, None
+            return None, None
         try:
-            result = read_result(path)
+            return read_record(path), None
         except RunDirectoryError as error:
-            return {}, None, error
-        try:
-            return result, JudgedRecord.model_validate(result), None
-        except ValidationError as error:
-            problem = error.errors()[0]
-            where, what = ".".join(map(str, problem["loc"])), problem["msg"].lower()
-            return result, None, DamagedResultError(f"{path}: `{where}` is wrong: {what}; it was edited or damaged")
+            return None, error
 
     @cached_property
     def roster(self) -> list[int]:
         """The agents that the run is known to have had: by its record, else by the files that they left."""
-        files = [path for directory in self._agents for path in directory.glob("*.*.json*")]
-        return roster_of(self.result) or agent_ids(path.name.partition(".")[0] for path in files)
+        names = (path.name.partition(".")[0] for directory in self._agents for path in directory.glob("*.*.json*"))
+        return self.record.known_agents or sorted({int(name) for name in names if _AGENT_ID.fullmatch(name)})
 
     def forget_record(self) -> None:
         """The record has been written anew: it is read once more when it is asked for."""
-        for name in ("_run", "result", "record", "record_error", "origin", "roster"):
+        for name in ("_record_file", "origin", "roster"):
             self.__dict__.pop(name, None)
 
     # What the agents left
@@ -152,7 +157,7 @@ class RunArchive:
         traces: dict[int, Trace] = {}
         problems, gaps = [], []
         skim = self._skim and self.large
-        of_the_run = roster_of(self.result)  # none where nothing says who flew, as of exports from the field
+        of_the_run = self.record.known_agents  # none where nothing says who flew, as of exports from the field
         for path in self._trace_files:
             if path.is_file() and path.stat().st_size > MAX_TRACE_BYTES:
                 problems.append(
@@ -167,7 +172,7 @@ class RunArchive:
             if agent_id in traces or (of_the_run and agent_id not in of_the_run):
                 problems.append(f"{path}: of an agent that is not of this run, or has a trace already; it is left out")
                 continue
-            recorded = self.record.agents.get(str(agent_id)) if self.record else None
+            recorded = self.record.agents.get(str(agent_id))
             if recorded is not None and recorded.trace_problem:
                 trace.problem = f"it ends early: {recorded.trace_problem}"
             if trace.problem:
@@ -203,9 +208,8 @@ class RunArchive:
     @property
     def problems(self) -> list[str]:
         """A sentence that names the file for each that cannot be used, or not wholly."""
-        record = [str(self.record_error)] if self.record_error else []
         before = self._before_final_reconcile.errors
-        return [*record, *self._read_traces[1], *self.exports.errors, *before]
+        return [*self.record_problems, *self._read_traces[1], *self.exports.errors, *before]
 
     @property
     def gaps(self) -> list[str]:
@@ -224,7 +228,7 @@ class RunArchive:
             yield from (f"agent {agent_id}: no trace, and so no lane in the timeline" for agent_id in without)
         if not (self.directory / NETWORK_FILE).is_file():
             yield f"{NETWORK_FILE} is missing: who could reach whom is not known"
-        flew = mapping(self.result, "vehicles") or listing(self.result, "scenario", "flight")
+        flew = self.record.vehicles or (self.record.scenario and self.record.scenario.flight)
         if flew and not (self.directory / TRACKS_FILE).is_file():
             yield f"{TRACKS_FILE} is missing: where the vehicles were is not known"
 

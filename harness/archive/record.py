@@ -1,4 +1,8 @@
-"""What run.json says: the record of one run, schema `ucp-run/1`. Keys are added, never removed or renamed."""
+"""What run.json says: the record of one run, schema `ucp-run/1`. Keys are added, never removed or renamed.
+
+The harness writes all of it. What is read back may be of a run that was killed, of another version, or edited: there
+is a default for every key of a `RunRecord`, which says that nothing is known of it.
+"""
 
 from typing import Annotated, Any, Literal
 
@@ -7,13 +11,17 @@ from pydantic import BaseModel, ConfigDict, Field
 from harness.backend_names import BackendName
 from harness.scenario import Scenario, faults
 from harness.scenario.faults import Disk
-from harness.scenario.verdicts import CharacteristicVerdict, Verdict
+from harness.scenario.verdicts import BESIDE, CharacteristicVerdict, Verdict
 
 SCHEMA = "ucp-run/1"
 
 
+AgentKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,4}$")]
+"""An agent's ID, or that of its vehicle, where JSON has text for keys."""
+
+
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="ignore", populate_by_name=True)
+    model_config = ConfigDict(extra="ignore", populate_by_name=True, allow_inf_nan=False)
 
 
 class FindingRecord(_Model):
@@ -108,8 +116,6 @@ class Cycle(_Model):
     row.
     """
 
-    model_config = ConfigDict(allow_inf_nan=False)
-
     since_s: float
     period_s: float | None = None
     periods: int | None = None
@@ -163,6 +169,24 @@ class CapturedFrames(_Model):
 
     received: int
     dropped: int
+
+
+class ReceiverCounters(_Model):
+    """How many packets to a vehicle the kernel let through, lost, and cut off; and what it was told to do to them."""
+
+    model_config = ConfigDict(extra="allow")
+
+    passed: int | None = None
+    lost: int | None = None
+    cut: int | None = None
+
+
+class Counters(_Model):
+    """What the kernel counted, by receiver."""
+
+    model_config = ConfigDict(extra="allow")
+
+    receivers: dict[AgentKey, ReceiverCounters] = {}
 
 
 class BlockHolders(_Model):
@@ -247,6 +271,9 @@ class RogueInjection(_Model):
     untraced: int = 0
 
 
+WRITTEN_FROM_THE_START = ("scenario", "seed", "backend", "versions", "started_at")
+
+
 class JudgedRecord(_Model):
     """The part of a record that a judgement of the run needs."""
 
@@ -259,27 +286,29 @@ class JudgedRecord(_Model):
     cycle: Cycle | None = None
     """Where agents were shown never to finish; if `proven`, the run stopped there."""
     mission_s: float | None = None
-    agents: dict[str, AgentRecord] = {}
+    agents: dict[AgentKey, AgentRecord] = {}
     engine: str | None = None
-    counters: dict[str, Any] | None = None
-    """What the kernel counted on the way to each vehicle: packets passed, lost, and cut off."""
+    counters: Counters | None = None
 
 
 class RunRecord(JudgedRecord):
-    """All of a record. Times are mission seconds except `wall_s`; what is not known yet is null or empty."""
+    """All of a record. Times are mission seconds except `wall_s`; what is not known, or not yet, is null or empty."""
 
-    scenario: Scenario
-    seed: int
-    backend: BackendName
-    versions: dict[str, str]
-    started_at: str
+    model_config = ConfigDict(json_schema_extra={"required": ["roster", *WRITTEN_FROM_THE_START]})
+
+    roster: list[int] = []
+    scenario: Scenario | None = None
+    seed: int | None = None
+    backend: BackendName | None = None
+    versions: dict[str, str] = {}
+    started_at: str | None = None
     wall_s: float | None = None
     outcome_detail: str | None = None
     settled: bool = False
-    vehicles: dict[str, dict[str, Any]] = {}
+    vehicles: dict[AgentKey, dict[str, Any]] = {}
     unmatched_fates: list[str] = []
     """A sentence for each scripted fate that decided nothing, and each injection that sent nothing."""
-    capture: dict[str, CapturedFrames] | None = None
+    capture: dict[AgentKey, CapturedFrames] | None = None
     """Of each vehicle, if captures were asked for and came to their end."""
     characteristics: dict[str, CharacteristicRecord] = {}
     steps: JudgementRecord | None = None
@@ -295,5 +324,18 @@ class RunRecord(JudgedRecord):
     errors: list[str] = []
     """A sentence for each file that the checker could not use, or not wholly."""
 
+    @property
+    def known_agents(self) -> list[int]:
+        """All agents that it names anywhere, whether or not they left anything; the lowest ID first."""
+        asked = self.scenario.roster if self.scenario else ()
+        return sorted({*self.roster, *asked, *map(int, self.agents), *map(int, self.vehicles)})
+
+    @property
+    def judgements(self) -> dict[str, CharacteristicRecord | JudgementRecord]:
+        """The verdicts on the characteristics by number, and those beside them by key."""
+        beside = {key: judgement for key in BESIDE if (judgement := getattr(self, key)) is not None}
+        return {**self.characteristics, **beside}
+
     def to_json(self) -> dict[str, Any]:
+        """The document, every key of it."""
         return self.model_dump(mode="json", by_alias=True)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
-from harness.archive.record import AgentRecord, Cycle, JudgedRecord
+from harness.archive.record import AgentRecord, Counters, Cycle, JudgedRecord
 from harness.archive.traces import Trace
 from harness.checker.cycles import cycle_of
 from harness.checker.replay import Life, replay
@@ -50,7 +50,7 @@ class Condition(BaseModel):
     fully_connected: bool | None = None
     agents: list[int] | None = None
     disk: str | None = None
-    counters: dict[str, Any] | None = None
+    counters: Counters | None = None
     """What the kernel had counted at the end."""
 
 
@@ -221,13 +221,13 @@ class Evidence:
 def gather(archive: RunArchive) -> Evidence:
     """All that an archive has of it."""
     problems = list(archive.problems)
-    if archive.record_error is not None:
+    if archive.record_problems and archive.judged_record is None:
         problems[0] += "; the exports are checked without it"
     injected = RogueTraffic().take_down(archive.injected(InjectedDatagram))
     return Evidence(
         archive.exports.by_agent,
         archive.traces,
-        archive.record,
+        archive.judged_record,
         problems,
         archive.before_final_reconcile,
         injected,

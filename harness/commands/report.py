@@ -9,7 +9,6 @@ import typer
 
 from harness import report
 from harness.archive.archive import RunArchive
-from harness.archive.result import mapping
 from harness.commands.terminal import complain
 from harness.errors import MachineError, RunDirectoryError
 
@@ -28,10 +27,9 @@ def report_command(run: Annotated[Path, typer.Argument(help="A run directory.")]
 
 def _missing(left: report.ReportSource) -> Iterator[str]:
     """A sentence for everything that a whole run would have left and this one has not."""
-    recorded = "schema" in left.result
-    if recorded and left.result.get("outcome") in (None, "running"):
+    if left.archive.recorded and left.record.outcome == "running":
         yield "the run has not recorded its end: it is still going on, or it was killed"
-    if not mapping(left.result, "characteristics"):
+    if not left.record.characteristics:
         yield f"there is no verdict: `ucp-harness check {left.run_dir}` judges what there is"
     yield from left.chains_missing
     yield from left.files_missing

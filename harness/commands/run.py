@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from harness.archive.directory import default_path
+from harness.archive.record import CapturedFrames
 from harness.backend_names import BackendName
 from harness.commands.terminal import complain, show_result, show_rogue, show_survival
 from harness.errors import HarnessError, ScenarioError
@@ -119,7 +120,8 @@ def _show_end(console: Console, finished: Run) -> None:
         complain(error)
     for sentence in finished.played.unmatched_fates:
         complain(f"{sentence}, so this run does not show what it was meant to")
-    if lacks := gaps({"capture": finished.played.capture}):
+    captured = finished.played.capture or {}
+    if lacks := gaps({vehicle: CapturedFrames.model_validate(frames) for vehicle, frames in captured.items()}):
         complain(f"{lacks}: choose a smaller --speedup")
     slow = [
         f"{vehicle} ({record['real_time_factor']:.2f})"

@@ -8,7 +8,6 @@ from typing import Any
 
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE
-from harness.archive.result import agent_ids, listing, mapping
 from harness.difference.keys import KeyDifference, differing_keys
 from harness.difference.steps import Step, completed_blocks, name
 from harness.errors import RunDirectoryError
@@ -110,11 +109,11 @@ class _Run:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.archive = RunArchive(path)
-        self.result = self.archive.result
-        if not self.result:
+        self.record = self.archive.record
+        if not self.archive.recorded:
             missing = RunDirectoryError(f"{path}: there is no {RUN_FILE}; is this a run directory?")
             raise self.archive.record_error or missing
-        self.roster: Sequence[int] = agent_ids(listing(self.result, "roster"))
+        self.roster: Sequence[int] = sorted({*self.record.roster})
         self.exports = self.archive.exports
         self.names: Mapping[str, str] = {
             block: known
@@ -127,14 +126,15 @@ class _Run:
         return [name(block, self.names) for block in export.chain_of_block_hashes] if export else []
 
     def problems(self) -> Iterator[str]:
-        if self.result.get("outcome") in (None, "running"):
+        if self.record.outcome == "running":
             yield f"{self.path}: the run has not recorded its end, and is compared up to there"
-        if self.archive.record_error is not None:
-            yield str(self.archive.record_error)
+        yield from self.archive.record_problems
         yield from self.exports.errors
 
     def asked(self) -> dict[str, Any]:
-        return {"seed": self.result.get("seed"), **mapping(self.result, "scenario")}
+        """What the run was to play, as JSON."""
+        scenario = self.record.scenario
+        return {"seed": self.record.seed, **(scenario.model_dump(mode="json", by_alias=True) if scenario else {})}
 
 
 def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
@@ -144,7 +144,7 @@ def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
     if a.roster != b.roster:
         roster_a, roster_b = (", ".join(ranges([*run.roster])) for run in (a, b))
         raise RunDirectoryError(f"A has agents {roster_a}, and B has {roster_b}: compare runs of the same agents")
-    if a.result.get("backend") != b.result.get("backend"):
+    if a.record.backend != b.record.backend:
         raise RunDirectoryError(
             "one run was in virtual time, whose traces leave out messages that change nothing, and one was not: "
             "compare runs of the same backend"

@@ -1,12 +1,11 @@
 """Gathers exports, and what is known of where their events come from."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import SUFFIX, Export
-from harness.archive.result import agent_ids, listing, mapping
+from harness.archive.record import AgentRecord, RunRecord
 from harness.errors import ExportError, RunDirectoryError
 from harness.play.backends import in_virtual_time
 
@@ -44,25 +43,25 @@ def read(archive: RunArchive) -> Logbook:
     if not exports.by_agent and not exports.errors:
         why = f"holds no exports (*{SUFFIX}): no agent of this run left its chain"
         raise RunDirectoryError(f"{archive.directory}: {why}")
-    run = archive.origin
-    absent = [agent_id for agent_id in agent_ids(listing(run, "roster")) if agent_id not in exports.by_agent]
+    record = archive.origin
+    absent = sorted({*record.roster} - {*exports.by_agent})
     return Logbook(
         exports.by_agent,
         name_blocks(exports.by_agent),
-        telemetry=_logged_telemetry(run),
-        absent={agent_id: _absent(agent_id, mapping(run, "agents", str(agent_id))) for agent_id in absent},
-        errors=[*([str(archive.record_error)] if archive.record_error else []), *exports.errors],
+        telemetry=_logged_telemetry(record),
+        absent={agent_id: _absent(agent_id, record.agents.get(str(agent_id))) for agent_id in absent},
+        errors=[*archive.record_problems, *exports.errors],
     )
 
 
-def _logged_telemetry(run: dict[str, Any]) -> bool:
+def _logged_telemetry(record: RunRecord) -> bool:
     """Events are random where no vehicle flies; those of exports that came without a run are taken for telemetry."""
-    source, kind = mapping(run, "scenario", "events").get("source"), mapping(run, "scenario", "vehicles").get("kind")
-    flown = source == "mavlink" and kind != "none"
-    return source is None or (flown and not in_virtual_time(run.get("backend")))
+    asked = record.scenario
+    if asked is None:
+        return True
+    return asked.events.source == "mavlink" and asked.vehicles.kind != "none" and not in_virtual_time(record.backend)
 
 
-def _absent(agent_id: int, agent: dict[str, Any]) -> str:
-    outcome = agent.get("outcome")
-    why = f" ({outcome})" if isinstance(outcome, str) and outcome != "exported" else ""
+def _absent(agent_id: int, agent: AgentRecord | None) -> str:
+    why = f" ({agent.outcome})" if agent is not None and agent.outcome != "exported" else ""
     return f"agent {agent_id} has no export here{why}"

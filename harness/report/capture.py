@@ -1,19 +1,17 @@
 """Whether the captures of a run are whole."""
 
-from typing import Any
+from collections.abc import Mapping
 
-from harness.archive.result import agent_ids, mapping, number
+from harness.archive.record import CapturedFrames
 from harness.report.chain_tree import ranges
 
 
-def gaps(result: dict[str, Any]) -> str | None:
-    """A sentence of what the captures lack, if they lack anything."""
-    captured = mapping(result, "capture")
-    dropped = {vehicle: number(captured, vehicle, "dropped") or 0 for vehicle in captured}
-    lacking = agent_ids(vehicle for vehicle, frames in dropped.items() if frames)
+def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
+    """A sentence of what the captures of these vehicles lack, if they lack anything."""
+    lacking = sorted(int(vehicle) for vehicle, frames in captured.items() if frames.dropped)
     if not lacking:
         return None
-    frames = sum(dropped.values())
-    received = sum(number(captured, vehicle, "received") or 0 for vehicle in captured)
+    dropped = sum(frames.dropped for frames in captured.values())
+    received = sum(frames.received for frames in captured.values())
     whose = f"vehicle{'s' if len(lacking) > 1 else ''} {', '.join(ranges(lacking))}"
-    return f"the capture lacks {frames:.0f} of {received:.0f} frames, of {whose}: this machine was too slow to keep up"
+    return f"the capture lacks {dropped} of {received} frames, of {whose}: this machine was too slow to keep up"

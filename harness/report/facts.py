@@ -1,9 +1,7 @@
 """What the page and report.md both say of a run: what was asked, how it ended, and its figures."""
 
-from typing import Any
-
 from harness.archive.exports import Exports
-from harness.archive.result import mapping, number, roster_of
+from harness.archive.record import RunRecord
 from harness.play.backends import in_virtual_time
 from harness.present import words
 
@@ -22,45 +20,41 @@ FIGURES = {
 }
 
 
-def title(result: dict[str, Any]) -> str:
-    return words.value(mapping(result, "scenario").get("name") or "unnamed scenario")
+def title(record: RunRecord) -> str:
+    return record.scenario.name if record.scenario else "unnamed scenario"
 
 
-def summary(result: dict[str, Any], exports: Exports) -> list[str]:
-    scenario = mapping(result, "scenario")
-    parts = [words.value(result["outcome"])] if result.get("outcome") else []
-    agents = len({*roster_of(result), *exports.by_agent})
+def summary(record: RunRecord, exports: Exports) -> list[str]:
+    """In a few words each: how it ended, who flew, what was asked, where and when it was played."""
+    scenario = record.scenario
+    parts: list[str] = [] if record.outcome == "running" else [record.outcome]
+    agents = len({*record.known_agents, *exports.by_agent})
     parts.append("1 agent" if agents == 1 else f"{agents} agents")
-    duration_s, speedup = number(scenario, "duration_s"), number(scenario, "speedup")
-    loss, wall_s = number(scenario, "network", "loss"), number(result, "wall_s")
-    if duration_s is not None:
-        parts.append(f"{words.duration(duration_s)} mission")
-    if loss is not None:
-        parts.append(f"{words.percent(loss)} loss")
-    if speedup is not None and not in_virtual_time(result.get("backend")):
-        parts.append(f"speedup {words.value(speedup)}")
-    parts += [
-        f"{key} {words.value(result[key])}" for key in ("seed", "backend", "engine") if result.get(key) is not None
-    ]
-    if wall_s is not None:
-        parts.append(f"{words.duration(wall_s)} wall time")
-    if result.get("started_at"):
-        parts.append(f"started {words.started(result['started_at'])}")
+    if scenario is not None:
+        parts.append(f"{words.duration(scenario.duration_s)} mission")
+        if isinstance(scenario.network.loss, float):
+            parts.append(f"{words.percent(scenario.network.loss)} loss")
+        if not in_virtual_time(record.backend):
+            parts.append(f"speedup {words.value(scenario.speedup)}")
+    played = {"seed": record.seed, "backend": record.backend, "engine": record.engine}
+    parts += [f"{key} {words.value(value)}" for key, value in played.items() if value is not None]
+    if record.wall_s is not None:
+        parts.append(f"{words.duration(record.wall_s)} wall time")
+    if record.started_at:
+        parts.append(f"started {words.started(record.started_at)}")
     return parts
 
 
-def outcome(result: dict[str, Any]) -> tuple[str, str] | None:
+def outcome(record: RunRecord) -> tuple[str, str] | None:
     """What kept the run from completing and the details, if something did."""
-    outcome = result.get("outcome")
-    if outcome == "completed":
+    if record.outcome == "completed":
         return None
-    detail = result.get("outcome_detail")
-    if outcome in (None, "running"):
-        return "This run has not recorded its end", words.value(detail or "It is still going on, or it was killed.")
-    return f"This run did not complete: {words.value(outcome)}", words.value(detail or "")
+    detail = record.outcome_detail
+    if record.outcome == "running":
+        return "This run has not recorded its end", detail or "It is still going on, or it was killed."
+    return f"This run did not complete: {record.outcome}", detail or ""
 
 
-def figures(result: dict[str, Any]) -> list[tuple[str, str]]:
+def figures(record: RunRecord) -> list[tuple[str, str]]:
     """Labels and values."""
-    known = mapping(result, "figures")
-    return [(FIGURES.get(key, words.label(key)), words.value(figure)) for key, figure in known.items()]
+    return [(FIGURES.get(key, words.label(key)), words.value(figure)) for key, figure in record.figures.items()]

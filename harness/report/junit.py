@@ -3,9 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-from pydantic import ValidationError
-
-from harness.archive.result import listing, mapping, number
+from harness.archive.record import RunRecord
 from harness.present import words
 from harness.present.junit import Case, to_xml
 from harness.report import facts
@@ -13,37 +11,28 @@ from harness.report.verdicts import Verdict, verdicts
 from harness.scenario.expect import Expect
 
 
-def to_junit(result: dict[str, Any]) -> str:
+def to_junit(record: RunRecord) -> str:
     """A characteristic fails if it is violated, or other than its scenario expects: as in pytest. One that was not
     applicable is skipped, with the reason."""
-    started_at = words.value(result.get("started_at") or "")
-    return to_xml(facts.title(result), "ucp-run", started_at, number(result, "wall_s"), _cases(result))
+    return to_xml(facts.title(record), "ucp-run", record.started_at or "", record.wall_s, _cases(record))
 
 
-def _cases(result: dict[str, Any]) -> Iterator[Case]:
-    judged, expect = verdicts(result), _expect(result)
-    if wrong := [*_wrong_with_run(result), *([] if judged else ["There is no verdict."])]:
+def _cases(record: RunRecord) -> Iterator[Case]:
+    judged, expect = verdicts(record), (record.scenario and record.scenario.expect) or Expect()
+    if wrong := [*_wrong_with_run(record), *([] if judged else ["There is no verdict."])]:
         yield Case("run", wrong)
     for verdict in judged:
         yield _characteristic(verdict, expect)
     if expect.figures:
-        figures: dict[str, float | None] = {name: number(result, "figures", name) for name in expect.figures}
+        figures: dict[str, float | None] = {name: record.figures.get(name) for name in expect.figures}
         yield Case("expected figures", list(expect.out_of_range(figures)))
 
 
-def _wrong_with_run(result: dict[str, Any]) -> Iterator[str]:
-    if ended := facts.outcome(result):
+def _wrong_with_run(record: RunRecord) -> Iterator[str]:
+    if ended := facts.outcome(record):
         yield ": ".join(filter(None, ended))
-    for fate in listing(result, "unmatched_fates"):
-        yield f"{words.value(fate)}, so this run does not show what it was meant to"
-
-
-def _expect(result: dict[str, Any]) -> Expect:
-    """What cannot be read is not expected."""
-    try:
-        return Expect.model_validate(mapping(result, "scenario", "expect"))
-    except ValidationError:
-        return Expect()
+    for fate in record.unmatched_fates:
+        yield f"{fate}, so this run does not show what it was meant to"
 
 
 def _characteristic(verdict: Verdict, expect: Expect) -> Case:

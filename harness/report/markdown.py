@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from harness.archive.result import mapping
 from harness.present import words
 from harness.present.markdown import escaped, row
 from harness.report import facts, network, rogue, survival
@@ -16,23 +15,22 @@ TEXT_LENGTH = 240
 
 
 def to_markdown(left: ReportSource) -> str:
-    result = left.result
-    judged, ended = verdicts(result), facts.outcome(result)
+    record = left.record
+    judged, ended = verdicts(record), facts.outcome(record)
     verdict, _ = headline(judged, completed=ended is None)
-    lines = [f"## {_short(facts.title(result))}", "", f"**{verdict}**", ""]
-    lines += [_short(" \u00b7 ".join(facts.summary(result, left.exports))), ""]
+    lines = [f"## {_short(facts.title(record))}", "", f"**{verdict}**", ""]
+    lines += [_short(" \u00b7 ".join(facts.summary(record, left.exports))), ""]
     if ended:
         lines += [f"**{_short(ended[0])}** {_short(ended[1])}".rstrip(), ""]
     lines += _listed([*left.chains_missing, *left.files_missing])
     lines += [*_verdict_table(judged), *_evidence(judged)] if judged else []
-    if figures := facts.figures(result):
+    if figures := facts.figures(record):
         lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]
-    if survived := survival.section(result, left.ink):
+    if survived := survival.section(record.survival, left.ink):
         lines += _listed(survived.sentences)
-    lines += _faults(network.faults(result))
-    lines += _listed(rogue.sentences(result))
-    known = mapping(result, "versions")
-    versions = ", ".join(f"{name} {words.value(version)}" for name, version in known.items())
+    lines += _faults(network.faults(record.faults))
+    lines += _listed(rogue.sentences(record.rogue))
+    versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     return "\n".join([*lines, f"<sub>{_short(versions)}</sub>"]) + "\n"
 
 

@@ -11,7 +11,6 @@ from typing import Any
 
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
-from harness.archive.result import mapping
 from harness.present.colours import Ink
 from harness.report import facts, html, map_section, network, rogue, survival, swarm, timeline, verdicts
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
@@ -27,16 +26,16 @@ _TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 def draw(left: ReportSource) -> str:
     """The page, as HTML."""
-    result, exports, ink = left.result, left.exports, left.ink
-    judged, outcome = verdicts.verdicts(result), facts.outcome(result)
+    record, exports, ink = left.record, left.exports, left.ink
+    judged, outcome = verdicts.verdicts(record), facts.outcome(record)
     timeline_section = timeline.section(left, name_blocks(exports.by_agent))
     return html.render(
         _TEMPLATE,
         styles=[TREE_STYLE + MAP_STYLE + timeline.STYLE + html.PAGE_STYLE],
         script=timeline.SCRIPT if timeline_section else "",
-        title=facts.title(result),
-        about=mapping(result, "scenario").get("about"),
-        summary=facts.summary(result, exports),
+        title=facts.title(record),
+        about=record.scenario.about if record.scenario else "",
+        summary=facts.summary(record, exports),
         headline=verdicts.headline(judged, completed=outcome is None),
         outcome=outcome,
         missing=[
@@ -44,18 +43,18 @@ def draw(left: ReportSource) -> str:
             ("Not all that a run leaves is here. What is below is drawn from the rest.", left.files_missing),
         ],
         verdicts=judged,
-        figures=facts.figures(result),
-        survival=survival.section(result, ink),
+        figures=facts.figures(record),
+        survival=survival.section(record.survival, ink),
         pictures=_pictures(exports.by_agent, left.archive.before_final_reconcile, ink),
         blocks=swarm.block_rows(exports.by_agent, ink),
         timeline=timeline_section,
-        strip=network.strip(result),
-        network=network.start(result),
-        faults=network.faults(result),
-        rogue=rogue.section(result),
+        strip=network.strip(record.scenario, record.faults),
+        network=network.start(record.network),
+        faults=network.faults(record.faults),
+        rogue=rogue.section(record.rogue),
         flight=map_section.section(left.archive.tracks(ink), left.network, ink),
         agents=swarm.agents_table(left.archive, ink),
-        versions=mapping(result, "versions"),
+        versions=record.versions,
         evidence_shown=EVIDENCE_SHOWN,
         long_text=LONG_TEXT,
     )

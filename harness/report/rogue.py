@@ -1,12 +1,9 @@
 """What the rogue node sent, and what the agents did with it, as the page says it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
-
-from pydantic import ValidationError
 
 from harness.archive.record import RogueInjection
-from harness.archive.result import listing
 from harness.checker.injections import done_with, in_words
 from harness.present import words
 
@@ -34,22 +31,15 @@ class Section:
     left_out: int
 
 
-def section(result: dict[str, Any]) -> Section | None:
-    """None if no rogue node was on the air, or the record says nothing of it that can be read."""
-    rows = [row for injection in _injections(result) for row in _rows(injection)]
+def section(injections: Sequence[RogueInjection]) -> Section | None:
+    """None if no rogue node was on the air, or the run's record says nothing of it."""
+    rows = [row for injection in injections for row in _rows(injection)]
     return Section(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
 
 
-def sentences(result: dict[str, Any]) -> list[str]:
+def sentences(injections: Sequence[RogueInjection]) -> list[str]:
     """One for each injection."""
-    return [in_words(injection) for injection in _injections(result)]
-
-
-def _injections(result: dict[str, Any]) -> list[RogueInjection]:
-    try:
-        return [RogueInjection.model_validate(injection) for injection in listing(result, "rogue")]
-    except ValidationError:
-        return []
+    return [in_words(injection) for injection in injections]
 
 
 def _rows(injection: RogueInjection) -> list[Row]:

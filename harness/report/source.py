@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from harness.archive.archive import RunArchive
 from harness.archive.connectivity import Connectivity
 from harness.archive.exports import Exports
-from harness.archive.result import DamagedResultError
+from harness.archive.record import RunRecord
+from harness.archive.record_file import DamagedRecordError
 from harness.archive.traces import Trace
 from harness.errors import RunDirectoryError
 from harness.present.colours import Ink
@@ -24,8 +24,8 @@ class ReportSource:
     ink: dict[int, Ink]
 
     @property
-    def result(self) -> dict[str, Any]:
-        return self.archive.result
+    def record(self) -> RunRecord:
+        return self.archive.record
 
     @property
     def exports(self) -> Exports:
@@ -51,14 +51,18 @@ class ReportSource:
         """Likewise for everything else that a whole run leaves."""
         exports = set(self.exports.errors)
         problems = [*(problem for problem in self.archive.problems if problem not in exports), *self.archive.gaps]
-        return [*map(self.archive.within, problems), *self.network.problems, *filter(None, [capture.gaps(self.result)])]
+        return [
+            *map(self.archive.within, problems),
+            *self.network.problems,
+            *filter(None, [capture.gaps(self.record.capture or {})]),
+        ]
 
 
 def read_source(archive: RunArchive) -> ReportSource:
     """Raises RunDirectoryError if this is no run directory, or one of another version."""
     error, directory = archive.record_error, archive.directory
-    if directory is None or not (archive.result or archive.roster):
+    if directory is None or not (archive.recorded or archive.roster):
         raise error or RunDirectoryError(f"{directory}: there is nothing of a run here; is this a run directory?")
-    if error is not None and not isinstance(error, DamagedResultError):
+    if error is not None and not isinstance(error, DamagedRecordError):
         raise error
     return ReportSource(archive, directory, swarm.agent_inks(archive))

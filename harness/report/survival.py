@@ -2,9 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
-
-from pydantic import ValidationError
 
 from harness.archive.record import Loss, Survival
 from harness.checker.survival import in_words
@@ -39,11 +36,9 @@ class Section:
     losses: list[LossRow]
 
 
-def section(result: dict[str, Any], ink: Mapping[int, Ink]) -> Section | None:
-    """None if the run's record says nothing of it, or nothing that can be read."""
-    try:
-        survived = Survival.model_validate(result.get("survival"))
-    except ValidationError:
+def section(survived: Survival | None, ink: Mapping[int, Ink]) -> Section | None:
+    """None if the run's record says nothing of it."""
+    if survived is None:
         return None
     return Section(in_words(survived), [_row(loss, ink) for loss in survived.losses])
 

@@ -7,7 +7,7 @@ from typing import Any
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
-from harness.archive.result import listing, mapping
+from harness.archive.record import AgentRecord
 from harness.present import words
 from harness.present.colours import Ink, inks
 from harness.report.chain_tree import holders, ranges
@@ -33,31 +33,27 @@ def missing(archive: RunArchive) -> list[str]:
     alike: dict[str, list[int]] = {}
     for agent_id in archive.roster:
         if agent_id not in archive.exports.by_agent:
-            alike.setdefault(_fate(mapping(archive.result, "agents", str(agent_id))), []).append(agent_id)
+            alike.setdefault(_fate(archive.record.agents.get(str(agent_id))), []).append(agent_id)
     return [f"{'agent' if len(ids) == 1 else 'agents'} {', '.join(ranges(ids))}{fate}" for fate, ids in alike.items()]
 
 
-def _fate(agent: dict[str, Any]) -> str:
-    if agent.get("outcome") == "killed":
+def _fate(agent: AgentRecord | None) -> str:
+    if agent is None:
+        return ": no usable export"
+    if agent.outcome == "killed":
         return ": killed, with all that was held there"
-    why = ", ".join(words.value(agent[key]) for key in ("outcome", "detail") if agent.get(key))
+    why = ", ".join(filter(None, (agent.outcome, agent.detail)))
     return ": no usable export" + (f" ({why})" if why else "")
 
 
 def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
     """Column labels, and a row (agent ID, ink, cells by column) for each agent and its vehicle."""
-    result, exports = archive.result, archive.exports.by_agent
+    record, exports = archive.record, archive.exports.by_agent
     rows = []
     columns: dict[str, None] = {}
     for agent_id in sorted({*archive.roster, *exports}):
-        cells: dict[str, Any] = {}
-        agent, vehicle = (mapping(result, owner, str(agent_id)) for owner in ("agents", "vehicles"))
-        cells |= {words.label(key): value for key, value in agent.items() if key not in ("detail", "dropped")}
-        gone = listing(agent, "completed_before")
-        cells["completed before"] = len(gone) or None
-        cells |= {key: agent.get(key) or None for key in ("restarts", "reboots")}
-        if dropped := mapping(agent, "dropped"):
-            cells["dropped"] = ", ".join(f"{words.value(count)} {reason}" for reason, count in dropped.items())
+        agent = record.agents.get(str(agent_id))
+        cells = _agent_cells(agent) if agent else {}
         if export := exports.get(agent_id):
             cells |= {
                 "idle": export.idle,
@@ -65,13 +61,23 @@ def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
                 "in chain": len(export.chain),
                 "waiting": len(export.blocks_to_be_committed) + len(export.reconcile_stack),
             }
-        for key, value in vehicle.items():
+        for key, value in record.vehicles.get(str(agent_id), {}).items():
             label = words.label(key)
             cells[f"vehicle {label}" if label in cells or key == "detail" else label] = value
-        cells["detail"] = agent.get("detail")
+        cells["detail"] = agent.detail if agent else None
         rows.append((agent_id, ink[agent_id], cells))
         columns |= dict.fromkeys(label for label, value in cells.items() if value is not None)
     return {"columns": sorted(columns, key=lambda label: label == "detail"), "rows": rows}
+
+
+def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
+    kept = agent.model_dump(mode="json", exclude={"detail", "dropped"})
+    cells: dict[str, Any] = {words.label(key): value for key, value in kept.items()}
+    cells["completed before"] = len(agent.completed_before) or None
+    cells |= {"restarts": agent.restarts or None, "reboots": agent.reboots or None}
+    if agent.dropped:
+        cells["dropped"] = ", ".join(f"{words.value(count)} {reason}" for reason, count in agent.dropped.items())
+    return cells
 
 
 def block_rows(exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> list[BlockRow]:

@@ -7,16 +7,14 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from markupsafe import Markup
-from pydantic import ValidationError
 
 from harness.archive.connectivity import Connectivity
 from harness.archive.history import LATEST_S, History, Message, Reconcile, Vote, ends_at, history_of, possible
-from harness.archive.record import Fault
+from harness.archive.record import RunRecord
 from harness.archive.replication import replication_of
-from harness.archive.result import listing, number
 from harness.present import words
 from harness.present.colours import Ink
 from harness.report import facts, timeline_charts, timeline_cycle, timeline_lanes
@@ -73,8 +71,8 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
     if not traces:
         return None
     notes = []
-    faults = _faults(left.result)
-    end_s = max(ends_at(traces), *(fault.at_s for fault in faults), _planned_s(left.result), 1.0)
+    faults = possible(left.record.faults)
+    end_s = max(ends_at(traces), *(fault.at_s for fault in faults), _planned_s(left.record), 1.0)
     course = history_of(traces, faults, end_s, whole=not left.archive.large)
     shades, shades_left_out = _shades(left.network, end_s)
     if shades_left_out:
@@ -94,7 +92,7 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
         picture.drawing,
         picture.legend,
         [
-            *filter(None, [timeline_cycle.row(left.result, end_s)]),
+            *([timeline_cycle.row(left.record.cycle, end_s)] if left.record.cycle else []),
             *timeline_charts.draw(replication_of(traces, faults), faults, shades, end_s),
         ],
         axis(end_s),
@@ -105,20 +103,11 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
     return Section(drawn, [*notes, *without, *picture.notes])
 
 
-def _planned_s(result: dict[str, Any]) -> float:
-    """How long the run was to be, if it did not end before."""
-    duration_s = number(result, "scenario", "duration_s") or 0.0
-    return duration_s if duration_s <= LATEST_S and facts.outcome(result) is None else 0.0
-
-
-def _faults(result: dict[str, Any]) -> list[Fault]:
-    faults = []
-    for fault in listing(result, "faults"):
-        try:
-            faults.append(Fault.model_validate(fault))
-        except ValidationError:
-            continue
-    return possible(faults)
+def _planned_s(record: RunRecord) -> float:
+    """How many mission seconds the run was to last, if it did not end before."""
+    if record.scenario is None or record.scenario.duration_s > LATEST_S or facts.outcome(record) is not None:
+        return 0.0
+    return record.scenario.duration_s
 
 
 def _shades(network: Connectivity, end_s: float) -> tuple[list[Shade], int]:

@@ -1,13 +1,10 @@
 """Under the lanes of a swarm that never finishes: a bracket for each time that it goes round, and the words."""
 
 from math import ceil
-from typing import Any
 
 from markupsafe import Markup
-from pydantic import ValidationError
 
 from harness.archive.record import Cycle
-from harness.archive.result import mapping
 from harness.checker.cycles import findings, in_words
 from harness.report.timeline_charts import Chart
 from harness.report.timeline_plot import pin, plot, short
@@ -22,12 +19,8 @@ _TOP, _BOTTOM = 3, 12
 _TEXT = 28
 
 
-def row(result: dict[str, Any], end_s: float) -> Chart | None:
-    """None if the run was not shown never to finish."""
-    try:
-        cycle = Cycle.model_validate(mapping(result, "cycle"))
-    except ValidationError:
-        return None
+def row(cycle: Cycle, end_s: float) -> Chart:
+    """A chart that ends with the run, at mission second `end_s`."""
     start_s = max(0.0, min(cycle.since_s, end_s))
     period_s = cycle.period_s if cycle.period_s is not None and cycle.period_s > 0 else end_s - start_s
     told = "; ".join(f"agent {finding.agent_id}, {finding.detail}" for finding in findings(cycle))[:MAX_TEXT]

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from harness.archive.result import listing, mapping
-from harness.present import words
+from harness.archive.record import CharacteristicRecord, FindingRecord, JudgementRecord, RunRecord
 from harness.scenario.verdicts import BESIDE, CHARACTERISTICS, JUDGED, kind_of
 
 STATEMENTS = {
@@ -55,30 +54,29 @@ class Verdict:
         return f"{self.number}. {self.name}" if self.number else self.name
 
 
-def verdicts(result: dict[str, Any]) -> list[Verdict]:
-    judged = mapping(result, "characteristics")
-    numbers = sorted({*judged, *CHARACTERISTICS} if judged else [], key=lambda key: (len(key), key))
-    entries = {key: mapping(judged, key) for key in numbers}
-    entries |= {key: mapping(result, key) for key in BESIDE if judged and mapping(result, key)}
-    verdicts = []
-    for key, entry in entries.items():
-        verdict = words.value(entry.get("verdict") or "not judged")
-        evidence = listing(entry, "evidence")
-        verdicts.append(
-            Verdict(
-                key=key,
-                number="" if key in BESIDE else key,
-                name=words.value(entry.get("name") or JUDGED.get(key, "")),
-                statement=STATEMENTS.get(key, ""),
-                verdict=verdict,
-                icon="?" if verdict == "not judged" else ICONS[kind_of(verdict)],
-                kind=KINDS[kind_of(verdict)],
-                reason=words.value(entry.get("reason") or ""),
-                evidence=[_evidence(piece) for piece in evidence[:EVIDENCE_KEPT]],
-                evidence_left_out=max(0, len(evidence) - EVIDENCE_KEPT),
-            )
-        )
-    return verdicts
+def verdicts(record: RunRecord) -> list[Verdict]:
+    """All of a run that was judged, also on a characteristic whose verdict the record has not; none of another run."""
+    if not record.characteristics:
+        return []
+    judged = record.judgements
+    keys = sorted({*record.characteristics, *CHARACTERISTICS}, key=lambda key: (len(key), key))
+    return [_verdict(key, judged.get(key)) for key in [*keys, *(key for key in BESIDE if key in judged)]]
+
+
+def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None) -> Verdict:
+    kind, evidence = kind_of(judged.verdict) if judged else "unknown", judged.evidence if judged else []
+    return Verdict(
+        key=key,
+        number="" if key in BESIDE else key,
+        name=judged.name if judged else JUDGED[key],
+        statement=STATEMENTS.get(key, ""),
+        verdict=judged.verdict if judged else "not judged",
+        icon=ICONS[kind] if judged else "?",
+        kind=KINDS[kind],
+        reason=judged.reason if judged else "",
+        evidence=[_evidence(finding) for finding in evidence[:EVIDENCE_KEPT]],
+        evidence_left_out=max(0, len(evidence) - EVIDENCE_KEPT),
+    )
 
 
 def headline(verdicts: list[Verdict], *, completed: bool) -> tuple[str, str]:
@@ -94,8 +92,6 @@ def headline(verdicts: list[Verdict], *, completed: bool) -> tuple[str, str]:
     return words_for_it, "violated" if beside else "holds" if completed and holding else "unknown"
 
 
-def _evidence(piece: Any) -> dict[str, Any]:
-    if not isinstance(piece, dict):
-        return {"detail": piece}
+def _evidence(finding: FindingRecord) -> dict[str, Any]:
     labels = {"agent_id": "agent", "block_hash": "hash"}
-    return {labels.get(key, words.label(key)): value for key, value in piece.items() if value is not None}
+    return {labels.get(key, key): value for key, value in finding.model_dump(exclude_none=True).items()}

@@ -27,7 +27,7 @@ def write(left: ReportSource) -> Path:
     """As `write_report` does, of what was read."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))
-    _write(left.run_dir / "junit.xml", to_junit(left.result))
+    _write(left.run_dir / "junit.xml", to_junit(left.record))
     page = left.run_dir / "report.html"
     _write(page, draw(left))
     return page

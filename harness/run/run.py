@@ -74,6 +74,7 @@ class Recording:
     def __init__(self, scenario: Scenario, seed: int, out: Path, backend: BackendName) -> None:
         self.directory = RunDirectory(out)
         self._started = time.monotonic()
+        self._scenario = scenario
         self._record = RunRecord(
             scenario=scenario,
             roster=list(scenario.roster),
@@ -90,6 +91,7 @@ class Recording:
 
     def tell(self, scenario: Scenario) -> None:
         """This is what the run plays: the scenario that it began with, and what it was told since."""
+        self._scenario = scenario
         self._update(scenario=scenario)
 
     def take_down(self, played: RunOutcome) -> None:
@@ -117,7 +119,7 @@ class Recording:
         evidence = checker.gather(archive)
         result, survived = checker.check(evidence), survival(evidence)
         wall_s = time.monotonic() - self._started
-        rogue = account(self._record.scenario, archive)
+        rogue = account(self._scenario, archive)
         cycle = evidence.cycle.model_dump() if evidence.cycle else None
         self._update(**result.to_json(), cycle=cycle, survival=survived, rogue=rogue, wall_s=round(wall_s, 1))
         archive.forget_record()

@@ -141,7 +141,7 @@ def test_the_record_is_found_in_whichever_directory_has_it(whole: Path, tmp_path
     (whole / "agents" / "2.chain.json").rename(moved := whole / "agents" / "2.chain.away")
     try:
         archive = RunArchive(tmp_path, whole)
-        assert archive.record is not None
+        assert archive.recorded
         assert archive.directory == whole
         assert [*archive.exports.by_agent] == [*archive.traces] == [1, 2, 3]
     finally:
@@ -189,7 +189,7 @@ def noting(reader: Callable[..., Any], read: list[object]) -> Callable[..., Any]
 
 def test_each_file_is_read_once(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[object] = []
-    for reader in ("read_trace", "read_result", "read_exports"):
+    for reader in ("read_trace", "read_record", "read_exports"):
         monkeypatch.setattr(archive_module, reader, noting(getattr(archive_module, reader), read))
     archive = RunArchive(whole)
     checker.check(checker.gather(archive))

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from harness.archive.record import CapturedFrames
 from harness.play.progress import Silent
 from harness.report.capture import gaps
 from harness.run.run import run
@@ -170,11 +171,9 @@ def test_a_capture_that_crashes_ends_the_run_with_one_sentence_and_status_3(tmp_
 
 def test_a_run_whose_captures_have_gaps_says_so(tmp_path: Path) -> None:
     counts = {"1": {"received": 10, "dropped": 0}, "7": {"received": 20, "dropped": 4}}
-    assert gaps({"capture": counts}) == (
-        "the capture lacks 4 of 30 frames, of vehicle 7: this machine was too slow to keep up"
-    )
-    assert gaps({"capture": {"1": counts["1"]}}) is None
-    assert gaps({"capture": None}) is None
+    frames = {vehicle: CapturedFrames.model_validate(counted) for vehicle, counted in counts.items()}
+    assert gaps(frames) == ("the capture lacks 4 of 30 frames, of vehicle 7: this machine was too slow to keep up")
+    assert gaps({"1": frames["1"]}) is None
     finished = run(scenario(**RUN, capture=True), 5, tmp_path / "run", Silent(), "sim")
     path = tmp_path / "run" / "run.json"
     path.write_text(json.dumps({**record(tmp_path / "run"), "capture": counts}))

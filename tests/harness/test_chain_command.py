@@ -32,7 +32,7 @@ EPOCH_US = 1_795_258_278_000_000  # 2026-11-21 10:51:18 UTC
 KML = {"kml": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
 FLOWN = {
     "backend": "process",
-    "scenario": {"events": {"source": "mavlink"}, "vehicles": {"kind": None}},
+    "scenario": {"name": "flown", "events": {"source": "mavlink"}, "vehicles": {"kind": None}},
 }
 
 
@@ -117,7 +117,10 @@ def test_events_that_no_vehicle_made_are_shown_as_bytes(tmp_path: Path) -> None:
         air.agents[1].add_event(LoggableEvent(5_000_000, WAYPOINT, bytes(6)), air.now)
         air.agents[1].add_event(LoggableEvent(6_000_000, 200, bytes(range(32))), air.now)
     air.settle()
-    simulated = {"backend": "sim", "scenario": {"events": {"source": "mavlink"}, "vehicles": {"kind": None}}}
+    simulated = {
+        "backend": "sim",
+        "scenario": {"name": "flown", "events": {"source": "mavlink"}, "vehicles": {"kind": None}},
+    }
     done = harness("chain", write_run(air, tmp_path / "run", CONNECTED, **simulated), "--decode")
     assert "    5.000 s  event 6, 6 bytes: 000000000000\n" in done.stdout
     assert "    6.000 s  event 200, 32 bytes: 0001020304050607…\n" in done.stdout
@@ -128,8 +131,8 @@ def test_events_that_no_vehicle_made_are_shown_as_bytes(tmp_path: Path) -> None:
     "change",
     [
         {"backend": "sim"},
-        {"scenario": {"events": {"source": "random"}, "vehicles": {"kind": None}}},
-        {"scenario": {"events": {"source": "mavlink"}, "vehicles": {"kind": "none"}}},
+        {"scenario": {"name": "flown", "events": {"source": "random"}, "vehicles": {"kind": None}}},
+        {"scenario": {"name": "flown", "events": {"source": "mavlink"}, "vehicles": {"kind": "none"}}},
     ],
 )
 def test_a_run_s_record_says_whether_vehicles_logged(flown: Air, tmp_path: Path, change: dict[str, Any]) -> None:

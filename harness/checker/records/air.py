@@ -6,7 +6,6 @@ A message is in its agent's trace before it is sent, and an agent that was kille
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 
-from harness.archive.result import mapping, number
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import times
 from harness.checker.records.clocks import slack_s
@@ -85,21 +84,18 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
         return  # nobody knows how much the others sent
     sent = {agent_id: _sent_by(evidence, agent_id, record.mission_s) for agent_id in evidence.traces}
     for agent_id, trace in evidence.traces.items():
-        counted = [
-            number(mapping(record.counters, "receivers", str(agent_id)), key) for key in ("passed", "lost", "cut")
-        ]
-        passed, lost, cut = counted
-        if passed is None or lost is None or cut is None:
+        counted = record.counters.receivers.get(str(agent_id)) if record.counters else None
+        if counted is None or counted.passed is None or counted.lost is None or counted.cut is None:
             continue
         by = record.mission_s - slack_s(trace)
         heard = sum("seq" in run.trigger for run in trace.runs if run.t < by)
-        if heard > passed:
-            detail = f"it handled {heard} messages, and the kernel let {passed:.0f} through to its vehicle"
+        if heard > counted.passed:
+            detail = f"it handled {heard} messages, and the kernel let {counted.passed} through to its vehicle"
             yield of_agent(agent_id, detail, "1")
         on_the_way = sum(messages for sender, messages in sent.items() if sender != agent_id)
-        if on_the_way > passed + lost + cut:
+        if on_the_way > (told_of := counted.passed + counted.lost + counted.cut):
             detail = f"the others sent {on_the_way} messages, and on the way to its vehicle the kernel counted "
-            yield of_agent(agent_id, f"{detail}{passed + lost + cut:.0f}", "1")
+            yield of_agent(agent_id, f"{detail}{told_of}", "1")
 
 
 def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:

@@ -65,6 +65,7 @@ def result_of(agent_ids: Sequence[int]) -> dict[str, Any]:
     ]
     return {
         "schema": "ucp-run/1",
+        "roster": list(agent_ids),
         "scenario": {
             "name": "15 % loss",
             "about": "The thesis's lossy test: every receiver drops 15 % of what it should hear.",
@@ -73,7 +74,7 @@ def result_of(agent_ids: Sequence[int]) -> dict[str, Any]:
             "speedup": 20,
             "network": {"loss": 0.15, "receivers": {}},
             "timeline": [
-                {"at_s": 300, "loss": None, "partition": [[1, 2], [3, 4, 5]], "heal": None},
+                {"at_s": 300, "loss": None, "partition": [list(agent_ids[:1])], "heal": None},
                 {"at_s": 600, "heal": True},
                 {"at_s": 900, "loss": 0.5},
             ],
@@ -139,7 +140,7 @@ def result_of(agent_ids: Sequence[int]) -> dict[str, Any]:
         "agents": {str(agent_id): {"outcome": "exported", "detail": None, "idle": True} for agent_id in agent_ids},
         "faults": [
             {"at_s": 300.0, "what": "partition", "detail": "1, 2 | 3, 4, 5"},
-            {"at_s": 600.0, "what": "heal", "detail": None},
+            {"at_s": 600.0, "what": "heal", "detail": ""},
             {"at_s": 900.0, "what": "loss", "detail": "50 % for every receiver"},
         ],
     }

@@ -1,0 +1,96 @@
+"""Reading a document of which parts may be damaged, edited, or of another version, by its model.
+
+What does not fit is taken out, the smallest part that can be spared, until the rest fits: of a list with one wrong
+entry the others are left, and of an entry that lacks a key nothing.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+Model = TypeVar("Model", bound=BaseModel)
+Place = tuple[dict[Any, Any] | list[Any], Any]
+"""A part of a document: what holds it, and its key or index there."""
+
+MAX_ROUNDS = 100
+"""Each round takes a part out of whatever is wrong: more than parts are within each other are not needed."""
+MAX_NAME = 80
+UNKNOWN = "extra_forbidden"
+HALF_A_CHARACTER = "string_unicode"
+"""Error types of pydantic."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """`key` of the document has something that is wrong: the first is `where`, and `more` follow."""
+
+    key: str
+    where: str
+    what: str
+    more: int
+
+    def __str__(self) -> str:
+        more = f" (and {self.more} more)" if self.more else ""
+        return f"`{self.where}` is wrong: {self.what}{more}"
+
+
+def fit(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[Misfit]]:
+    """What fits `model`, all of whose keys have defaults, and what was taken out of `document` because it does not.
+
+    Keys that the model does not know are passed over, and half a character in a text becomes a question mark.
+    """
+    misfits: dict[str, Misfit] = {}
+    for _ in range(MAX_ROUNDS):
+        try:
+            return model.model_validate(document), list(misfits.values())
+        except ValidationError as error:
+            errors = error.errors(include_url=False, include_context=False, include_input=False)
+        for misfit in _by_key(errors):
+            misfits.setdefault(misfit.key, misfit)
+        _take_out([place for problem in errors if not _mended(place := _place(document, problem["loc"]), problem)])
+    return model(), list(misfits.values())
+
+
+def _by_key(errors: Sequence[ErrorDetails]) -> Iterator[Misfit]:
+    by_key: dict[str, list[ErrorDetails]] = {}
+    for problem in errors:
+        if problem["type"] not in (UNKNOWN, HALF_A_CHARACTER):
+            by_key.setdefault(str(problem["loc"][0]), []).append(problem)
+    for key, (first, *others) in by_key.items():
+        where = ".".join(str(step)[:MAX_NAME] for step in first["loc"])
+        yield Misfit(key, where, first["msg"].lower(), len(others))
+
+
+def _place(document: dict[str, Any], loc: Sequence[int | str]) -> Place:
+    """The innermost part on the way to an error; steps that the document does not have say which type was tried."""
+    place: Place = document, loc[0]
+    here: Any = document
+    for step in loc:
+        in_list = isinstance(here, list) and isinstance(step, int) and step < len(here)
+        if in_list or (isinstance(here, dict) and step in here):
+            place, here = (here, step), here[step]
+    return place
+
+
+def _mended(place: Place, problem: ErrorDetails) -> bool:
+    """Text with half a character in it is as good with a question mark there."""
+    holder, key = place
+    if problem["type"] == HALF_A_CHARACTER and isinstance(text := holder[key], str):
+        holder[key] = text.encode(errors="replace").decode()
+        return bool(holder[key] != text)
+    return False
+
+
+def _take_out(places: Sequence[Place]) -> None:
+    """A part of a list does not move the others before they are taken out."""
+    lists: dict[int, tuple[list[Any], set[int]]] = {}
+    for holder, key in places:
+        if isinstance(holder, dict):
+            holder.pop(key, None)
+        else:
+            lists.setdefault(id(holder), (holder, set()))[1].add(key)
+    for holder, indices in lists.values():
+        holder[:] = [part for index, part in enumerate(holder) if index not in indices]

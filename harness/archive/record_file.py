@@ -1,0 +1,54 @@
+"""Reads run.json as it is: whole, half written by a run that was killed, of another version, or edited."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from harness.archive.lenient import fit
+from harness.archive.record import SCHEMA, JudgedRecord, RunRecord
+from harness.errors import RunDirectoryError
+
+MAX_BYTES = 64 * 1024 * 1024
+
+
+class DamagedRecordError(RunDirectoryError):
+    """There is no `run.json`, or what there is was cut off or edited."""
+
+
+@dataclass(frozen=True)
+class RecordFile:
+    """`record` is what can be used of a file, and `problems` are sentences that name it, on what cannot."""
+
+    record: RunRecord = field(default_factory=RunRecord)
+    judged: JudgedRecord | None = None
+    """The same, if all that a judgement needs is there and sound: half of it would make wrong verdicts."""
+    problems: list[str] = field(default_factory=list)
+
+
+def read_record(path: Path) -> RecordFile:
+    """Raises DamagedRecordError if nothing can be read, RunDirectoryError if it is of another schema: one sentence."""
+    record, misfits = fit(RunRecord, _document(path))
+    problems = {misfit.key: str(misfit) for misfit in misfits}
+    if "roster" not in record.model_fields_set:
+        problems.setdefault("roster", "`roster` is missing")
+    needed = problems.keys() & JudgedRecord.model_fields.keys()
+    first = sorted(problems, key=lambda key: key not in needed)
+    sentences = [f"{path}: {problems[key]}; it was edited or damaged" for key in first]
+    return RecordFile(record, None if needed else record, sentences)
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise DamagedRecordError(f"{path}: larger than {MAX_BYTES} bytes, which no run's record is")
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DamagedRecordError(f"{path}: cannot be read: {error.strerror}; is this a run directory?") from None
+    except (ValueError, RecursionError):
+        raise DamagedRecordError(f"{path}: truncated or damaged: not a JSON document") from None
+    if not isinstance(document, dict) or "schema" not in document:
+        raise DamagedRecordError(f"{path}: not the result of a run (it has no `schema`)")
+    if document["schema"] != SCHEMA:
+        raise RunDirectoryError(f"{path}: its schema is {document['schema']!r}, and this version reads {SCHEMA!r}")
+    return document
