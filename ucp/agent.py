@@ -307,8 +307,7 @@ def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
     """What the handler counts in, as a trace has it; None if it counts nothing."""
     if handler.tally is None:
         return None
-    counted: dict[str, int] | dict[bytes, list[int]] = getattr(core, handler.tally)
-    return {
-        key if isinstance(key, str) else key.hex(): count if isinstance(count, int) else list(count)
-        for key, count in counted.items()
-    }
+    counted: dict[Any, Any] = getattr(core, handler.tally)
+    if "yes" in counted:
+        return counted.copy()
+    return {candidate.hex(): list(count) for candidate, count in counted.items()}

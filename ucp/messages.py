@@ -242,8 +242,8 @@ CARRY_A_BLOCK = frozenset((CommitBlock, BlockResponse))
 
 def block_named(message: Message) -> bytes | None:
     """The hash of the block that a message is about, if it is about one."""
-    if isinstance(message, CommitBlock | BlockResponse):
-        return message.block.block_hash
+    if type(message) in CARRY_A_BLOCK:
+        return message.block.block_hash  # type: ignore[union-attr]
     return getattr(message, "block_hash", None)
 
 

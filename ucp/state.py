@@ -66,7 +66,9 @@ class AgentState:
     @property
     def idle(self) -> bool:
         """No timer armed, no reconcile, nothing triggered and not yet run."""
+        if self.reconcile_in_progress:
+            return False
         for timer in self.timers:
             if timer.deadline is not None:
                 return False
-        return not (self.reconcile_in_progress or self.triggered)
+        return not self.triggered

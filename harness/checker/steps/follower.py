@@ -1,23 +1,27 @@
 """Following one life of an agent: the reference core is given what the agent was given, a handler at a time."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, stored_blocks
 from harness.checker.steps.mission import Mission
-from harness.checker.steps.reference import ReferenceCore
+from harness.checker.steps.reference import Before, ReferenceCore
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of, why_not_handled
 from ucp.block import Block
 from ucp.events import MalformedEventsError
 from ucp.handler import EventHandler
-from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError
+from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.trace import HandlerRun, Recorded, StateSummary, Trigger
 
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
 COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted"))
 """Branches that begin a tally, or count in it; after others it may be what it likes."""
+
+TOUCH_A_TIMER = frozenset(("receive_response_block_for_hash",))
+"""Handlers of messages of whose steps it takes more than the changes to undo them."""
 
 Paused = Callable[[float, float], bool]
 """Whether the agent stood still at any time between two mission seconds."""
@@ -49,37 +53,46 @@ class Follower:
         self._adopted = False
         """Since the last input the agent was found to differ: what it has triggered since is its own affair."""
         self._began = False
+        self._none_ends_before = math.inf
+        """No timer of the reference's ends sooner, by the agent's clock."""
         self._top, self._top_hex = b"", ""
+        self._state: StateSummary | None = None
+        """What the agent said last of what it holds."""
 
     def follow(self, line: int, run: HandlerRun) -> None:
         """See where this run, or what should have come before it, differs from the reference."""
         if self.lost is not None:
             return
-        core = self._core
-        local = run.trigger.get("local")
+        core, trigger = self._core, run.trigger
+        local = trigger.get("local")
         if core.triggered or local is not None:
             self._triggered(line, run, local)
-        now = self._mission.local(run.t)
+        core.now = now = self._mission.local(run.t)
         if local is None:
             self._ran.clear()
             self._adopted = False
-            late = now - self._mission.late_s
-            for timer in core.timers:
-                if timer.deadline is not None and timer.deadline < late:
-                    self._overdue(line, run.t, now)
+            if self._none_ends_before < now - self._mission.late_s:
+                self._overdue(line, run.t, now)
         self._ran[run.handler] = line, run.t
-        core.now = now
-        before = core.before(run)
+        heard = "message" in trigger
+        before = None if heard and run.handler not in TOUCH_A_TIMER else core.before(run)
         try:
-            handler, inputs = self._input(run, now)
-            core.running = handler
-            branch = handler.run(core, *inputs)
+            if heard:
+                handler, sender, message = self._message(run, trigger)
+                core.running = handler
+                branch = handler.run(core, sender, message)
+            else:
+                handler, inputs = self._input(run, now)
+                core.running = handler
+                branch = handler.run(core, *inputs)
         except NotHandledError as error:
             self._differ(line, run.t, run.handler, f"it {error}")
         except (AssertionError, ValueError, KeyError, IndexError):  # the agent is where no agent comes to
             self._differ(line, run.t, run.handler, "it ran in a state in which the protocol does not run it")
         else:
             self._began = True
+            if core.started:
+                self._none_ends_before = min(self._none_ends_before, self._soonest_end())
             if not self._differs(run, handler, branch):
                 core.step_is_over()
                 return
@@ -146,15 +159,18 @@ class Follower:
                     said = f"it had not run by then, and the {timer.name} timer ended at t={ended_s:g} s"
                     self._differ(line, at_s, ON_TIMER[timer.name].name, said)
                     timer.stop()
+        self._none_ends_before = self._soonest_end()
+
+    def _soonest_end(self) -> float:
+        return min((timer.deadline for timer in self._core.timers if timer.deadline is not None), default=math.inf)
 
     # What came
 
     def _input(self, run: HandlerRun, now: float) -> tuple[EventHandler[Any], tuple[Any, ...]]:
-        """The handler that this runs, and what it is given. Raises NotHandledError."""
+        """The handler that this runs, and what it is given, where no message came. Raises NotHandledError."""
         trigger = run.trigger
-        if "message" in trigger:
-            handler, inputs = self._message(run.input, trigger)
-        elif "local" in trigger:
+        inputs: tuple[Any, ...]
+        if "local" in trigger:
             handler, inputs = self._local(run), ()
         elif "timer" in trigger:
             handler, inputs = self._timer(str(trigger["timer"]), now), ()
@@ -167,10 +183,7 @@ class Follower:
             handler, inputs = ON_LOCAL_EVENT["Reconcile Finalize"], ()
         else:
             raise NotHandledError("ran without a trigger that there is")
-        if handler.name != run.handler or handler.algorithm != run.algorithm:
-            raise NotHandledError(
-                f"ran as Algorithm {run.algorithm}; what came is for Algorithm {handler.algorithm}, {handler.name}"
-            )
+        _must_be(run, handler)
         return handler, inputs
 
     def _local(self, run: HandlerRun) -> EventHandler[Any]:
@@ -180,22 +193,25 @@ class Follower:
             self._core.go_along(run)
         return HANDLERS[run.handler]
 
-    def _message(self, datagram: Recorded | None, trigger: Trigger) -> tuple[EventHandler[Any], tuple[Any, ...]]:
+    def _message(self, run: HandlerRun, trigger: Trigger) -> tuple[EventHandler[Any], int, Message]:
+        """The handler that this runs, and what it is given: a message, and who sent it. Raises NotHandledError."""
         try:
-            sender, sequence, message = decoded(datagram)
+            sender, sequence, message = decoded(run.input)
         except MalformedDatagramError as malformed:
             raise NotHandledError(f"handled a datagram that is to be dropped: {malformed.reason}") from None
         if type(message) in CARRY_A_BLOCK:
             self._blocks.add_from(message)
         if reason := why_not_handled(self._mission.agent_id, self._mission.roster, sender, message):
             raise NotHandledError(f"handled a datagram that is to be dropped: {reason}")
-        told = trigger["message"], trigger.get("from"), trigger.get("seq")
-        if told != (message.NAME, sender, sequence):
+        name, by, number = trigger["message"], trigger.get("from"), trigger.get("seq")
+        if name != message.NAME or by != sender or number != sequence:
             raise NotHandledError(
-                f"said to have got {str(told[0])[:60]} {told[2]} from agent {told[1]}, "
+                f"said to have got {str(name)[:60]} {number} from agent {by}, "
                 f"and the datagram is {message.NAME} {sequence} from agent {sender}"
             )
-        return ON_MESSAGE[type(message)], (sender, message)
+        handler = ON_MESSAGE[type(message)]
+        _must_be(run, handler)
+        return handler, sender, message
 
     def _timer(self, name: str, now: float) -> EventHandler[Any]:
         timer = self._timers.get(name)
@@ -256,14 +272,17 @@ class Follower:
             return True
         if branch in COUNTING and "tally" in self._tells and run.tally != tally_of(core, handler):
             return True
-        state = run.state
+        state, reconciling, idle = run.state, core.reconcile_in_progress, core.idle
+        if state is self._state and not run.changes:  # the lengths and the top are what they were
+            return state.reconciling != reconciling or state.idle != idle
+        self._state = state
         return (
             state.top != self._top_in_hex()
             or state.chain != len(core.chain)
             or state.deque != len(core.blocks_to_be_committed)
             or state.stack != len(core.reconcile_stack)
-            or state.reconciling != core.reconcile_in_progress
-            or state.idle != core.idle
+            or state.reconciling != reconciling
+            or state.idle != idle
         )
 
     def _top_in_hex(self) -> str:
@@ -288,14 +307,24 @@ class Follower:
         expected.tally = tally_of(core, handler) if branch in COUNTING and "tally" in self._tells else run.tally
         return expected
 
-    def _adopt(self, line: int, run: HandlerRun, before: Any) -> None:
+    def _adopt(self, line: int, run: HandlerRun, before: Before | None) -> None:
         """Go on from the agent's own state."""
         self._adopted = True
+        self._state = None
         try:
             self._core.undo(before)
             self._core.adopt(run, self._blocks)
         except NotOnRecordError as error:
             self.lost = f"after trace line {line} agent {self._mission.agent_id} cannot be followed: {error}"
+        self._none_ends_before = self._soonest_end()
 
     def _differ(self, line: int, at_s: float, handler: str, said: str) -> None:
         self.deviations.append(Deviation(self._mission.agent_id, line, at_s, handler, said))
+
+
+def _must_be(run: HandlerRun, handler: EventHandler[Any]) -> None:
+    """Raises NotHandledError if the run is another handler's."""
+    if handler.name != run.handler or handler.algorithm != run.algorithm:
+        raise NotHandledError(
+            f"ran as Algorithm {run.algorithm}; what came is for Algorithm {handler.algorithm}, {handler.name}"
+        )

@@ -67,13 +67,13 @@ class ReferenceCore(Core):
             return False
         for told, (sequence, message) in zip(sent, self.outbox, strict=True):
             try:
-                sender, number, content = decoded(told.datagram)
+                datagram = decoded(told.datagram)
             except MalformedDatagramError:
                 return False
-            if content != message or (sender, number) != (self.agent_id, sequence):
+            if datagram != (self.agent_id, sequence, message):
                 return False
             about = block_named(message)
-            if (told.message, told.seq, told.block) != (message.NAME, sequence, about.hex() if about else None):
+            if told.message != message.NAME or told.seq != sequence or told.block != (about.hex() if about else None):
                 return False
         return True
 
@@ -89,8 +89,11 @@ class ReferenceCore(Core):
             if hashes and len(hashes[0]) == 2 * HASH_BYTES:
                 self.majority_response_block_hash = bytes.fromhex(hashes[0])
 
-    def undo(self, before: Before) -> None:
-        """Take back what the step did to blocks and timers; what it tallied, `adopt` overrides."""
+    def undo(self, before: Before | None) -> None:
+        """Take back what the step did to blocks and timers; what it tallied, `adopt` overrides.
+
+        `before` is None of a step that can have done nothing that its changes do not tell.
+        """
         for operation, block_hash in reversed(self.changes):
             match operation:
                 case "complete":
@@ -105,13 +108,14 @@ class ReferenceCore(Core):
                     self.blocks_to_be_committed.appendleft(self._moved[block_hash])
                 case "stack+":
                     self.reconcile_stack.pop()
-        self.reconcile_stack[:] = before.stack or ()
-        if before.current_block is not None:
-            self.current_block[:] = before.current_block
         for timer in self.timers:
             if timer.name in self.started:
                 timer.stop()
-        self.phase_three_timer.deadline = before.phase_three_ends
+        if before is not None:
+            self.reconcile_stack[:] = before.stack or ()
+            if before.current_block is not None:
+                self.current_block[:] = before.current_block
+            self.phase_three_timer.deadline = before.phase_three_ends
         self._sequence -= len(self.outbox)
         self.step_is_over()
 
