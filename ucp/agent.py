@@ -304,9 +304,12 @@ def why_not_handled(agent_id: int, roster: Container[int], sender: int, message:
 
 
 def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
-    """What the handler counts in, as a trace has it; None if it counts nothing."""
+    """What the handler counts in, or chooses from that, as a trace has it; None if it does neither."""
     if handler.tally is None:
         return None
+    if handler.tally == "majority_response_block_hash":
+        chosen = core.majority_response_block_hash
+        return {} if chosen is None else {chosen.hex(): core.reconcile_response_dictionary.get(chosen, [0])[0]}
     counted: dict[Any, Any] = getattr(core, handler.tally)
     if "yes" in counted:
         return counted.copy()

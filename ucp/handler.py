@@ -37,7 +37,7 @@ class EventHandler(Generic[P]):
     starts: tuple[str, ...]
     triggers: tuple[LocalEvent, ...]
     tally: str | None = None
-    """Name of the part of the state that it counts in."""
+    """Name of the part of the state that it counts in, or into which it puts what it chooses."""
 
     @property
     def title(self) -> str:
@@ -57,7 +57,7 @@ def event_handler(
 ) -> Callable[[Callable[P, str]], EventHandler[P]]:
     """Declare a function to be the handler of Algorithm `algorithm`, and the most that it does.
 
-    `branches` are those that it returns; `starts` names timers, `tally` what of the state it counts in.
+    `branches` are those that it returns; `starts` names timers, `tally` what of the state it counts in, or chooses.
     """
 
     def declare(run: Callable[P, str]) -> EventHandler[P]:

@@ -175,6 +175,7 @@ def most_named(candidates: dict[bytes, list[int]]) -> list[bytes]:
     "tie: top of chain",
     "tie: block",
     triggers=("Reconcile Phase 3", "Reconcile Finalize"),
+    tally="majority_response_block_hash",
 )
 def reconcile_phase_2_timer_expiration(core: Core) -> str:
     """Algorithm 15, Reconcile Phase 2 Timer Expiration: choose the plurality's answer.

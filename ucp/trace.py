@@ -106,7 +106,8 @@ class HandlerRun:
     input: what came with the trigger: the datagram as it was received; the event as a block has it; the blocks that
         were found on disk, in the order in which `changes` names them, a length (u16) before each.
     tally: what the handler counts in, after the run: {"yes": n, "no": n}, or of Algorithms 12 and 14
-        {block hash, or "" for Is Top Of Chain: [count, timestamp in microseconds]}.
+        {block hash, or "" for Is Top Of Chain: [count, timestamp in microseconds]}; of Algorithm 15
+        {block hash: count} of the chosen block.
     started: timers that the run started, and their durations in mission seconds.
     """
 

@@ -11,6 +11,8 @@ from ucp.trace import HandlerRun, Sent, Tally
 NameOf = Callable[[str], str]
 """Name of a block for people, by its hash."""
 
+CHOOSES = 15
+"""The algorithm whose tally is what it chose."""
 SHOWN = 3
 """More changes or messages of one step are counted."""
 
@@ -49,7 +51,9 @@ def differences(run: HandlerRun, expected: HandlerRun, name: NameOf) -> Iterator
     if (run.started or {}) != (expected.started or {}):
         yield _started(run.started or {}), _started(expected.started or {})
     if run.tally != expected.tally:
-        yield f"counted {_tally(run.tally or {}, name)}", f"counted {_tally(expected.tally or {}, name)}"
+        verb = "chosen" if run.algorithm == CHOOSES else "counted"
+        did = "chose" if run.algorithm == CHOOSES else "counted"
+        yield f"{did} {_tally(run.tally or {}, name)}", f"{verb} {_tally(expected.tally or {}, name)}"
     ours, theirs = expected.state, run.state
     for what in ("chain", "deque", "stack"):
         if as_changed and getattr(ours, what) != getattr(theirs, what):
@@ -119,7 +123,7 @@ def _tally(tally: Tally, name: NameOf) -> str:
         if key in ("yes", "no"):
             words.append(f"{key} {count}")
         else:
-            words.append(f"{name(key) if key else 'Is Top Of Chain'} {count}")
+            words.append(f"{name(key) if key else 'Is Top Of Chain'}: {count}")
     return ", ".join(words) + _more(list(tally))
 
 

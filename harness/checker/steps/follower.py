@@ -17,8 +17,8 @@ from ucp.trace import HandlerRun, Recorded, StateSummary, Trigger
 
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
-COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted"))
-"""Branches that begin a tally, or count in it; after others it may be what it likes."""
+COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted", "block", "tie: block"))
+"""Branches that begin a tally, count in it, or choose from it; after others it may be what it likes."""
 
 TOUCH_A_TIMER = frozenset(("receive_response_block_for_hash",))
 """Handlers of messages of whose steps it takes more than the changes to undo them."""

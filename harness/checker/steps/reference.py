@@ -239,12 +239,19 @@ class ReferenceCore(Core):
                 self.vote_count = votes
             case 8 | 10 if len(votes) == 2:
                 self.reconcile_vote_count = votes
+            case 15:
+                self.majority_response_block_hash = next(map(_as_hash, run.tally), None)
             case 12 | 14:
-                try:
-                    self.reconcile_response_dictionary = {
-                        bytes.fromhex(candidate): [int(number) for number in counted]
-                        for candidate, counted in run.tally.items()
-                        if isinstance(counted, list) and len(counted) == 2
-                    }
-                except ValueError:
-                    raise NotOnRecordError("its candidates are no block hashes") from None
+                self.reconcile_response_dictionary = {
+                    _as_hash(candidate): [int(number) for number in counted]
+                    for candidate, counted in run.tally.items()
+                    if isinstance(counted, list) and len(counted) == 2
+                }
+
+
+def _as_hash(text: str) -> bytes:
+    """Raises NotOnRecordError."""
+    try:
+        return bytes.fromhex(text)
+    except ValueError:
+        raise NotOnRecordError("its candidates are no block hashes") from None
