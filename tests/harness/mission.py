@@ -44,7 +44,8 @@ def write_exports(air: Air, directory: Path, traces: bool = True) -> list[Path]:
 def write_run(air: Air, directory: Path, network: list[dict[str, Any]], **record: Any) -> Path:
     """A run directory with exports, traces, and a record of the network."""
     write_exports(air, directory / "agents")
-    record = {"schema": "ucp-run/1", "roster": list(air.agents), "network": network, "agents": {}, **record}
+    ended = {"schema": "ucp-run/1", "outcome": "completed", "agents": {}}
+    record = {**ended, "roster": list(air.agents), "network": network, **record}
     (directory / "run.json").write_text(json.dumps(record))
     return directory
 

@@ -334,3 +334,14 @@ def disordered(data: st.DataObject, entries: list[Any]) -> list[Any]:
     swapped = list(entries)
     swapped[number], swapped[other] = entries[other], entries[number]
     return swapped
+
+
+def test_of_a_run_that_was_broken_off_nothing_tells_how_long_its_traces_should_be(directory: Path) -> None:
+    def break_off(document: Document) -> None:
+        document.update(outcome="running", agents={})
+
+    edit(directory / "run.json", break_off)
+    result = judged(directory)
+    assert {key for key, judgement in result.judgements.items() if judgement.kind == "good"} <= {"4", "5", "6"}
+    assert "the run did not come to its end" in result.beside["records"].reason
+    assert "the run did not come to its end" in result.beside["steps"].reason

@@ -45,7 +45,19 @@ def cross_examine(evidence: Evidence) -> Examination:
     for contradiction in contradictions:
         if contradiction.short:
             short.setdefault(contradiction.finding.agent_id, contradiction.finding.detail)
+    for agent_id in _untold(evidence):
+        short.setdefault(agent_id, "the run did not come to its end, and nothing tells where the trace should have its")
     return Examination(contradictions, short)
+
+
+def _untold(evidence: Evidence) -> Iterator[int]:
+    """Agents of a run that was broken off before it had taken down how much they had run."""
+    if evidence.record is None or evidence.record.outcome != "running":
+        return
+    for agent_id in evidence.traces:
+        recorded = evidence.recorded(agent_id)
+        if recorded is None or not recorded.handler_runs:
+            yield agent_id
 
 
 def check(evidence: Evidence) -> Judgement:
