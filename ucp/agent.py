@@ -172,7 +172,7 @@ class Agent:
             return
         self.received[message.NAME] += 1
         trigger: Trigger = {"message": message.NAME, "from": sender, "seq": sequence}
-        self._handle(now, trigger, self._on_message[type(message)], sender, message, came=datagram)
+        self._handle(now, trigger, datagram, self._on_message[type(message)], sender, message)
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
         """Log an event. Raises ValueError if it is larger than the mission's largest event."""
@@ -180,7 +180,7 @@ class Agent:
         if event.encoded_bytes > largest:
             raise ValueError(f"an event of {event.encoded_bytes} bytes is more than max_event_bytes {largest}")
         came = Recorded(None, event) if self._tracing else None
-        self._handle(now, {"event": event.event_id}, self._on_local_event["Build Data Block"], event, came=came)
+        self._handle(now, {"event": event.event_id}, came, self._on_local_event["Build Data Block"], event)
 
     def next_timer(self) -> float | None:
         """When `handle_timer` has something to do next, in mission seconds; None if no timer runs."""
@@ -211,7 +211,7 @@ class Agent:
         """Run the handlers of all timers that have expired at `now`, the earliest first."""
         while (timer := self._soonest()) is not None and timer.deadline is not None and timer.deadline <= now:
             timer.stop()
-            self._handle(now, {"timer": timer.name}, self._on_timer[timer.name])
+            self._handle(now, {"timer": timer.name}, None, self._on_timer[timer.name])
 
     def boot(self, found: StoredState, now: float) -> None:
         """Go on from what a former life left on its vehicle's disk; before any other input.
@@ -223,11 +223,11 @@ class Agent:
         core.now = now
         core.restore(found.completed, found.chain, found.deque, found.stack)
         came = Recorded(None, found) if self._tracing else None
-        self._handle(now, {"boot": len(core.chain)}, self._on_local_event["Reconcile Finalize"], came=came)
+        self._handle(now, {"boot": len(core.chain)}, came, self._on_local_event["Reconcile Finalize"])
 
     def begin_reconcile(self, now: float) -> None:
         """Reconcile because the operator asks (a final reconcile at the depot, Section 5.1)."""
-        self._handle(now, {"operator": "reconcile"}, self._on_local_event["Reconcile Begin"])
+        self._handle(now, {"operator": "reconcile"}, None, self._on_local_event["Reconcile Begin"])
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
         """What to broadcast, in order, as (sequence, message); empties the outbox."""
@@ -252,7 +252,7 @@ class Agent:
             self._trace.append(Dropped(now, reason, datagram or Recorded("")))
 
     def _handle(
-        self, now: float, trigger: Trigger, handler: EventHandler[Any], *inputs: object, came: Recorded | None = None
+        self, now: float, trigger: Trigger, came: Recorded | None, handler: EventHandler[Any], *inputs: object
     ) -> None:
         """Run a handler, and then those that it triggered, in order. `came` is the trace's `input`."""
         core = self._core
@@ -265,7 +265,7 @@ class Agent:
             if not core.triggered:
                 return
             event, by = core.triggered.popleft()
-            handler, trigger, inputs, came = self._on_local_event[event], {"local": by}, (), None
+            trigger, came, handler, inputs = {"local": by}, None, self._on_local_event[event], ()
 
     def _trace_run(self, trigger: Trigger, came: Recorded | None, handler: EventHandler[Any], branch: str) -> None:
         core, state = self._core, self._traced_state
@@ -275,7 +275,8 @@ class Agent:
             core.now, handler.name, handler.algorithm, trigger, branch, core.changes, core.announced, state, came
         )
         core.changes, core.announced = [], []
-        run.tally = tally_of(core, handler)
+        if handler.tally is not None:
+            run.tally = tally_of(core, handler)
         if core.started:
             run.started, core.started = core.started, {}
         self._trace.append(run)

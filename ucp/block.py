@@ -6,12 +6,15 @@ the block, so it lives in `ucp.chain`. A block therefore never changes when it i
 
 import hashlib
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 from ucp.wire import Kind, struct_of
 
 HASH_BYTES = 32
 MAX_EVENT_DATA_BYTES = 1024
 MAX_AGENT_ID = 0xFFFF
+CHAIN_HASHES_KEPT = 4096
+"""Agents of one process, and who judges them, come upon the same ones again and again."""
 
 BLOCK_FIELDS = {"agent_id": Kind.U32, "timestamp_us": Kind.U64}
 """What stands before a block's event data."""
@@ -23,9 +26,10 @@ def hash_digest(data: bytes) -> bytes:
     return hashlib.sha256(data).digest()
 
 
+@lru_cache(CHAIN_HASHES_KEPT)
 def next_chain_hash(chain_hash: bytes, block_hash: bytes) -> bytes:
     """CH_n = H(CH_{n-1} || BH_n) over the raw digests (eq. 3.2)."""
-    return hashlib.sha256(chain_hash + block_hash).digest()
+    return hash_digest(chain_hash + block_hash)
 
 
 @dataclass(frozen=True, slots=True)

@@ -247,9 +247,16 @@ def block_named(message: Message) -> bytes | None:
     return getattr(message, "block_hash", None)
 
 
+_BYTES: dict[type[Message], int] = {
+    message: HEADER.size + struct_of(message.WIRE).size
+    for message in (BlockAddRequest, ChainContainQuery, ChainContainResponse, ChainHashSuccessorQuery, RequestForBlock)
+}
+"""Length of the datagram of each message that has always the same."""
+
+
 def datagram_bytes(message: Message) -> int:
     """Length of the datagram that `encode` makes of `message`."""
-    return HEADER.size + len(message.body())
+    return _BYTES.get(type(message)) or HEADER.size + len(message.body())
 
 
 class Datagram(NamedTuple):

@@ -1,10 +1,13 @@
 """What an agent can be told: timers, sizes, and the readings of an ambiguous thesis."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args, get_type_hints
+from typing import Literal, get_args
 
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MAX_EVENT_BYTES
+
+Phase1Tie = Literal["phase2", "pop"]
+Phase2Tie = Literal["oldest", "block"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +28,9 @@ class Settings:
     """A vote also names the proposer's chain, so that a late vote of an earlier round cannot count."""
     changed_before_tally: bool = False
     """Algorithm 5 looks for a changed chain before it tallies, instead of after."""
-    phase1_tie: Literal["phase2", "pop"] = "phase2"
+    phase1_tie: Phase1Tie = "phase2"
     """Algorithm 11 on a tie: go on to phase 2 as printed, or pop another block."""
-    phase2_tie: Literal["oldest", "block"] = "oldest"
+    phase2_tie: Phase2Tie = "oldest"
     """Algorithm 15 on a tie: the oldest timestamp, or never "Is Top Of Chain" while a block is on offer."""
 
     def __post_init__(self) -> None:
@@ -40,7 +43,6 @@ class Settings:
             raise ValueError(f"max_block_bytes must be 1..{MAX_EVENT_DATA_BYTES}, not {self.max_block_bytes}")
         if not 0 < self.max_event_bytes <= self.max_block_bytes:
             raise ValueError(f"max_event_bytes must be 1..max_block_bytes, not {self.max_event_bytes}")
-        for name in ("phase1_tie", "phase2_tie"):
-            allowed = get_args(get_type_hints(Settings)[name])
+        for name, allowed in (("phase1_tie", get_args(Phase1Tie)), ("phase2_tie", get_args(Phase2Tie))):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {getattr(self, name)!r}")

@@ -4,6 +4,8 @@ Every handler run has a local trigger or a message that its sender really sent, 
 when its own timer does. Only traces can tell.
 """
 
+from typing import Any
+
 from harness.checker.evidence import Evidence, Sendings
 from harness.checker.judgement import Finding, Judgement, agents, violated
 from harness.checker.waiting import waited_too_long
@@ -31,7 +33,7 @@ def check(evidence: Evidence) -> Judgement:
             ran: set[str] = set()
             for line, run in life:
                 ran.add(run.handler)
-                if _is_as_sent(run, sent):
+                if _is_plainly_right(run, ran, sent):
                     continue  # most runs are like this, and patterns take long
                 sender = run.trigger.get("from")
                 if isinstance(sender, int) and sender not in sent:
@@ -56,14 +58,21 @@ def check(evidence: Evidence) -> Judgement:
     return Judgement(NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent")
 
 
-def _is_as_sent(run: HandlerRun, sent: dict[int, Sendings]) -> bool:
-    """Whether a message triggered the run that is this handler's, and was sent by whom it names."""
-    trigger = run.trigger
-    name = trigger.get("message")
-    if _OF_MESSAGE.get(name) != run.handler or _ALGORITHM[run.handler] != run.algorithm:  # type: ignore[arg-type]
+def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
+    """Whether its own timer, a handler that ran, or a message that was sent by whom it names triggered the run."""
+    trigger, handler = run.trigger, run.handler
+    if _ALGORITHM.get(handler) != run.algorithm:
         return False
-    of_sender = sent.get(trigger.get("from"), {})  # type: ignore[arg-type]
-    return trigger.get("seq") in of_sender.get(name, ())
+    if "seq" in trigger:
+        name = trigger.get("message")
+        if _OF_MESSAGE.get(name) != handler:  # type: ignore[arg-type]
+            return False
+        return trigger["seq"] in sent.get(trigger.get("from"), {}).get(name, ())
+    if len(trigger) > 1:
+        return False
+    if "local" in trigger:
+        return handler in _LOCAL and trigger["local"] in ran
+    return _OF_TIMER.get(trigger.get("timer")) == handler  # type: ignore[arg-type]
 
 
 def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:

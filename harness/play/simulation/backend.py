@@ -378,8 +378,7 @@ class Simulation:
             if life is None:
                 if self._rogue is not None and number == len(self.roster):
                     self._rogue.wake(self._now)
-                continue
-            if life.waiting is None:
+            elif life.waiting is None:
                 self._happen(number, life, what)
             elif what is not None:
                 life.waiting.append(happening)
@@ -387,13 +386,14 @@ class Simulation:
     def _happen(self, number: int, life: Incarnation, what: InFlight | Logged | RogueDatagram | None) -> None:
         agent = life.agent
         if isinstance(what, InFlight):
-            sender, message = what.sender, what.message
-            if type(message) in ONLY_COUNTED:
+            message = what.message
+            if self._tracing or type(message) in ONLY_COUNTED:
                 self._hear(number, life)
-            if what.sent_at >= life.born_at and (self._deliver_all or what.matters(agent.state, sender, message)):
-                if self._tracing:
-                    self._hear(number, life)
-                agent.receive_message(sender, what.sequence, message, self._local(life), what.datagram)
+            if what.sent_at < life.born_at:
+                return
+            if self._deliver_all or what.matters(agent.state, what.sender, message):
+                now = self._now if life.clock is None else self._local(life)
+                agent.receive_message(what.sender, what.sequence, message, now, what.datagram)
                 self._say(number, life)
                 if self._deliver_all or agent.state.reconcile_in_progress:
                     self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
@@ -445,16 +445,14 @@ class Simulation:
 
     def _say(self, number: int, life: Incarnation) -> None:
         """Send what the agent has to say, and take down what it has done."""
-        agent = life.agent
-        messages = agent.messages_to_send()
         in_trace = iter(self._take_down(life, self._now)) if self._tracing else None
-        for sequence, message in messages:
+        for sequence, message in life.agent.messages_to_send():
             data_bytes = datagram_bytes(message)
             life.bytes_sent += data_bytes
             datagram = next(in_trace) if in_trace else None
             self._air.broadcast(self._now, number, sequence, message, data_bytes, datagram)
             if self._rogue is not None:
-                self._rogue.hears(agent.agent_id, sequence, message, self._now)
+                self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
 
     def _wait(self, number: int, life: Incarnation) -> None:
         """Wait for the agent's next timer."""
@@ -476,7 +474,8 @@ class Simulation:
             entry.t = mission_s
             if isinstance(entry, HandlerRun):
                 life.handler_runs += 1
-                datagrams += [sent.datagram for sent in entry.sent]
+                for sent in entry.sent:
+                    datagrams.append(sent.datagram)
         self._recorder.write(life.agent.agent_id, entries)
         return datagrams
 
