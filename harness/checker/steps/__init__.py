@@ -13,7 +13,7 @@ from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.follower import Follower
+from harness.checker.steps.follower import Follower, Tells
 from harness.checker.steps.inputs import Blocks, decoded
 from harness.checker.steps.mission import ImpossibleMissionError, Mission, mission_of
 from ucp.agent import HANDLERS, ON_MESSAGE, why_not_handled
@@ -67,8 +67,8 @@ def _followers(evidence: Evidence, trace: Trace, mission: Mission, blocks: Block
     def was_paused(since: float, until: float) -> bool:
         return evidence.was_paused(mission.agent_id, since, until)
 
-    told = {"tally": any(run.tally for run in trace.runs), "started": any(run.started for run in trace.runs)}
-    tells = frozenset(key for key, is_told in told.items() if is_told)
+    tallying = frozenset(run.handler for run in trace.runs if run.tally is not None)
+    tells = Tells(tallying, timers=any(run.started for run in trace.runs))
     return [Follower(mission, tells, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, stored_blocks
@@ -31,13 +31,17 @@ class NotHandledError(Exception):
     """The reference would not have run this handler now: what the agent did, completing "it ..."."""
 
 
+class Tells(NamedTuple):
+    """What an agent's trace has of what may be left out: tallies, of these handlers, and which timers were started."""
+
+    tallying: frozenset[str]
+    timers: bool
+
+
 class Follower:
-    """Holds the handler runs of one life of an agent against what the reference does.
+    """Holds the handler runs of one life of an agent against what the reference does."""
 
-    `tells` names what the agent's trace has of what may be left out: `tally`, `started`.
-    """
-
-    def __init__(self, mission: Mission, tells: frozenset[str], blocks: Blocks, was_paused: Paused) -> None:
+    def __init__(self, mission: Mission, tells: Tells, blocks: Blocks, was_paused: Paused) -> None:
         self.deviations: list[Deviation] = []
         """Where it differs, in order."""
         self.lost: str | None = None
@@ -268,9 +272,9 @@ class Follower:
             return True
         if (run.sent or core.outbox) and not core.has_sent(run.sent):
             return True
-        if "started" in self._tells and (run.started or {}) != core.started:
+        if self._tells.timers and (run.started or {}) != core.started:
             return True
-        if branch in COUNTING and "tally" in self._tells and run.tally != tally_of(core, handler):
+        if branch in COUNTING and run.handler in self._tells.tallying and run.tally != tally_of(core, handler):
             return True
         state, reconciling, idle = run.state, core.reconcile_in_progress, core.idle
         if state is self._state and not run.changes:  # the lengths and the top are what they were
@@ -303,8 +307,9 @@ class Follower:
         )
         changes, sent = list(core.changes), core.sent_in_full()
         expected = HandlerRun(run.t, handler.name, handler.algorithm, run.trigger, branch, changes, sent, state)
-        expected.started = dict(core.started) if "started" in self._tells else run.started
-        expected.tally = tally_of(core, handler) if branch in COUNTING and "tally" in self._tells else run.tally
+        tells_tally = branch in COUNTING and run.handler in self._tells.tallying
+        expected.started = dict(core.started) if self._tells.timers else run.started
+        expected.tally = tally_of(core, handler) if tells_tally else run.tally
         return expected
 
     def _adopt(self, line: int, run: HandlerRun, before: Before | None) -> None:

@@ -11,8 +11,8 @@ from ucp.settings import Settings
 
 EARLY_WALL_S = 0.001
 """How early a timer may end, in wall seconds: an agent reads its clock more than once."""
-ROUNDING_S = 2e-6
-"""Traces have times to the microsecond."""
+ROUNDING_S = 2e-3
+"""A trace may have its times to the millisecond."""
 
 _SETTINGS = {setting.name for setting in fields(Settings)}
 
