@@ -17,6 +17,7 @@ Place = tuple[dict[Any, Any] | list[Any], Any]
 
 MAX_ROUNDS = 100
 """Each round takes a part out of whatever is wrong: more than parts are within each other are not needed."""
+MAX_MISFITS = 20_000
 MAX_NAME = 80
 UNKNOWN = "extra_forbidden"
 HALF_A_CHARACTER = "string_unicode"
@@ -40,13 +41,16 @@ class Misfit:
 def fit(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[Misfit]]:
     """What fits `model`, all of whose keys have defaults, and what was taken out of `document` because it does not.
 
-    Keys that the model does not know are passed over, and half a character in a text becomes a question mark.
+    Keys that the model does not know are passed over, and half a character in a text becomes a question mark. Raises
+    ValueError if more than `MAX_MISFITS` things are wrong.
     """
     misfits: dict[str, Misfit] = {}
     for _ in range(MAX_ROUNDS):
         try:
             return model.model_validate(document), list(misfits.values())
         except ValidationError as error:
+            if error.error_count() > MAX_MISFITS:
+                raise ValueError(f"{error.error_count()} things are wrong with it") from None
             errors = error.errors(include_url=False, include_context=False, include_input=False)
         for misfit in _by_key(errors):
             misfits.setdefault(misfit.key, misfit)

@@ -10,6 +10,8 @@ from harness.archive.record import SCHEMA, JudgedRecord, RunRecord
 from harness.errors import RunDirectoryError
 
 MAX_BYTES = 64 * 1024 * 1024
+MAX_VALUES = 2_000_000
+"""Of 100,000 scripted fates, which are as many as there can be, a record has 1,200,000 values."""
 
 
 class DamagedRecordError(RunDirectoryError):
@@ -28,7 +30,11 @@ class RecordFile:
 
 def read_record(path: Path) -> RecordFile:
     """Raises DamagedRecordError if nothing can be read, RunDirectoryError if it is of another schema: one sentence."""
-    record, misfits = fit(RunRecord, _document(path))
+    document = _document(path)
+    try:
+        record, misfits = fit(RunRecord, document)
+    except ValueError as error:
+        raise DamagedRecordError(f"{path}: {error}; it was edited or damaged") from None
     problems = {misfit.key: str(misfit) for misfit in misfits}
     if "roster" not in record.model_fields_set:
         problems.setdefault("roster", "`roster` is missing")
@@ -42,7 +48,10 @@ def _document(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise DamagedRecordError(f"{path}: larger than {MAX_BYTES} bytes, which no run's record is")
-        document = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if text.count(",") > MAX_VALUES:
+            raise DamagedRecordError(f"{path}: more than {MAX_VALUES} values, which no run's record has")
+        document = json.loads(text)
     except OSError as error:
         raise DamagedRecordError(f"{path}: cannot be read: {error.strerror}; is this a run directory?") from None
     except (ValueError, RecursionError):

@@ -11,7 +11,7 @@ from harness import checker
 from harness.archive.archive import RunArchive
 from harness.archive.lenient import fit
 from harness.archive.record import RunRecord
-from harness.archive.record_file import RecordFile, read_record
+from harness.archive.record_file import MAX_VALUES, DamagedRecordError, RecordFile, read_record
 from harness.play.progress import Silent
 from harness.run.run import run
 from tests.harness.mission import edit
@@ -86,6 +86,14 @@ def test_what_is_wrong_in_many_places_is_one_sentence_for_each_key(whole: Path, 
         "`errors.0`",
     ]
     assert "(and 49 more)" in file.problems[0]
+
+
+def test_what_is_mostly_wrong_is_refused_in_one_sentence(whole: Path, tmp_path: Path) -> None:
+    with pytest.raises(DamagedRecordError, match=r"run\.json: 30000 things are wrong with it; it was"):
+        edited(whole, tmp_path, lambda record: record.update(faults=[7] * 30_000))
+    (tmp_path / "run.json").write_text(f'{{"faults": [{"7," * MAX_VALUES}7, 7]}}')
+    with pytest.raises(DamagedRecordError, match=r"run\.json: more than 2000000 values, which no run's record has$"):
+        read_record(tmp_path / "run.json")
 
 
 def test_a_record_that_names_no_agents_says_so_and_is_not_judged_by(whole: Path, tmp_path: Path) -> None:
