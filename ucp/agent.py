@@ -213,7 +213,7 @@ class Agent:
             timer.stop()
             self._handle(now, {"timer": timer.name}, None, self._on_timer[timer.name])
 
-    def boot(self, found: StoredState, now: float) -> None:
+    def boot(self, recovered: StoredState, now: float) -> None:
         """Go on from what a former life left on its vehicle's disk; before any other input.
 
         Timers, votes and the block being built are gone. A reconcile that was going on ends as if nobody had answered
@@ -221,8 +221,8 @@ class Agent:
         """
         core = self._core
         core.now = now
-        core.restore(found.completed, found.chain, found.deque, found.stack)
-        came = Recorded(None, found) if self._tracing else None
+        core.restore(recovered.completed, recovered.chain, recovered.deque, recovered.stack)
+        came = Recorded(None, recovered) if self._tracing else None
         self._handle(now, {"boot": len(core.chain)}, came, self._on_local_event["Reconcile Finalize"])
 
     def begin_reconcile(self, now: float) -> None:

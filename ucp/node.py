@@ -184,8 +184,8 @@ class Node:
                 {"epoch_us": epoch_us, "speedup": self.mission.speedup},
             )
         )
-        if self._store is not None and self._store.found is not None:
-            self._drive(partial(self.agent.boot, self._store.found))
+        if self._store is not None and self._store.recovered is not None:
+            self._drive(partial(self.agent.boot, self._store.recovered))
             log.info("went on from a store of %d blocks", len(self.agent.state.chain))
         if self.mission.events.source != "none":
             self.generating = True

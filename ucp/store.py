@@ -105,7 +105,7 @@ class Store:
         }
         self._written: set[str] = set()
         self._file: BinaryIO | None = None
-        self.found = self._read()
+        self.recovered = self._read()
 
     def _read(self) -> StoredState | None:
         entries = _entries(self._path)

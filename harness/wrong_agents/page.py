@@ -18,7 +18,7 @@ from ucp.agent import HANDLERS
 from ucp.files import write_atomically
 from ucp.quirks import QUIRKS
 
-__all__ = ["BEGIN", "END", "NOTHING", "PAGE", "found", "main", "row", "rows_of"]
+__all__ = ["BEGIN", "END", "NOTHING", "PAGE", "findings_of", "main", "row", "rows_of"]
 
 PAGE = Path(__file__).parent / "WRONG_AGENTS.md"
 SEEDS = range(1, 17)
@@ -32,7 +32,7 @@ Trials = dict[int, Trial]
 """By seed."""
 
 
-def found(wrong: Trial, right: Trial) -> dict[str, float | None]:
+def findings_of(wrong: Trial, right: Trial) -> dict[str, float | None]:
     """What is bad of the wrong swarm and not of the right one, in the same mission."""
     return {key: first_s for key, first_s in wrong.bad.items() if key not in right.bad}
 
@@ -40,7 +40,7 @@ def found(wrong: Trial, right: Trial) -> dict[str, float | None]:
 def row(quirk: str, wrong: Trials, right: Trials) -> str:
     """A line of the table: what found the quirk, how often, and when."""
     about = QUIRKS[quirk]
-    findings = {seed: found(trial, right[seed]) for seed, trial in wrong.items()}
+    findings = {seed: findings_of(trial, right[seed]) for seed, trial in wrong.items()}
     counts = Counter(key for finding in findings.values() for key in finding)
     by = ", ".join(f"{key} ({count})" for key, count in sorted(counts.items(), key=_most_first)) or NOTHING
     firsts = [min(times) for finding in findings.values() if (times := [t for t in finding.values() if t is not None])]

@@ -4,7 +4,7 @@ import pytest
 
 from harness.checker import Result
 from harness.checker.judgement import Finding, Judgement
-from harness.wrong_agents.page import NOTHING, PAGE, first_found, found, row, rows_of
+from harness.wrong_agents.page import NOTHING, PAGE, findings_of, first_found, row, rows_of
 from harness.wrong_agents.trial import MISSIONS, Trial, judged, play
 from ucp.quirks import QUIRKS
 
@@ -27,11 +27,11 @@ def test_nothing_goes_unnoticed() -> None:
 def test_what_found_a_quirk_first_finds_it_again(quirk: str) -> None:
     first = cells(quirk)[-1]
     seed = int(first.removeprefix("seed ").split(":")[0])
-    assert first_found(seed, found(play(quirk, seed), play(None, seed))) == first
+    assert first_found(seed, findings_of(play(quirk, seed), play(None, seed))) == first
 
 
 def test_what_the_right_agent_is_charged_with_is_no_finding() -> None:
-    assert found(Trial({"5": 60.0, "2": 9.0}, None), Trial({"5": 70.0}, None)) == {"2": 9.0}
+    assert findings_of(Trial({"5": 60.0, "2": 9.0}, None), Trial({"5": 70.0}, None)) == {"2": 9.0}
 
 
 def test_a_row_says_what_found_it_how_often_how_soon_and_whether_the_right_handler_was_named() -> None:

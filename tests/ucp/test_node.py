@@ -359,7 +359,7 @@ def test_what_an_agent_sends_is_traced_and_stored_before(tmp_path: Path) -> None
             trace = read_trace(tmp_path / "7.trace.jsonl")
             assert trace is not None
             assert sequence in {said.seq for run in trace.runs for said in run.sent}
-            found = Store(tmp_path / "7.store", node.agent.state).found
+            found = Store(tmp_path / "7.store", node.agent.state).recovered
             assert found is not None
             assert [block.block_hash for block in found.deque] == [message.block_hash]
             sent.append(message)

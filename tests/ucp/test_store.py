@@ -47,7 +47,7 @@ def a_store(path: Path, blocks: int = 5) -> AgentState:
 
 
 def found(path: Path) -> StoredState | None:
-    return Store(path, Agent(1, [1, 2], INITIAL_DATA).state).found
+    return Store(path, Agent(1, [1, 2], INITIAL_DATA).state).recovered
 
 
 def test_at_every_moment_the_store_holds_what_the_agent_holds(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_at_every_moment_the_store_holds_what_the_agent_holds(tmp_path: Path) ->
         air.step()
         agent = air.agents[1]
         if step % 40 == 0 and (agent.state.reconcile_stack or step % 400 == 0):
-            stored = Store(tmp_path / "store", Agent(1, [1, 2, 3], INITIAL_DATA).state).found
+            stored = Store(tmp_path / "store", Agent(1, [1, 2, 3], INITIAL_DATA).state).recovered
             assert stored == StoredState.of(agent.state)
             kinds |= {kind for kind in ("chain", "deque", "stack") if getattr(stored, kind)}
     assert kinds == {"chain", "deque", "stack"}
@@ -146,9 +146,9 @@ def test_a_store_that_lost_its_end_is_good_again_from_the_first_thing_that_is_wr
     path.write_bytes(path.read_bytes()[:-10])
     agent = Agent(1, [1, 2], INITIAL_DATA)
     store = Store(path, agent.state)
-    assert store.found is not None
-    agent.boot(store.found, 1.0)
-    while agent.state.completed == store.found.completed:
+    assert store.recovered is not None
+    agent.boot(store.recovered, 1.0)
+    while agent.state.completed == store.recovered.completed:
         agent.add_event(LoggableEvent(0, 7, bytes(256)), 1.0)
     store.write([change for run in agent.trace() for change in run.changes])
     assert found(path) == StoredState.of(agent.state)
@@ -185,9 +185,9 @@ def test_a_full_disk_ends_the_store_and_leaves_what_was_written(
 
     again = Agent(1, [1, 2], INITIAL_DATA)
     store = Store(path, again.state)
-    assert store.found is not None
+    assert store.recovered is not None
     monkeypatch.setattr(os, "fdatasync", refuse)
-    again.boot(store.found, 1.0)
+    again.boot(store.recovered, 1.0)
     store.write([change for run in again.trace() for change in run.changes])
     assert store.problem == "No space left on device"
     assert path.read_bytes() == before

@@ -38,9 +38,9 @@ def _over_brown_outs(evidence: Evidence, agent_id: int, lives: list[Life]) -> It
     for before, after in pairwise(lives):
         if not after.runs or "boot" not in after.runs[0].trigger:
             continue
-        found = [block for operation, block in after.runs[0].changes if operation == "complete"]
-        if found[: len(before.completed)] != before.completed:
-            lost = next((block for block in before.completed if block not in found), before.completed[0])
+        restored = [block for operation, block in after.runs[0].changes if operation == "complete"]
+        if restored[: len(before.completed)] != before.completed:
+            lost = next((block for block in before.completed if block not in restored), before.completed[0])
             detail = f"at {after.runs[0].t:g} s it goes on with other blocks completed than it had when it went down"
             yield _of_block(evidence, agent_id, detail, lost)
 

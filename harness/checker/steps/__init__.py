@@ -91,8 +91,8 @@ def _wrongly_dropped(trace: Trace, mission: Mission) -> Iterator[Deviation]:
         except MalformedDatagramError:
             continue
         if why_not_handled(mission.agent_id, mission.roster, sender, message) is None:
-            said = f"it was not given a {message.NAME} of agent {sender}, which was dropped as {aside.dropped[:60]!r}"
-            yield Deviation(mission.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, said)
+            what = f"it was not given a {message.NAME} of agent {sender}, which was dropped as {aside.dropped[:60]!r}"
+            yield Deviation(mission.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
 
 
 def _deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:

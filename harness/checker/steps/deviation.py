@@ -19,13 +19,13 @@ SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """`did` and `should` complete "it ..." and "should have ..."; or `said` is all that there is to say."""
+    """`did` and `should` complete "it ..." and "should have ..."; or `what` is all that there is to say."""
 
     agent_id: int
     line: int
     t: float
     handler: str | None
-    said: str = ""
+    what: str = ""
     run: HandlerRun | None = None
     expected: HandlerRun | None = None
 
@@ -34,7 +34,7 @@ class Deviation:
         handler = f"Algorithm {known.algorithm}, {known.name}: " if known else ""
         where = f"trace line {self.line}, t={self.t:g} s: {handler}"
         if self.run is None or self.expected is None:
-            return where + self.said
+            return where + self.what
         did, should = zip(*differences(self.run, self.expected, name), strict=True)
         return f"{where}it {_and(did)}; it should have {_and(should)}"
 

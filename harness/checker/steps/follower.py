@@ -132,16 +132,16 @@ class Follower:
             if ON_LOCAL_EVENT[expected].name == run.handler and by == asked:
                 triggered.popleft()
                 return
-            said = f"it triggered {event}, and should have triggered {expected}"
+            what = f"it triggered {event}, and should have triggered {expected}"
             if by != asked:
-                said = f"it said to be triggered by {asked[:60]}, and was by {by}"
+                what = f"it said to be triggered by {asked[:60]}, and was by {by}"
         else:
             by = asked if asked in self._ran else run.handler
-            said = f"it triggered {event}, and should have triggered nothing"
+            what = f"it triggered {event}, and should have triggered nothing"
             if by == run.handler:
-                said = "it ran without having been triggered"
+                what = "it ran without having been triggered"
         at_line, at_s = self._ran.get(by, (line, run.t))
-        self._differ(at_line, at_s, by, said)
+        self._differ(at_line, at_s, by, what)
         triggered.clear()
         self._adopted = True
 
@@ -160,8 +160,8 @@ class Follower:
             if timer.deadline is not None and timer.deadline < late:
                 ended_s = at_s - (now - timer.deadline) / self._mission.rate
                 if not self._was_paused(ended_s, at_s):
-                    said = f"it had not run by then, and the {timer.name} timer ended at t={ended_s:g} s"
-                    self._differ(line, at_s, ON_TIMER[timer.name].name, said)
+                    what = f"it had not run by then, and the {timer.name} timer ended at t={ended_s:g} s"
+                    self._differ(line, at_s, ON_TIMER[timer.name].name, what)
                     timer.stop()
         self._none_ends_before = self._soonest_end()
 
@@ -245,7 +245,7 @@ class Follower:
         if self._began:
             raise NotHandledError("booted, which is only possible before anything else")
         try:
-            found = list(stored_blocks(run.input))
+            left = list(stored_blocks(run.input))
         except ValueError:
             raise NotHandledError("booted from a store that is none") from None
         places: dict[str, list[Block]] = {"chain+": [], "deque+": [], "stack+": []}
@@ -255,12 +255,12 @@ class Follower:
             if operation == "complete":
                 completed.append(bytes.fromhex(block_hash))
                 continue
-            if not found or operation not in places:
+            if not left or operation not in places:
                 break
-            block = found.pop(0)
+            block = left.pop(0)
             self._blocks.add(block)
             places[operation].append(block)
-            if not found:
+            if not left:
                 break
         self._core.restore(completed, *places.values())
 
@@ -323,8 +323,8 @@ class Follower:
             self.lost = f"after trace line {line} agent {self._mission.agent_id} cannot be followed: {error}"
         self._none_ends_before = self._soonest_end()
 
-    def _differ(self, line: int, at_s: float, handler: str, said: str) -> None:
-        self.deviations.append(Deviation(self._mission.agent_id, line, at_s, handler, said))
+    def _differ(self, line: int, at_s: float, handler: str, what: str) -> None:
+        self.deviations.append(Deviation(self._mission.agent_id, line, at_s, handler, what))
 
 
 def _must_be(run: HandlerRun, handler: EventHandler[Any]) -> None:

@@ -57,7 +57,7 @@ class _Topic:
 
     answers: dict[int, list[InFlight]] = field(default_factory=dict)
     askers: set[int] = field(default_factory=set)
-    said: int = 0
+    answer_count: int = 0
     """How many answers there are."""
     quiet_at: float = 0.0
     """None of the answers arrives later."""
@@ -202,9 +202,9 @@ class VirtualAir:
         now, rank, _, _ = self.place
         for asked in self.asked_by[number].values():
             topic = asked.topic
-            if asked.question[0] not in ONLY_COUNTED or (topic.said == asked.heard_of and now < asked.next_at):
+            if asked.question[0] not in ONLY_COUNTED or (topic.answer_count == asked.heard_of and now < asked.next_at):
                 continue
-            asked.heard_of, asked.next_at = topic.said, NEVER
+            asked.heard_of, asked.next_at = topic.answer_count, NEVER
             for sender, flights in topic.answers.items():
                 if sender in asked.heard:
                     continue
@@ -252,7 +252,7 @@ class VirtualAir:
     def _answer(self, question: Question, flight: InFlight, sender: int) -> None:
         """Keep an answer for those who ask, or will before it arrives."""
         topic = self._topics[question]
-        topic.said += 1
+        topic.answer_count += 1
         topic.quiet_at = self.quiet_at
         flights = topic.answers.get(sender)
         if flights is None:

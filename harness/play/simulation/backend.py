@@ -83,7 +83,7 @@ class Incarnation:
     clock: Clock | None
     """None shows mission time."""
     born_at: float
-    found: StoredState | None = None
+    recovered: StoredState | None = None
     """What was on its disk, if it came back from a brown-out with it."""
     deadline: float | None = None
     """When its next timer ends, in mission seconds."""
@@ -342,7 +342,7 @@ class Simulation:
         completed = dict.fromkeys(block.hex() for life in lives for block in life.agent.state.completed)
         for block in life.agent.state.completed if life else ():
             del completed[block.hex()]
-        reboots = sum(life.found is not None for life in lives)
+        reboots = sum(life.recovered is not None for life in lives)
         dropped = sum((life.agent.dropped for life in lives), Counter())
         return {
             "outcome": "exported" if life else "rebooting" if number in self._disks else "killed",
