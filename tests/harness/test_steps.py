@@ -2,7 +2,8 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -14,7 +15,11 @@ from harness.checker import Evidence, steps
 from harness.checker.judgement import Judgement
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
-from ucp.agent import HANDLERS
+from ucp.agent import HANDLERS, ON_LOCAL_EVENT
+from ucp.core import Core
+from ucp.handler import EventHandler
+from ucp.messages import TYPE_CODES
+from ucp.quirks import QUIRKS, Quirk
 from ucp.trace import Dropped, HandlerRun, Recorded
 
 LOSSY = {"network": {"loss": 0.25}, "duration_s": 600}
@@ -257,3 +262,63 @@ def test_an_agent_that_holds_what_nobody_can_know_is_followed_no_further(honest:
         "after trace line 5 agent 1 cannot be followed: no record has the data of block abababababab"
         in judgement.reason
     )
+
+
+def left_out(good: Any, core: Core, *inputs: object, branch: str) -> str:
+    """The handler says that it took the branch, and does nothing."""
+    return branch
+
+
+def done_twice(good: Any, core: Core, *inputs: object) -> str:
+    good(core, *inputs)
+    branch: str = good(core, *inputs)
+    return branch
+
+
+def nothing(good: Any, core: Core, *arguments: object) -> None:
+    """In the place of what the core does for a handler."""
+
+
+def mistakes(handler: EventHandler[Any]) -> Iterator[Quirk]:
+    """All mistakes of the simplest kinds that an implementation of this handler can make."""
+    wrong = {f"takes {branch}": partial(left_out, branch=branch) for branch in handler.branches}
+    for name, run in {**wrong, "twice": done_twice}.items():
+        yield mistake(handler, name, run, None)
+    for helper in ("send", "trigger", "start", "commit", "push_onto_deque", "take_from_deque", "pop_to_stack"):
+        yield mistake(handler, f"no {helper}", nothing, helper)
+
+
+def mistake(handler: EventHandler[Any], name: str, wrong: Callable[..., Any], helper: str | None) -> Quirk:
+    may = (
+        tuple(TYPE_CODES),
+        ("voting", "phase one", "phase two", "phase three", "finalize gap"),
+        tuple(ON_LOCAL_EVENT),
+    )
+    return Quirk(name, name, (handler.algorithm,), wrong, helper, (), *may, chance=False)
+
+
+def told(evidence: Evidence) -> list[str]:
+    return [run.to_line() for _, trace in sorted(evidence.traces.items()) for run in trace.runs]
+
+
+@pytest.fixture(scope="module")
+def right() -> list[str]:
+    return told(simulate(scenario(**LOSSY), 1, tracing=True, deliver_all=True).evidence)
+
+
+@pytest.mark.parametrize("handler", HANDLERS.values(), ids=lambda handler: handler.name)
+def test_whatever_a_handler_leaves_out_or_does_twice_is_found_and_named(
+    handler: EventHandler[Any], right: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What makes no difference in this mission cannot be found in it."""
+    different = 0
+    for quirk in mistakes(handler):
+        monkeypatch.setitem(QUIRKS, quirk.name, quirk)
+        run = simulate(scenario(**LOSSY, settle={"limit_s": 100}, quirks={quirk.name: True}), 1, tracing=True)
+        if told(run.evidence) == right:
+            continue
+        different += 1
+        judgement = run.result.beside["steps"]
+        assert judgement.verdict == "deviates", quirk.name
+        assert judgement.evidence[0].handler == handler.name, (quirk.name, judgement.evidence[0].detail)
+    assert different

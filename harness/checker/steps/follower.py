@@ -126,20 +126,22 @@ class Follower:
         if local is None:
             self._not_run()
             return
-        asked, event = str(local), EVENT_OF.get(run.handler, "what is no local event")
-        if triggered:
-            expected, by = triggered[0]
-            if ON_LOCAL_EVENT[expected].name == run.handler and by == asked:
-                triggered.popleft()
-                return
+        by, event = str(local), EVENT_OF.get(run.handler, "what is no local event")
+        expected, truly_by = triggered[0] if triggered else (None, None)
+        is_expected = expected is not None and ON_LOCAL_EVENT[expected].name == run.handler
+        if is_expected and by == truly_by:
+            triggered.popleft()
+            return
+        if is_expected:
+            what = f"it said to be triggered by {by[:60]}, and was by {truly_by}"
+            by = run.handler
+        elif by == truly_by:
             what = f"it triggered {event}, and should have triggered {expected}"
-            if by != asked:
-                what = f"it said to be triggered by {asked[:60]}, and was by {by}"
+        elif by in self._ran:
+            what = f"it triggered {event}, which it should not have, or not again"
         else:
-            by = asked if asked in self._ran else run.handler
-            what = f"it triggered {event}, and should have triggered nothing"
-            if by == run.handler:
-                what = "it ran without having been triggered"
+            what = "it ran without having been triggered"
+            by = run.handler
         at_line, at_s = self._ran.get(by, (line, run.t))
         self._differ(at_line, at_s, by, what)
         triggered.clear()
