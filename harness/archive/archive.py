@@ -62,29 +62,27 @@ class RunArchive:
     @property
     def recorded(self) -> bool:
         """Whether run.json is there, and anything of it can be read."""
-        return self._record_file[0] is not None
+        return self._record_file is not None and self._record_file.error is None
 
     @property
     def record(self) -> RunRecord:
         """What can be used of run.json; nothing is known where it is missing or damaged."""
-        return self._record_file[0].record if self._record_file[0] else RunRecord()
+        return self._record_file.record if self._record_file else RunRecord()
 
     @property
     def judged_record(self) -> JudgedRecord | None:
         """What a judgement needs of run.json; None if it is not there, or not all of that is sound."""
-        return self._record_file[0].judged if self._record_file[0] else None
+        return self._record_file.judged if self._record_file else None
 
     @property
     def record_error(self) -> RunDirectoryError | None:
         """Why nothing of run.json can be read, if it is there."""
-        return self._record_file[1]
+        return self._record_file.error if self._record_file else None
 
     @property
     def record_problems(self) -> list[str]:
         """A sentence on each thing that is wrong with run.json, what a judgement needs first."""
-        if self.record_error is not None:
-            return [str(self.record_error)]
-        return self._record_file[0].problems if self._record_file[0] else []
+        return self._record_file.problems if self._record_file else []
 
     @cached_property
     def origin(self) -> RunRecord:
@@ -95,14 +93,9 @@ class RunArchive:
         return next((RunArchive(path).record for path in beside if (path / RUN_FILE).is_file()), RunRecord())
 
     @cached_property
-    def _record_file(self) -> tuple[RecordFile | None, RunDirectoryError | None]:
+    def _record_file(self) -> RecordFile | None:
         path = self._in_directory(RUN_FILE)
-        if path is None or not path.exists():
-            return None, None
-        try:
-            return read_record(path), None
-        except RunDirectoryError as error:
-            return None, error
+        return read_record(path) if path is not None and path.exists() else None
 
     @cached_property
     def roster(self) -> list[int]:
@@ -119,6 +112,7 @@ class RunArchive:
 
     @cached_property
     def exports(self) -> Exports:
+        """Those of the agents as the run, or whoever brought them home, left them; `errors` tell of unusable files."""
         return read_exports(self._export_files)
 
     @cached_property

@@ -33,7 +33,11 @@ ROGUE_CONTROL = "rogue.control"
 
 
 class RunDirectory:
-    """Raises RunDirectoryError if it cannot be made, or holds anything already."""
+    """The directory of a run while it is played: where everybody works, and what is taken down as it happens.
+
+    Raises RunDirectoryError if it cannot be made, or holds anything already. What is written into it raises OSError
+    where the disk refuses, unless it says otherwise.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path.absolute()
@@ -44,12 +48,13 @@ class RunDirectory:
         claim(path, self.agents, self.vehicles)
 
     def vehicle(self, vehicle_id: int, life: int = 1) -> Path:
+        """The directory in which a vehicle works; each that takes the place of a lost one has its own."""
         path = self.vehicles / (str(vehicle_id) if life == 1 else f"{vehicle_id}-{life}")
         path.mkdir(exist_ok=True)
         return path
 
     def agent(self, agent_id: int, life: int = 1) -> Path:
-        """The directory in which the agent works."""
+        """The directory in which an agent works; each life of it has its own."""
         path = self.agents if life == 1 else self.agents / f"{agent_id}-{life}"
         path.mkdir(exist_ok=True)
         return path
@@ -61,6 +66,7 @@ class RunDirectory:
         return path
 
     def write_mission(self, directory: Path, agent_id: int, mission: Mapping[str, Any]) -> Path:
+        """Write what ucp/CONTRACT.md tells an agent at its start, and return the file."""
         path = directory / f"{agent_id}.mission.json"
         write_json_atomically(path, dict(mission))
         return path
@@ -97,13 +103,15 @@ class RunDirectory:
             shutil.copyfile(path, kept / path.name)
 
     def append_network(self, record: Mapping[str, Any]) -> None:
+        """A change of the network or a fault of agents, at `at_s` mission seconds, as it was made."""
         self._append(NETWORK_FILE, record)
 
     def append_injected(self, record: Mapping[str, Any]) -> None:
+        """A datagram of the rogue node, or several that are only counted, at `at_s` mission seconds."""
         self._append(ROGUE_FILE, record)
 
     def append_tracks(self, at_s: float, places: Mapping[int, Place]) -> None:
-        """`at_s` in mission seconds."""
+        """Where vehicles were at `at_s` mission seconds."""
         tracks = {str(vehicle): place.to_json() for vehicle, place in places.items()}
         self._append(TRACKS_FILE, {"at_s": round(at_s, 3), "places": tracks})
 

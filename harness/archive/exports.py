@@ -56,10 +56,13 @@ class ExportedBlock(BaseModel):
 
     @property
     def event_bytes(self) -> bytes:
+        """The loggable events, as a block has them (Section 3.1)."""
         return base64.b64decode(self.event_data)
 
 
 class ExportedInception(BaseModel):
+    """The inception block, which all agents of a mission share: its data is in base64."""
+
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     block_data: Base64
@@ -68,6 +71,8 @@ class ExportedInception(BaseModel):
 
 
 class CurrentBlock(BaseModel):
+    """The block that is being built: the events that it has by now, in base64."""
+
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     event_data: EventData
@@ -92,11 +97,13 @@ class Export(BaseModel):
 
     @property
     def top_chain_hash(self) -> str:
+        """That of the last block of the chain, or of the inception block."""
         top = self.chain[-1].chain_hash if self.chain else None
         return top or self.inception.chain_hash
 
     @property
     def chain_of_block_hashes(self) -> tuple[str, ...]:
+        """The chain without the inception block, oldest first."""
         return tuple(block.block_hash for block in self.chain)
 
     def blocks(self) -> Iterable[ExportedBlock]:

@@ -36,6 +36,8 @@ class FindingRecord(_Model):
 
 
 class CharacteristicRecord(_Model):
+    """The judgement on one of the six characteristics."""
+
     name: str
     verdict: CharacteristicVerdict
     reason: str

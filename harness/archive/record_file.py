@@ -26,10 +26,22 @@ class RecordFile:
     judged: JudgedRecord | None = None
     """The same, if all that a judgement needs is there and sound: half of it would make wrong verdicts."""
     problems: list[str] = field(default_factory=list)
+    error: RunDirectoryError | None = None
+    """Why nothing of it can be used."""
 
 
 def read_record(path: Path) -> RecordFile:
-    """Raises DamagedRecordError if nothing can be read, RunDirectoryError if it is of another schema: one sentence."""
+    """The record in `path`. A file of which nothing can be used has an `error`, in one sentence.
+
+    The error is a DamagedRecordError, unless the file is sound and of another schema.
+    """
+    try:
+        return _read(path)
+    except RunDirectoryError as error:
+        return RecordFile(problems=[str(error)], error=error)
+
+
+def _read(path: Path) -> RecordFile:
     document = _document(path)
     try:
         record, misfits = fit(RunRecord, document)

@@ -161,6 +161,7 @@ class Held:
         """What the last run's changes claim to remove although it was not there."""
 
     def replay(self, run: HandlerRun) -> None:
+        """The changes of the next run of the same life."""
         self.impossible = None
         for operation, block in run.changes:
             if operation == "complete":

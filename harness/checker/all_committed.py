@@ -8,6 +8,10 @@ NAME = "all committed everywhere"
 
 
 def check(evidence: Evidence) -> Judgement:
+    """By the exports at the end. Blocks that only killed agents held are left out (Section 3.3).
+
+    `not applicable` where an export is missing, an agent was not idle, or those that lack a block had no chance.
+    """
     if never_agrees := never(NAME, evidence):
         return never_agrees
     unknown = why_unknown(evidence)

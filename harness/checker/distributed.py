@@ -21,6 +21,7 @@ _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 
 
 def check(evidence: Evidence) -> Judgement:
+    """By the traces, every line of them; `not applicable` where one is missing, damaged or incomplete."""
     if not evidence.traces:
         return Judgement(NAME, "not applicable", "no traces: exports do not show what triggered the handlers")
     sent = evidence.sendings

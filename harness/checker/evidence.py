@@ -64,6 +64,7 @@ class RogueTraffic:
     """There are more, of which only the number is on record."""
 
     def take_down(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
+        """Add what the rogue node sent; returns itself."""
         for datagram in datagrams:
             self.messages.add((datagram.sender, datagram.sequence, datagram.message))
             self.counted |= datagram.count is not None
@@ -97,6 +98,7 @@ class Evidence:
         self.names = name_blocks(self.exports)
 
     def name(self, block_hash: str) -> str:
+        """The block's name for people, such as 4.11, or the beginning of its hash."""
         return self.names.get(block_hash, block_hash[:12])
 
     @cached_property

@@ -16,6 +16,10 @@ _Content = tuple[int, int, str]
 
 
 def check(evidence: Evidence) -> Judgement:
+    """By the exports, whose hashes are computed anew, and by what every agent says to have completed.
+
+    `not applicable` where there is no export, or nothing tells what a maker of blocks completed.
+    """
     findings: list[Finding] = []
     roster = evidence.roster
     completed = evidence.completed_blocks()

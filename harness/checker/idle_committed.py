@@ -7,6 +7,10 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
+    """By the exports at the end, and by the traces after every step.
+
+    `not applicable` where an agent was not idle at the end, or left no export.
+    """
     findings = [*_in_exports(evidence), *_in_traces(evidence)]
     if findings:
         return violated(NAME, "an idle agent held a completed block that was not in its chain", findings)

@@ -26,6 +26,8 @@ class Finding:
 
 @dataclass(frozen=True)
 class Judgement:
+    """What was judged, how, and why: `reason` is a sentence, and `evidence` the first of what speaks for it."""
+
     name: str
     verdict: Verdict
     reason: str
@@ -33,9 +35,11 @@ class Judgement:
 
     @property
     def kind(self) -> Kind:
+        """What the verdict amounts to; a bad one makes the exit status 1."""
         return kind_of(self.verdict)
 
     def to_json(self) -> dict[str, Any]:
+        """A `JudgementRecord` of `ucp-run/1`."""
         return {
             "name": self.name,
             "verdict": self.verdict,

@@ -13,6 +13,7 @@ NAME = "liveness"
 
 
 def check(evidence: Evidence) -> Judgement:
+    """`never finishes` if that is shown, `not finished` if the swarm was not idle; times are in mission seconds."""
     unknown = _why_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)

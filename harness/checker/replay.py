@@ -28,6 +28,7 @@ class Sight:
 
     @property
     def where(self) -> str:
+        """Such as "trace line 7, t=12.5 s, receive_commit_block"."""
         return f"trace line {self.line}, t={self.run.t:g} s, {self.run.handler}"
 
 

@@ -20,6 +20,7 @@ class TimerLag:
 
     @property
     def tolerable(self) -> bool:
+        """Whether that is at most a twentieth of what was asked."""
         return self.late_s <= TOLERATED * self.asked_s
 
 

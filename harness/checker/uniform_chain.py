@@ -10,6 +10,10 @@ NAME = "one uniform chain"
 
 
 def check(evidence: Evidence) -> Judgement:
+    """By the exports at the end.
+
+    `not applicable` where an export is missing, an agent was not idle, or those that differ had no chance.
+    """
     if never_agrees := never(NAME, evidence):
         return never_agrees
     unknown = why_unknown(evidence)

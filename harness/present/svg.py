@@ -76,6 +76,7 @@ def linear_axis(first: float, last: float, place: tuple[float, float]) -> Axis:
 
 
 def share_axis(place: tuple[float, float]) -> Axis:
+    """From 0 to 1, with a tick at each quarter; `place` is where it begins and ends, in pixels."""
     return Axis(0.0, 1.0, *place, [0.0, 0.25, 0.5, 0.75, 1.0])
 
 

@@ -32,6 +32,7 @@ def duration(seconds: float) -> str:
 
 
 def percent(share: float) -> str:
+    """A share of 0 to 1: 12.5 %."""
     return f"{_shortest(100 * share)}\u00a0%"
 
 

@@ -30,6 +30,8 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
 
 @dataclass(frozen=True)
 class Examination:
+    """What held each record against the others has come to."""
+
     contradictions: list[Contradiction]
     short: dict[int, str]
     """Agents whose trace is not whole -> how one knows."""
@@ -40,6 +42,7 @@ class Examination:
 
 
 def cross_examine(evidence: Evidence) -> Examination:
+    """All comparisons, in their order."""
     contradictions = [contradiction for compare in COMPARISONS for contradiction in compare(evidence)]
     short = {agent_id: trace.problem for agent_id, trace in evidence.traces.items() if trace.problem}
     for contradiction in contradictions:
@@ -61,6 +64,7 @@ def _untold(evidence: Evidence) -> Iterator[int]:
 
 
 def check(evidence: Evidence) -> Judgement:
+    """`contradict` at the first contradiction; `not applicable` where a trace is missing or not whole."""
     examination = evidence.examination
     findings = [contradiction.finding for contradiction in examination.contradictions]
     if findings:
@@ -82,6 +86,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def not_whole(examination: Examination) -> str:
+    """Whose trace is not whole, and how one knows; there is one at least."""
     agent_id, why = next(iter(examination.short.items()))
     others = len(examination.short) - 1
     more = f"; nor is that of {others} more" if others else ""

@@ -21,6 +21,7 @@ Datagrams = Counter[tuple[object, object]]
 
 
 def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
+    """A whole capture has what its vehicle's trace says was sent and handled, and nothing else of that vehicle."""
     captures = evidence.captures
     if captures is None:
         return

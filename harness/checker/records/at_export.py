@@ -27,6 +27,7 @@ FIELDS = {
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """An export is a state to which its trace has led, in all that it holds and in its order."""
     for agent_id, export in evidence.exports.items():
         trace = evidence.traces.get(agent_id)
         if trace is None or trace.problem:

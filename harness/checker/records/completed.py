@@ -10,6 +10,7 @@ from harness.checker.replay import Life
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """What an agent completed is the same, in the same order, wherever it is told."""
     for agent_id, lives in evidence.lives.items():
         if evidence.traces[agent_id].problem:
             continue

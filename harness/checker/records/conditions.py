@@ -16,6 +16,7 @@ Change = tuple[float, str, str | None, bool | None, tuple[int, ...], str | None]
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """Each change of the network and each fault is in both, with the same words, and times do not go back."""
     record, log = evidence.record, evidence.conditions
     if record is None or log is None or record.mission_s is None:
         return

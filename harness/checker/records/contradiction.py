@@ -18,4 +18,5 @@ class Contradiction:
 
 
 def of_agent(agent_id: int, detail: str, touches: str | None = None, *, short: bool = False) -> Contradiction:
+    """One that is about no block."""
     return Contradiction(Finding(agent_id, detail), touches, short)

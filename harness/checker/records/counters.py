@@ -18,6 +18,7 @@ ROUNDED_S = 5e-4
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """What an agent counted is what its trace has, as far as it had been written by then."""
     for agent_id, trace in evidence.traces.items():
         recorded = evidence.recorded(agent_id)
         if recorded is None or trace.problem:

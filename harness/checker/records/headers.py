@@ -10,6 +10,7 @@ MAX_VALUE = 40
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """All name one mission: its roster, settings, clock and inception block."""
     first: dict[str, tuple[object, str]] = {}
     if evidence.record is not None:
         first["roster"] = sorted(evidence.record.roster), "run.json"

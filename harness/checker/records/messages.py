@@ -14,6 +14,7 @@ CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """What was heard of a message is what its sender sent, and after it was sent."""
     slack = max(map(slack_s, evidence.traces.values()), default=0.0)
     sendings = evidence.sendings
     for agent_id, lives in evidence.lives.items():

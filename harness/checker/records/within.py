@@ -10,6 +10,7 @@ from harness.checker.replay import Life, Sight
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """What does not fit in each life of an agent, and from one life to the next."""
     for agent_id, lives in evidence.lives.items():
         for life in lives:
             yield from _in_life(evidence, agent_id, life)
@@ -30,6 +31,7 @@ def _in_life(evidence: Evidence, agent_id: int, life: Life) -> Iterator[Contradi
 
 
 def finding(evidence: Evidence, agent_id: int, sight: Sight) -> Finding:
+    """The sight as evidence, with the block's name for people."""
     block = sight.block_hash
     return Finding(agent_id, f"{sight.where}: {sight.what}", evidence.name(block) if block else None, block)
 

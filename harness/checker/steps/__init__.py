@@ -24,6 +24,7 @@ NAME = "every step"
 
 
 def check(evidence: Evidence) -> Judgement:
+    """`deviates` at the first step that differs; `not applicable` where not every step of every agent can be judged."""
     blocks = Blocks(block for export in evidence.exports.values() for block in export.blocks())
     deviations: list[Deviation] = []
     steps, unjudged, lost = 0, dict[int, str](), list[str]()

@@ -30,6 +30,7 @@ class Deviation:
     expected: HandlerRun | None = None
 
     def sentence(self, name: NameOf) -> str:
+        """Where, by which handler, what it did and what it should have done."""
         known = HANDLERS.get(self.handler or "")
         handler = f"Algorithm {known.algorithm}, {known.name}: " if known else ""
         where = f"trace line {self.line}, t={self.t:g} s: {handler}"

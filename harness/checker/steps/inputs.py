@@ -77,9 +77,11 @@ class Blocks:
         self._blocks: dict[str, Block] = {}
 
     def add(self, block: Block) -> None:
+        """A block that was seen whole."""
         self._blocks[block.block_hash.hex()] = block
 
     def add_from(self, message: Message) -> None:
+        """The block that a message carries, if it carries one."""
         if isinstance(message, CommitBlock | BlockResponse):
             self.add(message.block)
 

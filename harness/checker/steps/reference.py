@@ -43,6 +43,7 @@ class ReferenceCore(Core):
         self.changes.append((operation, block_hash))
 
     def before(self, run: HandlerRun) -> Before:
+        """What `undo` needs to take back the step that the run is compared with."""
         stack = list(self.reconcile_stack) if self.reconcile_stack else None
         current_block = bytes(self.current_block) if run.handler == "build_data_block" else None
         return Before(stack, current_block, self.phase_three_timer.deadline)
