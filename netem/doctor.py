@@ -17,8 +17,8 @@ from netem.lab import Lab, LabError
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One fact: whether it is as it should be, what was seen, and what to do if not (else empty).
+class LabRequirement:
+    """What a lab needs of a machine: whether it is there, what was seen, and what to do if not (else empty).
 
     Without what is `needed` there is no lab; of the engines any one will do.
     """
@@ -30,12 +30,12 @@ class Finding:
     needed: bool = True
 
 
-def examine() -> list[Finding]:
+def examine() -> list[LabRequirement]:
     """Everything that the lab needs, in the order in which it needs it. Takes about half a second."""
     ok, word = namespaces.probe()
-    findings = [Finding("namespaces", ok, word, "" if ok else namespaces.way_out(word))]
+    requirements = [LabRequirement("namespaces", ok, word, "" if ok else namespaces.way_out(word))]
     if not ok:
-        return findings
+        return requirements
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder, "lab.log")
         tried = {name: _try(name, log) for name in ("netem", "nftables")}
@@ -43,19 +43,19 @@ def examine() -> list[Finding]:
     broken = next((e for e in tried.values() if isinstance(e, LabError) and getattr(e, "stage", "") != "engine"), None)
     if broken is not None:
         reason = str(getattr(broken, "reason", broken))
-        return [*findings, Finding("network", False, reason, getattr(broken, "way_out", ""))]
-    findings.append(Finding("network", True, "bridge, veth pairs and a namespace for each vehicle"))
+        return [*requirements, LabRequirement("network", False, reason, getattr(broken, "way_out", ""))]
+    requirements.append(LabRequirement("network", True, "bridge, veth pairs and a namespace for each vehicle"))
     for name, result in tried.items():
         if isinstance(result, str):
-            findings.append(Finding(name, True, "works", needed=False))
+            requirements.append(LabRequirement(name, True, "works", needed=False))
         else:
             reason = str(getattr(result, "reason", result))
-            findings.append(Finding(name, False, reason, getattr(result, "way_out", ""), needed=False))
+            requirements.append(LabRequirement(name, False, reason, getattr(result, "way_out", ""), needed=False))
     if isinstance(chosen, str):
-        findings.append(Finding("engine", True, f"{chosen}, the first that works of netem and nftables"))
+        requirements.append(LabRequirement("engine", True, f"{chosen}, the first that works of netem and nftables"))
     else:
-        findings.append(Finding("engine", False, str(chosen), getattr(chosen, "way_out", "")))
-    return findings
+        requirements.append(LabRequirement("engine", False, str(chosen), getattr(chosen, "way_out", "")))
+    return requirements
 
 
 def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from typing import Literal
 
-from harness.archive.record import Fault
+from harness.archive.record import FaultRecord
 from harness.archive.traces import Trace
 from ucp.trace import HandlerRun
 
@@ -127,7 +127,9 @@ def lives(trace: Trace) -> list[list[HandlerRun]]:
     return [[run for _, run in life if in_time(run)] for life in trace.lives()]
 
 
-def history_of(traces: Mapping[int, Trace], faults: Iterable[Fault], end_s: float, *, whole: bool = True) -> History:
+def history_of(
+    traces: Mapping[int, Trace], faults: Iterable[FaultRecord], end_s: float, *, whole: bool = True
+) -> History:
     """`end_s` is when the run ended, in mission seconds; without `whole` traces there are no messages."""
     falls: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
@@ -236,7 +238,7 @@ def ends_at(traces: Mapping[int, Trace]) -> float:
     return max((run.t for trace in traces.values() for run in trace.runs if in_time(run)), default=0.0)
 
 
-def possible(faults: Iterable[Fault]) -> list[Fault]:
+def possible(faults: Iterable[FaultRecord]) -> list[FaultRecord]:
     """Those with a possible time, in order."""
     return sorted(
         (fault for fault in faults if math.isfinite(fault.at_s) and 0 <= fault.at_s <= LATEST_S),

@@ -62,7 +62,7 @@ class NetworkState(_Model):
     fully_connected: bool
 
 
-class Fault(_Model):
+class FaultRecord(_Model):
     """What a scenario did to the network or to agents at `at_s`; `detail` says it to people."""
 
     at_s: float
@@ -283,7 +283,7 @@ class JudgedRecord(_Model):
     roster: list[int]
     outcome: Literal["running", "completed", "interrupted", "failed"] = "running"
     network: list[NetworkState] = []
-    faults: list[Fault] = []
+    faults: list[FaultRecord] = []
     final_reconcile: FinalReconcile | None = None
     cycle: Cycle | None = None
     """Where agents were shown never to finish; if `proven`, the run stopped there."""

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from harness.archive.history import lives
-from harness.archive.record import Fault
+from harness.archive.record import FaultRecord
 from harness.archive.traces import Trace
 from ucp.trace import HandlerRun
 
@@ -29,9 +29,9 @@ class Replication:
     copies_mean: float | None
 
 
-def replication_of(traces: Mapping[int, Trace], faults: Iterable[Fault]) -> list[Replication]:
+def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -> list[Replication]:
     """How things stood from 0 s on, and after each moment that changed it."""
-    steps: list[tuple[float, int, int, Fault | HandlerRun]] = []
+    steps: list[tuple[float, int, int, FaultRecord | HandlerRun]] = []
     for fault in faults:
         steps += [(fault.at_s, 0, agent, fault) for agent in fault.agents or () if agent in traces]
     for agent, trace in traces.items():
@@ -41,7 +41,7 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[Fault]) -> list
     chains = _Chains(traces)
     states = [chains.replication(0.0)]
     for number, (at_s, life, agent, step) in enumerate(steps):
-        if isinstance(step, Fault):
+        if isinstance(step, FaultRecord):
             chains.suffer(agent, step)
         else:
             chains.play(agent, life, step)
@@ -68,7 +68,7 @@ class _Chains:
         self._blocks_with: Counter[int] = Counter()  # so many copies
         self._copies_of_completed = 0
 
-    def suffer(self, agent: int, fault: Fault) -> None:
+    def suffer(self, agent: int, fault: FaultRecord) -> None:
         if fault.loses_data:
             self._empty(agent)
             self._paths.pop(agent, None)

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 
 from harness.archive.exports import Export
-from harness.archive.record import BlockHolders, Fault, LeastHeld, Loss, Survival
+from harness.archive.record import BlockHolders, FaultRecord, LeastHeld, Loss, Survival
 from harness.archive.traces import Held, Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import agents
@@ -59,7 +59,7 @@ def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld 
     )
 
 
-def _losses(evidence: Evidence, lost: list[Fault], at_end: Mapping[str, list[int]]) -> list[Loss]:
+def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, list[int]]) -> list[Loss]:
     untold = [trace for trace in evidence.traces.values() if trace.problem]
     if untold or set(evidence.roster or ()) - set(evidence.traces):
         return [Loss(at_s=fault.at_s, what=fault.what, vehicles=fault.agents or []) for fault in lost]

@@ -25,21 +25,25 @@ def doctor_command(
     if kernel is Kernel.uml:
         asked = {"--json": as_json, "--measure": measure}
         raise typer.Exit(run_inside(["doctor", *(option for option, wanted in asked.items() if wanted)]))
-    findings = examine()
-    able = all(finding.ok for finding in findings if finding.needed)
+    requirements = examine()
+    able = all(requirement.ok for requirement in requirements if requirement.needed)
     if not as_json:
         table = Table.grid(padding=(0, 2))
-        for finding in findings:
-            mark = Text("✔", style="green") if finding.ok else Text("✘", style="red" if finding.needed else "yellow")
-            table.add_row(mark, finding.name, Text(finding.detail))
-            if not finding.ok and finding.way_out:
-                table.add_row("", "", Text(f"→ {finding.way_out}", style="dim"))
+        for requirement in requirements:
+            mark = (
+                Text("✔", style="green")
+                if requirement.ok
+                else Text("✘", style="red" if requirement.needed else "yellow")
+            )
+            table.add_row(mark, requirement.name, Text(requirement.detail))
+            if not requirement.ok and requirement.way_out:
+                table.add_row("", "", Text(f"→ {requirement.way_out}", style="dim"))
         Console().print(table)
     engines = []
     if measure and able:
         with calibration.saying(Console(stderr=True)) as say:
-            engines = calibration.measure_engines(findings, say)
-    records = [finding.to_json() for finding in findings]
+            engines = calibration.measure_engines(requirements, say)
+    records = [requirement.to_json() for requirement in requirements]
     if as_json:
         print_json({"findings": records, "measured": [engine.to_json() for engine in engines]} if measure else records)
     elif engines:

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from harness.errors import MachineError
-from harness.machine.doctor import Finding
+from harness.machine.doctor import Requirement
 from netem.errors import NetemError
 from netem.estimates import Estimate, Heard
 from netem.lab import EngineName
@@ -20,9 +20,9 @@ _SHOWN = {"": (100.0, "%"), "s": (1000.0, "ms"), "bit/s": (0.001, "kbit/s"), "pa
 """How people read a unit of `netem.measure`: times what, and its name."""
 
 
-def measure_engines(findings: Iterable[Finding], say: Callable[[str], None]) -> list[Measured]:
+def measure_engines(requirements: Iterable[Requirement], say: Callable[[str], None]) -> list[Measured]:
     """Measure every engine that works here, 10 to 30 seconds each; MachineError if the machine is too busy for it."""
-    working = {finding.name for finding in findings if finding.ok}
+    working = {requirement.name for requirement in requirements if requirement.ok}
     engines = [engine for engine in get_args(EngineName) if engine in working]
     try:
         return [measure(engine, studies(engine), _telling(engine, in_lab(engine), say)) for engine in engines]

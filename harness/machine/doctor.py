@@ -14,8 +14,11 @@ from sitl.vehicle import VehicleError
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One fact; `needed` if a run is impossible without it, and what would mend it."""
+class Requirement:
+    """What runs need of a machine, and what of it is there; `way_out` is what would mend it.
+
+    Without what is `needed` there is no run.
+    """
 
     name: str
     ok: bool
@@ -27,29 +30,29 @@ class Finding:
         return asdict(self)
 
 
-def examine() -> list[Finding]:
+def examine() -> list[Requirement]:
     """Look at this machine; builds and removes a small lab to find out what the kernel allows."""
-    python = Finding(
+    python = Requirement(
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
     )
     lab = [
-        Finding(finding.name, finding.ok, finding.needed, finding.detail, finding.way_out)
-        for finding in lab_doctor.examine()
+        Requirement(requirement.name, requirement.ok, requirement.needed, requirement.detail, requirement.way_out)
+        for requirement in lab_doctor.examine()
     ]
     return [python, *lab, _user_mode_linux(), _docker(), _ardupilot()]
 
 
-def _user_mode_linux() -> Finding:
+def _user_mode_linux() -> Requirement:
     use = "--kernel uml: all of netem, in a process without privileges"
     if uml.inside():
-        return Finding("User Mode Linux", True, False, "this is it")
+        return Requirement("User Mode Linux", True, False, "this is it")
     try:
-        return Finding("User Mode Linux", True, False, f"{uml.examine()}; for {use}")
+        return Requirement("User Mode Linux", True, False, f"{uml.examine()}; for {use}")
     except UmlError as error:
-        return Finding("User Mode Linux", False, False, str(error), f"with it there is {use}")
+        return Requirement("User Mode Linux", False, False, str(error), f"with it there is {use}")
 
 
-def _docker() -> Finding:
+def _docker() -> Requirement:
     from harness.play.containers.engine import DockerError, Engine
     from harness.play.containers.preflight import require_root
 
@@ -60,16 +63,16 @@ def _docker() -> Finding:
         engine.close()
         require_root()
     except DockerError as error:
-        return Finding("Docker", False, False, str(error), f"with it there is {use}")
-    return Finding("Docker", True, False, f"{version}, for {use}")
+        return Requirement("Docker", False, False, str(error), f"with it there is {use}")
+    return Requirement("Docker", True, False, f"{version}, for {use}")
 
 
-def _ardupilot() -> Finding:
+def _ardupilot() -> Requirement:
     try:
         ardupilot = ArduPilot.find(None, os.environ)
     except VehicleError as error:
-        return Finding("ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle")
+        return Requirement("ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle")
     if ardupilot.defaults is None:
         way_out = "put ArduPilot's default parameters, copter.parm, beside it: without them it may refuse to arm"
-        return Finding("ArduPilot SITL", False, False, f"{ardupilot.binary}, without copter.parm", way_out)
-    return Finding("ArduPilot SITL", True, False, str(ardupilot.binary))
+        return Requirement("ArduPilot SITL", False, False, f"{ardupilot.binary}, without copter.parm", way_out)
+    return Requirement("ArduPilot SITL", True, False, str(ardupilot.binary))

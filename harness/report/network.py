@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
-from harness.archive.record import Fault, NetworkState
+from harness.archive.record import FaultRecord, NetworkState
 from harness.present import words
 from harness.report import network_strip
 from harness.report.chain_tree import ranges
@@ -15,7 +15,7 @@ Change = tuple[float, float, tuple[str, float]]
 """From when to when something is so, and what, in words and as a level."""
 
 
-def strip(scenario: Scenario | None, faults: Sequence[Fault]) -> Markup | None:
+def strip(scenario: Scenario | None, faults: Sequence[FaultRecord]) -> Markup | None:
     """The network along mission time, as the scenario asked for it; None if that is not on record."""
     if scenario is None:
         return None
@@ -65,7 +65,7 @@ def start(states: Sequence[NetworkState]) -> str | None:
     return states[0].detail if states else None
 
 
-def faults(faults: Sequence[Fault]) -> list[tuple[str, str, str]]:
+def faults(faults: Sequence[FaultRecord]) -> list[tuple[str, str, str]]:
     """When, what, and everything else that is known of each fault."""
     rows = []
     for fault in faults:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.archive.record import Fault
+from harness.archive.record import FaultRecord
 from harness.archive.replication import Replication
 from harness.present import words
 from harness.present.svg import n
@@ -40,7 +40,9 @@ _LOOKS = ("broken", "whole")
 """Of two lines; one by itself is whole."""
 
 
-def draw(spreads: Sequence[Replication], faults: Sequence[Fault], shades: Sequence[Shade], end_s: float) -> list[Chart]:
+def draw(
+    spreads: Sequence[Replication], faults: Sequence[FaultRecord], shades: Sequence[Shade], end_s: float
+) -> list[Chart]:
     """A chart for each group of figures; `spreads` are how things stood from when on, in order, one at least."""
     moments = thinned(spreads, end_s)
     behind = shaded(shades, faults, HEIGHT)

@@ -14,7 +14,7 @@ from typing import TypeVar
 from markupsafe import Markup
 
 from harness.archive.history import CUT_SHORT, Commit, History, Phase, Reconcile, Tie, Vote
-from harness.archive.record import Fault
+from harness.archive.record import FaultRecord
 from harness.present.svg import n
 from harness.report.timeline_plot import Shade, pin, plot, seconds, shaded, short, told
 from harness.scenario.faults import KINDS
@@ -54,7 +54,7 @@ Span = TypeVar("Span", Vote, Reconcile)
 
 def draw(
     course: History,
-    faults: Sequence[Fault],
+    faults: Sequence[FaultRecord],
     shades: Sequence[Shade],
     agents: Sequence[int],
     names: Mapping[str, str],
@@ -101,7 +101,7 @@ def draw(
 
 
 def _legend(
-    course: History, faults: Sequence[Fault], shades: Sequence[Shade], *, by_phase: bool
+    course: History, faults: Sequence[FaultRecord], shades: Sequence[Shade], *, by_phase: bool
 ) -> list[tuple[Markup, str]]:
     """What is in the picture, and no more."""
     outcomes = {vote.outcome for vote in course.votes}
@@ -249,7 +249,7 @@ def _tie(tie: Tie, lane_height: int) -> Markup:
     )
 
 
-def _alive(agent: int, faults: Sequence[Fault], lane_height: int, end_s: float) -> list[Markup]:
+def _alive(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: float) -> list[Markup]:
     """The lane's ground, where the agent ran; a broken line where it was paused."""
     ran: list[tuple[float, float]] = []
     paused: list[tuple[float, float]] = []
@@ -286,5 +286,5 @@ def _alive(agent: int, faults: Sequence[Fault], lane_height: int, end_s: float) 
     return grounds + stills
 
 
-def _mark(fault: Fault) -> Markup:
+def _mark(fault: FaultRecord) -> Markup:
     return Markup('<path class="mark" d="{}"><title>{}</title></path>').format(fault.kind.mark, told(fault))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.archive.record import Fault
+from harness.archive.record import FaultRecord
 from harness.present.svg import linear_axis, n
 
 TICK_HEIGHT = 22
@@ -50,7 +50,7 @@ def pin(at_s: float, end_s: float, y: float, shape: Markup) -> Markup:
     )
 
 
-def shaded(shades: Sequence[Shade], faults: Sequence[Fault], height: float) -> Markup:
+def shaded(shades: Sequence[Shade], faults: Sequence[FaultRecord], height: float) -> Markup:
     """Behind everything: when the network was parted, and a rule where something was done to it or to agents."""
     parts = [
         Markup('<rect class="shade" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
@@ -70,7 +70,7 @@ def shaded(shades: Sequence[Shade], faults: Sequence[Fault], height: float) -> M
     return Markup("").join(parts)
 
 
-def told(fault: Fault) -> str:
+def told(fault: FaultRecord) -> str:
     return f"{seconds(fault.at_s)}: {fault.what[:60]}, {fault.detail[:300]}"
 
 

@@ -12,18 +12,18 @@ from typer.testing import CliRunner, Result
 from harness import cli
 from harness.commands import doctor as doctor_module
 from harness.machine import calibration
-from harness.machine.doctor import Finding
+from harness.machine.doctor import Requirement
 from netem.conditions import NetworkConditions
 from netem.errors import LabError
 from netem.estimates import Heard, Lateness, lost
 from netem.measure import Observer, Question, Study
 
 WORKS = [
-    Finding("netem", False, False, "unknown"),
-    Finding("nftables", True, False, "works"),
-    Finding("engine", True, True, "nftables"),
+    Requirement("netem", False, False, "unknown"),
+    Requirement("nftables", True, False, "works"),
+    Requirement("engine", True, True, "nftables"),
 ]
-NOTHING_WORKS = [Finding("engine", False, True, "nothing works", "install nftables")]
+NOTHING_WORKS = [Requirement("engine", False, True, "nothing works", "install nftables")]
 STUDY = Study(NetworkConditions(), (Question(1, 4, "loss 0.15", "lost", 0.15, lost),))
 
 
@@ -39,7 +39,7 @@ def losing(*shares: float) -> Observer:
     return observe
 
 
-def fake(monkeypatch: pytest.MonkeyPatch, observer: Observer, findings: list[Finding] = WORKS) -> None:
+def fake(monkeypatch: pytest.MonkeyPatch, observer: Observer, findings: list[Requirement] = WORKS) -> None:
     """A machine with these findings, whose network is an observer, and of which one question is asked."""
     monkeypatch.setattr(doctor_module, "examine", lambda: findings)
     monkeypatch.setattr(calibration, "studies", lambda engine: (STUDY,))

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from harness.archive.record import Fault, JudgedRecord
+from harness.archive.record import FaultRecord, JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
 from harness.checker.agreement import had_a_chance
@@ -251,11 +251,11 @@ def test_without_vehicles_nothing_can_crash() -> None:
 
 
 def test_a_word_on_record_that_is_no_known_fault_is_one_that_does_nothing() -> None:
-    unknown = Fault(at_s=1.0, what="earthquake", detail="agent 1", agents=[1])
+    unknown = FaultRecord(at_s=1.0, what="earthquake", detail="agent 1", agents=[1])
     assert not unknown.loses_data
     assert not (unknown.kind.ends_a_life or unknown.kind.takes_the_vehicle or unknown.kind.mark)
 
 
 @pytest.mark.parametrize(("disk", "loses"), [("kept", False), ("lost", True)])
 def test_a_reboot_loses_what_its_disk_does_not_keep(disk: Any, loses: bool) -> None:
-    assert Fault(at_s=1.0, what="reboot", detail="agent 1", agents=[1], disk=disk).loses_data == loses
+    assert FaultRecord(at_s=1.0, what="reboot", detail="agent 1", agents=[1], disk=disk).loses_data == loses

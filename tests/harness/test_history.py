@@ -9,7 +9,7 @@ from harness.archive import archive
 from harness.archive import history as told
 from harness.archive.archive import RunArchive
 from harness.archive.history import Message, Phase, Reconcile, Tie, Vote, ends_at, history_of
-from harness.archive.record import Fault
+from harness.archive.record import FaultRecord
 from harness.archive.replication import Replication, replication_of
 from harness.archive.traces import Header, Trace
 from harness.checker.uniform_chain import common_prefix
@@ -42,7 +42,7 @@ def played(name: str) -> Simulated:
     return simulate(load_scenario(SCENARIOS / f"{name}.yaml"), 1, tracing=True)
 
 
-def faults(simulated: Simulated) -> list[Fault]:
+def faults(simulated: Simulated) -> list[FaultRecord]:
     assert simulated.evidence.record is not None
     return simulated.evidence.record.faults
 
@@ -104,7 +104,7 @@ def test_what_a_loss_cuts_short_ends_with_it_and_the_rest_with_the_run() -> None
     proposed = a_run(5.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")])
     begun = [a_run(6.0, "reconcile_begin", "begun", trigger={"operator": "reconcile"}), a_run(6.0, "reconcile_phase_1")]
     traces = {1: a_trace(1, [proposed, *begun], [a_run(30.0, "process_next_deque_block", "proposed")])}
-    found = history_of(traces, [Fault(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
+    found = history_of(traces, [FaultRecord(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
     assert found.votes == [Vote(1, "aa", 5.0, 8.0, told.CUT_SHORT), Vote(1, "", 30.0, 50.0, told.CUT_SHORT)]
     phases = [Phase("phase 1", 6.0, 8.0, 1)]
     assert found.reconciles == [Reconcile(1, 6.0, 8.0, "asked by the operator", phases, done=False)]
@@ -113,7 +113,7 @@ def test_what_a_loss_cuts_short_ends_with_it_and_the_rest_with_the_run() -> None
 def test_what_an_agent_still_did_while_it_was_killed_ends_at_its_next_life_at_the_latest() -> None:
     proposed = [a_run(at_s, "process_next_deque_block", "proposed") for at_s in (8.2, 30.0)]
     traces = {1: a_trace(1, [proposed[0]], [proposed[1]])}
-    found = history_of(traces, [Fault(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
+    found = history_of(traces, [FaultRecord(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
     assert [(vote.start_s, vote.end_s) for vote in found.votes] == [(8.2, 30.0), (30.0, 50.0)]
 
 
@@ -208,7 +208,8 @@ def test_what_is_on_a_lost_disk_is_no_copy_any_more(disk: Any, copies: list[int]
     first, again = changes(1.0, "complete aa", "chain+ aa"), changes(9.0, "chain+ aa")
     traces = {1: a_trace(1, [first], [again]), 2: a_trace(2, [changes(1.0, "chain+ aa")])}
     downs = [
-        Fault(at_s=at_s, what=what, detail="", agents=[1], disk=disk) for at_s, what in ((5.0, "reboot"), (7.0, "boot"))
+        FaultRecord(at_s=at_s, what=what, detail="", agents=[1], disk=disk)
+        for at_s, what in ((5.0, "reboot"), (7.0, "boot"))
     ]
     found = replication_of(traces, downs)
     assert [[one for one in found if one.at_s <= at_s][-1].copies_min for at_s in (1.0, 5.0, 7.0, 9.0)] == copies

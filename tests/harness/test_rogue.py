@@ -7,7 +7,7 @@ import pytest
 
 from harness.play.rogue import journal
 from harness.play.rogue.crafted import corrupted, random_message
-from harness.play.rogue.rogue import Injected, Rogue
+from harness.play.rogue.rogue import Rogue, RogueDatagram
 from harness.play.rogue.sequences import forged_sequence, injection_of
 from harness.scenario.injection import MAX_FLOOD, MODELS
 from ucp.block import Block, next_chain_hash
@@ -37,17 +37,17 @@ def rogue() -> Rogue:
     return Rogue(ROSTER, seed=1)
 
 
-def begin(one: Rogue, what: str, now: float = 100.0, number: int = 1, **keys: Any) -> list[Injected]:
+def begin(one: Rogue, what: str, now: float = 100.0, number: int = 1, **keys: Any) -> list[RogueDatagram]:
     one.begin(number, MODELS[what].model_validate(keys), now)
     return one.to_send()
 
 
-def hears(one: Rogue, datagram: bytes, now: float) -> list[Injected]:
+def hears(one: Rogue, datagram: bytes, now: float) -> list[RogueDatagram]:
     one.hears(datagram, now)
     return one.to_send()
 
 
-def wait(one: Rogue, until: float) -> list[tuple[float, Injected]]:
+def wait(one: Rogue, until: float) -> list[tuple[float, RogueDatagram]]:
     """What it sends when."""
     sent = []
     while (at := one.next_timer()) is not None and at <= until:
@@ -56,7 +56,7 @@ def wait(one: Rogue, until: float) -> list[tuple[float, Injected]]:
     return sent
 
 
-def said(injected: Injected) -> Message:
+def said(injected: RogueDatagram) -> Message:
     return decode(injected.datagram)[2]
 
 
@@ -193,7 +193,7 @@ def test_the_journal_has_a_line_for_each_datagram_and_counts_a_flood(monkeypatch
     lines: list[dict[str, Any]] = []
     book = journal.Journal(lines.append)
     for at_s, datagram in ((1.0, COMMIT), (1.1, COMMIT[:-1]), (2.1, COMMIT), (2.9, COMMIT[:5]), (3.0, COMMIT)):
-        book.add(Injected(1, "replay", 1, datagram), at_s)
+        book.add(RogueDatagram(1, "replay", 1, datagram), at_s)
     book.close()
     assert [line.get("message", line.get("refused")) for line in lines[:2]] == ["Commit Block", "wrong length"]
     assert lines[0]["block"] == BLOCK.block_hash.hex()

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
 
-from harness.archive.record import Fault, NetworkState
+from harness.archive.record import FaultRecord, NetworkState
 from harness.checker.evidence import Condition, Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.scenario.changes import NO_MORE_FATES, RANGE
@@ -51,7 +51,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                 yield of_agent(of_all, f"{name} goes from {earlier:g} s back to {later:g} s")
 
 
-def _change(entry: NetworkState | Fault | Condition, fated_until: float) -> Change:
+def _change(entry: NetworkState | FaultRecord | Condition, fated_until: float) -> Change:
     connected = None if entry.at_s < fated_until else entry.fully_connected
     if isinstance(entry, NetworkState):
         return entry.at_s, entry.what, entry.detail, connected, (), None

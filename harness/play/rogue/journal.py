@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from harness.play.rogue.rogue import Injected
+from harness.play.rogue.rogue import RogueDatagram
 
 LINES = 2000
 
@@ -20,7 +20,7 @@ class Journal:
         self._counted: dict[int, dict[str, Any]] = {}
         """The line of each injection that is not written yet."""
 
-    def add(self, injected: Injected, at_s: float) -> None:
+    def add(self, injected: RogueDatagram, at_s: float) -> None:
         number, record = injected.injection, injected.to_json(at_s)
         self._lines[number] += 1
         if self._lines[number] <= LINES:

@@ -43,7 +43,7 @@ FLOODED_AT_ONCE = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Injected:
+class RogueDatagram:
     """One datagram of the rogue: `what` it is, of the injection with this number, under the address of `source`."""
 
     injection: int
@@ -86,8 +86,8 @@ class Rogue:
         self._top_chain_hash: bytes | None = None
         self._votes_name_chain = False
         self._windows: list[_Window] = []
-        self._waiting: list[tuple[float, int, Injected]] = []
-        self._outbox: list[Injected] = []
+        self._waiting: list[tuple[float, int, RogueDatagram]] = []
+        self._outbox: list[RogueDatagram] = []
         self._made = 0
 
     def hears(self, datagram: bytes, now: float) -> None:
@@ -130,7 +130,7 @@ class Rogue:
             if isinstance(window.injection, Flood):
                 self._flood(window, window.injection, now)
 
-    def to_send(self) -> list[Injected]:
+    def to_send(self) -> list[RogueDatagram]:
         """What to send now, in order; empties the outbox."""
         outbox, self._outbox = self._outbox, []
         return outbox
@@ -146,10 +146,10 @@ class Rogue:
             return
         elif isinstance(injection, Duplicate):
             for _ in range(injection.copies):
-                self._send(Injected(window.number, "duplicate", sender, datagram))
+                self._send(RogueDatagram(window.number, "duplicate", sender, datagram))
         elif isinstance(injection, Corrupt):
             changed = crafted.corrupted(datagram, injection.bits, self._rng)
-            self._send(Injected(window.number, "corrupt", sender, changed))
+            self._send(RogueDatagram(window.number, "corrupt", sender, changed))
         elif (
             isinstance(injection, DelayedCopy)
             and now < window.until - injection.by_s
@@ -157,7 +157,7 @@ class Rogue:
         ):
             self.sent[window.number] += 1
             self._made += 1
-            copy = Injected(window.number, "delay", sender, datagram)
+            copy = RogueDatagram(window.number, "delay", sender, datagram)
             heappush(self._waiting, (now + injection.by_s, self._made, copy))
 
     def _answer(self, forge: Forge, question: Message) -> Message | None:
@@ -177,7 +177,7 @@ class Rogue:
         matching = ((sender, data) for sender, name, data in reversed(self._heard) if replay.matches(name, sender))
         last = [heard for heard, _ in zip(matching, range(replay.count), strict=False)]
         for sender, data in reversed(last):
-            self._send(Injected(number, "replay", sender, data))
+            self._send(RogueDatagram(number, "replay", sender, data))
 
     def _forge_commit(self, number: int, forge: Forge, now: float) -> None:
         if self._top_chain_hash is None:
@@ -201,9 +201,9 @@ class Rogue:
 
     def _forge(self, number: int, what: str, sender: int, message: Any) -> None:
         sequence = forged_sequence(number, self.sent[number])
-        self._send(Injected(number, what, sender, crafted.datagram(sender, sequence, message)))
+        self._send(RogueDatagram(number, what, sender, crafted.datagram(sender, sequence, message)))
 
-    def _send(self, injected: Injected) -> None:
+    def _send(self, injected: RogueDatagram) -> None:
         self.sent[injected.injection] += 1
         self._outbox.append(injected)
 
