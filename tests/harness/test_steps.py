@@ -15,12 +15,14 @@ from harness.checker import Evidence, steps
 from harness.checker.judgement import Judgement
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
-from ucp.agent import HANDLERS, ON_LOCAL_EVENT
+from ucp.agent import HANDLERS, ON_LOCAL_EVENT, Agent
+from ucp.block import Block
 from ucp.core import Core
 from ucp.handler import EventHandler
 from ucp.messages import TYPE_CODES
 from ucp.quirks import QUIRKS, Quirk
-from ucp.trace import Dropped, HandlerRun, Recorded
+from ucp.store import StoredState
+from ucp.trace import SCHEMA, Dropped, HandlerRun, Recorded, in_base64
 
 LOSSY = {"network": {"loss": 0.25}, "duration_s": 600}
 
@@ -262,6 +264,21 @@ def test_an_agent_that_holds_what_nobody_can_know_is_followed_no_further(honest:
         "after trace line 5 agent 1 cannot be followed: no record has the data of block abababababab"
         in judgement.reason
     )
+
+
+def test_an_agent_that_goes_on_wrongly_from_a_broken_reconcile_is_followed_all_the_same() -> None:
+    agent = Agent(1, [1, 2], b"mission")
+    stack = [Block(1, 5, b"below"), Block(1, 6, b"above")]
+    agent.boot(StoredState(completed=[block.block_hash for block in stack], stack=stack), 0.0)
+    agent.handle_timer(1.0)
+    header = {"schema": SCHEMA, "agent_id": 1, "roster": [1, 2], "initial_data": in_base64(b"mission"), "clock": {}}
+    trace = Trace(Header.model_validate({**header, "settings": dataclasses.asdict(agent.state.settings)}))
+    trace.extend(agent.trace())
+    trace.runs[0].branch = "done"
+    judgement = steps.check(Evidence({}, {1: trace}))
+    assert judgement.reason.startswith(f"1 of {len(trace.runs)} handler runs differ")
+    (finding,) = judgement.evidence
+    assert "it took the branch 'done'; it should have taken 'recommitted, more to come'" in finding.detail
 
 
 def left_out(good: Any, core: Core, *inputs: object, branch: str) -> str:

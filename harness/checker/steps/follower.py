@@ -21,7 +21,7 @@ COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counte
 """Branches that begin a tally, count in it, or choose from it; after others it may be what it likes."""
 
 TOUCH_A_TIMER = frozenset(("receive_response_block_for_hash",))
-"""Handlers of messages of whose steps it takes more than the changes to undo them."""
+"""Other handlers of messages commit, send, count and trigger: their changes tell what it takes to undo their steps."""
 
 Paused = Callable[[float, float], bool]
 """Whether the agent stood still at any time between two mission seconds."""
@@ -36,6 +36,15 @@ class Tells(NamedTuple):
 
     tallying: frozenset[str]
     timers: bool
+
+
+class AnotherHandlerError(NotHandledError):
+    """The run is another handler's than `handler`, for which the input is."""
+
+    def __init__(self, run: HandlerRun, handler: EventHandler[Any]) -> None:
+        super().__init__(
+            f"ran as Algorithm {run.algorithm}; what came is for Algorithm {handler.algorithm}, {handler.name}"
+        )
 
 
 class Follower:
@@ -61,7 +70,7 @@ class Follower:
         """No timer of the reference's ends sooner, by the agent's clock."""
         self._top, self._top_hex = b"", ""
         self._state: StateSummary | None = None
-        """What the agent said last of what it holds."""
+        """What the agent said last of itself, while the reference is still in this state."""
 
     def follow(self, line: int, run: HandlerRun) -> None:
         """See where this run, or what should have come before it, differs from the reference."""
@@ -79,7 +88,8 @@ class Follower:
                 self._overdue(line, run.t, now)
         self._ran[run.handler] = line, run.t
         heard = "message" in trigger
-        before = None if heard and run.handler not in TOUCH_A_TIMER else core.before(run)
+        may_touch_timers = not heard or run.handler in TOUCH_A_TIMER
+        before = core.before(run) if may_touch_timers else None
         try:
             if heard:
                 handler, sender, message = self._message(run, trigger)
@@ -97,8 +107,9 @@ class Follower:
             self._began = True
             if core.started:
                 self._none_ends_before = min(self._none_ends_before, self._soonest_end())
-            if not self._differs(run, handler, branch):
-                core.step_is_over()
+            if not self._differs(run, handler, branch, may_touch_timers):
+                if core.changes or core.outbox or core.started:
+                    core.step_is_over()
                 return
             expected = self._expected(run, handler, branch)
             deviation = Deviation(self._mission.agent_id, line, run.t, run.handler, run=run, expected=expected)
@@ -119,6 +130,7 @@ class Follower:
 
     def _triggered(self, line: int, run: HandlerRun, local: int | str | None) -> None:
         """Handlers run that were triggered, and no others."""
+        self._state = None
         triggered = self._core.triggered
         if self._adopted:
             triggered.clear()
@@ -157,6 +169,7 @@ class Follower:
 
     def _overdue(self, line: int, at_s: float, now: float) -> None:
         """Timers that ended long ago, and whose handlers have not run."""
+        self._state = None
         late = now - self._mission.late_s
         for timer in self._core.timers:
             if timer.deadline is not None and timer.deadline < late:
@@ -189,7 +202,8 @@ class Follower:
             handler, inputs = ON_LOCAL_EVENT["Reconcile Finalize"], ()
         else:
             raise NotHandledError("ran without a trigger that there is")
-        _must_be(run, handler)
+        if handler.name != run.handler or handler.algorithm != run.algorithm:
+            raise AnotherHandlerError(run, handler)
         return handler, inputs
 
     def _local(self, run: HandlerRun) -> EventHandler[Any]:
@@ -216,7 +230,8 @@ class Follower:
                 f"and the datagram is {message.NAME} {sequence} from agent {sender}"
             )
         handler = ON_MESSAGE[type(message)]
-        _must_be(run, handler)
+        if handler.name != run.handler or handler.algorithm != run.algorithm:
+            raise AnotherHandlerError(run, handler)
         return handler, sender, message
 
     def _timer(self, name: str, now: float) -> EventHandler[Any]:
@@ -268,7 +283,7 @@ class Follower:
 
     # Whether it is as it should be
 
-    def _differs(self, run: HandlerRun, handler: EventHandler[Any], branch: str) -> bool:
+    def _differs(self, run: HandlerRun, handler: EventHandler[Any], branch: str, may_touch_timers: bool) -> bool:
         core = self._core
         if run.branch != branch or run.changes != core.changes:
             return True
@@ -278,17 +293,17 @@ class Follower:
             return True
         if branch in COUNTING and run.handler in self._tells.tallying and run.tally != tally_of(core, handler):
             return True
-        state, reconciling, idle = run.state, core.reconcile_in_progress, core.idle
-        if state is self._state and not run.changes:  # the lengths and the top are what they were
-            return state.reconciling != reconciling or state.idle != idle
+        state = run.state
+        if state is self._state and not (may_touch_timers or run.changes or core.triggered):
+            return state.reconciling != core.reconcile_in_progress
         self._state = state
         return (
             state.top != self._top_in_hex()
             or state.chain != len(core.chain)
             or state.deque != len(core.blocks_to_be_committed)
             or state.stack != len(core.reconcile_stack)
-            or state.reconciling != reconciling
-            or state.idle != idle
+            or state.reconciling != core.reconcile_in_progress
+            or state.idle != core.idle
         )
 
     def _top_in_hex(self) -> str:
@@ -327,11 +342,3 @@ class Follower:
 
     def _differ(self, line: int, at_s: float, handler: str, what: str) -> None:
         self.deviations.append(Deviation(self._mission.agent_id, line, at_s, handler, what))
-
-
-def _must_be(run: HandlerRun, handler: EventHandler[Any]) -> None:
-    """Raises NotHandledError if the run is another handler's."""
-    if handler.name != run.handler or handler.algorithm != run.algorithm:
-        raise NotHandledError(
-            f"ran as Algorithm {run.algorithm}; what came is for Algorithm {handler.algorithm}, {handler.name}"
-        )

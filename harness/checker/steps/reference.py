@@ -23,7 +23,7 @@ from ucp.trace import HandlerRun, Sent
 class Before(NamedTuple):
     """Of the state before a step what its changes do not tell."""
 
-    stack: list[Block] | None
+    stack: list[Block]
     current_block: bytes | None
     """Only of a step that logs an event."""
     phase_three_ends: float | None
@@ -42,11 +42,12 @@ class ReferenceCore(Core):
         self._moved[block_hash] = block
         self.changes.append((operation, block_hash))
 
-    def before(self, run: HandlerRun) -> Before:
-        """What `undo` needs to take back the step that the run is compared with."""
-        stack = list(self.reconcile_stack) if self.reconcile_stack else None
-        current_block = bytes(self.current_block) if run.handler == "build_data_block" else None
-        return Before(stack, current_block, self.phase_three_timer.deadline)
+    def before(self, run: HandlerRun) -> Before | None:
+        """What `undo` needs to take back the step that the run is compared with; None if its changes are all."""
+        logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline
+        if not (logs or self.reconcile_stack or phase_three_ends is not None):
+            return None
+        return Before(list(self.reconcile_stack), bytes(self.current_block) if logs else None, phase_three_ends)
 
     def step_is_over(self) -> None:
         """What has come of it is not wanted any more."""
@@ -93,7 +94,7 @@ class ReferenceCore(Core):
     def undo(self, before: Before | None) -> None:
         """Take back what the step did to blocks and timers; what it tallied, `adopt` overrides.
 
-        `before` is None of a step that can have done nothing that its changes do not tell.
+        `before` is None of a step whose changes tell all of it.
         """
         for operation, block_hash in reversed(self.changes):
             match operation:
@@ -109,11 +110,13 @@ class ReferenceCore(Core):
                     self.blocks_to_be_committed.appendleft(self._moved[block_hash])
                 case "stack+":
                     self.reconcile_stack.pop()
+                case "stack-":
+                    self.reconcile_stack.append(self._moved[block_hash])
         for timer in self.timers:
             if timer.name in self.started:
                 timer.stop()
         if before is not None:
-            self.reconcile_stack[:] = before.stack or ()
+            self.reconcile_stack[:] = before.stack
             if before.current_block is not None:
                 self.current_block[:] = before.current_block
             self.phase_three_timer.deadline = before.phase_three_ends
