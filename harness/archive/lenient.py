@@ -21,7 +21,10 @@ MAX_MISFITS = 20_000
 MAX_NAME = 80
 UNKNOWN = "extra_forbidden"
 HALF_A_CHARACTER = "string_unicode"
+MISSING = "missing"
+OF_A_MODEL = "model_type"
 """Error types of pydantic."""
+NOT_AN_OBJECT = "input should be an object"
 
 
 @dataclass(frozen=True)
@@ -52,31 +55,41 @@ def fit(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[Misfi
             if error.error_count() > MAX_MISFITS:
                 raise ValueError(f"{error.error_count()} things are wrong with it") from None
             errors = error.errors(include_url=False, include_context=False, include_input=False)
-        for misfit in _by_key(errors):
+        for misfit in _by_key(document, errors):
             misfits.setdefault(misfit.key, misfit)
-        _take_out([place for problem in errors if not _mended(place := _place(document, problem["loc"]), problem)])
+        places = [(problem, _place(document, problem["loc"])[0]) for problem in errors]
+        _take_out([place for problem, place in places if not _mended(place, problem)])
     return model(), list(misfits.values())
 
 
-def _by_key(errors: Sequence[ErrorDetails]) -> Iterator[Misfit]:
-    by_key: dict[str, list[ErrorDetails]] = {}
+def _by_key(document: dict[str, Any], errors: Sequence[ErrorDetails]) -> Iterator[Misfit]:
+    by_key: dict[str, dict[str, str]] = {}
     for problem in errors:
         if problem["type"] not in (UNKNOWN, HALF_A_CHARACTER):
-            by_key.setdefault(str(problem["loc"][0]), []).append(problem)
-    for key, (first, *others) in by_key.items():
-        where = ".".join(str(step)[:MAX_NAME] for step in first["loc"])
-        yield Misfit(key, where, first["msg"].lower(), len(others))
+            _, steps = _place(document, problem["loc"])
+            steps += problem["loc"][-1:] if problem["type"] == MISSING else ()
+            where = ".".join(str(step)[:MAX_NAME] for step in steps)
+            what = NOT_AN_OBJECT if problem["type"] == OF_A_MODEL else problem["msg"].lower()
+            by_key.setdefault(str(problem["loc"][0]), {}).setdefault(where, what)
+    for key, wrong in by_key.items():
+        where, what = next(iter(wrong.items()))
+        yield Misfit(key, where, what, len(wrong) - 1)
 
 
-def _place(document: dict[str, Any], loc: Sequence[int | str]) -> Place:
-    """The innermost part on the way to an error; steps that the document does not have say which type was tried."""
+def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, list[int | str]]:
+    """The innermost part on the way to an error, and the way there.
+
+    Steps that the document does not have say which type was tried.
+    """
     place: Place = document, loc[0]
     here: Any = document
+    way = []
     for step in loc:
         in_list = isinstance(here, list) and isinstance(step, int) and step < len(here)
         if in_list or (isinstance(here, dict) and step in here):
             place, here = (here, step), here[step]
-    return place
+            way.append(step)
+    return place, way
 
 
 def _mended(place: Place, problem: ErrorDetails) -> bool:

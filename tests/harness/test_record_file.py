@@ -70,13 +70,19 @@ def test_of_what_is_wrong_the_smallest_part_is_left_out_and_told(
 ) -> None:
     before, file = read_record(whole / "run.json").record, edited(whole, tmp_path, change)
     (problem,) = file.problems
-    assert problem.startswith(f"{tmp_path / 'run.json'}: `{where}")
+    assert problem.startswith(f"{tmp_path / 'run.json'}: `{where}` is wrong: ")
     assert problem.endswith("; it was edited or damaged")
     assert (file.judged is not None) == judged
     assert file.record.roster == before.roster
     assert file.record.characteristics == before.characteristics
     assert file.record.agents.keys() == before.agents.keys()
     assert file.record.scenario is not None
+
+
+def test_an_entry_that_lacks_a_key_is_left_out(whole: Path, tmp_path: Path) -> None:
+    file = edited(whole, tmp_path, lambda record: record["agents"]["1"].pop("outcome"))
+    assert [*file.record.agents] == ["2", "3"]
+    assert "`agents.1.outcome` is wrong: field required; " in file.problems[0]
 
 
 def test_what_is_wrong_in_many_places_is_one_sentence_for_each_key(whole: Path, tmp_path: Path) -> None:
