@@ -21,7 +21,7 @@ from ucp.quirks import QUIRKS
 __all__ = ["BEGIN", "END", "NOTHING", "PAGE", "findings_of", "main", "row", "rows_of"]
 
 PAGE = Path(__file__).parent / "WRONG_AGENTS.md"
-SEEDS = range(1, 17)
+SEEDS = range(1, 101)
 NOTHING = "**nothing**"
 HEADER = (
     f"| quirk | Algorithm | what the agent does wrong | found by, in so many of {len(SEEDS)} seeds | seeds | minutes | "
