@@ -14,8 +14,8 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
+from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.checker.steps.inputs import Blocks, decoded
-from harness.checker.steps.mission import ImpossibleMissionError, Mission, mission_of
 from ucp.agent import HANDLERS, ON_MESSAGE, why_not_handled
 from ucp.messages import MalformedDatagramError
 from ucp.trace import Dropped
@@ -33,14 +33,14 @@ def check(evidence: Evidence) -> Judgement:
             unjudged[agent_id] = "the trace is of ucp-trace/1, which lacks what the agent received"
             continue
         try:
-            mission = mission_of(trace.header)
-        except ImpossibleMissionError as error:
+            header = checked(trace.header)
+        except ImpossibleHeaderError as error:
             deviations.append(Deviation(agent_id, 1, 0.0, None, str(error)))
             continue
-        followers = _followers(evidence, trace, mission, blocks)
+        followers = _followers(evidence, trace, header, blocks)
         _follow(evidence, agent_id, trace, followers)
         deviations += [deviation for follower in followers for deviation in follower.deviations]
-        deviations += _wrongly_dropped(trace, mission)
+        deviations += _wrongly_dropped(trace, header)
         lost += [follower.lost for follower in followers if follower.lost]
         steps += len(trace.runs)
     if deviations:
@@ -62,15 +62,15 @@ def _why(unjudged: dict[int, str]) -> str:
     return "; ".join(f"of {agents(ids)} {why}" for why, ids in by_reason.items())
 
 
-def _followers(evidence: Evidence, trace: Trace, mission: Mission, blocks: Blocks) -> list[Follower]:
+def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: Blocks) -> list[Follower]:
     """One for each life."""
 
     def was_paused(since: float, until: float) -> bool:
-        return evidence.was_paused(mission.agent_id, since, until)
+        return evidence.was_paused(header.agent_id, since, until)
 
     tallying = frozenset(run.handler for run in trace.runs if run.tally is not None)
     tells = Tells(tallying, timers=any(run.started for run in trace.runs))
-    return [Follower(mission, tells, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
+    return [Follower(header, tells, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
 
 
 def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> None:
@@ -82,7 +82,7 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Fol
         followers[-1].end(evidence.ended_at_s)
 
 
-def _wrongly_dropped(trace: Trace, mission: Mission) -> Iterator[Deviation]:
+def _wrongly_dropped(trace: Trace, header: CheckedHeader) -> Iterator[Deviation]:
     """Datagrams that a handler should have been given."""
     for line, aside in trace.numbered_asides():
         if not isinstance(aside, Dropped):
@@ -91,9 +91,9 @@ def _wrongly_dropped(trace: Trace, mission: Mission) -> Iterator[Deviation]:
             sender, _, message = decoded(aside.datagram)
         except MalformedDatagramError:
             continue
-        if why_not_handled(mission.agent_id, mission.roster, sender, message) is None:
+        if why_not_handled(header.agent_id, header.roster, sender, message) is None:
             what = f"it was not given a {message.NAME} of agent {sender}, which was dropped as {aside.dropped[:60]!r}"
-            yield Deviation(mission.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
+            yield Deviation(header.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
 
 
 def _deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:

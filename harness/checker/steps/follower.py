@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.header import CheckedHeader
 from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, stored_blocks
-from harness.checker.steps.mission import Mission
 from harness.checker.steps.reference import Before, ReferenceCore
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of, why_not_handled
 from ucp.block import Block
@@ -50,16 +50,16 @@ class AnotherHandlerError(NotHandledError):
 class Follower:
     """Holds the handler runs of one life of an agent against what the reference does."""
 
-    def __init__(self, mission: Mission, tells: Tells, blocks: Blocks, was_paused: Paused) -> None:
+    def __init__(self, header: CheckedHeader, tells: Tells, blocks: Blocks, was_paused: Paused) -> None:
         self.deviations: list[Deviation] = []
         """Where it differs, in order."""
         self.lost: str | None = None
         """Why, and after which line, the agent cannot be followed any further."""
-        self._mission = mission
+        self._header = header
         self._tells = tells
         self._blocks = blocks
         self._was_paused = was_paused
-        self._core = ReferenceCore(mission.agent_id, mission.initial_data, mission.settings)
+        self._core = ReferenceCore(header.agent_id, header.initial_data, header.settings)
         self._timers = {timer.name: timer for timer in self._core.timers}
         self._ran: dict[str, tuple[int, float]] = {}
         """Handlers that have run since the last input: trace line, mission second."""
@@ -80,11 +80,11 @@ class Follower:
         local = trigger.get("local")
         if core.triggered or local is not None:
             self._triggered(line, run, local)
-        core.now = now = self._mission.local(run.t)
+        core.now = now = self._header.local(run.t)
         if local is None:
             self._ran.clear()
             self._adopted = False
-            if self._none_ends_before < now - self._mission.late_s:
+            if self._none_ends_before < now - self._header.late_s:
                 self._overdue(line, run.t, now)
         self._ran[run.handler] = line, run.t
         heard = "message" in trigger
@@ -112,7 +112,7 @@ class Follower:
                     core.step_is_over()
                 return
             expected = self._expected(run, handler, branch)
-            deviation = Deviation(self._mission.agent_id, line, run.t, run.handler, run=run, expected=expected)
+            deviation = Deviation(self._header.agent_id, line, run.t, run.handler, run=run, expected=expected)
             self.deviations.append(deviation)
         self._began = True
         self._adopt(line, run, before)
@@ -124,7 +124,7 @@ class Follower:
         self._not_run()
         if at_s is not None:
             line = max((line for line, _ in self._ran.values()), default=1)
-            self._overdue(line, at_s, self._mission.local(at_s))
+            self._overdue(line, at_s, self._header.local(at_s))
 
     # What should have come before
 
@@ -170,10 +170,10 @@ class Follower:
     def _overdue(self, line: int, at_s: float, now: float) -> None:
         """Timers that ended long ago, and whose handlers have not run."""
         self._state = None
-        late = now - self._mission.late_s
+        late = now - self._header.late_s
         for timer in self._core.timers:
             if timer.deadline is not None and timer.deadline < late:
-                ended_s = at_s - (now - timer.deadline) / self._mission.rate
+                ended_s = at_s - (now - timer.deadline) / self._header.rate
                 if not self._was_paused(ended_s, at_s):
                     what = f"it had not run by then, and the {timer.name} timer ended at t={ended_s:g} s"
                     self._differ(line, at_s, ON_TIMER[timer.name].name, what)
@@ -221,7 +221,7 @@ class Follower:
             raise NotHandledError(f"handled a datagram that is to be dropped: {malformed.reason}") from None
         if type(message) in CARRY_A_BLOCK:
             self._blocks.add_from(message)
-        if reason := why_not_handled(self._mission.agent_id, self._mission.roster, sender, message):
+        if reason := why_not_handled(self._header.agent_id, self._header.roster, sender, message):
             raise NotHandledError(f"handled a datagram that is to be dropped: {reason}")
         name, by, number = trigger["message"], trigger.get("from"), trigger.get("seq")
         if name != message.NAME or by != sender or number != sequence:
@@ -240,7 +240,7 @@ class Follower:
             raise NotHandledError(f"ran as the {name[:60]} timer ended, which was not running")
         early = timer.deadline - now
         timer.stop()
-        if early > self._mission.early_s:
+        if early > self._header.early_s:
             raise NotHandledError(f"ran {early:.3g} s before the {name} timer ended")
         return ON_TIMER[name]
 
@@ -251,7 +251,7 @@ class Follower:
             raise NotHandledError(f"logged what is no event: {malformed}") from None
         if event.event_id != event_id:
             raise NotHandledError(f"said to have logged event {event_id}, and what it logged is {event.event_id}")
-        if event.encoded_bytes > (largest := self._mission.settings.max_event_bytes):
+        if event.encoded_bytes > (largest := self._header.settings.max_event_bytes):
             raise NotHandledError(
                 f"logged an event of {event.encoded_bytes} bytes, more than max_event_bytes {largest}"
             )
@@ -337,8 +337,8 @@ class Follower:
             self._core.undo(before)
             self._core.adopt(run, self._blocks)
         except NotOnRecordError as error:
-            self.lost = f"after trace line {line} agent {self._mission.agent_id} cannot be followed: {error}"
+            self.lost = f"after trace line {line} agent {self._header.agent_id} cannot be followed: {error}"
         self._none_ends_before = self._soonest_end()
 
     def _differ(self, line: int, at_s: float, handler: str, what: str) -> None:
-        self.deviations.append(Deviation(self._mission.agent_id, line, at_s, handler, what))
+        self.deviations.append(Deviation(self._header.agent_id, line, at_s, handler, what))

@@ -17,12 +17,12 @@ ROUNDING_S = 2e-3
 _SETTINGS = {setting.name for setting in fields(Settings)}
 
 
-class ImpossibleMissionError(Exception):
+class ImpossibleHeaderError(Exception):
     """No agent can have these settings, or this clock: a sentence."""
 
 
 @dataclass(frozen=True)
-class Mission:
+class CheckedHeader:
     """`early_s` and `late_s` are how far from its end a timer may be handled, in mission seconds."""
 
     agent_id: int
@@ -39,17 +39,17 @@ class Mission:
         return self.offset_s + self.rate * mission_s
 
 
-def mission_of(header: Header) -> Mission:
-    """Raises ImpossibleMissionError."""
+def checked(header: Header) -> CheckedHeader:
+    """Raises ImpossibleHeaderError."""
     try:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
         settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
     except (ValueError, TypeError) as error:
-        raise ImpossibleMissionError(f"its trace begins with settings that cannot be: {error}") from None
+        raise ImpossibleHeaderError(f"its trace begins with settings that cannot be: {error}") from None
     speedup, drift = _clock(header, "speedup", 1.0), _clock(header, "drift", 0.0)
     if speedup <= 0 or drift <= -1:
-        raise ImpossibleMissionError("its trace begins with a clock that cannot be")
-    return Mission(
+        raise ImpossibleHeaderError("its trace begins with a clock that cannot be")
+    return CheckedHeader(
         header.agent_id,
         frozenset(header.roster),
         initial_data,
@@ -64,5 +64,5 @@ def mission_of(header: Header) -> Mission:
 def _clock(header: Header, key: str, default: float) -> float:
     value: Any = header.clock.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ImpossibleMissionError(f"its trace begins with a clock that cannot be: {key} {str(value)[:20]}")
+        raise ImpossibleHeaderError(f"its trace begins with a clock that cannot be: {key} {str(value)[:20]}")
     return float(value)
