@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -102,6 +103,7 @@ def test_what_an_agent_may_choose_or_suffer_is_no_finding(keys: dict[str, Any]) 
         ("early_phase3_expiry", "reconcile_phase_3", "started the phase three timer for 0 s; it should have started"),
         ("stale_chain_hash", "receive_response_block_for_hash", "it had the top chain hash "),
         ("commit_whatever_the_vote", "vote_timer_expiration", "it should have taken 'not approved'"),
+        ("forget_own_vote", "process_next_deque_block", "it counted yes 0, no 0; it should have counted yes 1, no 0"),
         ("hide_commits", "vote_timer_expiration", "it sent nothing; it should have sent Commit Block about block "),
         ("approve_everything", "receive_request_add_block", "saying approve True"),
         ("commit_without_succession", "receive_commit_block", "it should have taken 'does not succeed'"),
@@ -122,7 +124,7 @@ def test_one_mistake_is_one_finding(honest: Evidence) -> None:
         first_run(runs, "receive_request_add_block", "approve").branch = "disapprove"
 
     judgement = steps.check(edited(honest, 2, disapprove_once))
-    assert judgement.reason.startswith("1 of ")
+    assert judgement.reason.startswith("1 difference in ")
     (finding,) = judgement.evidence
     assert finding.agent_id == 2
     assert "it took the branch 'disapprove'; it should have taken 'approve'" in finding.detail
@@ -136,7 +138,7 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
     )
     judgement = simulated.result.beside["steps"]
     assert ignored > 1
-    assert judgement.reason.startswith(f"{ignored} of ")
+    assert judgement.reason.startswith(f"{ignored} differences in ")
     assert {finding.handler for finding in judgement.evidence} == {"receive_commit_block"}
 
 
@@ -276,7 +278,7 @@ def test_an_agent_that_goes_on_wrongly_from_a_broken_reconcile_is_followed_all_t
     trace.extend(agent.trace())
     trace.runs[0].branch = "done"
     judgement = steps.check(Evidence({}, {1: trace}))
-    assert judgement.reason.startswith(f"1 of {len(trace.runs)} handler runs differ")
+    assert judgement.reason.startswith(f"1 difference in {len(trace.runs)} handler runs")
     (finding,) = judgement.evidence
     assert "it took the branch 'done'; it should have taken 'recommitted, more to come'" in finding.detail
 
@@ -339,3 +341,19 @@ def test_whatever_a_handler_leaves_out_or_does_twice_is_found_and_named(
         assert judgement.verdict == "deviates", quirk.name
         assert judgement.evidence[0].handler == handler.name, (quirk.name, judgement.evidence[0].detail)
     assert different
+
+
+def test_handlers_that_there_are_not_are_counted_together_however_many_names_they_have(honest: Evidence) -> None:
+    def rename(runs: list[HandlerRun]) -> None:
+        for number, run in enumerate(runs):
+            run.handler = f"handler_{number}" * 20
+
+    judgement = steps.check(edited(honest, 3, rename))
+    assert judgement.verdict == "deviates"
+    assert len(judgement.reason) < 500
+    assert {finding.handler for finding in judgement.evidence} <= {None, *HANDLERS}
+
+
+@pytest.mark.parametrize("moment", [math.nan, math.inf, -1e300, 1e300])
+def test_a_moment_that_cannot_be_is_no_traceback(honest: Evidence, moment: float) -> None:
+    steps.check(edited(honest, 2, lambda runs: setattr(runs[7], "t", moment)))

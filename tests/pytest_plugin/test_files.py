@@ -62,7 +62,7 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
             "*_ tie.yaml::sim-seed1 _*",
             "characteristic 1, distributed: violated: *",
             "    agent 1: *a reconcile did not go on within*",
-            "steps: deviates: 1 of *",
+            "steps: deviates: 1 difference in *",
             "    agent 1: *Algorithm 15, reconcile_phase_2_timer_expiration: it took the branch 'crashed by *",
             "liveness: never finishes: agent 1 hangs since 42 s: not idle, and no timer runs that would end that",
             "report: *",

@@ -8,6 +8,7 @@ compared again from its own state, so that one mistake is one finding.
 
 from collections import Counter
 from collections.abc import Iterator
+from itertools import islice
 
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
@@ -100,21 +101,26 @@ def _deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost:
     deviations.sort(key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
     first_of: dict[tuple[int, str | None], Deviation] = {}
     for deviation in deviations:
-        first_of.setdefault((deviation.agent_id, deviation.handler), deviation)
-    counts = Counter((deviation.agent_id, deviation.handler) for deviation in deviations)
+        first_of.setdefault((deviation.agent_id, _known(deviation)), deviation)
+    counts = Counter((deviation.agent_id, _known(deviation)) for deviation in deviations)
     findings = []
-    for (agent_id, handler), deviation in first_of.items():
+    for (agent_id, handler), deviation in islice(first_of.items(), MAX_EVIDENCE):
         more = counts[agent_id, handler] - 1
         again = f"; {times(more)} more later" if more else ""
         findings.append(Finding(agent_id, f"{deviation.sentence(evidence.name)}{again}", handler=handler))
-    by_handler = Counter(deviation.handler for deviation in deviations).most_common()
-    reason = f"{len(deviations)} of {steps} handler runs differ, the first in {_title(deviations[0].handler)}"
+    by_handler = Counter(map(_known, deviations)).most_common()
+    differences = f"{len(deviations)} difference{'s' if len(deviations) > 1 else ''} in {steps} handler runs"
+    reason = f"{differences}, the first in {_title(_known(deviations[0]))}"
     if len(by_handler) > 1:
         reason += f"; by handler: {', '.join(f'{_title(handler)} {count}' for handler, count in by_handler)}"
-    return Judgement(NAME, "deviates", "; ".join([reason, *lost]), findings[:MAX_EVIDENCE])
+    return Judgement(NAME, "deviates", "; ".join([reason, *lost[:MAX_EVIDENCE]]), findings)
+
+
+def _known(deviation: Deviation) -> str | None:
+    """Whose it is, if it is one of the 20's: a record may name any other."""
+    return deviation.handler if deviation.handler in HANDLERS else None
 
 
 def _title(handler: str | None) -> str:
     """ "Algorithm 5, vote_timer_expiration"."""
-    known = HANDLERS.get(handler or "")
-    return f"Algorithm {known.algorithm}, {known.name}" if known else "what is no handler"
+    return f"Algorithm {HANDLERS[handler].algorithm}, {handler}" if handler else "what is no handler of the protocol"
