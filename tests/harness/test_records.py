@@ -345,3 +345,37 @@ def test_of_a_run_that_was_broken_off_nothing_tells_how_long_its_traces_should_b
     assert {key for key, judgement in result.judgements.items() if judgement.kind == "good"} <= {"4", "5", "6"}
     assert "the run did not come to its end" in result.beside["records"].reason
     assert "the run did not come to its end" in result.beside["steps"].reason
+
+
+@pytest.mark.parametrize(
+    ("passed", "lost", "sentence"),
+    [
+        (0, 0, None),
+        (-1000, 1000, "and the kernel let 0 through to its vehicle"),
+        (-20, 0, "and on the way to its vehicle the kernel counted"),
+    ],
+)
+def test_the_kernel_counted_what_was_sent_and_heard(
+    tmp_path: Path, passed: int, lost: int, sentence: str | None
+) -> None:
+    asked = scenario(agents=3, duration_s=200, events={"source": "random", "mean_s": 5})
+    directory = run(asked, 1, tmp_path / "run", Silent(), backend="sim").directory
+    sent = {agent: sum(len(step.get("sent", ())) for step in lines(trace(directory, agent))) for agent in (1, 2, 3)}
+
+    def count(document: Document) -> None:
+        """As a run of processes has it, with so many more or fewer for agent 2."""
+        others = {agent: sum(sent.values()) - sent[agent] for agent in sent}
+        receivers = {str(agent): {"passed": others[agent], "lost": 0, "cut": 0} for agent in sent}
+        receivers["2"] |= {"passed": max(0, others[2] + passed), "lost": min(lost, others[2])}
+        document.update(engine="nftables", counters={"engine": "nftables", "receivers": receivers})
+
+    edit(directory / "run.json", count)
+    result = judged(directory)
+    if sentence is None:
+        assert result.beside["records"].verdict == "agree"
+    else:
+        assert sentence in said(result)
+
+
+def lines(path: Path) -> list[Document]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
