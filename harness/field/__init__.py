@@ -1,0 +1,1 @@
+"""What came home from a real flight: sorted, stepped through, and played again."""
