@@ -1,47 +1,110 @@
-"""The command line: puts the commands together.
+"""The command line: which commands there are; each is imported when it is called.
 
 Exit status 0: ran, and no characteristic is violated. 1: at least one is violated, or an agent failed. 2: the request
 was wrong. 3: this machine cannot do it. 130: interrupted.
 """
 
 import sys
-from typing import NoReturn
+from importlib import import_module
+from importlib.metadata import version
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 
-from harness.commands import sitl
-from harness.commands.chain import chain_command
-from harness.commands.check import check_command
-from harness.commands.clean import clean_command
-from harness.commands.diff import diff_command
-from harness.commands.doctor import doctor_command
-from harness.commands.explore import explore_command
-from harness.commands.matrix import matrix_command
-from harness.commands.packets import packets_command
-from harness.commands.report import report_command
-from harness.commands.run import run_command
-from harness.commands.scale import scale_command
-from harness.commands.terminal import complain
 from harness.errors import HarnessError
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Test harness for the Uniform Chain Protocol.",
-)
-app.command("run")(run_command)
-app.command("check")(check_command)
-app.command("report")(report_command)
-app.command("diff")(diff_command)
-app.command("chain")(chain_command)
-app.command("packets")(packets_command)
-app.command("matrix")(matrix_command)
-app.command("explore")(explore_command)
-app.command("scale")(scale_command)
-app.command("clean")(clean_command)
-app.command("doctor")(doctor_command)
-app.add_typer(sitl.app, name="sitl")
+COMMANDS = {
+    "run": (
+        "harness.commands.run:run_command",
+        "Play a scenario, check the six characteristics, write a report.",
+    ),
+    "check": (
+        "harness.commands.check:check_command",
+        "Decide the six characteristics from exported chains, and from traces beside them.",
+    ),
+    "report": (
+        "harness.commands.report:report_command",
+        "Write report.html, report.md, junit.xml and chains.svg again, also of a run that was killed half-way.",
+    ),
+    "diff": (
+        "harness.commands.diff:diff_command",
+        "Say where two runs part: exit status 0 if they do not, 1 if they do.",
+    ),
+    "chain": (
+        "harness.commands.chain:chain_command",
+        "Print each agent's chain, block by block; or put what the vehicles logged on a map.",
+    ),
+    "packets": (
+        "harness.commands.packets:packets_command",
+        "Print each datagram, who received it and who lost it, and what was answered to it, from a run's captures.",
+    ),
+    "matrix": (
+        "harness.commands.matrix:matrix_command",
+        "Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated.",
+    ),
+    "explore": (
+        "harness.commands.explore:explore_command",
+        "Play seed after seed in virtual time until a characteristic is violated; then find the smallest such run.",
+    ),
+    "scale": (
+        "harness.commands.scale:scale_command",
+        "Fit how messages, bytes and time grow with agents and blocks, in the simulation; by default about 4 minutes.",
+    ),
+    "clean": (
+        "harness.commands.clean:clean_command",
+        "Remove the containers of runs on Docker that are over; those of a run that goes on, and all others, stay.",
+    ),
+    "doctor": (
+        "harness.commands.doctor:doctor_command",
+        "Say what this machine can do, and what would let it do more; with --measure, whether it does as asked.",
+    ),
+    "sitl": (
+        "harness.commands.sitl:app",
+        "Install ArduPilot's SITL binaries, and say which there are.",
+    ),
+}
+"""Where each is, and what it does: the first line of its own help."""
+
+
+class Commands(TyperGroup):
+    """All commands, of which only the one that is called is there in full."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] in COMMANDS:
+            self.add_command(loaded(args[0]), args[0])
+        return super().resolve_command(ctx, args)
+
+
+def loaded(name: str) -> Any:
+    """The command in full, or the group of commands."""
+    module, _, attribute = COMMANDS[name][0].partition(":")
+    command = getattr(import_module(module), attribute)
+    if not isinstance(command, typer.Typer):
+        alone = typer.Typer(add_completion=False)
+        alone.command(name)(command)
+        command = alone
+    return typer.main.get_command(command)
+
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, pretty_exceptions_enable=False)
+for _name, (_, _summary) in COMMANDS.items():
+    app.command(_name, help=_summary)(lambda: None)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        sys.stdout.write(f"ucp-harness {version('ucp-harness')}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _harness(
+    of_itself: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Say which version this is.")
+    ] = False,
+) -> None:
+    """Test harness for the Uniform Chain Protocol."""
 
 
 def main() -> NoReturn:
@@ -49,6 +112,8 @@ def main() -> NoReturn:
     try:
         app()
     except HarnessError as error:
+        from harness.commands.terminal import complain
+
         complain(str(error))
         sys.exit(error.exit_status)
     sys.exit(0)

@@ -42,7 +42,7 @@ def packets_command(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The same as JSON on standard output.")] = False,
 ) -> None:
-    """Print each datagram, who received it and who lost it, and what was answered to it, from the captures of a run."""
+    """Print each datagram, who received it and who lost it, and what was answered to it, from a run's captures."""
     selection = Selection(sender, receiver, message, between)
     captures = read_captures(capture_files(paths))
     if captures.used:
