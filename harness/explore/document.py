@@ -140,6 +140,8 @@ def with_agents(document: Document, kept: Collection[int]) -> Document:
     document = with_key(document, "schedule", [schedule for schedule in schedules if schedule])
     flights = [_of(flight, ("vehicles",), kept) for flight in document.get("flight", [])]
     document = with_key(document, "flight", [flight for flight in flights if flight["vehicles"]])
+    quirks = {name: _of_kept(value, kept) for name, value in document.get("quirks", {}).items()}
+    document = with_key(document, "quirks", {name: value for name, value in quirks.items() if value is not None})
     for key in ("clocks", "vehicles.types"):
         named = at(document, key) or {}
         document = with_key(document, key, {name: value for name, value in named.items() if int(name) in kept})
@@ -188,6 +190,14 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
     faults = [kind.what for kind in ASKED_FOR]
     entry = _of(entry, faults, kept)
     return entry if all(entry.get(fault) != [] for fault in faults) else None
+
+
+def _of_kept(quirk: Any, kept: Collection[int]) -> Any:
+    """A quirk of all agents, or of those that are left; None if none of its agents is."""
+    if not isinstance(quirk, dict):
+        return quirk
+    quirk = _of(quirk, ("agents",), kept)
+    return quirk if quirk["agents"] else None
 
 
 def _of(entry: Document, keys: Collection[str], kept: Collection[int]) -> Document:

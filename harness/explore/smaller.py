@@ -125,7 +125,8 @@ def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
 
 
 def _fewer_of_each(shrinker: Shrinker) -> None:
-    for key in ("timeline", "schedule", "events.script", "fates", "network.links"):
+    wrong = [f"quirks.{name}.agents" for name in shrinker.best.get("quirks", {})]
+    for key in ("timeline", "schedule", "events.script", "fates", "network.links", *wrong):
         document = shrinker.best
         if at(document, key):
             shrinker.fewest(at(document, key), lambda kept, d=document, k=key: with_key(d, k, list(kept)))  # type: ignore[misc]

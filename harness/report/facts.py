@@ -4,6 +4,7 @@ from harness.archive.exports import Exports
 from harness.archive.record import RunRecord
 from harness.play.backends import in_virtual_time
 from harness.present import words
+from harness.scenario.quirks import in_words
 
 FIGURES = {
     "blocks": "blocks completed",
@@ -34,6 +35,7 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
         parts.append(f"{words.duration(scenario.duration_s)} mission")
         if isinstance(scenario.network.loss, float):
             parts.append(f"{words.percent(scenario.network.loss)} loss")
+        parts += in_words(scenario.quirks)
         if not in_virtual_time(record.backend):
             parts.append(f"speedup {words.value(scenario.speedup)}")
     played = {"seed": record.seed, "backend": record.backend, "engine": record.engine}

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from pydantic import Field, WithJsonSchema, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from harness.scenario.docker import Docker
 from harness.scenario.events import Events
@@ -16,6 +16,8 @@ from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.flight import Flight
 from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
+from harness.scenario.quirks import AskedQuirks, OfSome, of_agent
+from harness.scenario.quirks import check as check_quirks
 from harness.scenario.schedule import NEEDED, Schedule
 from harness.scenario.states import Step, refuse_ambiguity, steps
 from harness.scenario.timeline import TimelineEntry
@@ -24,7 +26,7 @@ from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError
 from sitl.plan import PlanError
 from ucp.block import MAX_AGENT_ID
-from ucp.quirks import QUIRKS, check_quirk
+from ucp.quirks import Quirks, in_force
 from ucp.settings import Settings
 
 
@@ -39,15 +41,6 @@ class Clock(Model):
 
     offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     drift: Annotated[float, Field(gt=-0.5, le=1.0)] = 0.0
-
-
-def _schema_of_quirks() -> dict[str, Any]:
-    probability, flag = {"type": "number", "minimum": 0, "maximum": 1}, {"type": "boolean"}
-    known = {
-        name: {"description": quirk.sentence, **(probability if quirk.chance else flag)}
-        for name, quirk in QUIRKS.items()
-    }
-    return {"type": "object", "properties": known, "additionalProperties": False}
 
 
 class Scenario(Model):
@@ -68,8 +61,8 @@ class Scenario(Model):
     """Any program that follows ucp/CONTRACT.md, with its arguments; the mission file's name is added."""
     docker: Docker = Docker()
     settings: Settings = Settings()
-    quirks: Annotated[dict[str, bool | float], WithJsonSchema(_schema_of_quirks())] = {}
-    """Mistakes that all agents make (`ucp.quirks`)."""
+    quirks: AskedQuirks = {}
+    """Mistakes that all agents make, or those that are named (`ucp.quirks`)."""
     clocks: dict[VehicleKey, Clock] = {}
     fates: Annotated[list[Fate], Field(max_length=100_000)] = []
     settle: Settle = Settle()
@@ -96,6 +89,15 @@ class Scenario(Model):
     def on_the_air(self) -> tuple[int, ...]:
         """The vehicles, and the rogue node if there is one."""
         return self.roster if self.rogue is None else (*self.roster, self.rogue)
+
+    def quirks_of(self, agent_id: int) -> Quirks:
+        """Mistakes that this agent is asked to make."""
+        return of_agent(self.quirks, agent_id)
+
+    @property
+    def has_wrong_agents(self) -> bool:
+        """Whether any agent is wrong on purpose."""
+        return any(in_force(self.quirks_of(agent_id)) for agent_id in self.roster)
 
     def flight_of(self, vehicle: int) -> Flight | None:
         """The flight that names this vehicle, if one does."""
@@ -144,8 +146,7 @@ class Scenario(Model):
     @classmethod
     def _known_quirks(cls, quirks: Any) -> Any:
         if isinstance(quirks, dict):
-            for name, value in quirks.items():
-                check_quirk(str(name), value)
+            check_quirks(quirks)
         return quirks
 
     @model_validator(mode="after")
@@ -167,6 +168,10 @@ class Scenario(Model):
         yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named())
         yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
         yield from (("clocks", vehicle) for vehicle in self.clocks)
+        for name, asked in self.quirks.items():
+            yield from (
+                (f"quirks.{name}.agents", agent) for agent in (asked.agents if isinstance(asked, OfSome) else ())
+            )
         yield from (("vehicles.types", vehicle) for vehicle in self.vehicles.types)
         for index, flight in enumerate(self.flight):
             yield from ((f"flight.{index}.vehicles", vehicle) for vehicle in flight.vehicles)

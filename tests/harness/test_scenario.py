@@ -99,6 +99,17 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nquirks: {hide_commits: 1}", "hide_commits is true or false, not 1"),
         ("name: x\nquirks: {hide_commit: true}", "unknown quirk 'hide_commit': of the"),
         ("name: x\nquirks: {5: true}", "unknown quirk '5'"),
+        (
+            "name: x\nquirks: {crash_on_tie: {agents: [9]}}",
+            "quirks.crash_on_tie.agents names vehicle 9, which does not",
+        ),
+        ("name: x\nquirks: {crash_on_tie: {agents: []}}", "at least 1 item"),
+        ("name: x\nquirks: {crash_on_tie: {agents: [1], value: 1}}", "crash_on_tie is true or false, not 1"),
+        ("name: x\nquirks: {ignore_commit: {agents: [1]}}", "ignore_commit is a probability 0..1, not True"),
+        (
+            "name: x\nquirks: {crash_on_tie: {agents: [1], valu: false}}",
+            "`quirks.crash_on_tie.valu` is unknown: there are agents, value",
+        ),
         ("name: x\nvehicles: {kind: boat}", "it should be 'ardupilot', 'embedded' or 'none'"),
         ("name: x\nvehicles: {home: [100, 0, 0, 0]}", "latitude -90..90"),
         ("name: [x", "not YAML at line 1"),

@@ -161,6 +161,20 @@ def test_a_wrong_agent_hears_what_cannot_matter_to_a_right_one(quirk: str) -> No
     assert digest(simulate(off, 1, tracing=True)) == digest(simulate(right, 1, tracing=True))
 
 
+def test_a_quirk_of_some_agents_is_theirs_alone() -> None:
+    """Who is not named is right, and so is everybody where nobody is left who is wrong."""
+    some = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [2, 3]}})
+    assert some.quirks_of(2) == {"vote_while_reconciling": True} and some.quirks_of(1) == {}
+    steps = simulate(some, 1, tracing=True).result.beside["steps"]
+    assert steps.verdict == "deviates" and {finding.agent_id for finding in steps.evidence} <= {2, 3}
+    everybody = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [1, 2, 3, 4, 5]}})
+    alike = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": True})
+    assert digest(simulate(everybody, 1, tracing=True)) == digest(simulate(alike, 1, tracing=True))
+    nobody = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [2], "value": False}})
+    right = scenario(network={"loss": 0.2})
+    assert digest(simulate(nobody, 1, tracing=True)) == digest(simulate(right, 1, tracing=True))
+
+
 def test_nor_where_flight_makes_the_network() -> None:
     one = load_scenario(SCENARIOS / "split_rejoin.yaml")
     needed, all_ = simulate(one, 1, tracing=True), simulate(one, 1, tracing=True, deliver_all=True)

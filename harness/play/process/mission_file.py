@@ -44,7 +44,7 @@ def mission_file(
             "vehicle_port": AGENT_PORT,
         },
         "settings": dataclasses.asdict(scenario.settings),
-        "quirks": {**NO_QUIRKS, **scenario.quirks},
+        "quirks": {**NO_QUIRKS, **scenario.quirks_of(agent_id)},
         "seed": agent_seed(seed, agent_id, life),
         "speedup": scenario.speedup,
         "epoch_us": epoch_us,

@@ -30,7 +30,7 @@ from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
 from ucp.messages import datagram_bytes
-from ucp.quirks import in_force, wrong_handlers
+from ucp.quirks import wrong_handlers
 from ucp.store import StoredState
 from ucp.trace import Entry, HandlerRun, Recorded
 
@@ -117,9 +117,9 @@ class BlockNames:
 class Simulation:
     """A swarm in virtual time; see `harness.play.mission.Swarm`. Agents are numbered in the roster's order.
 
-    `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. Agents with
-    quirks always hear everything: what cannot matter to the right agent may matter to a wrong one. `breathe` is awaited
-    every few mission seconds. `fate_script` makes what plays the scenario's fates, and `air` what carries
+    `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. Where anybody
+    has quirks all hear everything: what cannot matter to the right agent may matter to a wrong one. `breathe` is
+    awaited every few mission seconds. `fate_script` makes what plays the scenario's fates, and `air` what carries
     messages.
     """
 
@@ -143,7 +143,7 @@ class Simulation:
         self._initial_data = f"{scenario.name}, seed {seed}".encode()
         self._recorder = recorder
         self._tracing = recorder.tracing
-        self._deliver_all = deliver_all = deliver_all or bool(in_force(scenario.quirks))
+        self._deliver_all = deliver_all = deliver_all or scenario.has_wrong_agents
         self._breathe = breathe
         self._now = 0.0
         self._generating = True
@@ -256,7 +256,7 @@ class Simulation:
         """None while there is more to come than agents themselves do, or lots decide what becomes of them."""
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
-        wrong = in_force(self.scenario.quirks)
+        wrong = self.scenario.has_wrong_agents
         if self._generating or moving or self._rogue is not None or wrong or delays is None:
             return None
         return Recurrence(delays)
@@ -490,7 +490,7 @@ class Simulation:
             self.roster,
             self._initial_data,
             scenario.settings,
-            handlers=wrong_handlers(scenario.quirks, Random(seed)),
+            handlers=wrong_handlers(scenario.quirks_of(agent_id), Random(seed)),
             tracing=self._tracing,
         )
         source = RandomEvents(Random(seed), scenario.events.mean_s)

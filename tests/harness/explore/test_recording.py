@@ -54,6 +54,14 @@ def test_agents_that_are_left_out_fly_no_more() -> None:
     assert scenario_of(with_agents(document_of(asked), [1])).flight_of(3) is None
 
 
+def test_agents_that_are_left_out_take_their_quirks_along() -> None:
+    asked = scenario(agents=4, quirks={"crash_on_tie": {"agents": [2, 3]}, "hide_commits": True})
+    fewer = scenario_of(with_agents(document_of(asked), [1, 3]))
+    assert fewer.quirks_of(3) == {"crash_on_tie": True, "hide_commits": True}
+    assert fewer.quirks_of(1) == {"hide_commits": True}
+    assert "crash_on_tie" not in scenario_of(with_agents(document_of(asked), [1, 4])).quirks
+
+
 def test_a_recording_names_what_was_lost() -> None:
     asked = scenario(
         agents=[1, 2],
