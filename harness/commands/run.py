@@ -17,8 +17,6 @@ from harness.errors import HarnessError, ScenarioError
 from harness.machine.kernel import Kernel, run_inside
 from harness.play import progress
 from harness.play.backends import BACKENDS
-from harness.play.process.vehicle import system_ids
-from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.report.capture import gaps
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
@@ -88,6 +86,8 @@ def run_command(
 
 def _emit_compose(console: Console, scenario: Scenario, seed: int, file: Path) -> None:
     from harness.play.containers.compose import write_compose
+    from harness.play.process.vehicle import system_ids
+    from harness.play.process.vehicle_kinds import choose_vehicles
 
     beside = write_compose(scenario, seed, choose_vehicles(scenario), system_ids(scenario.roster), file)
     console.print(f"{file} and {beside}: docker compose -f {file} up", highlight=False, soft_wrap=True)

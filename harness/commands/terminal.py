@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 from rich.console import Console, RenderableType
@@ -16,9 +16,11 @@ from rich.text import Text
 from harness import checker
 from harness.archive.record import RogueInjection, Survival
 from harness.checker import injections, survival
-from harness.matrix.record import MatrixRecord
-from harness.scale.record import ScaleRecord
 from harness.scenario.verdicts import CHARACTERISTICS, Kind
+
+if TYPE_CHECKING:
+    from harness.matrix.record import MatrixRecord
+    from harness.scale.record import ScaleRecord
 
 STYLES: dict[Kind, str] = {"good": "green", "bad": "bold red", "unknown": "yellow"}
 MARKS: dict[Kind, str] = {"good": "✔", "bad": "✘", "unknown": "-"}
@@ -53,7 +55,7 @@ def show_rogue(console: Console, injected: list[RogueInjection]) -> None:
         console.print(injections.in_words(injection), highlight=False, soft_wrap=True)
 
 
-def end_sweep(record: MatrixRecord | ScaleRecord, table: RenderableType | None, picture: Path) -> NoReturn:
+def end_sweep(record: "MatrixRecord | ScaleRecord", table: RenderableType | None, picture: Path) -> NoReturn:
     """Show what came out, as JSON if there is no table, and exit."""
     if table is None:
         print_json(record.to_json())

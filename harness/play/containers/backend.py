@@ -4,14 +4,15 @@ The docker SDK takes its time to import, which who plays no containers need not 
 """
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
-from harness.play.process.lab import MissionLab
-from harness.play.process.preflight import refuse_what_programs_cannot
 from harness.play.process.processes import Processes
 from harness.scenario import Scenario
+
+if TYPE_CHECKING:
+    from harness.play.process.lab import MissionLab
 
 
 class Containers(Processes):
@@ -20,6 +21,7 @@ class Containers(Processes):
 
     def refuse(self, scenario: Scenario) -> None:
         from harness.play.containers.preflight import refuse_what_docker_cannot
+        from harness.play.process.preflight import refuse_what_programs_cannot
 
         refuse_what_programs_cannot(scenario)
         refuse_what_docker_cannot(scenario)
@@ -30,7 +32,7 @@ class Containers(Processes):
             return list(scenario.agent_command)  # a program in the image
         return super().agent_command(scenario)
 
-    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> MissionLab:
+    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "MissionLab":
         from harness.play.containers.lab import ContainerLab
 
         return await ContainerLab.open(scenario, rundir, say)

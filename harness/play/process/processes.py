@@ -1,39 +1,46 @@
-"""The backend of processes: vehicles and agents as programs of this machine, in a private network."""
+"""The backend of processes: vehicles and agents as programs of this machine, in a private network.
+
+What builds networks and flies vehicles takes its time to import, which who plays in virtual time need not wait for.
+"""
 
 import asyncio
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from datetime import UTC, datetime
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
 from harness.play.backend import Backend
 from harness.play.mission import Swarm
-from harness.play.process import agent
-from harness.play.process.backend import ProcessRun
-from harness.play.process.lab import MissionLab
-from harness.play.process.preflight import network_needs, refuse_what_programs_cannot
-from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.play.progress import Progress
 from harness.scenario import Scenario
-from netem.lab import Lab as ProcessLab
+
+if TYPE_CHECKING:
+    from harness.play.process.lab import MissionLab
 
 
 class Processes(Backend):
     name: ClassVar[BackendName] = "process"
 
     def refuse(self, scenario: Scenario) -> None:
+        from harness.play.process.preflight import refuse_what_programs_cannot
+
         refuse_what_programs_cannot(scenario)
         self.agent_command(scenario)
 
     def agent_command(self, scenario: Scenario) -> list[str]:
         """What starts an agent, but for the mission file. Raises HarnessError if nothing would."""
-        return agent.agent_command(scenario)
+        from harness.play.process.agent import agent_command
 
-    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> MissionLab:
+        return agent_command(scenario)
+
+    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "MissionLab":
         """What vehicles and agents live in; see `harness.play.process.lab.OpenLab`."""
-        return await ProcessLab.open(scenario.on_the_air, needs=network_needs(scenario), log=rundir.lab_log)
+        from harness.play.process.preflight import network_needs
+        from netem.lab import Lab
+
+        return await Lab.open(scenario.on_the_air, needs=network_needs(scenario), log=rundir.lab_log)
 
     def open(
         self,
@@ -45,6 +52,9 @@ class Processes(Backend):
         *,
         keeps_disks: bool = False,
     ) -> AbstractAsyncContextManager[Swarm]:
+        from harness.play.process.backend import ProcessRun
+        from harness.play.process.vehicle_kinds import choose_vehicles
+
         # Another run is another mission: its blocks must not be taken for this one's.
         initial_data = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
         return ProcessRun(

@@ -34,6 +34,10 @@ class VirtualCapture:
             ]
             self._open = opened.pop_all()
 
+    def air(self, *arguments: Any, deliver_all: bool) -> "CapturedAir":
+        """An air that is taken down."""
+        return CapturedAir(self, *arguments, deliver_all=deliver_all)
+
     def take_down(self, mission_s: float, number: int, frame: bytes, *, outbound: bool) -> None:
         """The vehicle with this number sends the frame, or it reaches that vehicle."""
         self._files[number].packet(round(mission_s * NANOSECONDS), frame, outbound=outbound)

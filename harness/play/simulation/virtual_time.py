@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
-from functools import partial
+from typing import TYPE_CHECKING
 
 from harness.archive.directory import RunDirectory
 from harness.errors import InterruptedRunError, MachineError, ScenarioError
@@ -12,9 +12,11 @@ from harness.play.control import Status
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.backend import Incarnation, Simulation
-from harness.play.simulation.captured_air import CapturedAir, VirtualCapture
 from harness.play.simulation.on_disk import OnDisk
 from harness.scenario import Scenario
+
+if TYPE_CHECKING:
+    from harness.play.simulation.captured_air import VirtualCapture
 
 
 class VirtualTime(Backend):
@@ -58,7 +60,7 @@ class VirtualTime(Backend):
 
         with closing(OnDisk(rundir)) as files:
             capture = _captures(rundir, scenario) if scenario.capture else None
-            air = partial(CapturedAir, capture) if capture else VirtualAir
+            air = capture.air if capture else VirtualAir
             simulation = Simulation(scenario, seed, files, breathe=breathe, air=air)
             try:
                 yield simulation
@@ -81,7 +83,9 @@ def _failure(error: OSError, rundir: RunDirectory) -> MachineError:
     return MachineError(f"{error.strerror}: {error.filename or rundir.path}")
 
 
-def _captures(rundir: RunDirectory, scenario: Scenario) -> VirtualCapture:
+def _captures(rundir: RunDirectory, scenario: Scenario) -> "VirtualCapture":
+    from harness.play.simulation.captured_air import VirtualCapture  # draws in what builds networks
+
     try:
         return VirtualCapture(rundir.capture(), scenario.roster)
     except OSError as error:
