@@ -39,6 +39,10 @@ COMMANDS = {
         "harness.commands.packets:packets_command",
         "Print each datagram, who received it and who lost it, and what was answered to it, from a run's captures.",
     ),
+    "mission": (
+        "harness.commands.mission:app",
+        "Make the mission files of a swarm, and compare those on its vehicles.",
+    ),
     "matrix": (
         "harness.commands.matrix:matrix_command",
         "Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated.",

@@ -1,11 +1,10 @@
 """The mission file: all that one agent is told before it starts (schema `ucp-mission/1`, see CONTRACT.md)."""
 
 import base64
-import binascii
 import dataclasses
 import ipaddress
 import json
-import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -74,7 +73,7 @@ def load_mission(path: Path) -> Mission:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise MissionError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise MissionError(f"{path}: not JSON: {error}") from None
     try:
         return parse_mission(document)
@@ -90,7 +89,7 @@ def parse_mission(document: Any) -> Mission:
         raise MissionError(f"`schema` is {document.get('schema')!r}, and this agent reads {SCHEMA!r}")
     agent_id = _integer(document, "agent_id", 1, MAX_AGENT_ID)
     roster = _get(document, "roster", list)
-    if not roster or not all(isinstance(member, int) and 1 <= member <= MAX_AGENT_ID for member in roster):
+    if not roster or not all(type(member) is int and 1 <= member <= MAX_AGENT_ID for member in roster):
         raise MissionError(f"`roster` must list agent IDs 1..{MAX_AGENT_ID}")
     if agent_id not in roster:
         raise MissionError(f"`agent_id` {agent_id} is not on the `roster`")
@@ -131,7 +130,7 @@ def _integer(document: dict[str, Any], key: str, low: int, high: int) -> int:
 
 def _positive(document: dict[str, Any], key: str) -> float:
     value = document.get(key)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < math.inf:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value <= sys.float_info.max:
         raise MissionError(f"`{key}` must be a number above 0, not {value!r}")
     return float(value)
 
@@ -139,14 +138,14 @@ def _positive(document: dict[str, Any], key: str) -> float:
 def _initial_data(document: dict[str, Any]) -> bytes:
     try:
         return base64.b64decode(_get(document, "initial_data", str), validate=True)
-    except binascii.Error as error:
+    except ValueError as error:
         raise MissionError(f"`initial_data` is not base64: {error}") from None
 
 
 def _network(document: dict[str, Any]) -> Network:
     for key in ("address", "broadcast"):
         try:
-            ipaddress.IPv4Address(document.get(key))
+            ipaddress.IPv4Address(str(document.get(key)))
         except ValueError:
             raise MissionError(f"`network.{key}` must be an IPv4 address, not {document.get(key)!r}") from None
     return Network(document["address"], document["broadcast"], _integer(document, "port", 1, 65535))

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from harness.archive.exports import Export
 from harness.archive.record import RunRecord
+from harness.depot.manifest import Manifest
 from harness.matrix import MatrixRecord
 from harness.packets.document import PacketsRecord
 from harness.scale import ScaleRecord
@@ -21,6 +22,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "scenario": Scenario,
     "ucp-chain-export-1": Export,
     "ucp-matrix-1": MatrixRecord,
+    "ucp-mission-manifest-1": Manifest,
     "ucp-packets-1": PacketsRecord,
     "ucp-run-1": RunRecord,
     "ucp-scale-1": ScaleRecord,

@@ -1,0 +1,164 @@
+"""`ucp-harness mission`: what every vehicle is given before it takes off, and whether all of them have it."""
+
+import ipaddress
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from harness.commands.terminal import complain, print_json, print_lines
+from harness.depot.mission_files import MissionFileError, Plan, write
+from harness.depot.same_mission import compare
+from harness.errors import WRONG_REQUEST
+from harness.scenario import Scenario, load_scenario
+from harness.scenario.load import parse
+from ucp.messages import PORT
+from ucp.quirks import in_force
+
+DIFFERENT = 1
+
+app = typer.Typer(no_args_is_help=True, help="Make the mission files of a swarm, and compare those on its vehicles.")
+
+
+@app.command("new")
+def new_command(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Directory for the files, one for each vehicle.")],
+    agents: Annotated[
+        str | None, typer.Option(help="The roster: a number of agents, or their IDs, as 10,28,32.")
+    ] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(help="A scenario whose name, roster, settings and events are taken.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="What the mission is called.")] = None,
+    initial_data: Annotated[
+        str | None,
+        typer.Option(help="BD_0, as text or @FILE; without it the mission's name and the time at which it was made."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--setting", help="KEY=VALUE of ucp/settings.py, as vote_timeout_s=8.")
+    ] = None,
+    events: Annotated[
+        list[str] | None,
+        typer.Option("--event", help="KEY=VALUE of the events, as source=random or log=mode,position."),
+    ] = None,
+    subnet: Annotated[
+        str | None, typer.Option(help="Vehicle 7 is its 7th address; without it 10.77.x.y, of 10.76.0.0/14.")
+    ] = None,
+    addresses: Annotated[
+        list[str] | None, typer.Option("--address", help="ID=ADDRESS of a vehicle that has another.")
+    ] = None,
+    broadcast: Annotated[str | None, typer.Option(help="Without it that of the subnet.")] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="UDP port.")] = PORT,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of these names.")] = False,
+) -> None:
+    """Write a mission file for each vehicle, all with one inception block, and a manifest of what they share."""
+    asked = _scenario(scenario, agents, name)
+    if in_force(asked.quirks):
+        complain(f"{scenario}: its quirks ({', '.join(in_force(asked.quirks))}) are left out: a mission asks for none")
+    plan = Plan(
+        asked,
+        _initial_data(initial_data, asked.name),
+        settings=_pairs("--setting", settings),
+        events=_events(_pairs("--event", events)),
+        subnet=_subnet(subnet),
+        addresses={_agent_id(key): value for key, value in _texts("--address", addresses).items()},
+        broadcast=broadcast,
+        port=port,
+    )
+    *files, manifest = write(plan, out, overwrite=overwrite)
+    print_lines([*map(str, files), str(manifest), compare([*files, manifest]).in_words()])
+
+
+@app.command("verify")
+def verify_command(
+    paths: Annotated[
+        list[Path], typer.Argument(help="Mission files, chain exports, traces, a manifest, or directories of them.")
+    ],
+    as_json: Annotated[bool, typer.Option("--json", help="The differences as JSON on standard output.")] = False,
+) -> None:
+    """Say whether all carry the same mission: exit status 0 if they do, 1 if they differ, 2 if nothing is usable."""
+    comparison = compare(paths)
+    if as_json:
+        print_json(comparison.to_json())
+    else:
+        print_lines(map(str, comparison.differences))
+        if comparison.verdict == "same":
+            print_lines([comparison.in_words()])
+    if comparison.verdict == "nothing usable":
+        complain("none of these files says of which mission it is: give mission files, chain exports or traces")
+        raise typer.Exit(WRONG_REQUEST)
+    if comparison.verdict == "differ":
+        raise typer.Exit(DIFFERENT)
+
+
+def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenario:
+    """What is asked for, as a scenario. Raises ScenarioError, MissionFileError."""
+    if path is None and agents is None:
+        raise MissionFileError("whose mission is it? Give the roster by --agents 10,28,32, or a --scenario")
+    if path is None:
+        return parse({"name": name or "mission", "agents": _roster(agents or "")})
+    asked = load_scenario(path)
+    roster = {} if agents is None else {"agents": _roster(agents)}
+    chosen = {"name": name or asked.name, "agents": list(asked.roster), **roster}
+    kept = {"settings": asked.settings, "events": asked.events, "quirks": asked.quirks}
+    return parse({**chosen, **kept})
+
+
+def _roster(text: str) -> int | list[int]:
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isascii() and part.isdecimal() and len(part) < 10 for part in parts):
+        raise MissionFileError(f"`--agents` is {text!r}: it should be a number of agents, or IDs as 10,28,32")
+    return int(parts[0]) if len(parts) == 1 else [int(part) for part in parts]
+
+
+def _initial_data(text: str | None, name: str) -> bytes:
+    if text is None:
+        return f"{name}, made {datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%fZ}".encode()
+    if not text.startswith("@"):
+        return text.encode(errors="surrogateescape")
+    try:
+        return Path(text[1:]).read_bytes()
+    except OSError as error:
+        raise MissionFileError(f"{text[1:]} cannot be read: {error.strerror}; name another file for the data") from None
+
+
+def _subnet(text: str | None) -> ipaddress.IPv4Network | None:
+    try:
+        return None if text is None else ipaddress.IPv4Network(text)
+    except ValueError as error:
+        raise MissionFileError(f"`--subnet` is {text!r}, not a network such as 10.1.0.0/16: {error}") from None
+
+
+def _agent_id(text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and len(text) < 10):
+        raise MissionFileError(f"`--address` names vehicle {text!r}: it should be an ID, as 7=10.1.0.7")
+    return int(text)
+
+
+def _texts(option: str, pairs: list[str] | None) -> dict[str, str]:
+    texts = {}
+    for pair in pairs or ():
+        key, equals, text = pair.partition("=")
+        if not equals or not key:
+            raise MissionFileError(f"`{option}` is {pair!r}: it should be KEY=VALUE")
+        texts[key] = text
+    return texts
+
+
+def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
+    """Values as JSON has them; whatever is no JSON is text."""
+    values: dict[str, Any] = {}
+    for key, text in _texts(option, pairs).items():
+        try:
+            values[key] = json.loads(text)
+        except (ValueError, RecursionError):
+            values[key] = text
+    return values
+
+
+def _events(values: dict[str, Any]) -> dict[str, Any]:
+    """Kinds of events need no brackets."""
+    log = values.get("log")
+    return {**values, "log": log.split(",")} if isinstance(log, str) else values
