@@ -31,6 +31,10 @@ COMMANDS = {
         "harness.commands.diff:diff_command",
         "Say where two runs part: exit status 0 if they do not, 1 if they do.",
     ),
+    "replay": (
+        "harness.commands.replay:replay_command",
+        "Feed what one agent saw into the reference core, step by step: exit status 1 if it did anything else.",
+    ),
     "chain": (
         "harness.commands.chain:chain_command",
         "Print each agent's chain, block by block; or put what the vehicles logged on a map.",

@@ -27,6 +27,10 @@ class RunDirectoryError(HarnessError):
     """The run directory cannot be written or read."""
 
 
+class FieldError(HarnessError):
+    """Nothing of what came home from the field can be used."""
+
+
 class MachineError(HarnessError):
     """This machine cannot do what was asked."""
 

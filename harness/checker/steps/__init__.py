@@ -7,7 +7,6 @@ compared again from its own state, so that one mistake is one finding.
 """
 
 from collections import Counter
-from collections.abc import Iterator
 from itertools import islice
 
 from harness.archive.traces import Trace
@@ -19,7 +18,7 @@ from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, c
 from harness.checker.steps.inputs import Blocks, decoded
 from ucp.agent import HANDLERS, ON_MESSAGE, why_not_handled
 from ucp.messages import MalformedDatagramError
-from ucp.trace import Dropped
+from ucp.trace import Commanded, Dropped
 
 NAME = "every step"
 
@@ -41,7 +40,9 @@ def check(evidence: Evidence) -> Judgement:
         followers = _followers(evidence, trace, header, blocks)
         _follow(evidence, agent_id, trace, followers)
         deviations += [deviation for follower in followers for deviation in follower.deviations]
-        deviations += _wrongly_dropped(trace, header)
+        for line, aside in trace.numbered_asides():
+            if (deviation := wrongly_dropped(header, line, aside)) is not None:
+                deviations.append(deviation)
         lost += [follower.lost for follower in followers if follower.lost]
         steps += len(trace.runs)
     if deviations:
@@ -69,8 +70,7 @@ def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: 
     def was_paused(since: float, until: float) -> bool:
         return evidence.was_paused(header.agent_id, since, until)
 
-    tallying = frozenset(run.handler for run in trace.runs if run.tally is not None)
-    tells = Tells(tallying, timers=any(run.started for run in trace.runs))
+    tells = Tells.of(trace)
     return [Follower(header, tells, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
 
 
@@ -83,18 +83,18 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Fol
         followers[-1].end(evidence.ended_at_s)
 
 
-def _wrongly_dropped(trace: Trace, header: CheckedHeader) -> Iterator[Deviation]:
-    """Datagrams that a handler should have been given."""
-    for line, aside in trace.numbered_asides():
-        if not isinstance(aside, Dropped):
-            continue
-        try:
-            sender, _, message = decoded(aside.datagram)
-        except MalformedDatagramError:
-            continue
-        if why_not_handled(header.agent_id, header.roster, sender, message) is None:
-            what = f"it was not given a {message.NAME} of agent {sender}, which was dropped as {aside.dropped[:60]!r}"
-            yield Deviation(header.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
+def wrongly_dropped(header: CheckedHeader, line: int, aside: Dropped | Commanded) -> Deviation | None:
+    """What is wrong with a line that is no handler run: a datagram was dropped, and should have been handled."""
+    if not isinstance(aside, Dropped):
+        return None
+    try:
+        sender, _, message = decoded(aside.datagram)
+    except MalformedDatagramError:
+        return None
+    if why_not_handled(header.agent_id, header.roster, sender, message) is not None:
+        return None
+    what = f"it was not given a {message.NAME} of agent {sender}, which was dropped as {aside.dropped[:60]!r}"
+    return Deviation(header.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
 
 
 def _deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:

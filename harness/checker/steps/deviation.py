@@ -33,11 +33,14 @@ class Deviation:
         """Where, by which handler, what it did and what it should have done."""
         known = HANDLERS.get(self.handler or "")
         handler = f"Algorithm {known.algorithm}, {known.name}: " if known else ""
-        where = f"trace line {self.line}, t={self.t:g} s: {handler}"
+        return f"trace line {self.line}, t={self.t:g} s: {handler}{self.difference(name)}"
+
+    def difference(self, name: NameOf) -> str:
+        """What it did and what it should have done."""
         if self.run is None or self.expected is None:
-            return where + self.what
+            return self.what
         did, should = zip(*differences(self.run, self.expected, name), strict=True)
-        return f"{where}it {_and(did)}; it should have {_and(should)}"
+        return f"it {_and(did)}; it should have {_and(should)}"
 
 
 def differences(run: HandlerRun, expected: HandlerRun, name: NameOf) -> Iterator[tuple[str, str]]:

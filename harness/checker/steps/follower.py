@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any, NamedTuple
 
+from harness.archive.traces import Trace
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.header import CheckedHeader
 from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, stored_blocks
@@ -13,6 +15,7 @@ from ucp.block import Block
 from ucp.events import MalformedEventsError
 from ucp.handler import EventHandler
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
+from ucp.state import AgentState
 from ucp.trace import HandlerRun, Recorded, StateSummary, Trigger
 
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
@@ -37,6 +40,11 @@ class Tells(NamedTuple):
     tallying: frozenset[str]
     timers: bool
 
+    @classmethod
+    def of(cls, trace: Trace) -> "Tells":
+        tallying = frozenset(run.handler for run in trace.runs if run.tally is not None)
+        return cls(tallying, timers=any(run.started for run in trace.runs))
+
 
 class AnotherHandlerError(NotHandledError):
     """The run is another handler's than `handler`, for which the input is."""
@@ -55,6 +63,8 @@ class Follower:
         """Where it differs, in order."""
         self.lost: str | None = None
         """Why, and after which line, the agent cannot be followed any further."""
+        self.stops_before_handler = False
+        """Call `breakpoint()` before each handler: whoever steps from there into `run` is in the handler."""
         self._header = header
         self._tells = tells
         self._blocks = blocks
@@ -94,10 +104,14 @@ class Follower:
             if heard:
                 handler, sender, message = self._message(run, trigger)
                 core.running = handler
+                if self.stops_before_handler:
+                    breakpoint()
                 branch = handler.run(core, sender, message)
             else:
                 handler, inputs = self._input(run, now)
                 core.running = handler
+                if self.stops_before_handler:
+                    breakpoint()
                 branch = handler.run(core, *inputs)
         except NotHandledError as error:
             self._differ(line, run.t, run.handler, f"it {error}")
@@ -116,6 +130,18 @@ class Follower:
             self.deviations.append(deviation)
         self._began = True
         self._adopt(line, run, before)
+
+    @property
+    def state(self) -> AgentState:
+        """What the agent holds, asks and counts by now; to look at."""
+        return self._core
+
+    def copy(self) -> "Follower":
+        """Another, which goes on from here by itself; what it has found by now is left out."""
+        keep = (self._header, self._tells, self._blocks, self._was_paused, self._state, *self._core.unchanging())
+        memo: dict[int, Any] = {id(kept): kept for kept in keep}
+        memo[id(self.deviations)] = []
+        return deepcopy(self, memo)
 
     def end(self, at_s: float | None) -> None:
         """See what should have come by the end of the run, at `at_s`, of an agent that was there to the end."""

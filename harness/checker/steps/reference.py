@@ -1,9 +1,10 @@
 """The reference core of the step judge: it can also be put into the state that an agent says it is in."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded
+from ucp.agent import HANDLERS
 from ucp.block import HASH_BYTES, Block
 from ucp.core import Core
 from ucp.messages import (
@@ -41,6 +42,11 @@ class ReferenceCore(Core):
         block_hash = block.block_hash.hex()
         self._moved[block_hash] = block
         self.changes.append((operation, block_hash))
+
+    def unchanging(self) -> Iterator[object]:
+        """What it refers to and never changes: a copy of it may refer to the same."""
+        yield from (self.settings, self.chain.inception, self._moved, *self._moved.values(), *HANDLERS.values())
+        yield from (message for _, message in self.outbox)
 
     def before(self, run: HandlerRun) -> Before | None:
         """What `undo` needs to take back the step that the run is compared with; None if its changes are all."""

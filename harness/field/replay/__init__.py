@@ -1,0 +1,15 @@
+"""An agent's record, fed into the reference core step by step, forward and back.
+
+record.py     what one agent's trace has to be played: its lines in order, and what lies beside it
+player.py     plays them, and goes back exactly
+places.py     places to stop at: a line, a handler, a block
+names.py      what blocks are called, from whatever record says it
+source.py     where a handler's code is
+summary.py    what came of a whole record, for people
+document.py   the same for programs
+"""
+
+from harness.field.replay.player import Player
+from harness.field.replay.record import Record, open_record
+
+__all__ = ["Player", "Record", "open_record"]

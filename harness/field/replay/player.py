@@ -1,0 +1,190 @@
+"""Plays a record: the reference core is given what the agent was given, forward and back, always the same.
+
+Going back is exact: it plays again, from a checkpoint shortly before.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+from harness.checker.steps import wrongly_dropped
+from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.follower import Follower, Tells
+from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded
+from harness.field.replay.record import Entry, Record
+from ucp.block import Block
+from ucp.messages import MalformedDatagramError
+from ucp.state import AgentState
+from ucp.trace import HandlerRun
+
+CHECKPOINT_STEPS = 1000
+"""Between two checkpoints. Going back plays half as many steps in the mean: some milliseconds."""
+
+
+@dataclass
+class Found:
+    """What has come of playing so far."""
+
+    steps: int = 0
+    """Handler runs that were held against the reference's."""
+    unjudged: int = 0
+    """Handler runs that could not be."""
+    lost: list[str] = field(default_factory=list)
+    """Why not: sentences."""
+    deviations: list[Deviation] = field(default_factory=list)
+
+    def copy(self) -> "Found":
+        return Found(self.steps, self.unjudged, list(self.lost), list(self.deviations))
+
+    @property
+    def first(self) -> Deviation | None:
+        """The difference that stands first in the record."""
+        return min(self.deviations, key=lambda deviation: deviation.line, default=None)
+
+
+@dataclass(frozen=True)
+class _Checkpoint:
+    follower: Follower
+    life: int
+    found: Found
+
+
+class Player:
+    """At `position` so many entries of the record have been played; `found` is what has come of these.
+
+    `until_s`: nothing later than this mission second is played.
+    """
+
+    def __init__(self, record: Record, until_s: float | None = None) -> None:
+        self.record = record
+        entries = record.entries
+        self.entries = entries if until_s is None else entries[: _later_than(entries, until_s)]
+        self.position = 0
+        self.found = Found()
+        self._tells = Tells.of(record.trace)
+        self._blocks = RecordedBlocks(record)
+        self._follower, self._life = self._born(), 1
+        self._checkpoints = {0: _Checkpoint(self._follower.copy(), 1, self.found.copy())}
+
+    @property
+    def state(self) -> AgentState:
+        """What the agent holds, asks and counts by now."""
+        return self._follower.state
+
+    @property
+    def lost(self) -> str | None:
+        """Why nobody knows what the agent holds now, if that is so."""
+        return self._follower.lost
+
+    @property
+    def entry(self) -> Entry | None:
+        """What was played last."""
+        return self.entries[self.position - 1] if self.position else None
+
+    @property
+    def at_end(self) -> bool:
+        return self.position == len(self.entries)
+
+    def deviations_here(self) -> list[Deviation]:
+        """Where the entry played last differs."""
+        line = self.entry.line if self.entry else 0
+        return [deviation for deviation in self.found.deviations if deviation.line == line]
+
+    def forward(self, *, into_debugger: bool = False) -> Entry:
+        """Play the next entry; `into_debugger` calls `breakpoint()` right before its handler runs."""
+        entry = self.entries[self.position]
+        if isinstance(entry.what, HandlerRun):
+            if entry.life != self._life:
+                self._follower, self._life = self._born(), entry.life
+            self._follower.stops_before_handler = into_debugger
+            try:
+                self._follow(entry, entry.what)
+            finally:
+                self._follower.stops_before_handler = False
+        elif (deviation := wrongly_dropped(self.record.header, entry.line, entry.what)) is not None:
+            self.found.deviations.append(deviation)
+        self.position += 1
+        if self.position % CHECKPOINT_STEPS == 0 and self.position not in self._checkpoints:
+            self._checkpoints[self.position] = _Checkpoint(self._follower.copy(), self._life, self.found.copy())
+        return entry
+
+    def to(self, position: int) -> None:
+        """Go there, forward or back."""
+        position = max(0, min(position, len(self.entries)))
+        if position < self.position:
+            nearest = max(known for known in self._checkpoints if known <= position)
+            checkpoint = self._checkpoints[nearest]
+            self._follower, self._life = checkpoint.follower.copy(), checkpoint.life
+            self.found, self.position = checkpoint.found.copy(), nearest
+        while self.position < position:
+            self.forward()
+
+    def to_end(self) -> Found:
+        """Play the rest; what has come of the whole record, also of what should have come after its last line."""
+        self.to(len(self.entries))
+        found = self.found.copy()
+        if len(self.entries) == len(self.record.entries) and (until_s := self.record.was_there_until_s) is not None:
+            follower = self._follower.copy()
+            follower.end(until_s)
+            found.deviations += follower.deviations
+        return found
+
+    def _follow(self, entry: Entry, run: HandlerRun) -> None:
+        follower, found = self._follower, self.found
+        if follower.lost is not None:
+            found.unjudged += 1
+            return
+        follower.follow(entry.line, run)
+        found.steps += 1
+        if follower.deviations:
+            found.deviations += follower.deviations
+            follower.deviations.clear()
+        if follower.lost is not None:
+            found.lost.append(follower.lost)
+
+    def _born(self) -> Follower:
+        return Follower(self.record.header, self._tells, self._blocks, self.record.was_paused)
+
+
+class RecordedBlocks(Blocks):
+    """Blocks by hash, wherever they are on record: what was played by now makes no difference."""
+
+    def __init__(self, record: Record) -> None:
+        super().__init__(())
+        self._record = record
+        self._looked = False
+
+    def get(self, block_hash: str) -> Block:
+        try:
+            return super().get(block_hash)
+        except NotOnRecordError:
+            if self._looked:
+                raise
+        self._looked = True
+        for block in self._everywhere():
+            self.add(block)
+        return super().get(block_hash)
+
+    def _everywhere(self) -> Iterator[Block]:
+        for export in self._record.beside.exports.values():
+            for exported in export.blocks():
+                yield Block(exported.agent_id, exported.timestamp_us, exported.event_bytes)
+        for trace in (self._record.trace, *self._record.beside.traces.values()):
+            for run in trace.runs:
+                datagrams = [run.input] if "message" in run.trigger else []
+                for datagram in (*datagrams, *(sent.datagram for sent in run.sent)):
+                    try:
+                        message = decoded(datagram).message
+                    except MalformedDatagramError:
+                        continue
+                    if (block := getattr(message, "block", None)) is not None:
+                        yield block
+
+
+def _later_than(entries: Iterable[Entry], until_s: float) -> int:
+    """How many entries stand before the first that is later."""
+    count = 0
+    for entry in entries:
+        if entry.what.t > until_s:
+            break
+        count += 1
+    return count

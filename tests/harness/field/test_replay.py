@@ -1,0 +1,148 @@
+"""A record played again: what it finds, that it goes back exactly, and what it makes of what is broken."""
+
+import json
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import FieldError
+from harness.field.replay import Player, open_record
+from harness.field.replay import player as player_module
+from harness.field.replay.names import Names
+from harness.field.replay.places import next_place, place
+from harness.field.replay.source import source_of
+from tests.harness.command import harness, sentences
+from tests.harness.field.flights import flown, trace_of
+from ucp.agent import HANDLERS
+from ucp.trace import HandlerRun
+
+REPOSITORY = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def right(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return flown(tmp_path_factory.mktemp("right") / "run")
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return flown(tmp_path_factory.mktemp("wrong") / "run", quirks={"stale_chain_hash": True}, duration_s=900)
+
+
+def held(player: Player) -> Any:
+    """All that the reference holds and has found, to compare."""
+    state = {name: value for name, value in vars(player.state).items() if "timer" not in name and name != "running"}
+    state["chain"] = (player.state.chain.top_chain_hash, list(player.state.chain))
+    state.pop("_moved")
+    timers = [(timer.name, timer.deadline, timer.active) for timer in player.state.timers]
+    return deepcopy(state), timers, player.found.copy()
+
+
+def test_what_a_right_agent_did_is_what_the_reference_does(right: Path) -> None:
+    for agent in (1, 2, 3):
+        ended = harness("replay", right, "--agent", agent)
+        assert ended.returncode == 0, ended.stdout
+        assert "✔ no difference: " in ended.stdout
+        assert sentences(ended.stderr) == []
+
+
+def test_the_first_difference_is_shown_with_its_handler_and_where_its_code_is(wrong: Path) -> None:
+    ended = harness("replay", trace_of(wrong, 2))
+    assert ended.returncode == 1
+    assert "the first:" in ended.stdout
+    assert "Algorithm 18, receive_response_block_for_hash (" in ended.stdout
+    assert "it had the top chain hash" in ended.stdout
+
+
+def test_programs_are_told_the_same(wrong: Path) -> None:
+    ended = harness("replay", wrong, "--agent", 2, "--json")
+    document = json.loads(ended.stdout)
+    assert (ended.returncode, document["verdict"], document["agent_id"]) == (1, "deviates", 2)
+    first = document["differences"][0]
+    assert (first["handler"], first["algorithm"]) == ("receive_response_block_for_hash", 18)
+    assert first["source"] == source_of("receive_response_block_for_hash")
+    assert document["steps"] + len(document["unjudged_because"]) > 100
+
+
+def test_every_handler_is_where_it_is_said_to_be() -> None:
+    for name in HANDLERS:
+        path, _, line = source_of(name).rpartition(":")
+        assert (Path.cwd() / path).read_text().splitlines()[int(line) - 1].startswith(f"def {name}(")
+
+
+@pytest.mark.parametrize("mission", ["right", "wrong"])
+def test_going_back_is_exact(mission: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(player_module, "CHECKPOINT_STEPS", 50)
+    record = open_record(request.getfixturevalue(mission), 2)
+    player = Player(record)
+    seen = [held(player)]
+    while not player.at_end:
+        player.forward()
+        seen.append(held(player))
+    last = len(seen) - 1
+    for position in (*range(last, max(last - 120, 0), -1), 0, last, last // 2, last // 2 - 1, 1):
+        player.to(position)
+        assert held(player) == seen[position], position
+
+
+def test_until_a_second_nothing_later_is_played(wrong: Path) -> None:
+    record = open_record(wrong, 2)
+    first = Player(record).to_end().first
+    assert first is not None
+    before = Player(record, first.t - 0.001)
+    assert before.to_end().deviations == []
+    assert before.entries[-1].what.t < first.t <= record.entries[len(before.entries)].what.t
+
+
+def test_places_are_lines_handlers_algorithms_and_blocks(right: Path) -> None:
+    record = open_record(right, 1)
+    player, names = Player(record), Names(record)
+    by_name = next_place(player, place("vote_timer_expiration", names))
+    assert by_name == next_place(player, place("A5", names))
+    assert by_name is not None
+    player.to(by_name)
+    assert isinstance(player.entry.what, HandlerRun) and player.entry.what.handler == "vote_timer_expiration"
+    assert next_place(player, place(str(player.entry.line), names)) is None
+    player.to(by_name + 1)
+    assert next_place(player, place("a5", names), backward=True) == by_name
+    player.to(0)
+    block = next(hash_ for run in record.trace.runs for operation, hash_ in run.changes if operation == "complete")
+    assert names.of(block) == "1.1"
+    assert next_place(player, place("1.1", names)) == next_place(player, place(block[:10], names)) is not None
+
+
+@pytest.mark.parametrize("words", ["vote_timer_expired", "A21", "", "0.0.0", "nothing at all"])
+def test_what_is_no_place_is_said_to_be_none(words: str, right: Path) -> None:
+    with pytest.raises(FieldError, match="is no place to stop at"):
+        place(words, Names(open_record(right, 1)))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("a.trace.jsonl", "", "not a trace"),
+        ("a.trace.jsonl", "no trace\n", "not a trace"),
+        ("a.chain.json", "{}", "not a trace"),
+        ("a.trace.jsonl", None, "cannot be read: No such file"),
+    ],
+)
+def test_what_cannot_be_played_is_one_sentence_and_status_2(
+    name: str, content: str | None, sentence: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    ended = harness("replay", tmp_path / name)
+    assert ended.returncode == 2
+    (said,) = sentences(ended.stderr)
+    assert sentence in said
+
+
+def test_whose_record_is_meant_has_to_be_said(right: Path) -> None:
+    ended = harness("replay", right)
+    assert (ended.returncode, sentences(ended.stderr)) == (
+        2,
+        [f"{right}: whose record is to be played? Choose with --agent: 1, 2, 3"],
+    )
+    assert harness("replay", right, "--agent", 9).returncode == 2
