@@ -3,7 +3,12 @@
 Two idle agents with different chains stay different, since only a vote or another's phase 2 query starts a reconcile.
 So a difference is a violation only where full connectivity is on record, and since then a completed reconcile of the
 differing agent that began after the others' chains had stopped changing. Else the characteristics do not apply.
+
+The system is whoever was there to the end: an agent that was switched off before tells nobody what it holds, and learns
+nothing. Where everybody was switched off it is all of them, and a chance only one that nobody missed.
 """
+
+import math
 
 from harness.checker import cycles
 from harness.checker.evidence import Evidence
@@ -31,10 +36,16 @@ def why_unknown(evidence: Evidence) -> str | None:
         return "there is no export to look at"
     if evidence.missing:
         return f"there is no export of {agents(evidence.missing)}"
-    busy = [agent_id for agent_id, export in evidence.exports.items() if not export.idle]
+    busy = [agent_id for agent_id, export in evidence.present.items() if not export.idle]
+    if set(busy) & set(evidence.switched_off):
+        return f"{agents(busy)} {'was' if len(busy) == 1 else 'were'} switched off before {_idle(busy)}"
     if busy:
         return f"{agents(busy)} {'was' if len(busy) == 1 else 'were'} not idle at the end"
     return None
+
+
+def _idle(ids: list[int]) -> str:
+    return "it was idle" if len(ids) == 1 else "they were idle"
 
 
 def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
@@ -67,18 +78,33 @@ def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
     if changed.get(peer, 0.0) > since:
         since, when = changed[peer], f"the chain of agent {peer} changed last"
     proposed = [run.t for run in evidence.traces[agent_id].runs if run.branch == "proposed" and run.t >= since]
-    sentence = f"agent {agent_id} completed no reconcile that began after {since:g} s, when {when}, "
+    if (there_s := evidence.all_there_s)[0] > since:
+        since, when = there_s[0], "others were switched off"
+    within = f"that began after {since:g} s, when {when}"
+    if there_s[1] < math.inf:
+        within += f", and ended by {there_s[1]:g} s, when the first was switched off"
+    sentence = f"agent {agent_id} completed no reconcile {within}, "
     return sentence + (
         f"and none came of the vote at {proposed[-1]:g} s" if proposed else "and proposed no block since"
     )
 
 
+def without(evidence: Evidence) -> str:
+    """Of whom the exports that agree are not, for the end of a sentence."""
+    away = set(evidence.exports) - set(evidence.present)
+    return f"; without {agents(away)}, which {'was' if len(away) == 1 else 'were'} switched off" if away else ""
+
+
 def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
-    """Those of `differing` that completed a reconcile since full connectivity and the others' last change."""
+    """Those of `differing` that completed a reconcile since full connectivity and the others' last change.
+
+    One during which nobody was missing whose export is judged, and nobody else was there.
+    """
     since = evidence.connected_since_s
     if since is None:
         return set()
     had = set()
+    from_s, until_s = evidence.all_there_s
     last_change = {agent_id: trace.chain_changed_at() for agent_id, trace in evidence.traces.items()}
     for agent_id in differing & set(evidence.traces):
         others_changed_at = max((t for peer, t in last_change.items() if peer != agent_id), default=0.0)
@@ -86,7 +112,7 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
             began = False
             for _, run in life:
                 if run.handler == "reconcile_begin" and run.branch == "begun":
-                    began = run.t >= max(since, others_changed_at)
-                elif began and run.handler == "reconcile_finalize" and not run.state.reconciling:
+                    began = run.t >= max(since, others_changed_at, from_s)
+                elif began and run.t <= until_s and run.handler == "reconcile_finalize" and not run.state.reconciling:
                     had.add(agent_id)
     return had

@@ -1,5 +1,6 @@
 """What the checker looks at: exports, traces where there are any, and what the run's record says of the network."""
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -178,11 +179,38 @@ class Evidence:
         end_s = self.ended_at_s
         return [agent_id for agent_id in self.exports if end_s is not None and self.was_paused(agent_id, end_s, end_s)]
 
+    @cached_property
+    def switched_off(self) -> dict[int, float]:
+        """Agents that ended in order before the run did, and when, in mission seconds: their exports are of then."""
+        return {
+            agent_id: fault.at_s
+            for fault in (self.record.faults if self.record else ())
+            for agent_id in (fault.agents or () if fault.kind.leaves_an_export else ())
+        }
+
+    @property
+    def present(self) -> dict[int, Export]:
+        """Exports of whoever was there to the end; of all, if everybody was switched off."""
+        there = {agent_id: export for agent_id, export in self.exports.items() if agent_id not in self.switched_off}
+        return there or self.exports
+
+    @property
+    def all_there_s(self) -> tuple[float, float]:
+        """From when to when, in mission seconds, those who are `present` had only each other, and all of them."""
+        off_s = self.switched_off.values()
+        if set(self.exports) <= set(self.switched_off):
+            return 0.0, min(off_s, default=math.inf)
+        return max(off_s, default=0.0), math.inf
+
+    def end_of(self, agent_id: int) -> float | None:
+        """When the run ended for this agent; None if it is not on record."""
+        return self.switched_off.get(agent_id, self.ended_at_s)
+
     @property
     def busy(self) -> list[int]:
-        """Agents that are not idle at the end, and do not stand still."""
-        still = self.paused_at_end
-        return [agent_id for agent_id, export in self.exports.items() if not export.idle and agent_id not in still]
+        """Agents that are not idle at the end, and neither stand still nor are switched off."""
+        gone = {*self.paused_at_end, *self.switched_off}
+        return [agent_id for agent_id, export in self.exports.items() if not export.idle and agent_id not in gone]
 
     @cached_property
     def cycle(self) -> Cycle | None:

@@ -5,6 +5,7 @@ blocks are still being committed, and so tell how fast.
 """
 
 from harness.checker import cycles
+from harness.checker.agreement import without
 from harness.checker.evidence import Evidence
 from harness.checker.figures import uniform_at_s
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents
@@ -34,18 +35,24 @@ def _why_unknown(evidence: Evidence) -> str | None:
         return "there is no export to look at"
     if evidence.missing:
         return f"there is no export of {agents(evidence.missing)}"
+    early = [agent_id for agent_id in evidence.switched_off if not evidence.exports[agent_id].idle]
+    if early and set(evidence.present) <= set(evidence.switched_off):
+        return f"{agents(early)} {'was' if len(early) == 1 else 'were'} switched off before the swarm was idle"
     if evidence.paused_at_end and not evidence.busy:
         return f"{agents(evidence.paused_at_end)} stood still to the end"
     return None
 
 
 def _finished(evidence: Evidence) -> str:
-    idle = f"all {len(evidence.exports)} agents were idle" if len(evidence.exports) > 1 else "the agent was idle"
-    at = "" if evidence.ended_at_s is None else f" at {evidence.ended_at_s:.0f} s"
-    chains = len({export.chain_of_block_hashes for export in evidence.exports.values()})
+    there = evidence.present
+    idle = f"all {len(there)} agents were idle" if len(there) > 1 else "the agent was idle"
+    when = "" if evidence.ended_at_s is None else f" at {evidence.ended_at_s:.0f} s"
+    at = " when they were switched off" if set(there) <= set(evidence.switched_off) else when
+    chains = len({export.chain_of_block_hashes for export in there.values()})
     uniform_s = uniform_at_s(evidence)
     since = "" if uniform_s is None else f" since {uniform_s:.1f} s"
-    return f"{idle}{at}, with {'one chain' if chains == 1 else f'{chains} distinct chains'}{since}"
+    one = "one chain" if chains == 1 else f"{chains} distinct chains"
+    return f"{idle}{at}, with {one}{since}{without(evidence)}"
 
 
 def _not_finished(evidence: Evidence) -> str:

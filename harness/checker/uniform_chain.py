@@ -2,9 +2,9 @@
 
 from collections import Counter
 
-from harness.checker.agreement import had_a_chance, never, why_no_chance, why_unknown
+from harness.checker.agreement import had_a_chance, never, why_no_chance, why_unknown, without
 from harness.checker.evidence import Evidence
-from harness.checker.judgement import Finding, Judgement, violated
+from harness.checker.judgement import Finding, Judgement, agents, violated
 
 NAME = "one uniform chain"
 
@@ -19,12 +19,12 @@ def check(evidence: Evidence) -> Judgement:
     unknown = why_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)
-    chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}
+    chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.present.items()}
     holders = Counter(chains.values())
     if len(holders) == 1:
-        return Judgement(
-            NAME, "holds", f"{len(chains)} agents hold the same chain of {len(next(iter(holders)))} blocks"
-        )
+        who = f"{len(chains)} agents hold the same" if len(chains) > 1 else f"{agents(set(chains))} holds a"
+        same = f"{who} chain of {len(next(iter(holders)))} blocks"
+        return Judgement(NAME, "holds", same + without(evidence))
     most_common = max(holders, key=lambda chain: (holders[chain], len(chain), chain))
     differing = {agent_id for agent_id, chain in chains.items() if chain != most_common}
     no_chance = why_no_chance(evidence, differing)

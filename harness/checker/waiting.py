@@ -70,8 +70,8 @@ def waited_too_long(evidence: "Evidence") -> Iterator[Finding]:
             reconcile = _Wait("a reconcile did not go on", reconcile_s)
             yield from _in_life(evidence, agent_id, life, vote, reconcile)
         whole = agent_id in evidence.exports and not trace.problem
-        if whole and evidence.ended_at_s is not None:
-            yield from _overdue(evidence, agent_id, evidence.ended_at_s, vote, reconcile)
+        if whole and (ended_at_s := evidence.end_of(agent_id)) is not None:
+            yield from _overdue(evidence, agent_id, ended_at_s, vote, reconcile)
 
 
 def _in_life(

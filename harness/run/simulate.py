@@ -125,5 +125,5 @@ class InMemory:
     def _exports(self, simulation: Simulation) -> dict[int, Export]:
         return {
             life.agent.agent_id: self._maker.export(life.agent.state, simulation.timestamp_us(life))
-            for life in simulation.living()
+            for life in simulation.exporting()
         }

@@ -259,3 +259,47 @@ def test_a_word_on_record_that_is_no_known_fault_is_one_that_does_nothing() -> N
 @pytest.mark.parametrize(("disk", "loses"), [("kept", False), ("lost", True)])
 def test_a_reboot_loses_what_its_disk_does_not_keep(disk: Any, loses: bool) -> None:
     assert FaultRecord(at_s=1.0, what="reboot", detail="agent 1", agents=[1], disk=disk).loses_data == loses
+
+
+def test_a_landed_agent_logs_nothing_more_and_takes_part_as_before() -> None:
+    simulated = played([{"at_s": 300, "stop_events": [2, 5]}], network={"loss": 0.2})
+    assert not [run.t for run in simulated.evidence.traces[2].runs if "event" in run.trigger and run.t > 300]
+    assert [run.t for run in simulated.evidence.traces[1].runs if "event" in run.trigger and run.t > 300]
+    assert [run for run in simulated.evidence.traces[2].runs if run.branch == "committed" and run.t > 320]
+
+
+def test_an_agent_that_is_switched_off_leaves_its_chain_and_loses_nothing() -> None:
+    simulated = played([{"at_s": 300, "switch_off": [2, 5]}], final_reconcile=True)
+    assert sorted(simulated.evidence.exports) == [1, 2, 3, 4, 5]
+    assert simulated.evidence.exports[2].exported_at_us == 300_000_000
+    assert simulated.played.agents["2"]["outcome"] == "exported"
+    assert simulated.played.agents["2"]["detail"] == "switched off at 300 s"
+    assert max(run.t for run in simulated.evidence.traces[2].runs) <= 300
+    assert not simulated.result.bad
+    uniform = simulated.result.characteristics["6"]
+    assert uniform.verdict == "holds" and "without agents 2 and 5, which were switched off" in uniform.reason
+    assert simulated.result.beside["liveness"].verdict == "finished"
+
+
+def test_what_only_a_switched_off_agent_holds_is_at_home_with_it_and_no_violation() -> None:
+    alone = [{"at_s": 0, "partition": [[1], [2, 3]]}, {"at_s": 400, "switch_off": [1]}, {"at_s": 401, "heal": True}]
+    simulated = played(alone, agents=3, final_reconcile=True)
+    assert not simulated.result.bad
+    assert "8 more were gone with the agents that were killed or switched off" in (
+        simulated.result.characteristics["5"].reason
+    )
+
+
+def test_nobody_has_to_finish_who_is_switched_off() -> None:
+    """Everybody is, one after another, in the middle of what they do."""
+    off = [{"at_s": 580 + agent, "switch_off": [agent]} for agent in range(1, 6)]
+    simulated = played(off, network={"loss": 0.3})
+    assert not simulated.result.bad
+    assert simulated.result.beside["liveness"].verdict == "not applicable"
+    assert "switched off before" in simulated.result.beside["liveness"].reason
+    assert simulated.result.characteristics["6"].verdict == "not applicable"
+
+
+def test_who_is_switched_off_stays_off() -> None:
+    with pytest.raises(ValidationError, match="agent 2 is switched off then, not killed"):
+        faulty([{"at_s": 300, "switch_off": [2]}, {"at_s": 400, "restart": [2]}])

@@ -80,7 +80,7 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Fol
         for line, run in life:
             follower.follow(line, run)
     if agent_id in evidence.exports and not trace.cut_off and not trace.problem:
-        followers[-1].end(evidence.ended_at_s)
+        followers[-1].end(evidence.end_of(agent_id))
 
 
 def wrongly_dropped(header: CheckedHeader, line: int, aside: Dropped | Commanded) -> Deviation | None:

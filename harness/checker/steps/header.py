@@ -7,6 +7,7 @@ from typing import Any
 
 from harness.archive.traces import Header
 from harness.checker.waiting import SLACK_WALL_S
+from ucp.block import MAX_AGENT_ID
 from ucp.settings import Settings
 
 EARLY_WALL_S = 0.001
@@ -46,6 +47,8 @@ def checked(header: Header) -> CheckedHeader:
         settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
     except (ValueError, TypeError) as error:
         raise ImpossibleHeaderError(f"its trace begins with settings that cannot be: {error}") from None
+    if not 1 <= header.agent_id <= MAX_AGENT_ID:
+        raise ImpossibleHeaderError(f"its trace begins with an agent ID that cannot be: {str(header.agent_id)[:20]}")
     speedup, drift = _clock(header, "speedup", 1.0), _clock(header, "drift", 0.0)
     if speedup <= 0 or drift <= -1:
         raise ImpossibleHeaderError("its trace begins with a clock that cannot be")

@@ -67,6 +67,8 @@ class _Incarnation:
     """When it told its status, in mission seconds."""
     killed: bool = False
     """The data that it held is gone."""
+    switched_off: bool = False
+    """What it did between its last status and its end only its files tell."""
     reboot: bool = False
     """It began with what was on disk."""
     counted: bool = False
@@ -203,6 +205,21 @@ class AgentProcess:
             await self._process.wait()
             self._control_path.unlink(missing_ok=True)
 
+    async def switch_off(self) -> None:
+        """SIGTERM: it exports its chain and ends. Stop watching it before. Raises AgentFailedError if it does not."""
+        assert self._process is not None
+        async with self._being_asked:
+            if self.awake:
+                await self._ask_status()
+            at_s = self._now()
+            self._control.close()
+            status = await self._process.terminate(STOP_GRACE_S)
+            self._lives[-1].switched_off = True
+            if status != 0:
+                raise self._failed("not exported", f"was switched off (SIGTERM), and ended with {self._process.end}")
+            self.outcome, self.detail = "exported", f"switched off at {at_s:.1f} s"
+            self._rundir.bring_export(self.agent_id, self._lives[-1].directory)
+
     async def pause(self) -> None:
         """It stands still, and what reaches it waits in its socket, as much as fits there."""
         assert self._process is not None
@@ -313,7 +330,8 @@ class AgentProcess:
         statuses = [life.status for life in lives if life.status is not None]
         if not statuses:
             return record
-        last_words_of = lives[-1].status if self.outcome not in ("killed", "rebooting") else None
+        ended_at_once = self.outcome in ("killed", "rebooting") or lives[-1].switched_off
+        last_words_of = None if ended_at_once else lives[-1].status
         failures = [status.send_failures for status in statuses if status.send_failures is not None]
         return record | {
             "idle": last_words_of.idle if last_words_of else None,

@@ -234,6 +234,15 @@ class ProcessRun:
     async def resume(self, agent_id: int) -> None:
         await self.agents[self._number(agent_id)].resume()
 
+    async def stop_logging(self, agent_id: int) -> None:
+        await self.agents[self._number(agent_id)].ask("stop_events")
+
+    async def switch_off(self, agent_id: int) -> None:
+        number = self._number(agent_id)
+        self._watchers.stop(f"agent {agent_id}")
+        landed = [self._shoot_down(self.vehicles[number])] if self.vehicles else []
+        await asyncio.gather(self.agents[number].switch_off(), *landed)
+
     def _number(self, agent_id: int) -> int:
         return self.scenario.roster.index(agent_id)
 

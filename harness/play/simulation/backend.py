@@ -95,6 +95,8 @@ class Incarnation:
     handler_runs: int = 0
     """Counted while tracing."""
     ended_at: float | None = None
+    logs: bool = True
+    """Whether it still logs events."""
 
 
 class BlockNames:
@@ -153,6 +155,7 @@ class Simulation:
         """By number; the last is the rogue node's, which is no agent and has no life."""
         self._disks: dict[int, StoredState] = {}
         """What is on the disk of the agents that reboot with it."""
+        self._switched_off: dict[int, Incarnation] = {}
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
@@ -332,13 +335,20 @@ class Simulation:
     def living(self) -> Iterator[Incarnation]:
         return (life for life in self._alive if life is not None)
 
+    def exporting(self) -> Iterator[Incarnation]:
+        """Those who leave an export, in the roster's order: who lives, and who was switched off."""
+        for number, life in enumerate(self._alive):
+            if (leaves := self._switched_off.get(number, life)) is not None:
+                yield leaves
+
     def timestamp_us(self, life: Incarnation) -> int:
-        """What the agent's clock shows, in microseconds; never less than 0."""
-        return max(0, round(self._local(life) * MICROSECONDS))
+        """What the agent's clock shows, or showed at its end, in microseconds; never less than 0."""
+        return max(0, round(self._local(life, life.ended_at) * MICROSECONDS))
 
     def _agent_to_json(self, number: int) -> dict[str, Any]:
         lives = self._lives[number]
-        life = self._alive[number]
+        off = self._switched_off.get(number)
+        life = off or self._alive[number]
         completed = dict.fromkeys(block.hex() for life in lives for block in life.agent.state.completed)
         for block in life.agent.state.completed if life else ():
             del completed[block.hex()]
@@ -346,6 +356,7 @@ class Simulation:
         dropped = sum((life.agent.dropped for life in lives), Counter())
         return {
             "outcome": "exported" if life else "rebooting" if number in self._disks else "killed",
+            **({"detail": f"switched off at {off.ended_at:g} s"} if off else {}),
             "restarts": len(lives) - 1 - reboots,
             "reboots": reboots,
             "completed_before": list(completed),
@@ -403,7 +414,7 @@ class Simulation:
             self._hear(number, life)
             agent.receive_datagram(what.datagram, self._local(life))
             self._after(number, life)
-        elif self._generating and what[0] in (ANY_LIFE, len(self._lives[number])):
+        elif self._generating and life.logs and what[0] in (ANY_LIFE, len(self._lives[number])):
             if self._tracing:
                 self._hear(number, life)
             _, event_id, data = what
@@ -560,6 +571,17 @@ class Simulation:
         for happening in waiting:
             if not isinstance(happening[3], InFlight | RogueDatagram):
                 self._happen(number, life, happening[3])
+
+    async def stop_logging(self, agent_id: int) -> None:
+        if (life := self._alive[self._number[agent_id]]) is not None:
+            life.logs = False
+
+    async def switch_off(self, agent_id: int) -> None:
+        number = self._number[agent_id]
+        life = self._alive[number]
+        await self.end_life(agent_id)
+        if life is not None:
+            self._switched_off[number] = life
 
     # An agent's clock
 

@@ -48,7 +48,7 @@ class OnDisk:
 
     def export(self, simulation: Simulation) -> None:
         """Raises OSError."""
-        for life in simulation.living():
+        for life in simulation.exporting():
             path = self._rundir.agents / f"{life.agent.agent_id}.chain.json"
             write_json_atomically(path, export_chain(life.agent.state, simulation.timestamp_us(life)))
 

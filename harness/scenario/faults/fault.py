@@ -18,13 +18,15 @@ from harness.scenario.vehicles import Vehicles
 Agents = Annotated[list[VehicleId], Field(min_length=1)]
 Disk = Literal["kept", "lost"]
 
-RUNNING, PAUSED, KILLED, REBOOTING = "running", "paused", "killed", "rebooting"
+RUNNING, PAUSED, KILLED, REBOOTING, SWITCHED_OFF = "running", "paused", "killed", "rebooting", "switched off"
 """States of an agent. A fault may lead to another, with a word of its own."""
 
 CROSS = "M-5-5l10 10m0-10l-10 10"
 BARS = "M-3-5v10M3-5v10"
 ARROW = "M-4-5l9 5-9 5z"
 DIAMOND = "M0-6l6 6-6 6-6-6z"
+SQUARE = "M-5-5h10v10h-10z"
+BAR = "M0-6v12"
 """Marks: SVG paths around the origin."""
 
 
@@ -44,6 +46,12 @@ class Lives(Protocol):
         """Have the agent stand still; what reaches it waits."""
 
     async def resume(self, agent_id: int) -> None: ...
+
+    async def stop_logging(self, agent_id: int) -> None:
+        """Have the agent log no more events in this life."""
+
+    async def switch_off(self, agent_id: int) -> None:
+        """Have the agent export its chain and end, and its vehicle with it."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,8 @@ class Fault:
     begins_a_life: ClassVar[bool] = False
     takes_the_vehicle: ClassVar[bool] = False
     """The vehicle is out of the air, with all that the agent held."""
+    leaves_an_export: ClassVar[bool] = False
+    """The life ends in order: what the agent held by then is in its export, and not lost."""
     brings_a_vehicle: ClassVar[bool] = False
     """Another one, in the place of one that was taken."""
     stands_still: ClassVar[bool] = False
@@ -101,7 +111,7 @@ class Fault:
     @classmethod
     def loses_data(cls, disk: Disk | None) -> bool:
         """Whether all that the agents held is gone, by what it left of their disks."""
-        return cls.ends_a_life and disk != "kept"
+        return cls.ends_a_life and not cls.leaves_an_export and disk != "kept"
 
     @classmethod
     def further_keys(cls) -> list[str]:
