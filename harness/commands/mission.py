@@ -14,8 +14,8 @@ from harness.depot.same_mission import compare
 from harness.errors import WRONG_REQUEST
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import parse
+from harness.scenario.quirks import in_words
 from ucp.messages import PORT
-from ucp.quirks import in_force
 
 DIFFERENT = 1
 
@@ -55,8 +55,8 @@ def new_command(
 ) -> None:
     """Write a mission file for each vehicle, all with one inception block, and a manifest of what they share."""
     asked = _scenario(scenario, agents, name)
-    if in_force(asked.quirks):
-        complain(f"{scenario}: its quirks ({', '.join(in_force(asked.quirks))}) are left out: a mission asks for none")
+    if asked.has_wrong_agents:
+        complain(f"{scenario}: its quirks ({', '.join(in_words(asked.quirks))}) are left out: a mission asks for none")
     plan = Plan(
         asked,
         _initial_data(initial_data, asked.name),
