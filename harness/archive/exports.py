@@ -180,13 +180,25 @@ def read_export(path: Path) -> Export:
         raise ExportError(f"{path}: not a chain export (not UTF-8 text)") from None
     try:
         document = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
-        where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "its nesting"
-        raise ExportError(f"{path}: truncated or damaged: not JSON at {where}; export it again") from None
+    except (ValueError, RecursionError) as error:
+        raise not_json(path, error) from None
+    return export_of(path, document)
+
+
+def not_json(path: Path, error: ValueError | RecursionError) -> ExportError:
+    """What json found wrong with an export."""
+    where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "its nesting"
+    if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
+        where = "a number of thousands of digits"
+    return ExportError(f"{path}: truncated or damaged: not JSON at {where}; export it again")
+
+
+def export_of(path: Path, document: Any) -> Export:
+    """The export that a JSON document is. Raises ExportError, as `read_export` of the file that it is in."""
     if not isinstance(document, dict) or "schema" not in document:
         raise ExportError(f"{path}: not a chain export (it has no `schema`)")
     if document["schema"] != SCHEMA:
-        raise ExportError(f"{path}: its schema is {document['schema']!r}, and this version reads {SCHEMA!r}")
+        raise ExportError(f"{path}: its schema is {str(document['schema'])[:40]!r}, and this version reads {SCHEMA!r}")
     try:
         return Export.model_validate(document)
     except ValidationError as error:

@@ -8,11 +8,11 @@ import json
 import re
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, islice, pairwise
+from itertools import accumulate, compress, islice, pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
@@ -73,11 +73,23 @@ HANDLER_RUN = TypeAdapter(HandlerRun)
 ASIDE = TypeAdapter(Dropped | Commanded)
 
 
+class Gap(NamedTuple):
+    """Lines of a trace are lost or damaged: `position` runs stand before them, and what follows is of a later state.
+
+    `lines` and `lost_bytes` are those that stand in the file and say nothing; nobody knows how many were never written.
+    """
+
+    position: int
+    lines: int
+    lost_bytes: int
+
+
 @dataclass
 class Trace:
     """`runs` of all lives of the agent; those with index n >= starts[k] are of life k + 2, after the kth restart.
 
-    `asides` are the lines of other things, each with the number of runs that stand before it.
+    `asides` are the lines of other things, each with the number of runs that stand before it. A trace from the field
+    (`harness.field.homecoming`) may have `gaps`; one of a run has none, and ends where it is damaged.
     """
 
     header: Header
@@ -87,6 +99,11 @@ class Trace:
     problem: str | None = None
     cut_off: bool = False
     """Whether it ends in half a line, which is not read."""
+    gaps: list[Gap] = field(default_factory=list)
+    jumps: list[int] = field(default_factory=list)
+    """Positions of runs before which the agent's clock was set, as it seems: their time goes back, or far ahead."""
+    lines: tuple[Sequence[int], Sequence[int]] | None = None
+    """In which line of its file each of `runs`, and of `asides`, stands; None where they stand one after another."""
 
     def lives(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
         """Each life of the agent: its runs, with their lines, which count from 1. A life begins with a header line."""
@@ -95,6 +112,8 @@ class Trace:
             yield self._numbered(start, end, life)
 
     def _numbered(self, start: int, end: int, life: int) -> Iterator[tuple[int, HandlerRun]]:
+        if self.lines is not None:
+            return zip(islice(self.lines[0], start, end), islice(self.runs, start, end), strict=True)
         if not self.asides:
             return enumerate(islice(self.runs, start, end), start + life + 1)
         before = [position for position, _ in self.asides]
@@ -105,6 +124,9 @@ class Trace:
 
     def numbered_asides(self) -> Iterator[tuple[int, Dropped | Commanded]]:
         """The lines of other things, with their numbers."""
+        if self.lines is not None:
+            yield from zip(self.lines[1], (aside for _, aside in self.asides), strict=True)
+            return
         for count, (position, aside) in enumerate(self.asides, 1):
             yield position + 1 + bisect_right(self.starts, position) + count, aside
 
@@ -125,6 +147,9 @@ class Trace:
             runs=[run for run, keep in zip(self.runs, kept, strict=True) if keep],
             starts=[before[start] for start in self.starts],
             asides=[(before[position], aside) for position, aside in self.asides],
+            gaps=[gap._replace(position=before[gap.position]) for gap in self.gaps],
+            jumps=[before[position] for position in self.jumps],
+            lines=self.lines and ([*compress(self.lines[0], kept)], self.lines[1]),
         )
 
     def completed(self) -> list[str]:
@@ -188,6 +213,13 @@ class Held:
                     self.not_in_chain.add(block)
 
 
+def parsed(line: bytes) -> Header | Entry:
+    """What a line of a trace says. Raises ValueError if it says nothing."""
+    if b'"handler"' in line:
+        return HANDLER_RUN.validate_json(line)
+    return ASIDE.validate_json(line) if b'"schema"' not in line else HEADER.validate_json(line)
+
+
 def only_takes_in(run: HandlerRun) -> bool:
     """Whether the handler took a message in, and nothing changed."""
     return not run.changes and run.handler.startswith("receive_")
@@ -228,17 +260,17 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                 if skim and trace is not None and _ONLY_TAKES_IN.fullmatch(line):
                     continue
                 try:
+                    entry = parsed(line) if trace else HEADER.validate_json(line)
                     if trace is None:
-                        trace = Trace(HEADER.validate_json(line))
-                    elif b'"handler"' in line:
-                        trace.runs.append(HANDLER_RUN.validate_json(line))
-                    elif b'"schema"' not in line:
-                        trace.asides.append((len(trace.runs), ASIDE.validate_json(line)))
-                    else:
-                        if HEADER.validate_json(line) != trace.header:
-                            trace.problem = f"line {number} is the header of another agent, or of another run"
-                            break
+                        assert isinstance(entry, Header)
+                        trace = Trace(entry)
+                    elif not isinstance(entry, Header):
+                        trace.extend((entry,))
+                    elif entry == trace.header:
                         trace.starts.append(len(trace.runs))
+                    else:
+                        trace.problem = f"line {number} is the header of another agent, or of another run"
+                        break
                 except ValueError:
                     if trace is not None:
                         trace.problem = f"line {number} is damaged"

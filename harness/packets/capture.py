@@ -8,6 +8,7 @@ import hashlib
 from array import array
 from collections import Counter
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -82,13 +83,14 @@ class Capture:
     def listening(self, time_ns: int) -> bool:
         return self.began_ns is not None and self.ended_ns is not None and self.began_ns <= time_ns <= self.ended_ns
 
-    def read(self, datagrams: dict[bytes, Datagram]) -> None:
-        """Add what the file saw to `datagrams`. Raises CaptureError if it is no capture."""
+    def read(self, datagrams: dict[bytes, Datagram], most_frames: int | None = None) -> None:
+        """Add what the file saw, or its first frames, to `datagrams`. Raises CaptureError if it is no capture."""
         file = CaptureFile(self.path)
         first_ns, last_ns = _LAST_NS, -1
         sent_by: Counter[int] = Counter()
         senders: set[int] = set()  # of datagrams whose direction the file does not say
-        for frame in file:
+        frames = iter(file)
+        for frame in islice(frames, most_frames):
             self.frames += 1
             if not 0 <= frame.time_ns <= _LAST_NS:
                 self.not_ucp["at an impossible time"] += 1
@@ -107,6 +109,7 @@ class Capture:
                     sent_by[datagram.sender] += 1
                 elif not direction:
                     senders.add(datagram.sender)
+        self.frames += sum(1 for _ in frames)
         self._understand(file, sent_by)
         self.sees_itself = self.about is not None or bool(sent_by) or self.vehicle in senders
         epoch_ns = self.about.epoch_us * 1000 if self.about else first_ns

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from harness.archive.opened import Opened
 from harness.errors import CaptureError
 
 INBOUND, OUTBOUND = 1, 2
@@ -28,6 +29,8 @@ _PCAP = {  # magic -> byte order, nanoseconds in a unit of the fraction
     b"\xa1\xb2\x3c\x4d": (">", 1),
     b"\x4d\x3c\xb2\xa1": ("<", 1),
 }
+MAGICS = (_SECTION, *_PCAP)
+"""What a capture begins with."""
 
 
 class Frame(NamedTuple):
@@ -75,20 +78,22 @@ class CaptureFile:
     def __iter__(self) -> Iterator[Frame]:
         """Raises CaptureError if the file cannot be read or is no capture."""
         try:
-            with self.path.open("rb") as file:
-                magic = file.read(4)
+            with Opened(self.path) as file:
+                magic = file.peek(4)[:4]
                 if not magic:
                     raise CaptureError(f"{self.path}: empty: the capture ended before it began")
-                if magic != _SECTION and magic not in _PCAP:
+                if magic not in MAGICS:
                     raise CaptureError(
                         f"{self.path}: not a capture: it begins neither as pcapng nor as pcap; "
                         "`ucp-harness run --capture` and `tcpdump -w` write such files"
                     )
-                file.seek(0)
+                broken = ""
                 try:
                     yield from self._pcapng(file) if magic == _SECTION else self._pcap(file, *_PCAP[magic])
-                except _BrokenError as broken:
-                    self.trouble = f"{broken}; what is before it was read"
+                except _BrokenError as error:
+                    broken = str(error)
+                if file.trouble or broken:
+                    self.trouble = f"{file.trouble or broken}; what is before it was read"
         except OSError as error:
             raise CaptureError(f"{self.path}: cannot be read: {error.strerror}") from None
 

@@ -4,6 +4,7 @@ Field data is broken: lines are cut, two flights are in one file, a file is ther
 Everything usable is used, and whatever is left out is named.
 """
 
-from harness.field.homecoming.homecoming import Flight, Homecoming, LeftOut
+from harness.field.homecoming.homecoming import Flight, Homecoming, LeftOut, Remark
+from harness.field.homecoming.sorting import sort_out
 
-__all__ = ["Flight", "Homecoming", "LeftOut"]
+__all__ = ["Flight", "Homecoming", "LeftOut", "Remark", "sort_out"]

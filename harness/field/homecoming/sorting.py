@@ -1,0 +1,122 @@
+"""Recognises what each file is, by its content, and puts together what is of one flight."""
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from harness.archive.exports import MAX_EXPORT_BYTES, Export, export_of, not_json
+from harness.archive.opened import Opened
+from harness.errors import CaptureError, ExportError
+from harness.field.homecoming.files import files_of
+from harness.field.homecoming.flights import put_together
+from harness.field.homecoming.glance import Glance, glance
+from harness.field.homecoming.homecoming import Homecoming, LeftOut, Remark
+from harness.field.homecoming.lives import Life, read_lives
+from harness.gc_pause import gc_paused
+from harness.packets.pcap import MAGICS
+from ucp.export import SCHEMA as EXPORT_SCHEMA
+
+MAX_DOCUMENTS = 1000
+"""Exports in one file."""
+ALIKE_TOLD = 3
+"""Of files of one directory that are left out for the same reason."""
+_BLANK = " \t\r\n\0\ufeff"
+
+
+@gc_paused()
+def sort_out(paths: Iterable[Path]) -> Homecoming:
+    """What is in files and directories, of whatever name and in whatever state: sorted by flight.
+
+    Raises FieldError if a path does not exist. What cannot be used is told in `left_out`, and nothing else is raised.
+    """
+    left_out: list[LeftOut] = []
+    remarks: list[Remark] = []
+    sorter = _Sorter(left_out)
+    for path in files_of(paths, left_out):
+        sorter.take(path)
+    flights = put_together(sorter.lives, sorter.exports, sorter.captures, left_out, remarks)
+    return Homecoming(flights, [*_summed_up(left_out)], remarks)
+
+
+class _Sorter:
+    def __init__(self, left_out: list[LeftOut]) -> None:
+        self.lives: list[Life] = []
+        self.exports: list[tuple[Path, Export]] = []
+        self.captures: list[Glance] = []
+        self._left_out = left_out
+
+    def take(self, path: Path) -> None:
+        try:
+            with Opened(path) as file:
+                begins = file.peek(4096)[:4096]
+            if begins[:4] in MAGICS:
+                seen = glance(path, self._left_out)
+                self.captures += [seen] if seen else []
+            elif lives := read_lives(path, self._left_out):
+                self.lives += lives
+            else:
+                self._take_exports(path)
+        except OSError as error:
+            self._drop(path, f"it cannot be read: {error.strerror}")
+        except CaptureError as error:
+            self._drop(path, str(error).removeprefix(f"{path}: "))
+
+    def _take_exports(self, path: Path) -> None:
+        with Opened(path, MAX_EXPORT_BYTES) as file:
+            data = file.read()
+            if file.trouble:
+                self._drop(path, f"it is no whole file: {file.trouble}")
+                return
+        try:
+            text = data.decode("utf-8").strip(_BLANK)
+        except UnicodeDecodeError:
+            text = ""
+        if not text.startswith(("{", "[")):
+            self._drop(path, _what_else(data))
+            return
+        try:
+            for document in _documents(text):
+                self.exports.append((path, export_of(path, document)))
+        except ExportError as error:
+            self._drop(path, str(error).removeprefix(f"{path}: "))
+        except (ValueError, RecursionError) as error:
+            what = "a chain export, but " if EXPORT_SCHEMA in text else ""
+            self._drop(path, what + str(not_json(path, error)).removeprefix(f"{path}: "))
+
+    def _drop(self, path: Path, why: str) -> None:
+        self._left_out.append(LeftOut(path, why))
+
+
+def _documents(text: str) -> Iterator[Any]:
+    """JSON documents, one after another. Raises ValueError or RecursionError where it is none."""
+    decoder, position = json.JSONDecoder(), 0
+    for _ in range(MAX_DOCUMENTS):
+        if position == len(text):
+            return
+        document, position = decoder.raw_decode(text, position)
+        while position < len(text) and text[position] in _BLANK:
+            position += 1
+        yield document
+
+
+def _what_else(data: bytes) -> str:
+    if not data.strip(b"\0\r\n\t "):
+        return "it is empty" if not data else "there is nothing in it but NUL and blanks, as a loss of power leaves it"
+    printable = sum(byte >= 32 or byte in b"\t\r\n" for byte in data[:4096])
+    text = "text" if printable > 0.9 * len(data[:4096]) else "neither text nor a capture"
+    return f"it is no trace, chain export or capture: {text} that says nothing of UCP here"
+
+
+def _summed_up(left_out: list[LeftOut]) -> Iterator[LeftOut]:
+    """Files of one directory that are left out for the same reason are told together if they are many."""
+    alike: dict[tuple[Path, str], list[LeftOut]] = {}
+    for each in left_out:
+        alike.setdefault((each.path.parent, each.why) if each.line is None else (each.path, str(each.line)), []).append(
+            each
+        )
+    for (_, why), group in alike.items():
+        yield from group[:ALIKE_TOLD]
+        if more := group[ALIKE_TOLD:]:
+            names = ", ".join(each.path.name for each in more[:10]) + (", ..." if len(more) > 10 else "")
+            yield LeftOut(more[0].path.parent, f"{len(more)} more files ({names}) are left out likewise: {why}")
