@@ -4,6 +4,7 @@ Exit status 0: ran, and no characteristic is violated. 1: at least one is violat
 was wrong. 3: this machine cannot do it. 130: interrupted.
 """
 
+import os
 import sys
 from importlib import import_module
 from importlib.metadata import version
@@ -12,7 +13,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from harness.errors import HarnessError
+from harness.errors import HarnessError, MachineError
 
 COMMANDS = {
     "run": (
@@ -118,13 +119,25 @@ def _harness(
 def main() -> NoReturn:
     """The console script: a user's mistake ends in one sentence and the right exit status, never in a traceback."""
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
     except HarnessError as error:
-        from harness.commands.terminal import complain
-
-        complain(str(error))
-        sys.exit(error.exit_status)
+        _end(str(error), error.exit_status)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+        _end(f"standard output cannot be written: {error.strerror}", MachineError.exit_status)
     sys.exit(0)
+
+
+def _end(sentence: str, exit_status: int) -> NoReturn:
+    from harness.commands.terminal import complain
+
+    complain(sentence)
+    sys.exit(exit_status)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import ipaddress
 import json
+import stat
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +69,10 @@ class Mission:
 def load_mission(path: Path) -> Mission:
     """Raises MissionError."""
     try:
-        if path.stat().st_size > MAX_MISSION_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise MissionError(f"{path}: not a file that holds a mission")
+        if status.st_size > MAX_MISSION_BYTES:
             raise MissionError(f"{path}: larger than {MAX_MISSION_BYTES} bytes, which no mission file is")
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -94,7 +98,7 @@ def parse_mission(document: Any) -> Mission:
     if agent_id not in roster:
         raise MissionError(f"`agent_id` {agent_id} is not on the `roster`")
     epoch_us = document.get("epoch_us")
-    if epoch_us is not None and (not isinstance(epoch_us, int) or epoch_us < 0):
+    if epoch_us is not None and (type(epoch_us) is not int or epoch_us < 0):
         raise MissionError("`epoch_us` must be microseconds since the Unix epoch, or null to wait for `start`")
     store = document.get("store")
     if store is not None and (not isinstance(store, str) or not store):

@@ -249,7 +249,7 @@ class Node:
 
     def _start(self, request: dict[str, Any]) -> dict[str, Any]:
         epoch_us = request.get("epoch_us")
-        if not isinstance(epoch_us, int) or epoch_us < 0:
+        if type(epoch_us) is not int or epoch_us < 0:
             raise CommandError("start needs `epoch_us`, microseconds since the Unix epoch")
         if self.clock.running:
             raise CommandError("the mission has started already")

@@ -1,5 +1,6 @@
 """From a file to a scenario (or to whatever else is YAML), and from what pydantic found to a sentence for a person."""
 
+import stat
 from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -48,7 +49,10 @@ class _Loader(yaml.SafeLoader):
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
     """The mapping in a YAML file that should be a `what`. Raises ScenarioError."""
     try:
-        if path.stat().st_size > MAX_SCENARIO_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ScenarioError(f"{path}: not a file that holds a {what}")
+        if status.st_size > MAX_SCENARIO_BYTES:
             raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which no {what} is")
         document = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506  (a safe loader)
     except OSError as error:

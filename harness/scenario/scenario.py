@@ -29,6 +29,9 @@ from ucp.block import MAX_AGENT_ID
 from ucp.quirks import Quirks, in_force
 from ucp.settings import Settings
 
+MAX_DURATION_S = 31 * 86400
+"""No mission is longer: a run in virtual time would take hours and all memory."""
+
 
 class Settle(Model):
     """After the mission the agents finish their votes and reconciles, for at most `limit_s` mission seconds."""
@@ -49,7 +52,7 @@ class Scenario(Model):
     name: Annotated[str, Field(min_length=1, max_length=200)]
     about: Annotated[str, Field(max_length=2000)] = ""
     agents: int | list[int] = 5
-    duration_s: Seconds = 1200.0
+    duration_s: Annotated[Seconds, Field(le=MAX_DURATION_S)] = 1200.0
     speedup: Annotated[float, Field(gt=0, le=1000)] = 20.0
     network: NetworkModel = NetworkModel()
     timeline: Annotated[list[TimelineEntry], Field(max_length=10_000)] = []

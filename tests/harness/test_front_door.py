@@ -6,12 +6,14 @@ import sys
 from importlib import import_module
 from importlib.metadata import version
 from inspect import getdoc
+from pathlib import Path
 
 import pytest
 import typer
 
 from harness.cli import COMMANDS
-from tests.harness.command import COMMAND, harness
+from tests.harness.command import COMMAND, harness, sentences, write_scenario
+from tests.harness.mission import CONNECTED, fly, write_run
 
 ITS_OWN = {"harness", "harness.cli", "harness.errors"}
 
@@ -64,3 +66,28 @@ def test_a_command_that_there_is_not_is_told_from_those_that_there_are() -> None
     refused = harness("chek")
     assert refused.returncode == 2
     assert "Did you mean 'check'?" in refused.stderr
+
+
+def test_a_full_standard_output_is_no_verdict(tmp_path: Path) -> None:
+    run_dir = write_run(fly(agents=3, duration_s=400), tmp_path / "run", CONNECTED)
+    for arguments in (["--help"], ["sitl", "--help"], ["check", run_dir], ["check", run_dir, "--json"]):
+        with Path("/dev/full").open("w") as full:
+            ended = subprocess.run(
+                [*COMMAND, *map(str, arguments)], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            )
+        assert ended.returncode == 3
+        assert sentences(ended.stderr) == ["standard output cannot be written: No space left on device"]
+
+
+def test_what_is_no_file_is_no_scenario(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "scenario.yaml")
+    for path in (tmp_path / "scenario.yaml", "/dev/zero", tmp_path):
+        refused = harness("run", path)
+        assert refused.returncode == 2
+        assert sentences(refused.stderr) == [f"{path}: not a file that holds a scenario"]
+
+
+def test_a_mission_beyond_reason_is_refused(tmp_path: Path) -> None:
+    refused = harness("run", write_scenario(tmp_path, duration_s=10**9))
+    assert refused.returncode == 2
+    assert "`duration_s` is 1000000000: it should be less than or equal to 2678400" in refused.stderr

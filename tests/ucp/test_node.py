@@ -190,6 +190,7 @@ def test_a_quirk_makes_the_agent_wrong_until_it_is_taken_away(agent: AgentUnderT
     [
         ("fly", {}, "unknown command 'fly': there are status, start"),
         ("start", {"epoch_us": "now"}, "epoch_us"),
+        ("start", {"epoch_us": True}, "epoch_us"),
         ("reconcile", {}, "has not started"),
         ("quirk", {"name": "ignore_commit", "value": 7}, "probability"),
         ("quirk", {"name": "never_reconcile", "value": 1}, "never_reconcile is true or false"),
@@ -232,6 +233,8 @@ def test_a_port_in_use_is_one_sentence_and_status_2(agent: AgentUnderTest, tmp_p
     [
         ({"schema": "ucp-mission/9"}, "`schema` is 'ucp-mission/9'"),
         ({"agent_id": 8}, "not on the `roster`"),
+        ({"roster": [True, 7]}, "`roster`"),
+        ({"epoch_us": True}, "`epoch_us`"),
         ({"agent_id": "7"}, "`agent_id` must be a whole number"),
         ({"roster": [7, True]}, "`roster` must list agent IDs"),
         ({"speedup": 0}, "`speedup` must be a number above 0"),
