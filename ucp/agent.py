@@ -210,8 +210,12 @@ class Agent:
     def handle_timer(self, now: float) -> None:
         """Run the handlers of all timers that have expired at `now`, the earliest first."""
         while (timer := self._soonest()) is not None and timer.deadline is not None and timer.deadline <= now:
-            timer.stop()
-            self._handle(now, {"timer": timer.name}, None, self._on_timer[timer.name])
+            self.end_timer(timer, now)
+
+    def end_timer(self, timer: Timer, now: float) -> None:
+        """Run the handler of a timer that runs: it ends at `now`, however late."""
+        timer.stop()
+        self._handle(now, {"timer": timer.name}, None, self._on_timer[timer.name])
 
     def boot(self, recovered: StoredState, now: float) -> None:
         """Go on from what a former life left on its vehicle's disk; before any other input.

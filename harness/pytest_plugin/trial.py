@@ -5,6 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
+from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, MachineError
 from harness.pytest_plugin.findings import JudgementInTest
 from harness.run.run import Run
@@ -47,7 +48,14 @@ class Trial:
                 expected = self._expect.verdict(key)
                 lines += JudgementInTest.of(key, judgement).lines()
                 lines += [f"    expected: {expected}"] if expected else []
-        return lines + list(self._expect.out_of_range(finished.result.figures))
+        lines += self._expect.out_of_range(finished.result.figures)
+        return [*lines, *self._other_chains(finished)]
+
+    def _other_chains(self, finished: Run) -> list[str]:
+        if not self._expect.chains:
+            return []
+        exports = RunArchive(finished.directory).exports.by_agent
+        return [*self._expect.other_chains({agent: export.top_chain_hash for agent, export in exports.items()})]
 
 
 @contextmanager

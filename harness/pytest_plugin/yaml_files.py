@@ -9,7 +9,7 @@ import pytest
 MAX_BYTES = 1024 * 1024
 TOP_LEVEL_KEY = re.compile(rb"^([A-Za-z_][\w-]*)[ \t]*:", re.MULTILINE)
 PLACES: pytest.StashKey[list[Path]] = pytest.StashKey()
-EXPECTED = re.compile(rb"\b(?:characteristics|figures|backends|seeds)[\"']?[ \t]*:")
+EXPECTED = re.compile(rb"\b(?:characteristics|figures|chains|backends|seeds)[\"']?[ \t]*:")
 NOTHING_SPECIAL = re.compile(rb"[ \t]*(?:\{[ \t]*\})?[ \t]*(?:#.*)?\s*")
 
 

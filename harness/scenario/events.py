@@ -1,19 +1,36 @@
 """Where loggable events come from."""
 
+import base64
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from harness.scenario.model import Instant, Model, Seconds, VehicleId
+from harness.scenario.model import Data, Instant, Model, Seconds, VehicleId
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
+
+Bytes = bytes
+"""A scripted event has a key of that name."""
+MAX_DATA_CHARACTERS = 1400
+"""What 1024 bytes are in base64, and some more."""
 
 
 class ScriptedEvent(Model):
-    """At `at_s` mission seconds `agent` logs one event with `bytes` bytes of data, all zero."""
+    """At `at_s` mission seconds `agent` logs one event with `bytes` bytes of data, all zero.
+
+    Or the event of a flight, word for word: with this `data`, in base64, this `event_id`, and the `timestamp_us` that
+    the vehicle's clock showed; without it the event has the time of the agent's clock.
+    """
 
     at_s: Instant
     agent: VehicleId
     bytes: Annotated[int, Field(ge=0, le=1024)] = 256
+    event_id: Annotated[int, Field(ge=1, le=254, strict=True)] = 1
+    data: Annotated[Data, Field(max_length=MAX_DATA_CHARACTERS)] | None = None
+    timestamp_us: Annotated[int, Field(ge=0, lt=2**64, strict=True)] | None = None
+
+    @property
+    def event_data(self) -> Bytes:
+        return Bytes(self.bytes) if self.data is None else base64.b64decode(self.data)
 
 
 class Events(Model):

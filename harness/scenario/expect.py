@@ -6,6 +6,7 @@ expect:
   records: agree
   liveness: finished
   figures: {mutual_chain: {min: 40}, distinct_chains: 1, reconciles: {max: 20}}
+  chains: {10: 5f0c...}
   backends: [sim, process]
   seeds: [1, 2, 3]
 """
@@ -16,7 +17,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from harness.backend_names import BackendName
-from harness.scenario.model import BOUNDED, Model
+from harness.scenario.model import BOUNDED, Model, VehicleKey
 from harness.scenario.verdicts import (
     BESIDE,
     CHARACTERISTICS,
@@ -47,6 +48,8 @@ FigureName = Literal[
 
 NUMBERS = {number: int(number) for number in CHARACTERISTICS}
 """The characteristics; JSON has strings for keys."""
+
+ChainHash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -103,6 +106,8 @@ class Expect(Model):
     records: RecordsVerdict | None = None
     liveness: LivenessVerdict | None = None
     figures: dict[FigureName, Annotated[Range, BeforeValidator(_exactly)]] = {}
+    chains: dict[VehicleKey, ChainHash] = {}
+    """The top chain hash with which the agent ends: no two chains have the same."""
     backends: Annotated[list[BackendName], Field(min_length=1)] = ["sim"]
     seeds: Annotated[list[Annotated[int, Field(ge=0, strict=True)]], Field(min_length=1, max_length=10_000)] = [1]
 
@@ -148,3 +153,12 @@ class Expect(Model):
             if figure is None or figure not in wanted:
                 shown = "not known" if figure is None else f"{figure:g}"
                 yield f"{name.replace('_', ' ')} is {shown}, and should be {wanted.describe()}"
+
+    def other_chains(self, top_chain_hashes: Mapping[int, str]) -> Iterator[str]:
+        """A sentence for each agent that ends with another chain; `top_chain_hashes` are those of the exports."""
+        for agent_id, wanted in self.chains.items():
+            ended = top_chain_hashes.get(agent_id)
+            if ended is None:
+                yield f"agent {agent_id} has left no chain, and should end with {wanted[:12]} on top"
+            elif ended != wanted:
+                yield f"agent {agent_id} ends with the chain hash {ended[:12]} on top, and should with {wanted[:12]}"

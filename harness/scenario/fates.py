@@ -5,6 +5,7 @@ fates:
   - {message: Next in Sequence Response, sender: 3, name: third}
   - {message: Next in Sequence Response, sender: 4, after: third}
   - {sender: 3, from_s: 300, until_s: 600, hold_until_s: 600}
+  - {sender: 3, receiver: 4, arrivals: 0@12.3 1@12.75 4@31}
 """
 
 from typing import Annotated, Any, Literal
@@ -12,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from harness.scenario.model import Instant, Model, VehicleId
+from harness.scenario.numbered import Arrivals
 
 MessageName = Literal[
     "Block Add Request",
@@ -27,6 +29,9 @@ MessageName = Literal[
 
 BlockName = Annotated[str, Field(pattern=r"^[1-9]\d{0,4}\.[1-9]\d{0,6}$")]
 """`<agent>.<ordinal>`, the ordinal counting from 1 that agent's completed blocks. YAML needs quotes: "4.10"."""
+
+OUTCOMES = ("drop", "delay_s", "hold_until_s", "after", "arrivals")
+"""Keys that say what becomes of a message."""
 
 FateName = Annotated[str, Field(min_length=1, max_length=100)]
 
@@ -47,7 +52,9 @@ class Fate(Model):
     One of these happens; a partition still lets nothing pass:
     `drop: true`: it is lost; `delay_s`: it arrives after so long, whatever chance says; `hold_until_s`: it arrives at
     that mission second, if it would have arrived before; `after`: it arrives right after the message that the fate
-    with that `name` is about; `name` alone: it arrives as chance says.
+    with that `name` is about; `name` alone: it arrives as chance says; `arrivals`: of all datagrams from `sender` to
+    `receiver` those with these numbers, from 0 through all lives of the sender, arrive at these mission seconds, one
+    that is named twice also twice, and no others.
     """
 
     message: MessageName | None = None
@@ -62,11 +69,12 @@ class Fate(Model):
     delay_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     hold_until_s: Instant | None = None
     after: FateName | None = None
+    arrivals: Arrivals | None = None
     name: FateName | None = None
 
     @property
     def as_chance_says(self) -> bool:
-        return not self.drop and self.delay_s is None and self.hold_until_s is None and self.after is None
+        return all(getattr(self, key) is None for key in OUTCOMES)
 
     @property
     def counts(self) -> tuple[int, ...] | None:
@@ -74,9 +82,15 @@ class Fate(Model):
 
     @model_validator(mode="after")
     def _one_outcome(self) -> "Fate":
-        outcomes = [key for key in ("drop", "delay_s", "hold_until_s", "after") if getattr(self, key) is not None]
+        outcomes = [key for key in OUTCOMES if getattr(self, key) is not None]
         if len(outcomes) > 1 or not (outcomes or self.name):
-            raise ValueError("needs exactly one of `drop: true`, `delay_s`, `hold_until_s` or `after`, or a `name`")
+            raise ValueError(
+                "needs exactly one of `drop: true`, `delay_s`, `hold_until_s`, `after` or `arrivals`, or a `name`"
+            )
+        if self.arrivals is not None:
+            others = [key for key in ("message", "block", "count", "from_s", "until_s", "name") if getattr(self, key)]
+            if self.sender is None or self.receiver is None or others:
+                raise ValueError("`arrivals` are from a `sender` to a `receiver`, and need no other key")
         if self.from_s is not None and self.until_s is not None and self.from_s >= self.until_s:
             raise ValueError(f"from_s {self.from_s:g} is not before until_s {self.until_s:g}")
         return self
@@ -92,6 +106,8 @@ class Fate(Model):
             if self.hold_until_s is not None
             else f"deliver after {self.after!r}"
             if self.after
+            else "deliver at the seconds given"
+            if self.arrivals
             else f"name {self.name!r}"
         )
         words = [what, self.message or "every message"]

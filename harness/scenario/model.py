@@ -1,9 +1,11 @@
 """What all parts of a scenario share: strict models, and the types of their values."""
 
+import base64
+import binascii
 import reprlib
 from typing import Annotated
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from ucp.block import MAX_AGENT_ID
 
@@ -22,6 +24,18 @@ VehicleKey = Annotated[
     VehicleId, BeforeValidator(lambda value: int(value) if isinstance(value, str) and value.isdecimal() else value)
 ]
 """A vehicle as the key of a mapping: JSON has strings there."""
+
+
+def _decodable(text: str) -> str:
+    try:
+        base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError):
+        raise ValueError("should be base64") from None
+    return text
+
+
+Data = Annotated[str, AfterValidator(_decodable)]
+"""Bytes, in base64."""
 
 
 class Model(BaseModel):

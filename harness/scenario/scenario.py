@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
+from harness.scenario.datagrams import ScriptedDatagram
 from harness.scenario.docker import Docker
 from harness.scenario.events import Events
 from harness.scenario.expect import Expect
@@ -14,8 +15,9 @@ from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.flight import Flight
-from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Seconds, VehicleKey
+from harness.scenario.model import BOUNDED, MAX_AGENTS, Data, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
+from harness.scenario.numbered import Lateness
 from harness.scenario.quirks import AskedQuirks, OfSome, of_agent
 from harness.scenario.quirks import check as check_quirks
 from harness.scenario.schedule import NEEDED, Schedule
@@ -31,6 +33,7 @@ from ucp.settings import Settings
 
 MAX_DURATION_S = 31 * 86400
 """No mission is longer: a run in virtual time would take hours and all memory."""
+MAX_INITIAL_DATA = 64 * 1024
 
 
 class Settle(Model):
@@ -68,6 +71,13 @@ class Scenario(Model):
     """Mistakes that all agents make, or those that are named (`ucp.quirks`)."""
     clocks: dict[VehicleKey, Clock] = {}
     fates: Annotated[list[Fate], Field(max_length=100_000)] = []
+    datagrams: Annotated[list[ScriptedDatagram], Field(max_length=100_000)] = []
+    """What is on the air beside what agents send."""
+    lateness: dict[VehicleKey, Lateness] = {}
+    """Timers that end late, by agent: "3+0.25" is the fourth that it has started, from 0 through all its lives, which
+    ends a quarter of a mission second late. Those between are punctual."""
+    initial_data: Annotated[Data, Field(max_length=MAX_INITIAL_DATA)] | None = None
+    """BD_0, in base64. Without it each run has its own: in virtual time made of `name` and seed."""
     settle: Settle = Settle()
     final_reconcile: bool = False
     capture: bool = False
@@ -171,6 +181,9 @@ class Scenario(Model):
         yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named())
         yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
         yield from (("clocks", vehicle) for vehicle in self.clocks)
+        yield from (("lateness", vehicle) for vehicle in self.lateness)
+        for index, datagram in enumerate(self.datagrams):
+            yield from ((f"datagrams.{index}.reaches", vehicle) for vehicle in datagram.reaches)
         for name, asked in self.quirks.items():
             yield from (
                 (f"quirks.{name}.agents", agent) for agent in (asked.agents if isinstance(asked, OfSome) else ())

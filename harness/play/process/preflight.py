@@ -26,6 +26,8 @@ def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
     """Raises ScenarioError naming the keys that real processes cannot be given yet."""
     keys = [
         *(["fates"] if scenario.fates else []),
+        *(["datagrams"] if scenario.datagrams else []),
+        *(["lateness"] if scenario.lateness else []),
         *(["clocks"] if scenario.clocks else []),
         *(["events.source: scripted"] if scenario.events.source == "scripted" else []),
     ]

@@ -4,6 +4,7 @@ What builds networks and flies vehicles takes its time to import, which who play
 """
 
 import asyncio
+import base64
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from datetime import UTC, datetime
@@ -56,7 +57,8 @@ class Processes(Backend):
         from harness.play.process.vehicle_kinds import choose_vehicles
 
         # Another run is another mission: its blocks must not be taken for this one's.
-        initial_data = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
+        own = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
+        initial_data = own if scenario.initial_data is None else base64.b64decode(scenario.initial_data)
         return ProcessRun(
             scenario,
             seed,

@@ -16,6 +16,7 @@ from random import Random
 from typing import Any
 
 from harness.play.rogue import crafted
+from harness.play.rogue.line import line_of
 from harness.play.rogue.sequences import forged_sequence
 from harness.scenario.injection import Corrupt, DelayedCopy, Duplicate, Flood, Forge, Injection, Replay
 from ucp.block import next_chain_hash
@@ -30,7 +31,6 @@ from ucp.messages import (
     MalformedDatagramError,
     Message,
     NextInSequenceResponse,
-    block_named,
     decode,
 )
 
@@ -52,15 +52,7 @@ class RogueDatagram:
     datagram: bytes
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """The record of the datagram, sent at `at_s`; `refused` is why no agent would take it for a message."""
-        record = {"at_s": round(at_s, 6), "injection": self.injection, "what": self.what, "source": self.source}
-        try:
-            sender, sequence, message = decode(self.datagram)
-        except MalformedDatagramError as malformed:
-            return {**record, "bytes": len(self.datagram), "refused": malformed.reason}
-        block = block_named(message)
-        decoded = {"message": message.NAME, "sender": sender, "sequence": sequence}
-        return {**record, **decoded, "block": block.hex() if block else None, "bytes": len(self.datagram)}
+        return line_of(at_s, self.injection, self.what, self.source, self.datagram)
 
 
 @dataclass(slots=True)

@@ -79,8 +79,9 @@ class _Asked:
     """When the first answer of all arrives, and its rank, where no other is wanted."""
 
 
-Logged = tuple[int, int, bytes]
-"""An event that an agent is about to log: in which of its lives (0: whichever it is), event ID, data."""
+Logged = tuple[int, int, bytes, int | None]
+"""An event that an agent is about to log: in which of its lives (0: whichever it is), event ID, data, and its time in
+microseconds, None for that of the agent's clock."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,19 +5,23 @@ Each agent's events, the lots of each sender, and each agent's quirks have rando
 one fault leaves the others as they are. Vehicles are tracks, without telemetry, so events are those of Algorithm 21.
 """
 
+import base64
 import dataclasses
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, Any, Protocol
 
 from harness.gc_pause import gc_paused
 from harness.play.mission import RunOutcome
 from harness.play.radio_range import TRACK_S, RadioRange, tracks_of
+from harness.play.rogue.line import OF_NO_INJECTION, line_of
 from harness.play.seeds import agent_seed
 from harness.play.simulation.air import NEVER, Happening, InFlight, Logged, RogueDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, NameOf
+from harness.play.simulation.late_timers import LateTimers
 from harness.play.simulation.recurrence import LOOK_AFTER_S, Recurrence, Waiting
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, disconnected_until, injected_nothing
@@ -38,7 +42,6 @@ if TYPE_CHECKING:
     from harness.play.simulation.rogue import VirtualRogue
 
 ENGINE = "virtual time"
-SCRIPTED_EVENT_ID = 1
 ANY_LIFE = 0
 BREATH_S = 20.0
 """Mission seconds between two looks at whoever watches."""
@@ -142,7 +145,7 @@ class Simulation:
         self.played = RunOutcome(engine=ENGINE)
         self.stage = "mission"
         self.network = ""
-        self._initial_data = f"{scenario.name}, seed {seed}".encode()
+        self._initial_data = _initial_data(scenario, seed)
         self._recorder = recorder
         self._tracing = recorder.tracing
         self._deliver_all = deliver_all = deliver_all or scenario.has_wrong_agents
@@ -156,6 +159,8 @@ class Simulation:
         self._disks: dict[int, StoredState] = {}
         """What is on the disk of the agents that reboot with it."""
         self._switched_off: dict[int, Incarnation] = {}
+        self._late = {self._number[agent_id]: LateTimers(text) for agent_id, text in scenario.lateness.items()}
+        """By number, of the agents that have any."""
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
@@ -186,7 +191,14 @@ class Simulation:
         for number in range(len(self.roster)):
             self._start(number)
         for event in self.scenario.events.script:
-            self._air.expect(event.at_s, self._number[event.agent], (ANY_LIFE, SCRIPTED_EVENT_ID, bytes(event.bytes)))
+            logged = ANY_LIFE, event.event_id, event.event_data, event.timestamp_us
+            self._air.expect(event.at_s, self._number[event.agent], logged)
+        for scripted in self.scenario.datagrams:
+            stray = RogueDatagram(scripted.source, base64.b64decode(scripted.datagram))
+            for agent_id, at_s in scripted.reaches.items():
+                self._air.inject(at_s, stray, [self._number[agent_id]])
+            at_s = min(scripted.reaches.values())
+            self._recorder.injected(line_of(at_s, OF_NO_INJECTION, "datagram", stray.source, stray.datagram))
 
     async def until(self, mission_s: float) -> None:
         if self._breathe is None and not self._tracks:
@@ -260,7 +272,7 @@ class Simulation:
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
         wrong = self.scenario.has_wrong_agents
-        if self._generating or moving or self._rogue is not None or wrong or delays is None:
+        if self._generating or moving or self._rogue is not None or wrong or delays is None or self._late:
             return None
         return Recurrence(delays)
 
@@ -417,9 +429,11 @@ class Simulation:
         elif self._generating and life.logs and what[0] in (ANY_LIFE, len(self._lives[number])):
             if self._tracing:
                 self._hear(number, life)
-            _, event_id, data = what
+            _, event_id, data, timestamp_us = what
+            if timestamp_us is None:
+                timestamp_us = self.timestamp_us(life)
             self._recorder.logged(self._now, agent.agent_id, len(data))
-            agent.add_event(LoggableEvent(self.timestamp_us(life), event_id, data), self._local(life))
+            agent.add_event(LoggableEvent(timestamp_us, event_id, data), self._local(life))
             self._expect_event(number, life)
             self._after(number, life)
 
@@ -429,7 +443,10 @@ class Simulation:
         self._hear(number, life)
         if self._recurrence is not None:
             self._recurrence.timers_end(self._now, max(soonest, self._local(life)), life.agent.state)
-        life.agent.handle_timer(max(soonest, self._local(life)))
+        if number in self._late:
+            self._late_timer_ends(number, life)
+        else:
+            life.agent.handle_timer(max(soonest, self._local(life)))
         self._air.no_longer_asked(number, life.agent.state)
         self._after(number, life)
 
@@ -469,13 +486,30 @@ class Simulation:
         """Wait for the agent's next timer."""
         agent = life.agent
         soonest = agent.next_timer()
-        deadline = None if soonest is None else max(self._now, _mission_time(life, soonest))
+        deadline = None if soonest is None else max(self._now, self._ends_at(number, life, soonest))
         if deadline != life.deadline:
             life.deadline = deadline
             if deadline is not None:
                 self._air.expect(deadline, number, None)
         busy_until = agent.answers_nobody_until()
         self._air.busy_until[number] = 0.0 if busy_until is None else _mission_time(life, busy_until)
+
+    def _ends_at(self, number: int, life: Incarnation, soonest: float) -> float:
+        """When a timer ends next, of which the first should by the agent's clock at `soonest`."""
+        if number not in self._late:
+            return _mission_time(life, soonest)
+        late = self._late[number]
+        late.look(life.agent.state)
+        ends = late.next(partial(_mission_time, life))
+        assert ends is not None, "a timer runs"
+        return ends[0]
+
+    def _late_timer_ends(self, number: int, life: Incarnation) -> None:
+        ends = self._late[number].next(partial(_mission_time, life))
+        assert ends is not None, "it was expected to end now"
+        name, _, deadline = ends[1]
+        timer = next(timer for timer in life.agent.state.timers if timer.name == name)
+        life.agent.end_timer(timer, max(deadline, self._local(life)))
 
     def _take_down(self, life: Incarnation, mission_s: float) -> list[Recorded | None]:
         """Write what the agent has done into its trace; the datagrams that it sent, as the trace has them."""
@@ -519,7 +553,7 @@ class Simulation:
         if self.scenario.events.source != "scripted":
             due, event_id, data = life.source.next()
             this_life = len(self._lives[number])
-            self._air.expect(max(self._now, life.born_at + due), number, (this_life, event_id, data))
+            self._air.expect(max(self._now, life.born_at + due), number, (this_life, event_id, data, None))
 
     # What faults do to it: harness.scenario.faults.Lives
 
@@ -590,6 +624,12 @@ class Simulation:
         clock = life.clock
         now = self._now if mission_s is None else mission_s
         return now if clock is None else clock.offset_s + (1 + clock.drift) * now
+
+
+def _initial_data(scenario: Scenario, seed: int) -> bytes:
+    if scenario.initial_data is not None:
+        return base64.b64decode(scenario.initial_data)
+    return f"{scenario.name}, seed {seed}".encode()
 
 
 def _chain_changed_at(life: Incarnation) -> float:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from harness.scenario.fates import Fate
+from harness.scenario.numbered import numbered
 from netem.medium import RandomDraws
 from ucp.messages import Message, block_named
 
@@ -16,12 +17,20 @@ NameOf = Callable[[bytes], str | None]
 
 @dataclass(slots=True, eq=False)
 class _Part:
-    """One fate and what it has come to: messages that fit it, and deliveries that it decided."""
+    """One fate and what it has come to: messages that fit it, and deliveries that it decided.
+
+    `arrivals` are the mission seconds at which the sender's datagrams arrive that have not been sent yet, by number.
+    """
 
     index: int
     fate: Fate
     fitting: int = 0
     decided: int = 0
+    arrivals: dict[int, list[float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for number, at_s in numbered(self.fate.arrivals or ""):
+            self.arrivals.setdefault(number, []).append(at_s)
 
 
 @dataclass(slots=True)
@@ -76,7 +85,9 @@ class FateScript:
             if fate.after is not None:
                 decided.waiting.append((receiver, fate.after))
                 continue
-            if fate.drop:
+            if fate.arrivals is not None:
+                arrivals = [max(now, at) for at in part.arrivals.pop(part.fitting - 1, ())]
+            elif fate.drop:
                 arrivals = []
             elif fate.delay_s is not None:
                 arrivals = [now + fate.delay_s]
@@ -89,6 +100,8 @@ class FateScript:
 
     def standing(self, now: float) -> tuple[int, ...] | None:
         """How far each fate has counted, as far as that still matters; None while the time of one is to come."""
+        if any(part.arrivals for part in self._parts):
+            return None
         times = (time for part in self._parts for time in (part.fate.from_s, part.fate.until_s, part.fate.hold_until_s))
         if any(time is not None and time > now for time in times):
             return None
@@ -104,6 +117,9 @@ class FateScript:
             fate = f"fates.{part.index} ({part.fate.describe()})"
             if not part.decided:
                 sentences.append(f"{fate} never matched a message")
+            elif part.arrivals:
+                numbers = f"{len(part.arrivals)} of its datagrams, the first number {min(part.arrivals)}"
+                sentences.append(f"{fate}: {numbers}, never left")
             elif part.fate.after in waiting:
                 sentences.append(f"{fate}: the message that {part.fate.after!r} is about never arrived")
         return sentences

@@ -53,6 +53,9 @@ class Lives(Protocol):
     async def switch_off(self, agent_id: int) -> None:
         """Have the agent export its chain and end, and its vehicle with it."""
 
+    async def reconcile(self, agent_id: int) -> None:
+        """Have the agent begin a reconcile."""
+
 
 @dataclass(frozen=True)
 class Fault:

@@ -1,0 +1,32 @@
+"""Seconds by number, short enough for thousands of them in a file: "17@12.345 18@12.5", or "3+0.25" for a duration."""
+
+import re
+from collections.abc import Iterable
+from typing import Annotated
+
+from pydantic import Field
+
+MAX_CHARACTERS = 1024 * 1024
+_SECONDS = r"\d{1,9}(?:\.\d{1,12})?"
+
+
+def _listed(sign: str) -> str:
+    entry = rf"\d{{1,10}}{re.escape(sign)}{_SECONDS}"
+    return rf"^{entry}(?: {entry})*$"
+
+
+def numbered(text: str) -> list[tuple[int, float]]:
+    """(number, seconds), in the order of the text."""
+    pairs = (re.split(r"[@+]", entry) for entry in text.split())
+    return [(int(number), float(seconds)) for number, seconds in pairs]
+
+
+def in_text(pairs: Iterable[tuple[int, float]], sign: str) -> str:
+    """As a file says it, to the microsecond."""
+    return " ".join(f"{number}{sign}{seconds:.6f}".rstrip("0").rstrip(".") for number, seconds in pairs)
+
+
+Arrivals = Annotated[str, Field(pattern=_listed("@"), max_length=MAX_CHARACTERS)]
+"""Number of a datagram, and the mission second at which it arrives."""
+Lateness = Annotated[str, Field(pattern=_listed("+"), max_length=MAX_CHARACTERS)]
+"""Number of a timer, and by how many seconds it ends late."""
