@@ -20,6 +20,10 @@ COMMANDS = {
         "harness.commands.run:run_command",
         "Play a scenario, check the six characteristics, write a report.",
     ),
+    "scenarios": (
+        "harness.commands.scenarios:scenarios_command",
+        "List the scenarios that come along: `ucp-harness run loss_15` plays one.",
+    ),
     "check": (
         "harness.commands.check:check_command",
         "Decide the six characteristics from exported chains, and from traces beside them.",

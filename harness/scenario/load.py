@@ -9,6 +9,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from harness.errors import ScenarioError
+from harness.scenario import library
 from harness.scenario.model import BOUNDED
 from harness.scenario.scenario import Scenario
 
@@ -47,7 +48,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
-    """The mapping in a YAML file that should be a `what`. Raises ScenarioError."""
+    """The mapping in a YAML file that should be a `what`, or comes along by that name. Raises ScenarioError."""
+    path = library.find(path)
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
@@ -55,6 +57,9 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
         if status.st_size > MAX_SCENARIO_BYTES:
             raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which no {what} is")
         document = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506  (a safe loader)
+    except FileNotFoundError:
+        names = "`ucp-harness scenarios` lists those that come along"
+        raise ScenarioError(f"{path}: there is no such file or {what}; {names}") from None
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:

@@ -141,7 +141,7 @@ def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
 
 
 def test_a_missing_or_oversized_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="cannot be read: No such file"):
+    with pytest.raises(ScenarioError, match="there is no such file or scenario; `ucp-harness scenarios` lists"):
         load_scenario(tmp_path / "none.yaml")
     with pytest.raises(ScenarioError, match="larger than"):
         load_scenario(write(tmp_path, "#" * 2_000_000))

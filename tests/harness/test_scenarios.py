@@ -15,6 +15,7 @@ from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from harness.scenario.changes import RANGE
 from harness.scenario.expect import NUMBERS
+from tests.harness.command import harness
 from ucp.trace import StateSummary
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -293,3 +294,16 @@ def test_a_final_reconcile_makes_one_chain_of_all_that_is_left(name: str, seed: 
 def test_there_is_a_scenario_for_every_rate_of_the_thesis() -> None:
     lossy = {path.stem: load_scenario(path).network.loss for path in SCENARIOS.glob("loss_*.yaml")}
     assert lossy == {f"loss_{rate * 100:.0f}": rate for rate in yaml.safe_load(MATRIX.read_text())["loss"] if rate}
+
+
+def test_the_library_is_there_by_name_from_anywhere(tmp_path: Path) -> None:
+    listed = harness("scenarios", cwd=tmp_path).stdout
+    for path in SCENARIOS.glob("*.yaml"):
+        assert path.stem in listed
+    assert load_scenario(Path("loss_15")) == load_scenario(SCENARIOS / "loss_15.yaml")
+
+
+def test_a_file_comes_before_a_scenario_that_comes_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "loss_15").write_text("name: mine")
+    monkeypatch.chdir(tmp_path)
+    assert load_scenario(Path("loss_15")).name == "mine"

@@ -119,7 +119,7 @@ def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
         ({"backend": "kernel"}, "`backend.0` is 'kernel': it should be 'process', 'docker' or 'sim'"),
         ({"keep": "none"}, "`keep` is 'none': it should be 'violated' or 'all'"),
         ({"delay": [0.1]}, "`delay` is unknown: there are name, about, scenario, loss, seeds, agents, backend, keep"),
-        ({"scenario": "nowhere.yaml"}, "nowhere.yaml: cannot be read: No such file or directory"),
+        ({"scenario": "nowhere.yaml"}, "nowhere.yaml: there is no such file or scenario"),
         ({"name": None}, "is missing"),
     ],
 )

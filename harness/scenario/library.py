@@ -1,0 +1,28 @@
+"""The scenarios that come along, by name: `loss_15` is scenarios/loss_15.yaml, wherever the harness is installed."""
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parents[1]
+FOLDER = next(folder for folder in (_PACKAGE / "scenarios", _PACKAGE.parent / "scenarios") if folder.is_dir())
+"""In an installed package inside of it; in a checkout beside it."""
+
+
+def names() -> list[str]:
+    """All of them, in alphabetical order."""
+    return sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+def find(path: Path) -> Path:
+    """The file that comes along by this name, if it is such a name and no file; else what was given."""
+    named = FOLDER / f"{path}.yaml"
+    return named if len(path.parts) == 1 and not path.exists() and named.is_file() else path
+
+
+def opening(name: str) -> str:
+    """The sentence that its file begins with."""
+    comment = []
+    for line in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        comment.append(line.removeprefix("#").strip())
+    return " ".join(comment).partition(". ")[0].removesuffix(".") + "."
