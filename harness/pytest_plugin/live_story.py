@@ -89,6 +89,12 @@ class Told:
             self._played_s = change.at_s
         await swarm.until(mission_s)
 
+    async def from_now_until(self, swarm: mission.Swarm, mission_s: float) -> None:
+        """As `until`. Raises ScenarioError if that is over, or never comes."""
+        if not swarm.now() <= mission_s < math.inf:
+            raise ScenarioError(f"a mission does not go on until {mission_s:g} s: it is at {swarm.now():g} s")
+        await self.until(swarm, mission_s)
+
     async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> RunOutcome | None:
         """Go on until everybody has voted since something was last told, and all are idle; None if that takes longer.
 

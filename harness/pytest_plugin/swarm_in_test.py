@@ -1,9 +1,10 @@
 """The swarm of a test, which tells what happens to it: any backend, mission seconds, one sentence after another."""
 
 import asyncio
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -72,10 +73,20 @@ class SwarmInTest:
 
     # The network
 
-    def partition(self, *groups: list[int], for_s: float | None = None) -> None:
-        """Cut the groups from each other; agents that none of them names form one more together."""
+    def partition(self, *groups: list[int], for_s: float | None = None) -> AbstractContextManager[None]:
+        """Cut the groups from each other; agents that none of them names form one more together.
+
+        `with swarm.partition([1, 2]):` heals at the end of its block.
+        """
         __tracebackhide__ = True
         self._change(partition=[list(group) for group in groups], for_s=for_s)
+        return self._healing()
+
+    @contextmanager
+    def _healing(self) -> Iterator[None]:
+        __tracebackhide__ = True
+        yield
+        self.heal()
 
     def heal(self) -> None:
         """Undo the partition."""
@@ -130,12 +141,14 @@ class SwarmInTest:
     def run_for(self, seconds: float) -> None:
         """Let the mission go on for so long."""
         __tracebackhide__ = True
+        if not 0 <= seconds < math.inf:
+            raise ScenarioError(f"a mission does not go on for {seconds:g} s")
         self._act(lambda swarm: self._told.until(swarm, swarm.now() + seconds))
 
     def run_until(self, mission_s: float) -> None:
-        """Let the mission go on until then."""
+        """Let the mission go on until then, which is not over yet."""
         __tracebackhide__ = True
-        self._act(lambda swarm: self._told.until(swarm, mission_s))
+        self._act(lambda swarm: self._told.from_now_until(swarm, mission_s))
 
     def wait_idle(self, limit_s: float = 1800.0) -> None:
         """Let the mission go on until what was told last has sunk in.

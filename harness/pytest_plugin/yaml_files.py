@@ -1,5 +1,6 @@
 """Which YAML files are tests of ours, found out without parsing those that are not: a project has many others."""
 
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,7 +15,7 @@ NOTHING_SPECIAL = re.compile(rb"[ \t]*(?:\{[ \t]*\})?[ \t]*(?:#.*)?\s*")
 
 
 def is_asked_for(path: Path, config: pytest.Config) -> bool:
-    """Whether it, or a directory round it below pytest's root, is a testpath or named on the command line."""
+    """Whether it, or a directory round it, is a testpath or named on the command line; `pytest .` names the root."""
     if PLACES not in config.stash:
         config.stash[PLACES] = _places(config)
     return any(path.is_relative_to(place) for place in config.stash[PLACES])
@@ -23,8 +24,10 @@ def is_asked_for(path: Path, config: pytest.Config) -> bool:
 def _places(config: pytest.Config) -> list[Path]:
     root = config.rootpath
     testpaths = [path for pattern in config.getini("testpaths") for path in _matching(root, pattern)]
-    named = [config.invocation_params.dir / argument.split("::")[0] for argument in config.args]
-    return [*testpaths, *(path for path in named if root in path.parents)]
+    if config.args_source is not pytest.Config.ArgsSource.ARGS:
+        return testpaths
+    named = (config.invocation_params.dir / argument.split("::")[0] for argument in config.args)
+    return [*testpaths, *(Path(os.path.normpath(path)) for path in named)]
 
 
 def _matching(root: Path, pattern: str) -> Iterable[Path]:

@@ -33,11 +33,13 @@ def test_a_file_is_a_test_if_it_is_named_or_lies_in_a_testpath_and_expects_somet
         write_scenario(pytester, f"{folder}/yes.yaml", expect={})
         write_scenario(pytester, f"{folder}/no.yaml")
     assert collected(pytester) == []
-    assert collected(pytester, ".") == []
+    everything = ["a/yes.yaml::sim-seed1", "b/yes.yaml::sim-seed1"]
+    assert collected(pytester, ".") == collected(pytester, pytester.path) == everything
     assert collected(pytester, "a/no.yaml") == []
     assert collected(pytester, "a") == collected(pytester, "a/yes.yaml") == ["a/yes.yaml::sim-seed1"]
     pytester.makeini("[pytest]\ntestpaths = b")
-    assert collected(pytester) == collected(pytester, ".") == ["b/yes.yaml::sim-seed1"]
+    assert collected(pytester) == ["b/yes.yaml::sim-seed1"]
+    assert collected(pytester, ".") == everything
 
 
 def test_a_run_as_expected_passes_and_leaves_nothing(pytester: pytest.Pytester) -> None:

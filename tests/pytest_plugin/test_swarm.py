@@ -49,6 +49,24 @@ def test_the_story_holds_with_any_seed(pytester: pytest.Pytester, seed: int) -> 
     run(pytester, "--ucp-seed", seed).assert_outcomes(passed=1)
 
 
+def test_a_partition_heals_at_the_end_of_its_block(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        def test_story(swarm):
+            with swarm.partition([1, 2], [3, 4, 5]):
+                swarm.run_for(300)
+            swarm.run_for(100)
+        """
+    )
+    run(pytester, "--ucp-keep", pytester.path / "kept").assert_outcomes(passed=1)
+    (record,) = (pytester.path / "kept").glob("*/run.json")
+    entries = json.loads(record.read_text())["scenario"]["timeline"]
+    assert [(entry["at_s"], entry["partition"], entry["heal"]) for entry in entries] == [
+        (0.001, [[1, 2], [3, 4, 5]], None),
+        (300.001, None, True),
+    ]
+
+
 @pytest.mark.lab
 def test_the_same_story_is_told_to_processes(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(STORY)
@@ -252,6 +270,9 @@ def test_the_network_changes_for_a_while_and_a_test_that_ends_waits_for_that(pyt
         ("swarm.kill(1, 2, 3, 4, 5)", "the timeline leaves nobody: *"),
         ("swarm.characteristic(7)", "there is no characteristic 7: they are 1 to 6"),
         ("swarm.judgement('6')", "there is no judgement '6': there are steps, records, liveness"),
+        ("swarm.run_for(-5)", "a mission does not go on for -5 s"),
+        ("swarm.run_for(9); swarm.run_until(8)", "a mission does not go on until 8 s: it is at 9 s"),
+        ("swarm.run_until(float('inf'))", "a mission does not go on until inf s: it is at 0 s"),
         ("swarm.chain(6)", "there is no chain of agent 6: there are those of [[]1, 2, 3, 4, 5[]]"),
         ("swarm.pause(1); swarm.wait_idle(20)", "within 20 mission seconds not every agent has voted and become idle"),
     ],
