@@ -52,6 +52,10 @@ COMMANDS = {
         "harness.commands.mission:app",
         "Make the mission files of a swarm, and compare those on its vehicles.",
     ),
+    "reconstruct": (
+        "harness.commands.reconstruct:reconstruct_command",
+        "Make a scenario that flies what came home again, in virtual time: exit status 1, and where, if it cannot.",
+    ),
     "matrix": (
         "harness.commands.matrix:matrix_command",
         "Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated.",

@@ -11,7 +11,7 @@ from harness.explore.recording import Recording, record
 from harness.explore.search import Judge, Searched, Violation, search, simulated
 from harness.explore.shrink import BudgetSpentError, Shrinker
 from harness.explore.smaller import replays, scenario_of, shrink, size
-from harness.explore.write import claim, evidence_lines, to_yaml, write
+from harness.explore.write import claim, evidence_lines, file_of, write
 from harness.scenario import Scenario
 
 MAX_RUNS = 5000
@@ -123,5 +123,5 @@ def _written(
         f"Shrunk from {source}, seed {seed}: {words}.",
         f"  {replay}",
     ]
-    written = write(path, to_yaml(document, header, recorded(document)))
+    written = write(path, file_of(document, header, recorded(document)))
     return Shrunk(written, seed, judgements, words, replay.replace(str(path), str(written)))

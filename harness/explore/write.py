@@ -1,10 +1,7 @@
 """The smallest run as a scenario file: short, read by people, and played again by `ucp-harness run`."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from harness.archive.directory import default_path
 from harness.checker.judgement import Judgement
@@ -12,23 +9,9 @@ from harness.errors import MachineError, RunDirectoryError
 from harness.explore.document import Document, at
 from harness.explore.recording import Lost, Recording
 from harness.scenario.verdicts import CHARACTERISTICS
+from harness.scenario.write import to_yaml
 
 EVIDENCE_SHOWN = 5
-ORDER = (
-    "name",
-    "agents",
-    "duration_s",
-    "network",
-    "clocks",
-    "settings",
-    "quirks",
-    "timeline",
-    "schedule",
-    "events",
-    "fates",
-    "settle",
-    "final_reconcile",
-)
 
 
 def claim(out: Path | None, name: str) -> Path:
@@ -57,16 +40,20 @@ def write(path: Path, text: str) -> Path:
             raise MachineError(f"{free} cannot be written: {error.strerror}") from None
 
 
-def to_yaml(document: Document, header: list[str], recording: Recording) -> str:
+def file_of(document: Document, header: list[str], recording: Recording) -> str:
     """`recording` of this very document says when each message was sent that a fate is about."""
-    sent = {(lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost}
-    lines = [f"# {line}".rstrip() for line in header]
+    sent: dict[Any, Lost] = {(lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost}
+
+    def remark(entry: Document) -> str | None:
+        key = entry.get("message"), entry.get("sender"), entry.get("receiver"), _hashable(entry.get("count"))
+        if (lost := sent.get(key)) is None:
+            return None
+        return f"sent at {lost.at_s:.3f} s" + (f", block {lost.block}" if lost.block else "")
+
+    comment = [*header]
     if at(document, "settings.max_block_bytes") is not None:
-        lines.append("# Blocks are full as soon as another event of the largest size might not fit: here, after one.")
-    for key in ORDER:
-        if key in document:
-            lines += _lines(key, _plain(document[key]), sent)
-    return "\n".join(lines) + "\n"
+        comment.append("Blocks are full as soon as another event of the largest size might not fit: here, after one.")
+    return to_yaml(document, comment, remark)
 
 
 def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
@@ -83,38 +70,5 @@ def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
     return lines
 
 
-def _lines(key: str, value: Any, sent: dict[Any, Lost]) -> Iterator[str]:
-    """One line for a key, or one for each of a list of mappings."""
-    if key == "events" and "script" in value:
-        yield "events:"
-        yield f"  source: {value['source']}"
-        yield "  script:"
-        yield from (f"    - {_flow(event)}" for event in value["script"])
-    elif isinstance(value, list) and value and isinstance(value[0], dict):
-        yield f"{key}:"
-        for entry in value:
-            lost = sent.get(
-                (entry.get("message"), entry.get("sender"), entry.get("receiver"), _hashable(entry.get("count")))
-            )
-            about = f", block {lost.block}" if lost and lost.block else ""
-            yield f"  - {_flow(entry)}" + (f"  # sent at {lost.at_s:.3f} s{about}" if lost else "")
-    else:
-        yield f"{key}: {_flow(value)}"
-
-
 def _hashable(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
-
-
-def _flow(value: Any) -> str:
-    written: str = yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=1e9, allow_unicode=True)
-    return written.strip()[1:-1]
-
-
-def _plain(value: Any) -> Any:
-    """Whole numbers without a point; agents that are keys as numbers."""
-    if isinstance(value, dict):
-        return {int(key) if key.isdecimal() else key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return int(value) if isinstance(value, float) and value.is_integer() else value

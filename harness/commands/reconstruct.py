@@ -1,0 +1,41 @@
+"""`ucp-harness reconstruct`: from what came home to a scenario that flies it again."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from harness.commands.terminal import complain, print_json
+from harness.errors import VIOLATED, RunDirectoryError
+from harness.field.homecoming import sort_out
+from harness.field.reconstruct import reconstruct, write
+
+
+def reconstruct_command(
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="What came home: directories and files; run directories too.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The scenario; must be new.")],
+    as_json: Annotated[bool, typer.Option("--json", help="What came of it, as JSON on standard output.")] = False,
+) -> None:
+    """Make a scenario that flies what came home again, in virtual time: exit status 1, and where, if it cannot."""
+    if out.exists():
+        raise RunDirectoryError(f"{out} exists: choose another --out, nothing is overwritten")
+    with Console(stderr=True).status("reading what came home") as status:
+        homecoming = sort_out(paths)
+        flight = homecoming.largest()
+        name = f"{paths[0].resolve().name} flown again"[:200]
+        reconstruction = reconstruct(flight, name, status.update)
+    left_out = [*homecoming.sentences()]
+    write(reconstruction, out, paths, left_out)
+    for sentence in left_out:
+        complain(sentence)
+    if as_json:
+        print_json({"scenario": str(out), **reconstruction.to_json()})
+    else:
+        console = Console(highlight=False)
+        for sentence in (reconstruction.sentence, *reconstruction.problems[1:], *reconstruction.remarks, str(out)):
+            console.print(sentence, soft_wrap=True, markup=False)
+    if reconstruction.problems:
+        raise typer.Exit(VIOLATED)

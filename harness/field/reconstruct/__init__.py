@@ -1,0 +1,15 @@
+"""A flight flown again in virtual time, from whatever came home of it.
+
+inputs      a trace, taken apart into what reached the agent
+rehearsal   one agent alone: how far its record is what the protocol does
+clocks      what the agents' clocks show beside each other, from messages alone
+timetable   when everything happens, on one time for all
+script      that as a scenario
+comparing   what virtual time did, beside what is on record
+file        the scenario as a file
+"""
+
+from harness.field.reconstruct.file import write
+from harness.field.reconstruct.reconstruct import Reconstruction, reconstruct
+
+__all__ = ["Reconstruction", "reconstruct", "write"]

@@ -1,0 +1,249 @@
+"""From what came home to a scenario that flies it again, and whether it does."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from harness.archive.exports import Export
+from harness.checker import Evidence, steps
+from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, checked
+from harness.errors import FieldError
+from harness.field.homecoming import Flight
+from harness.field.reconstruct.comparing import FirstDifference, first_difference
+from harness.field.reconstruct.inputs import UnusableInputError, lives_of
+from harness.field.reconstruct.rehearsal import Rehearsal, rehearse
+from harness.field.reconstruct.script import Mission, scenario_of
+from harness.field.reconstruct.timetable import Timetable, timetable
+from harness.run.simulate import InMemory, Simulated, simulate_in_memory
+from harness.scenario.load import parse
+from harness.scenario.write import Document
+from ucp.clock import MICROSECONDS
+from ucp.quirks import QUIRKS
+
+SEED = 1
+"""Of the reconstruction, in which nothing is left to chance."""
+
+NOTHING = "no agent's record says in full what reached it (ucp-trace/2), so nothing can be flown again"
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class AgentOutcome:
+    """What became of one agent: how many `blocks` its chain has in virtual time, and `why` that is not its flight."""
+
+    agent_id: int
+    blocks: int
+    why: str | None = None
+
+
+@dataclass
+class Reconstruction:
+    """A scenario, and what it reproduces.
+
+    `agents` are those that left a record; `remarks` say what was assumed; `difference` is the first step at which
+    virtual time did something else than the record of an agent that was to be played in full.
+    """
+
+    document: Document
+    agents: list[AgentOutcome]
+    remarks: list[str]
+    difference: FirstDifference | None
+    simulated: Simulated
+    table: Timetable = field(repr=False)
+
+    @property
+    def problems(self) -> list[str]:
+        """Why it is not the whole flight, the first place first; empty if it is."""
+        first = [self.difference.sentence] if self.difference else []
+        return first + [f"agent {agent.agent_id} {agent.why}" for agent in self.agents if agent.why]
+
+    @property
+    def blocks(self) -> int:
+        """How many there are in the chains that came out as they did."""
+        exports = self.simulated.evidence.exports
+        chains = (exports[agent].chain_of_block_hashes for agent in self.reproduced if agent in exports)
+        return len({block for chain in chains for block in chain})
+
+    @property
+    def reproduced(self) -> list[int]:
+        return [agent.agent_id for agent in self.agents if agent.why is None]
+
+    @property
+    def sentence(self) -> str:
+        """What it comes to."""
+        whole, all_of_them = len(self.reproduced), len(self.agents)
+        if not self.problems:
+            chains = "the chain" if whole == 1 else f"all {whole} chains"
+            return f"reproduces {chains}, {self.blocks} blocks"
+        return f"reproduces {whole} of {all_of_them} chains: {self.problems[0]}"
+
+    def to_json(self) -> dict[str, Any]:
+        exports = self.simulated.evidence.exports
+        return {
+            "reproduced": not self.problems,
+            "chains": {
+                str(agent.agent_id): {
+                    "blocks": agent.blocks,
+                    "top_chain_hash": exports[agent.agent_id].top_chain_hash if agent.agent_id in exports else None,
+                    "reproduced": agent.why is None,
+                    "why": agent.why,
+                }
+                for agent in self.agents
+            },
+            "blocks": self.blocks,
+            "first_difference": None
+            if self.difference is None
+            else {
+                "agent_id": self.difference.agent_id,
+                "at_s": round(self.difference.at_s, 6),
+                "line": self.difference.line,
+                "handler": self.difference.handler,
+                "recorded": self.difference.recorded,
+                "played": self.difference.played,
+            },
+            "problems": self.problems,
+            "remarks": self.remarks,
+        }
+
+
+def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -> Reconstruction:
+    """Fly it again. `tell` is told what is being done. Raises FieldError if there is nothing to fly it by."""
+    tell("reading what each agent was told")
+    remarks: list[str] = []
+    headers = _headers(flight, remarks)
+    mission = _mission(flight, headers, name, remarks)
+    rehearsals: dict[int, Rehearsal] = {}
+    why: dict[int, str] = {}
+    for agent_id, header in headers.items():
+        tell(f"agent {agent_id} alone")
+        try:
+            lives = lives_of(flight.traces[agent_id], header)
+        except UnusableInputError as error:
+            why[agent_id] = f"cannot be played: {error}"
+            continue
+        if header.settings != mission.settings:
+            why[agent_id] = "was set otherwise than the others, and a scenario has one set of settings"
+            continue
+        rehearsal = rehearse(header, lives)
+        if rehearsal.parting:
+            rehearsal = _with_a_quirk(header, lives, rehearsal, remarks)
+        if rehearsal.parting:
+            why[agent_id] = _parted(flight, agent_id, rehearsal)
+        if rehearsal.played:
+            rehearsals[agent_id] = rehearsal
+    if not rehearsals:
+        first = next((f": agent {agent_id} {words}" for agent_id, words in why.items()), "")
+        raise FieldError(NOTHING + first)
+    tell("putting everything in order")
+    table = timetable(rehearsals)
+    document = scenario_of(mission, table, rehearsals)
+    tell("flying it again")
+    simulated = simulate_in_memory(InMemory(tracing=True), parse(document), SEED)
+    difference = first_difference(table, rehearsals, simulated)
+    _compare_chains(flight, rehearsals, simulated, why)
+    came_home = sorted({*flight.traces, *flight.exports})
+    for agent_id in came_home:
+        if agent_id not in rehearsals and agent_id not in why:
+            why[agent_id] = "has left no trace, and what reached it is not on record"
+    for agent_id in sorted(set(mission.roster) - set(rehearsals)):
+        remarks.append(f"agent {agent_id} is not played: what others heard of it is put on the air as they heard it")
+    remarks += table.impossible
+    remarks += _clocks_in_words(table)
+    agents = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in came_home]
+    document["expect"] = _expected(simulated, rehearsals)
+    return Reconstruction(document, agents, remarks, difference, simulated, table)
+
+
+def _headers(flight: Flight, remarks: list[str]) -> dict[int, CheckedHeader]:
+    headers: dict[int, CheckedHeader] = {}
+    for agent_id, trace in sorted(flight.traces.items()):
+        if not trace.header.has_inputs:
+            remarks.append(f"agent {agent_id}: its trace is of ucp-trace/1, which lacks what it received")
+            continue
+        try:
+            headers[agent_id] = checked(trace.header)
+        except ImpossibleHeaderError as error:
+            remarks.append(f"agent {agent_id}: {error}")
+    return headers
+
+
+def _mission(flight: Flight, headers: Mapping[int, CheckedHeader], name: str, remarks: list[str]) -> Mission:
+    """What most agents were told."""
+    if not headers:
+        raise FieldError(NOTHING)
+    settings, _ = Counter(header.settings for header in headers.values()).most_common(1)[0]
+    initial_data, _ = Counter(header.initial_data for header in headers.values()).most_common(1)[0]
+    if flight.initial_data is not None:
+        initial_data = flight.initial_data
+    roster = sorted({*flight.roster, *headers, *(agent for header in headers.values() for agent in header.roster)})
+    return Mission(name, tuple(roster), initial_data, settings)
+
+
+def _with_a_quirk(header: CheckedHeader, lives: Any, parted: Rehearsal, remarks: list[str]) -> Rehearsal:
+    """The rehearsal with a known mistake that explains the whole record; `parted` if none does."""
+    for name, quirk in QUIRKS.items():
+        if quirk.chance:
+            continue
+        rehearsal = rehearse(header, lives, {name: True})
+        if rehearsal.parting is None:
+            remarks.append(f"agent {header.agent_id} behaves as with {name}: {quirk.sentence}")
+            return rehearsal
+    return parted
+
+
+def _parted(flight: Flight, agent_id: int, rehearsal: Rehearsal) -> str:
+    """Why the agent cannot be played any further: the step judge's word, if it has one."""
+    assert rehearsal.parting is not None, "it has parted"
+    judgement = steps.check(Evidence(flight.exports, {agent_id: flight.traces[agent_id]}))
+    findings = [finding.detail for finding in judgement.evidence if finding.agent_id == agent_id]
+    parting = rehearsal.parting
+    words = findings[0] if findings else f"trace line {parting.line}, t={parting.at_s:g} s: it {parting.what}"
+    return f"does not do what the protocol says, and is played up to there: {words}"
+
+
+def _compare_chains(
+    flight: Flight, rehearsals: Mapping[int, Rehearsal], simulated: Simulated, why: dict[int, str]
+) -> None:
+    for agent_id, rehearsal in rehearsals.items():
+        if agent_id in why:
+            continue
+        played: Export | None = simulated.evidence.exports.get(agent_id)
+        chain = list(played.chain_of_block_hashes) if played else None
+        home = flight.exports.get(agent_id)
+        if chain != rehearsal.chain:
+            why[agent_id] = "ends with another chain in virtual time than by its trace"
+        elif home is not None and list(home.chain_of_block_hashes) != chain:
+            why[agent_id] = _export_differs(home, rehearsal, flight)
+
+
+def _export_differs(home: Export, rehearsal: Rehearsal, flight: Flight) -> str:
+    trace = flight.traces[home.agent_id]
+    last_s = trace.runs[-1].t if trace.runs else 0.0
+    return (
+        f"is played up to the end of its trace at t={last_s:g} s, with {len(rehearsal.chain)} blocks in its chain: "
+        f"its export has {len(home.chain)}, and how it came to those is not on record"
+    )
+
+
+def _clocks_in_words(table: Timetable) -> Iterator[str]:
+    for agent_id, line in sorted(table.clocks.items()):
+        drift = (line.rate - 1) * MICROSECONDS
+        if abs(line.offset_s) >= 0.1 or abs(drift) >= 1:
+            yield f"agent {agent_id}'s clock was {line.offset_s:+.3f} s off, and drifted by {drift:+.0f} ppm"
+
+
+def _blocks(simulated: Simulated, agent_id: int) -> int:
+    export = simulated.evidence.exports.get(agent_id)
+    return len(export.chain) if export else 0
+
+
+def _expected(simulated: Simulated, rehearsals: Mapping[int, Rehearsal]) -> Document:
+    """What this run comes to: its chains, and the verdicts that are bad, which are what happened."""
+    exports = simulated.evidence.exports
+    chains = {str(agent): exports[agent].top_chain_hash for agent in sorted(rehearsals) if agent in exports}
+    bad = {key: simulated.result.judgements[key].verdict for key in simulated.result.bad}
+    characteristics = {key: verdict for key, verdict in bad.items() if key.isdecimal()}
+    beside = {key: verdict for key, verdict in bad.items() if not key.isdecimal()}
+    return {**({"characteristics": characteristics} if characteristics else {}), **beside, "chains": chains}

@@ -1,0 +1,101 @@
+"""A scenario as a file that people read: a comment at the top, a line for each event, fate or change."""
+
+from collections.abc import Callable, Iterable, Iterator
+from textwrap import wrap
+from typing import Any
+
+import yaml
+
+ORDER = (
+    "name",
+    "agents",
+    "duration_s",
+    "initial_data",
+    "network",
+    "clocks",
+    "settings",
+    "quirks",
+    "expect",
+    "timeline",
+    "schedule",
+    "events",
+    "fates",
+    "datagrams",
+    "lateness",
+    "settle",
+    "final_reconcile",
+)
+WIDTH = 112
+
+Document = dict[str, Any]
+
+
+def to_yaml(
+    document: Document, comment: Iterable[str], remark: Callable[[Document], str | None] = lambda entry: None
+) -> str:
+    """The file. `remark` is what is to be said beside an entry of a list."""
+    lines = [f"# {line}".rstrip() for line in comment]
+    for key in ORDER:
+        if key in document:
+            lines += _lines(key, _plain(document[key]), remark)
+    return "\n".join(lines) + "\n"
+
+
+def _lines(key: str, value: Any, remark: Callable[[Document], str | None]) -> Iterator[str]:
+    """One line for a key, or one for each of a list of mappings."""
+    if key == "events" and "script" in value:
+        yield "events:"
+        yield f"  source: {value['source']}"
+        yield "  script:"
+        yield from (f"    - {_flow(event)}" for event in value["script"])
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        yield f"{key}:"
+        for entry in value:
+            beside = remark(entry)
+            yield from _entry(entry, f"  # {beside}" if beside else "")
+    elif isinstance(value, dict) and any(map(_is_long, value.values())):
+        yield f"{key}:"
+        for name, item in value.items():
+            yield from _item(f"  {_flow(name)}", item)
+    else:
+        yield f"{key}: {_flow(value)}"
+
+
+def _entry(entry: Document, beside: str) -> Iterator[str]:
+    """A list's entry in a line; one that has a long text in several."""
+    if not any(map(_is_long, entry.values())):
+        yield f"  - {_flow(entry)}{beside}"
+        return
+    begin = "  - "
+    for name, item in entry.items():
+        yield from _item(begin + name, item)
+        begin = "    "
+
+
+def _item(key: str, value: Any) -> Iterator[str]:
+    """A key whose text, if it is long, goes over several lines, as YAML's folded style has it."""
+    if not _is_long(value) or " " not in value:
+        yield f"{key}: {_flow(value)}"
+        return
+    yield f"{key}: >-"
+    indent = " " * (len(key) - len(key.lstrip(" -")) + 2)
+    yield from wrap(value, WIDTH, initial_indent=indent, subsequent_indent=indent, break_long_words=False)
+
+
+def _is_long(value: Any) -> bool:
+    return isinstance(value, str) and len(value) > WIDTH // 2
+
+
+def _flow(value: Any) -> str:
+    written: str = yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=1e9, allow_unicode=True)
+    return written.strip()[1:-1]
+
+
+def _plain(value: Any) -> Any:
+    """Whole numbers without a point; agents that are keys as numbers."""
+    if isinstance(value, dict):
+        named = ((int(key) if isinstance(key, str) and key.isdecimal() else key, item) for key, item in value.items())
+        return {key: _plain(item) for key, item in named}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value

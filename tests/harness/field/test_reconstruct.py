@@ -1,0 +1,142 @@
+"""A flight flown again: from what came home of runs in virtual time."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import FieldError
+from harness.field.homecoming import sort_out
+from harness.field.reconstruct import Reconstruction, reconstruct, write
+from harness.run.simulate import simulate
+from harness.scenario import load_scenario
+from tests.harness.command import harness, sentences
+from tests.harness.field.flights import flown, trace_of
+
+FIELD: dict[str, Any] = {
+    "agents": [10, 28, 32, 118, 120],
+    "duration_s": 600,
+    "network": {"loss": 0.15},
+    "events": {"source": "random", "mean_s": 10},
+    "clocks": {28: {"offset_s": 3.2, "drift": 0.0001}, 118: {"offset_s": -2, "drift": -0.002}},
+    "timeline": [
+        {"at_s": 100, "partition": [[10, 28], [32, 118, 120]]},
+        {"at_s": 200, "heal": True},
+        {"at_s": 250, "pause": [10]},
+        {"at_s": 290, "resume": [10]},
+        {"at_s": 300, "kill": [32]},
+        {"at_s": 350, "restart": [32]},
+        {"at_s": 400, "reboot": [120], "down_s": 20, "disk": "kept"},
+        {"at_s": 550, "reconcile": [28]},
+    ],
+}
+
+
+def home(directory: Path, run: Path, *left_out: str) -> Path:
+    """What a flight would bring home of a run: no record of the harness."""
+    directory.mkdir()
+    for path in (run / "agents").glob("*.json*"):
+        if path.name not in left_out:
+            shutil.copy(path, directory)
+    return directory
+
+
+def again(directory: Path) -> Reconstruction:
+    return reconstruct(sort_out([directory]).largest(), "again")
+
+
+def test_a_flight_with_all_that_happens_in_the_field_is_flown_again(tmp_path: Path) -> None:
+    reconstruction = again(home(tmp_path / "home", flown(tmp_path / "run", **FIELD)))
+    assert reconstruction.problems == []
+    assert reconstruction.reproduced == FIELD["agents"]
+    faults = [key for entry in reconstruction.document["timeline"] for key in entry if key != "at_s"]
+    assert [fault for fault in faults if fault in ("pause", "resume", "kill", "restart", "reboot", "reconcile")] == [
+        *("pause", "resume", "kill", "restart", "reboot", "reconcile")
+    ]
+
+
+def test_the_file_is_a_scenario_that_comes_to_the_same_and_to_what_it_expects(tmp_path: Path) -> None:
+    reconstruction = again(home(tmp_path / "home", flown(tmp_path / "run", **FIELD)))
+    write(reconstruction, tmp_path / "again.yaml", [tmp_path / "home"], [])
+    scenario = load_scenario(tmp_path / "again.yaml")
+    simulated = simulate(scenario, 77, tracing=True)
+    assert scenario.expect is not None
+    assert simulated.played.unmatched_fates == []
+    tops = {agent: export.top_chain_hash for agent, export in simulated.evidence.exports.items()}
+    assert [*scenario.expect.other_chains(tops)] == []
+    assert all(scenario.expect.as_expected(key, of.verdict) for key, of in simulated.result.judgements.items())
+
+
+def test_clocks_come_out_beside_each_other(tmp_path: Path) -> None:
+    clocks = again(home(tmp_path / "home", flown(tmp_path / "run", **FIELD))).table.clocks
+    beside = clocks[28].after(clocks[10].inverse())
+    assert beside.shows(300.0) - 300.0 == pytest.approx(3.2 + 0.0001 * 300, abs=0.05)
+
+
+def test_of_an_agent_that_did_not_come_home_what_others_heard_is_on_the_air(tmp_path: Path) -> None:
+    run = flown(tmp_path / "run", **FIELD)
+    reconstruction = again(home(tmp_path / "home", run, "118.trace.jsonl", "118.chain.json"))
+    assert reconstruction.problems == []
+    assert reconstruction.reproduced == [10, 28, 32, 120]
+    assert {datagram["source"] for datagram in reconstruction.document["datagrams"]} == {118}
+    assert any("agent 118 is not played" in remark for remark in reconstruction.remarks)
+
+
+def test_what_comes_after_the_end_of_a_trace_that_was_cut_is_said_to_be_unknown(tmp_path: Path) -> None:
+    directory = home(tmp_path / "home", flown(tmp_path / "run", **FIELD))
+    trace = directory / "118.trace.jsonl"
+    lines = trace.read_bytes().splitlines(keepends=True)
+    trace.write_bytes(b"".join(lines[: len(lines) // 2]))
+    reconstruction = again(directory)
+    assert reconstruction.reproduced == [10, 28, 32, 120]
+    assert "agent 118 is played up to the end of its trace" in reconstruction.problems[0]
+
+
+def test_of_a_wrong_agent_the_first_wrong_step_is_named_or_its_mistake(tmp_path: Path) -> None:
+    wrong = {"approve_everything": {"agents": [2]}}
+    named = again(home(tmp_path / "home", flown(tmp_path / "run", network={"loss": 0.3}, quirks=wrong)))
+    assert named.problems == []
+    assert any("agent 2 behaves as with approve_everything" in remark for remark in named.remarks)
+    ignoring = {"ignore_commit": {"agents": [2], "value": 0.5}}
+    parted = again(home(tmp_path / "home2", flown(tmp_path / "run2", quirks=ignoring)))
+    assert parted.reproduced == [1, 3]
+    assert "agent 2 does not do what the protocol says" in parted.problems[0]
+    assert "receive_commit_block" in parted.problems[0]
+
+
+def test_a_record_without_the_parts_that_may_be_missing_will_do(tmp_path: Path) -> None:
+    directory = home(tmp_path / "home", flown(tmp_path / "run", agents=3))
+    for path in directory.glob("*.trace.jsonl"):
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        for line in lines:
+            line.pop("tally", None)
+            line.pop("started", None)
+            if "t" in line:
+                line["t"] = round(line["t"], 3)
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert again(directory).problems == []
+
+
+def test_nothing_to_fly_by_is_a_mistake_of_the_request(tmp_path: Path) -> None:
+    directory = home(tmp_path / "home", flown(tmp_path / "run"), *(f"{agent}.trace.jsonl" for agent in (1, 2, 3)))
+    with pytest.raises(FieldError, match="ucp-trace/2"):
+        again(directory)
+
+
+def test_the_command_says_what_it_reproduces(tmp_path: Path) -> None:
+    run = flown(tmp_path / "run")
+    out = tmp_path / "again.yaml"
+    made = harness("reconstruct", run, "-o", out, "--json")
+    assert made.returncode == 0, made.stderr
+    assert json.loads(made.stdout)["reproduced"] is True
+    assert out.read_text().startswith("# Made by `ucp-harness reconstruct`")
+    refused = harness("reconstruct", run, "-o", out)
+    assert refused.returncode == 2
+    assert sentences(refused.stderr) == [f"{out} exists: choose another --out, nothing is overwritten"]
+    trace = trace_of(run, 2)
+    trace.write_bytes(trace.read_bytes()[:20_000])
+    cut = harness("reconstruct", run, "-o", tmp_path / "cut.yaml")
+    assert cut.returncode == 1
+    assert cut.stdout.startswith("reproduces 2 of 3 chains: agent 2 is played up to the end of its trace")
