@@ -7,6 +7,9 @@ names.py      what blocks are called, from whatever record says it
 source.py     where a handler's code is
 summary.py    what came of a whole record, for people
 document.py   the same for programs
+words.py      a step, a state and a difference, for people
+others.py     what the other agents did at that moment
+prompt.py     the commands of whoever steps through it
 """
 
 from harness.field.replay.player import Player

@@ -1,0 +1,140 @@
+"""What the other agents did at the moment at which a record stands, if their records are there."""
+
+from bisect import bisect_right
+from collections.abc import Iterator
+from functools import cached_property
+from itertools import accumulate
+
+from rich.text import Text
+
+from harness.archive.traces import Trace
+from harness.field.replay.player import Player
+from harness.field.replay.record import Record
+from ucp.clock import MICROSECONDS
+from ucp.trace import HandlerRun
+
+NEAR_S = 2.0
+"""Steps of others so near to the moment are shown, in mission seconds before and after."""
+STEPS_SHOWN = 2
+"""Before, and after; besides what has to do with the step."""
+
+
+class Others:
+    """Reads their records when it is first asked.
+
+    Traces have mission seconds. Where agents began to count at different moments, by their own clocks, that is reckoned
+    with; clocks that are wrong are not.
+    """
+
+    def __init__(self, record: Record) -> None:
+        self._record = record
+
+    @cached_property
+    def _traces(self) -> dict[int, "_Other"]:
+        ours = self._record.trace
+        return {
+            agent_id: _Other(trace, _ahead_s(ours, trace))
+            for agent_id, trace in sorted(self._record.beside.traces.items())
+            if agent_id != self._record.agent_id
+        }
+
+    def at(self, player: Player) -> Iterator[Text]:
+        """What each did around this moment, what it held then, and what it has to do with this step."""
+        entry = player.entry
+        now = entry.what.t if entry else 0.0
+        top = player.state.chain.top_chain_hash.hex()
+        run = entry.what if entry and isinstance(entry.what, HandlerRun) else None
+        if not self._traces:
+            yield Text("  no other agent's record lies beside this one", style="yellow")
+        for agent_id in sorted({*self._record.header.roster, *self._traces} - {self._record.agent_id}):
+            other = self._traces.get(agent_id)
+            if other is None:
+                yield Text(f"  agent {agent_id}: its record is not here", style="dim")
+                continue
+            yield Text(f"  agent {agent_id}: ", style="bold").append(other.held(now, top), "not bold")
+            if run is not None:
+                yield from other.has_to_do_with(self._record.agent_id, agent_id, run)
+            for number in other.near(now):
+                line, theirs = other.runs[number]
+                after_s = theirs.t - other.ahead_s - now
+                words = (
+                    f"{after_s:+8.3f} s  line {line}: A{theirs.algorithm} {theirs.handler[:40]}: {theirs.branch[:40]}"
+                )
+                yield Text(f"    {words}", style="dim")
+
+
+class _Other:
+    """`ahead_s`: so much more its clock shows at the same moment."""
+
+    def __init__(self, trace: Trace, ahead_s: float) -> None:
+        self.ahead_s = ahead_s
+        self.runs = [numbered for life in trace.lives() for numbered in life]
+        self._times = [*accumulate((run.t - ahead_s for _, run in self.runs), max)]
+
+    @cached_property
+    def _sent(self) -> dict[tuple[object, object], list[int]]:
+        """The runs that sent a message, by type and sequence number."""
+        sent: dict[tuple[object, object], list[int]] = {}
+        for number, (_, run) in enumerate(self.runs):
+            for message in run.sent:
+                sent.setdefault((message.message, message.seq), []).append(number)
+        return sent
+
+    @cached_property
+    def _heard(self) -> dict[tuple[object, object, object], list[int]]:
+        """The runs that a message triggered, by sender, type and sequence number."""
+        heard: dict[tuple[object, object, object], list[int]] = {}
+        for number, (_, run) in enumerate(self.runs):
+            if "message" in run.trigger:
+                key = (run.trigger.get("from"), run.trigger["message"], run.trigger.get("seq"))
+                heard.setdefault(key, []).append(number)
+        return heard
+
+    def near(self, now: float) -> range:
+        """Its last runs before this moment, and the next."""
+        first, until = (bisect_right(self._times, now + seconds) for seconds in (-NEAR_S, NEAR_S))
+        middle = bisect_right(self._times, now)
+        return range(max(first, middle - STEPS_SHOWN), min(until, middle + STEPS_SHOWN))
+
+    def held(self, now: float, top: str) -> str:
+        """What it held."""
+        number = bisect_right(self._times, now) - 1
+        if number < 0:
+            return "nothing yet"
+        line, run = self.runs[number]
+        state = run.state
+        chain = "the same chain" if state.top == top else f"another chain of {state.chain}"
+        doing = "reconciling" if state.reconciling else "idle" if state.idle else "voting"
+        return (
+            f"{chain}, deque {state.deque}, stack {state.stack}, {doing} since line {line}, {run.t:.3f} s of its clock"
+        )
+
+    def has_to_do_with(self, ours: int, theirs: int, run: HandlerRun) -> Iterator[Text]:
+        """Where it sent what triggered our run, and what it made of what our run sent."""
+        if run.trigger.get("from") == theirs:
+            numbers = self._sent.get((run.trigger.get("message"), run.trigger.get("seq")), [])
+            for line, sending in self._nearest(numbers, run.t):
+                yield Text(
+                    f"    sent it at line {line}, by {sending.handler[:40]}: {sending.branch[:40]}", style="green"
+                )
+        for message in run.sent:
+            heard = self._nearest(self._heard.get((ours, message.message, message.seq), []), run.t)
+            for line, hearing in heard:
+                words = f"heard {message.message[:60]} {message.seq} at line {line}: {hearing.branch[:40]}"
+                yield Text(f"    {words}", style="green")
+            if not heard:
+                yield Text(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
+
+    def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
+        """The sequence numbers of a new life begin anew: it is the run nearest in time."""
+        runs = (self.runs[number] for number in numbers)
+        return sorted(runs, key=lambda numbered: abs(numbered[1].t - self.ahead_s - at_s))[:1]
+
+
+def _ahead_s(ours: Trace, theirs: Trace) -> float:
+    """How much more their mission clock shows than ours, by the moments at which they began."""
+    own, other = (trace.header.clock.get("epoch_us") for trace in (ours, theirs))
+    speedup = ours.header.clock.get("speedup", 1.0)
+    if not (isinstance(own, int) and isinstance(other, int) and isinstance(speedup, int | float)):
+        return 0.0
+    return (own - other) / MICROSECONDS * speedup
