@@ -46,6 +46,8 @@ class Result:
     beside: dict[str, Judgement] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
     """A sentence for each file that could not be used, or not wholly."""
+    chains: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    """The hashes of the blocks in each agent's chain, the oldest first."""
 
     @property
     def judgements(self) -> dict[str, Judgement]:
@@ -76,4 +78,5 @@ def check(evidence: Evidence) -> Result:
         figures(evidence),
         {key: judge(evidence) for key, judge in BESIDE.items()},
         evidence.errors,
+        {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()},
     )

@@ -48,7 +48,10 @@ class Trial:
                 expected = self._expect.verdict(key)
                 lines += JudgementInTest.of(key, judgement).lines()
                 lines += [f"    expected: {expected}"] if expected else []
+        deviating = [(finding.agent_id, finding.handler) for finding in finished.result.beside["steps"].evidence]
         lines += self._expect.out_of_range(finished.result.figures)
+        lines += self._expect.other_common(finished.result.chains)
+        lines += self._expect.other_deviations(deviating)
         return [*lines, *self._other_chains(finished)]
 
     def _other_chains(self, finished: Run) -> list[str]:

@@ -1,6 +1,6 @@
 """junit.xml: a test case for each characteristic, for expected figures, and for a run that did not complete."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from harness.archive.record import RunRecord
@@ -11,13 +11,13 @@ from harness.report.verdicts import Verdict, verdicts
 from harness.scenario.expect import Expect
 
 
-def to_junit(record: RunRecord) -> str:
+def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> str:
     """A characteristic fails if it is violated, or other than its scenario expects: as in pytest. One that was not
-    applicable is skipped, with the reason."""
-    return to_xml(facts.title(record), "ucp-run", record.started_at or "", record.wall_s, _cases(record))
+    applicable is skipped, with the reason. `chains` has the blocks of each agent's."""
+    return to_xml(facts.title(record), "ucp-run", record.started_at or "", record.wall_s, _cases(record, chains))
 
 
-def _cases(record: RunRecord) -> Iterator[Case]:
+def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[Case]:
     judged, expect = verdicts(record), (record.scenario and record.scenario.expect) or Expect()
     if wrong := [*_wrong_with_run(record), *([] if judged else ["There is no verdict."])]:
         yield Case("run", wrong)
@@ -26,6 +26,11 @@ def _cases(record: RunRecord) -> Iterator[Case]:
     if expect.figures:
         figures: dict[str, float | None] = {name: record.figures.get(name) for name in expect.figures}
         yield Case("expected figures", list(expect.out_of_range(figures)))
+    if expect.common:
+        yield Case("expected chains", list(expect.other_common(chains)))
+    if expect.deviations:
+        found = [(finding.agent_id, finding.handler) for finding in (record.steps.evidence if record.steps else ())]
+        yield Case("expected deviations", list(expect.other_deviations(found)))
 
 
 def _wrong_with_run(record: RunRecord) -> Iterator[str]:

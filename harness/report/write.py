@@ -27,10 +27,14 @@ def write(left: ReportSource) -> Path:
     """As `write_report` does, of what was read."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))
-    _write(left.run_dir / "junit.xml", to_junit(left.record))
+    _write(left.run_dir / "junit.xml", to_junit(left.record, _chains(left)))
     page = left.run_dir / "report.html"
     _write(page, draw(left))
     return page
+
+
+def _chains(left: ReportSource) -> dict[int, tuple[str, ...]]:
+    return {agent_id: export.chain_of_block_hashes for agent_id, export in left.exports.by_agent.items()}
 
 
 def _write(path: Path, text: str) -> None:

@@ -1,4 +1,4 @@
-"""What a scenario expects of its runs: which verdicts and figures, on which backends, with which seeds.
+"""What a scenario expects of its runs: which verdicts, figures, chains and mistakes; where, and with which seeds.
 
 expect:
   characteristics: {1: holds, 5: holds, 6: not applicable}
@@ -7,17 +7,21 @@ expect:
   liveness: finished
   figures: {mutual_chain: {min: 40}, distinct_chains: 1, reconciles: {max: 20}}
   chains: {10: 5f0c...}
+  common: [{agents: [10, 28], blocks: {min: 40}}, {agents: [32], blocks: {max: 20}}]
+  deviations: {32: reconcile_phase_2_timer_expiration}
   backends: [sim, process]
   seeds: [1, 2, 3]
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from itertools import takewhile
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from harness.backend_names import BackendName
-from harness.scenario.model import BOUNDED, Model, VehicleKey
+from harness.scenario.model import BOUNDED, Model, VehicleId, VehicleKey
 from harness.scenario.verdicts import (
     BESIDE,
     CHARACTERISTICS,
@@ -27,6 +31,7 @@ from harness.scenario.verdicts import (
     StepsVerdict,
     kind_of,
 )
+from ucp.agent import HANDLERS
 
 FigureName = Literal[
     "agents",
@@ -95,8 +100,20 @@ def _exactly(value: Any) -> Any:
     return {"min": value, "max": value}
 
 
+Count = Annotated[Range, BeforeValidator(_exactly)]
+
+
+class Common(Model):
+    """How many blocks from the inception block on these agents' chains share; of one agent: how many it has."""
+
+    agents: Annotated[list[VehicleId], Field(min_length=1)]
+    blocks: Count
+
+
 class Expect(Model):
     """A characteristic that is not named may be anything but violated, and so what is judged beside them.
+
+    `deviations`: in which handler each agent that is wrong first did other than the algorithms say, and nobody else.
 
     Every seed is played on every backend.
     """
@@ -105,9 +122,11 @@ class Expect(Model):
     steps: StepsVerdict | None = None
     records: RecordsVerdict | None = None
     liveness: LivenessVerdict | None = None
-    figures: dict[FigureName, Annotated[Range, BeforeValidator(_exactly)]] = {}
+    figures: dict[FigureName, Count] = {}
     chains: dict[VehicleKey, ChainHash] = {}
     """The top chain hash with which the agent ends: no two chains have the same."""
+    common: Annotated[list[Common], Field(max_length=1000)] = []
+    deviations: dict[VehicleKey, str] = {}
     backends: Annotated[list[BackendName], Field(min_length=1)] = ["sim"]
     seeds: Annotated[list[Annotated[int, Field(ge=0, strict=True)]], Field(min_length=1, max_length=10_000)] = [1]
 
@@ -128,6 +147,21 @@ class Expect(Model):
                 )
         return figures
 
+    @field_validator("deviations")
+    @classmethod
+    def _known_handlers(cls, deviations: dict[int, str]) -> dict[int, str]:
+        for handler in deviations.values():
+            if handler not in HANDLERS:
+                near = ", ".join(get_close_matches(handler[:80], HANDLERS, cutoff=0.0))
+                raise ValueError(f"there is no handler {BOUNDED.repr(handler)}: the nearest are {near}")
+        return deviations
+
+    @model_validator(mode="after")
+    def _who_deviates_is_found(self) -> "Expect":
+        if self.deviations and self.steps not in (None, "deviates"):
+            raise ValueError(f"`deviations` need `steps: deviates`, not {self.steps}")
+        return self
+
     @field_validator("backends", "seeds")
     @classmethod
     def _each_once(cls, values: list[Any]) -> list[Any]:
@@ -139,6 +173,8 @@ class Expect(Model):
         """What is expected of this characteristic, or judgement beside them; None if nothing is said of it."""
         if key in BESIDE:
             expected: str | None = getattr(self, key)
+            if key == "steps" and self.deviations:
+                return "deviates"
             return expected
         return self.characteristics.get(NUMBERS.get(key, 0))
 
@@ -162,3 +198,39 @@ class Expect(Model):
                 yield f"agent {agent_id} has left no chain, and should end with {wanted[:12]} on top"
             elif ended != wanted:
                 yield f"agent {agent_id} ends with the chain hash {ended[:12]} on top, and should with {wanted[:12]}"
+
+    def named(self) -> Iterator[tuple[str, int]]:
+        """Every agent that is named, with the key that names it."""
+        yield from (("chains", agent) for agent in self.chains)
+        yield from (("deviations", agent) for agent in self.deviations)
+        for index, common in enumerate(self.common):
+            yield from ((f"common.{index}.agents", agent) for agent in common.agents)
+
+    def other_common(self, chains: Mapping[int, Sequence[str]]) -> Iterator[str]:
+        """A sentence for each chain, or common part of several, that is not as long as it should be."""
+        for common in self.common:
+            there = all(agent in chains for agent in common.agents)
+            levels = zip(*(chains[agent] for agent in common.agents), strict=False) if there else ()
+            shared = sum(1 for _ in takewhile(lambda level: len(set(level)) == 1, levels)) if there else None
+            if shared is None or shared not in common.blocks:
+                whose = f"agent{'s' if len(common.agents) > 1 else ''} {' '.join(map(str, common.agents))}"
+                common_to = f"the {'common ' if len(common.agents) > 1 else ''}chain of {whose}"
+                yield f"{common_to} {_has(shared)}, and should have {common.blocks.describe()}"
+
+    def other_deviations(self, found: Iterable[tuple[int, str | None]]) -> Iterator[str]:
+        """A sentence for each agent that deviates otherwise than it should; `found`: agents and handlers, by time."""
+        if not self.deviations:
+            return
+        first: dict[int, str | None] = {}
+        for agent, handler in found:
+            first.setdefault(agent, handler)
+        for agent in sorted({*first, *self.deviations}):
+            if first.get(agent, "") != (wanted := self.deviations.get(agent, "")):
+                does = (
+                    f"deviates first in {first[agent] or 'no known handler'}" if agent in first else "does not deviate"
+                )
+                yield f"agent {agent} {does}, and should {f'in {wanted}' if wanted else 'not'}"
+
+
+def _has(blocks: int | None) -> str:
+    return "is not known" if blocks is None else f"has {blocks} block{'' if blocks == 1 else 's'}"

@@ -189,6 +189,7 @@ class Scenario(Model):
                 (f"quirks.{name}.agents", agent) for agent in (asked.agents if isinstance(asked, OfSome) else ())
             )
         yield from (("vehicles.types", vehicle) for vehicle in self.vehicles.types)
+        yield from ((f"expect.{key}", agent) for key, agent in (self.expect.named() if self.expect else ()))
         for index, flight in enumerate(self.flight):
             yield from ((f"flight.{index}.vehicles", vehicle) for vehicle in flight.vehicles)
         for index, fate in enumerate(self.fates):

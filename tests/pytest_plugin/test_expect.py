@@ -54,3 +54,42 @@ def test_what_is_judged_beside_the_characteristics_can_be_expected_too() -> None
     assert not expect.as_expected("liveness", "never finishes")
     assert expect.as_expected("records", "not applicable")
     assert not expect.as_expected("records", "contradict")
+
+
+CHAINS = {10: "abcd", 28: "abcd", 32: "ab", 118: "abx"}
+
+
+@pytest.mark.parametrize(
+    ("wanted", "sentences"),
+    [
+        ({"common": [{"agents": [32], "blocks": {"max": 2}}]}, []),
+        (
+            {"common": [{"agents": [32], "blocks": {"max": 1}}]},
+            ["the chain of agent 32 has 2 blocks, and should have at most 1"],
+        ),
+        ({"common": [{"agents": [10, 28, 118], "blocks": 2}]}, []),
+        (
+            {"common": [{"agents": [10, 28, 118], "blocks": {"min": 3}}]},
+            ["the common chain of agents 10 28 118 has 2 blocks, and should have at least 3"],
+        ),
+        (
+            {"common": [{"agents": [10, 7], "blocks": 1}]},
+            ["the common chain of agents 10 7 is not known, and should have 1"],
+        ),
+    ],
+)
+def test_chains_are_compared_with_what_they_should_be(wanted: dict[str, Any], sentences: list[str]) -> None:
+    assert list(Expect.model_validate(wanted).other_common(CHAINS)) == sentences
+
+
+def test_who_deviates_where_can_be_expected() -> None:
+    expect = Expect.model_validate({"deviations": {32: "reconcile_phase_3"}})
+    assert expect.as_expected("steps", "deviates") and not expect.as_expected("steps", "as specified")
+    assert list(expect.other_deviations([(32, "reconcile_phase_3"), (32, "reconcile_phase_2")])) == []
+    assert list(expect.other_deviations([(32, "reconcile_phase_2"), (10, None)])) == [
+        "agent 10 deviates first in no known handler, and should not",
+        "agent 32 deviates first in reconcile_phase_2, and should in reconcile_phase_3",
+    ]
+    assert list(expect.other_deviations([])) == ["agent 32 does not deviate, and should in reconcile_phase_3"]
+    with pytest.raises(ValueError, match="the nearest are reconcile_phase_3"):
+        Expect.model_validate({"deviations": {32: "reconcile_phase_33"}})

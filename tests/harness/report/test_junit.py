@@ -18,7 +18,7 @@ Case = tuple[str, str, str] | None
 
 
 def suite_of(result: dict[str, Any]) -> ElementTree.Element:
-    (suite,) = ElementTree.fromstring(to_junit(fit(RunRecord, result)[0]))  # noqa: S314 - ours
+    (suite,) = ElementTree.fromstring(to_junit(fit(RunRecord, result)[0], {}))  # noqa: S314 - ours
     return suite
 
 
