@@ -36,6 +36,10 @@ COMMANDS = {
         "harness.commands.diff:diff_command",
         "Say where two runs part: exit status 0 if they do not, 1 if they do.",
     ),
+    "import": (
+        "harness.commands.import_:import_command",
+        "Bring records of any kind into one directory that `check`, `replay`, `reconstruct` and `packets` read.",
+    ),
     "replay": (
         "harness.commands.replay:replay_command",
         "Feed what one agent saw into the reference core, step by step: exit status 1 if it did anything else.",

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from harness.archive.traces import SUFFIX as TRACE_SUFFIX
 from harness.errors import ExportError, RunDirectoryError
 from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
 from ucp.export import SCHEMA
@@ -264,13 +265,14 @@ def agents_directory(directory: Path) -> Path:
 def export_files(paths: Iterable[Path]) -> list[Path]:
     """The exports in run directories, in directories that hold exports, and those that are named themselves.
 
-    A run directory may have none. Raises RunDirectoryError if a path does not exist, or is a directory of other things.
+    A run directory may have none, and so may one with traces. Raises RunDirectoryError if a path does not exist, or is
+    a directory of other things.
     """
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
             exports = export_paths(path)
-            if not exports and not (path / RUN_FILE).exists():
+            if not exports and not (path / RUN_FILE).exists() and not _holds_traces(path):
                 raise RunDirectoryError(f"{path}: neither a run directory nor a directory with *{SUFFIX} files")
             files += exports
         elif path.exists():
@@ -278,6 +280,10 @@ def export_files(paths: Iterable[Path]) -> list[Path]:
         else:
             raise RunDirectoryError(f"{path}: does not exist; give a run directory or exports (*{SUFFIX})")
     return files
+
+
+def _holds_traces(directory: Path) -> bool:
+    return any(agents_directory(directory).glob(f"*{TRACE_SUFFIX}"))
 
 
 def _first_problem(error: ValidationError) -> str:

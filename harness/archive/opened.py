@@ -22,6 +22,11 @@ class Opened(io.BufferedReader):
         super().__init__(self._content, _CHUNK_BYTES)
 
     @property
+    def packed(self) -> bool:
+        """Whether gzip packed the file."""
+        return self._content.packed
+
+    @property
     def trouble(self) -> str:
         return self._content.trouble
 
@@ -36,7 +41,7 @@ class _Content(io.RawIOBase):
             os.close(descriptor)
             raise OSError(errno.EISDIR, "is a directory") if is_directory else OSError(errno.EINVAL, "is not a file")
         self._file = open(descriptor, "rb", buffering=0)  # noqa: PTH123, SIM115
-        self._packed = self._file.read(2) == GZIP_MAGIC
+        self.packed = self._file.read(2) == GZIP_MAGIC
         self._file.seek(0)
         self._unpacker = _unpacker()
         self._input = b""
@@ -49,7 +54,7 @@ class _Content(io.RawIOBase):
         if not most:
             if self._next(1):
                 self.trouble = f"what is beyond {self._most // 1024 // 1024} MiB is not read"
-                self._packed, self._input = False, b""
+                self.packed, self._input = False, b""
                 self._file.seek(0, os.SEEK_END)
             return 0
         data = self._next(most)
@@ -64,7 +69,7 @@ class _Content(io.RawIOBase):
 
     def _next(self, most: int) -> bytes:
         """Up to so many bytes; none at the end."""
-        return self._unpacked(most) if self._packed else self._file.read(most)
+        return self._unpacked(most) if self.packed else self._file.read(most)
 
     def _unpacked(self, most: int) -> bytes:
         while not self.trouble:

@@ -68,6 +68,8 @@ _ONLY_TAKES_IN = re.compile(
 )
 """A line as agents write it whose handler took a message in, and nothing changed. Whatever else fits is as sound."""
 
+_LOST = re.compile(rb'\{"lost_lines":(\d{1,9}),"lost_bytes":(\d{1,12})\}')
+
 HEADER: TypeAdapter[Header] = TypeAdapter(_VersionedHeader)
 HANDLER_RUN = TypeAdapter(HandlerRun)
 ASIDE = TypeAdapter(Dropped | Commanded)
@@ -220,6 +222,17 @@ def parsed(line: bytes) -> Header | Entry:
     return ASIDE.validate_json(line) if b'"schema"' not in line else HEADER.validate_json(line)
 
 
+def gap_line(gap: Gap) -> str:
+    """What stands in a trace in the place of lines that are lost: whoever reads runs only stops there."""
+    return f'{{"lost_lines":{gap.lines},"lost_bytes":{gap.lost_bytes}}}\n'
+
+
+def gap_in(line: bytes) -> tuple[int, int] | None:
+    """How many lines, and bytes, are lost where this line stands; None if it does not say so."""
+    told = _LOST.fullmatch(line.strip())
+    return None if told is None else (int(told[1]), int(told[2]))
+
+
 def only_takes_in(run: HandlerRun) -> bool:
     """Whether the handler took a message in, and nothing changed."""
     return not run.changes and run.handler.startswith("receive_")
@@ -273,7 +286,8 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                         break
                 except ValueError:
                     if trace is not None:
-                        trace.problem = f"line {number} is damaged"
+                        lost = gap_in(line)
+                        trace.problem = f"line {number} is damaged" if lost is None else f"lines are lost at {number}"
                     break
     except OSError:
         return None

@@ -29,6 +29,7 @@ _PCAP = {  # magic -> byte order, nanoseconds in a unit of the fraction
     b"\xa1\xb2\x3c\x4d": (">", 1),
     b"\x4d\x3c\xb2\xa1": ("<", 1),
 }
+PCAPNG_MAGIC = _SECTION
 MAGICS = (_SECTION, *_PCAP)
 """What a capture begins with."""
 

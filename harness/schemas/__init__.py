@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from harness.archive.exports import Export
 from harness.archive.record import RunRecord
 from harness.depot.manifest import Manifest
+from harness.field.adapters.record import ImportRecord
 from harness.matrix import MatrixRecord
 from harness.packets.document import PacketsRecord
 from harness.scale import ScaleRecord
@@ -21,6 +22,7 @@ DIRECTORY = Path(__file__).parent
 MODELS: dict[str, type[BaseModel]] = {
     "scenario": Scenario,
     "ucp-chain-export-1": Export,
+    "ucp-import-1": ImportRecord,
     "ucp-matrix-1": MatrixRecord,
     "ucp-mission-manifest-1": Manifest,
     "ucp-packets-1": PacketsRecord,

@@ -9,6 +9,7 @@ from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE
 from harness.errors import FieldError
 from harness.field.homecoming.homecoming import LeftOut
 
+_IMPORT_FILE = "import.json"
 MAX_FILES = 10_000
 MAX_DEPTH = 16
 _BY_THE_HARNESS = {
@@ -56,7 +57,7 @@ def _walk(path: Path, left_out: list[LeftOut], *, named: bool = False, depth: in
             if depth > MAX_DEPTH:
                 left_out.append(LeftOut(path, f"it is more than {MAX_DEPTH} directories deep"))
                 return
-            not_here = _BY_THE_HARNESS if (path / RUN_FILE).is_file() else ()
+            not_here = _BY_THE_HARNESS if (path / RUN_FILE).is_file() else {_IMPORT_FILE}
             for inner in sorted(path.iterdir(), key=_by_number):
                 if inner.name not in not_here:
                     yield from _walk(inner, left_out, depth=depth + 1)

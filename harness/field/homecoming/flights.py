@@ -9,6 +9,8 @@ import binascii
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +19,7 @@ from harness.archive.traces import Header, Trace
 from harness.field.homecoming.glance import Glance
 from harness.field.homecoming.homecoming import Flight, LeftOut, Remark
 from harness.field.homecoming.lives import Life
+from ucp.events import LoggableEvent
 from ucp.trace import HandlerRun
 
 
@@ -37,6 +40,7 @@ class _Gathering:
     exports: dict[int, tuple[Path, Export]] = field(default_factory=dict)
     captures: dict[int, Path] = field(default_factory=dict)
     more_captures: list[Path] = field(default_factory=list)
+    logged: dict[int, list[LoggableEvent]] = field(default_factory=lambda: defaultdict(list))
     hashes: set[str] = field(default_factory=set)
     directories: set[Path] = field(default_factory=set)
 
@@ -51,8 +55,9 @@ class _Gathering:
 
     @property
     def size(self) -> tuple[int, int]:
-        return len(self.lives) + len(self.exports) + len(self.captures), self.runs
+        return len(self.lives) + len(self.exports) + len(self.captures) + len(self.logged), self.runs
 
+    @cached_property
     def spans(self) -> tuple[float, float]:
         """From when to when its handlers ran, in the seconds of its blocks' timestamps."""
         times = [run.t for lives in self.lives.values() for life in lives for run in life.runs]
@@ -64,6 +69,7 @@ def put_together(
     lives: Iterable[Life],
     exports: Iterable[tuple[Path, Export]],
     captures: Iterable[Glance],
+    logged: Iterable[tuple[Path, int, LoggableEvent]],
     left_out: list[LeftOut],
     remarks: list[Remark],
 ) -> list[Flight]:
@@ -75,6 +81,8 @@ def put_together(
         _add_headless(gatherings, life, left_out, remarks)
     for capture in captures:
         _add_capture(gatherings, capture)
+    for path, agent_id, event in logged:
+        _add_logged(gatherings, path, agent_id, event)
     gatherings.sort(key=lambda gathering: gathering.size, reverse=True)
     return [_flight(gathering, remarks) for gathering in gatherings]
 
@@ -94,7 +102,7 @@ def _by_mission(lives: Iterable[Life], left_out: list[LeftOut]) -> tuple[list[_G
             headless.append(life)
         elif life.header.agent_id not in life.header.roster:
             why = f"agent {life.header.agent_id} is not on the roster that its own trace names"
-            left_out.append(LeftOut(life.path, why, life.first_line))
+            left_out.append(LeftOut(life.path, why, life.first_line, life.counts))
         else:
             by_header[_mission_of(life.header), life.header.agent_id].append(life)
         last = life
@@ -119,7 +127,7 @@ def _told_apart(lives: list[Life], left_out: list[LeftOut]) -> Iterator[list[Lif
         twin = next((other for flight in flights for other in flight if _is_copy(life, other)), None)
         if twin is not None:
             if life.runs or life.path != twin.path:
-                left_out.append(LeftOut(life.path, _copy_of(life, twin), life.first_line))
+                left_out.append(LeftOut(life.path, _copy_of(life, twin), life.first_line, life.counts))
             continue
         room = next((flight for flight in flights if not any(_overlap(life, other) for other in flight)), None)
         if room is None:
@@ -152,8 +160,8 @@ def _is_copy(life: Life, other: Life) -> bool:
 def _copy_of(life: Life, twin: Life) -> str:
     where = "in this file, too" if life.path == twin.path else f"in {twin.path}"
     if len(life.runs) == len(twin.runs):
-        return f"what begins here stands {where}, from line {twin.first_line} on, and is used once"
-    return f"what begins here stands {where}, from line {twin.first_line} on, with more of it left"
+        return f"what begins here stands {where}, from {twin.counts} {twin.first_line} on, and is used once"
+    return f"what begins here stands {where}, from {twin.counts} {twin.first_line} on, with more of it left"
 
 
 def _overlap(life: Life, other: Life) -> bool:
@@ -194,6 +202,7 @@ def _merged(gatherings: list[_Gathering]) -> list[_Gathering]:
         for agent_id, lives in gathering.lives.items():
             host.lives[agent_id] = lives
         host.hashes |= gathering.hashes
+        host.__dict__.pop("spans", None)
         host.directories |= gathering.directories
         if host.mission.initial_data is None or host.mission.epoch_us is None:
             host.mission = host.mission._replace(
@@ -215,7 +224,7 @@ def _same_flight(gathering: _Gathering, other: _Gathering) -> bool:
         return False
     if None in (mine.epoch_us, its.epoch_us):
         return True
-    (begins, ends), (its_begins, its_ends) = gathering.spans(), other.spans()
+    (begins, ends), (its_begins, its_ends) = gathering.spans, other.spans
     return begins <= its_ends and its_begins <= ends
 
 
@@ -316,7 +325,7 @@ def _add_capture(gatherings: list[_Gathering], capture: Glance) -> None:
         key=lambda each: (
             shared(each),
             capture.epoch_us is not None and capture.epoch_us == each.mission.epoch_us,
-            capture.path.parent in each.directories,
+            capture.source.parent in each.directories,
             each.size,
         ),
         default=None,
@@ -325,13 +334,28 @@ def _add_capture(gatherings: list[_Gathering], capture: Glance) -> None:
         likeliest = _Gathering(_Mission(None, (), capture.epoch_us))
         gatherings.append(likeliest)
     likeliest.hashes |= capture.hashes
-    likeliest.directories.add(capture.path.parent)
+    likeliest.directories.add(capture.source.parent)
     if likeliest.mission.epoch_us is None:
         likeliest.mission = likeliest.mission._replace(epoch_us=capture.epoch_us)
     if capture.vehicle is None or capture.vehicle in likeliest.captures:
         likeliest.more_captures.append(capture.path)
     else:
         likeliest.captures[capture.vehicle] = capture.path
+
+
+def _add_logged(gatherings: list[_Gathering], path: Path, agent_id: int, event: LoggableEvent) -> None:
+    """An event is of the flight that was under way then, else of the one whose files lie beside."""
+
+    def under_way(gathering: _Gathering) -> bool:
+        begins, ends = gathering.spans
+        return begins <= event.timestamp_us / 1e6 <= ends
+
+    able = [each for each in gatherings if not each.mission.roster or agent_id in each.mission.roster]
+    likeliest = max(able, key=lambda each: (under_way(each), path.parent in each.directories, each.size), default=None)
+    if likeliest is None:
+        likeliest = _Gathering(_Mission(None, (), None))
+        gatherings.append(likeliest)
+    likeliest.logged[agent_id].append(event)
 
 
 # What comes out
@@ -349,6 +373,7 @@ def _flight(gathering: _Gathering, remarks: list[Remark]) -> Flight:
         gathering.mission.roster,
         gathering.mission.epoch_us,
         gathering.more_captures,
+        {agent_id: sorted(events, key=attrgetter("timestamp_us")) for agent_id, events in gathering.logged.items()},
         {agent_id: list(dict.fromkeys(life.path for life in lives)) for agent_id, lives in gathering.lives.items()},
     )
 
@@ -381,6 +406,7 @@ def _clock_remarks(agent_id: int, lives: list[Life], trace: Trace) -> Iterator[R
             life.path,
             f"the clock of agent {agent_id} jumps from {before:.3f} s to {after:.3f} s here{more}",
             life.run_lines[position],
+            life.counts,
         )
 
 

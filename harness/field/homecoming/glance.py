@@ -17,6 +17,8 @@ class Glance:
     vehicle: int | None
     epoch_us: int | None
     hashes: frozenset[str]
+    source: Path
+    """The file that it is, or was made from."""
 
 
 def glance(path: Path, left_out: list[LeftOut]) -> Glance | None:
@@ -30,4 +32,4 @@ def glance(path: Path, left_out: list[LeftOut]) -> Glance | None:
         return None
     named = (name for each in datagrams.values() for name in (each.summary.block_hash, each.summary.chain_hash))
     hashes = frozenset(name.hex() for name in named if name is not None)
-    return Glance(path, capture.vehicle, capture.about.epoch_us if capture.about else None, hashes)
+    return Glance(path, capture.vehicle, capture.about.epoch_us if capture.about else None, hashes, path)

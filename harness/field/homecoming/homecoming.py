@@ -7,6 +7,7 @@ from pathlib import Path
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
 from harness.errors import FieldError
+from ucp.events import LoggableEvent
 
 
 @dataclass(frozen=True)
@@ -17,10 +18,12 @@ class Remark:
     why: str
     line: int | None = None
     """Counting from 1; None for the whole file."""
+    counts: str = "line"
+    """What `line` counts: of a bag its messages."""
 
     @property
     def sentence(self) -> str:
-        where = f"{self.path}" if self.line is None else f"{self.path}, line {self.line}"
+        where = f"{self.path}" if self.line is None else f"{self.path}, {self.counts} {self.line}"
         return f"{where}: {self.why}"
 
 
@@ -44,17 +47,19 @@ class Flight:
     """Mission second 0 in microseconds since the Unix epoch, if any trace or capture says it."""
     more_captures: list[Path] = field(default_factory=list)
     """Further captures of the same vehicles, and those of points that only listened."""
+    logged: dict[int, list[LoggableEvent]] = field(default_factory=dict)
+    """Events that an agent was given, as somebody beside it took them down: its own trace has them anyway."""
     sources: dict[int, list[Path]] = field(default_factory=dict)
     """The files that the trace of an agent was read from."""
 
     @property
     def agents(self) -> list[int]:
         """All that left anything, the lowest ID first."""
-        return sorted({*self.traces, *self.exports, *self.captures})
+        return sorted({*self.traces, *self.exports, *self.captures, *self.logged})
 
     @property
     def files(self) -> int:
-        return len(self.traces) + len(self.exports) + len(self.captures)
+        return len(self.traces) + len(self.exports) + len(self.captures) + len(self.logged)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from harness.archive.history import LATEST_S
 from harness.archive.opened import Opened
-from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, parsed
+from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, gap_in, parsed
 from harness.field.homecoming.homecoming import LeftOut
 from ucp.messages import HEADER as DATAGRAM_HEADER
 from ucp.messages import MAGIC
@@ -42,6 +42,10 @@ class Life:
     path: Path
     header: Header | None
     first_line: int
+    agent: int | None = None
+    """Whose it is, as its source says."""
+    counts: str = "line"
+    """What its lines are called."""
     runs: list[HandlerRun] = field(default_factory=list)
     run_lines: list[int] = field(default_factory=list)
     asides: list[tuple[int, Dropped | Commanded]] = field(default_factory=list)
@@ -55,6 +59,8 @@ class Life:
         """By its header; else by the datagrams that it sent, or the file's name."""
         if self.header is not None:
             return self.header.agent_id
+        if self.agent is not None:
+            return self.agent
         for run in self.runs:
             for sent in run.sent:
                 if sent.datagram is not None and (sender := _sender(sent.datagram.text)):
@@ -84,17 +90,15 @@ class Life:
 
 def read_lives(path: Path, left_out: list[LeftOut]) -> list[Life]:
     """The lives that are in a file, in its order; none if it is no trace. Raises OSError if it cannot be read."""
-    reader = _Reader(path)
+    reader = TraceReader(path)
     with Opened(path, MAX_TRACE_BYTES) as file:
         for number, line, ended in _lines(file):
             reader.take(number, line, ended)
             if reader.hopeless:
                 break
-    lives = [life for life in reader.lives if life.runs or life.asides or life.header]
-    if lives:
-        left_out += reader.left_out()
-        if file.trouble:
-            left_out.append(LeftOut(path, file.trouble))
+    lives = reader.ended(left_out)
+    if lives and file.trouble:
+        left_out.append(LeftOut(path, file.trouble))
     return lives
 
 
@@ -108,16 +112,21 @@ class _Damage:
         return line == self.last or (line == self.last + 1 and why == self.why)
 
 
-class _Reader:
-    def __init__(self, path: Path) -> None:
+class TraceReader:
+    """Takes the lines of a trace one after another, whatever they are; `lives` are what they make."""
+
+    def __init__(self, path: Path, agent_id: int | None = None, counts: str = "line") -> None:
+        """`agent_id` is whose they are, if their source says it; `counts` what their numbers count."""
         self.path = path
+        self._agent_id, self._counts = agent_id, counts
         self.lives: list[Life] = []
         self.hopeless = False
         self._read_bytes = self._runs = 0
         self._damaged: list[_Damage] = []
         self._cut_off: int | None = None
 
-    def take(self, number: int, line: bytes, ended: bool) -> None:
+    def take(self, number: int, line: bytes, ended: bool = True) -> None:
+        """The line with this number; one that did not end may be cut off."""
         self._read_bytes += len(line)
         self.hopeless = not self.lives and self._read_bytes > NOTHING_WITHIN_BYTES
         if self._runs == MAX_RUNS:
@@ -132,6 +141,8 @@ class _Reader:
                 self._lose(number, piece, "bytes of NUL stand here, as a loss of power leaves them")
             elif entry := _entry(piece):
                 self._add(entry, number)
+            elif lost := gap_in(piece):
+                self._was_lost(number, *lost)
             elif rescued := _rescued(piece):
                 lost_bytes, at_its_end = rescued
                 self._lose(number, piece[:lost_bytes], "it is damaged; what can be read at its end is used")
@@ -145,17 +156,20 @@ class _Reader:
 
     def _add(self, entry: Header | Entry, number: int) -> None:
         if isinstance(entry, Header):
-            self.lives.append(Life(self.path, entry, number))
+            self.lives.append(self._life(entry, number))
             return
         if not self.lives:
-            self.lives.append(Life(self.path, None, number))
+            self.lives.append(self._life(None, number))
             self.lives[-1].lose(0, 0)  # nobody knows what was before it
         self._runs += 1
         self.lives[-1].add(entry, number)
 
+    def _life(self, header: Header | None, number: int) -> Life:
+        return Life(self.path, header, number, self._agent_id, self._counts)
+
     def _lose(self, number: int, text: bytes, why: str) -> None:
         if b'"ucp-trace/' in text or b'"initial_data"' in text:
-            self.lives.append(Life(self.path, None, number))  # that was a header, whatever else it said
+            self.lives.append(self._life(None, number))  # that was a header, whatever else it said
         elif self.lives:
             self.lives[-1].lose(0 if text.startswith(b"\0") else 1, len(text))
         if self._damaged and self._damaged[-1].goes_on(number, why):
@@ -163,15 +177,35 @@ class _Reader:
         else:
             self._damaged.append(_Damage(number, number, why))
 
-    def left_out(self) -> Iterator[LeftOut]:
+    def lose_unseen(self) -> None:
+        """Here lines may be lost, which nobody has seen."""
+        if self.lives:
+            self.lives[-1].lose(0, 0)
+
+    def _was_lost(self, number: int, lines: int, lost_bytes: int) -> None:
+        """Before this file was made, as an import says."""
+        if self.lives:
+            self.lives[-1].lose(lines, lost_bytes)
+        what = "what was before this" if not lines else "a line" if lines == 1 else f"{lines} lines"
+        self._damaged.append(_Damage(number, number, f"{what} was lost already when this file was made"))
+
+    def ended(self, left_out: list[LeftOut]) -> list[Life]:
+        """The lives; what was damaged is told if there are any."""
+        lives = [life for life in self.lives if life.runs or life.asides or life.header]
+        left_out += self._left_out() if lives else ()
+        return lives
+
+    def _left_out(self) -> Iterator[LeftOut]:
         for damage in self._damaged[:_PLACES_TOLD]:
-            more = f", and so is what follows up to line {damage.last}" if damage.last > damage.first else ""
-            yield LeftOut(self.path, f"{damage.why}{more}", damage.first)
+            more = f", and so is what follows up to {self._counts} {damage.last}" if damage.last > damage.first else ""
+            yield LeftOut(self.path, f"{damage.why}{more}", damage.first, self._counts)
         if rest := self._damaged[_PLACES_TOLD:]:
             places = "1 more place" if len(rest) == 1 else f"{len(rest)} more places"
-            yield LeftOut(self.path, f"{places} in it are damaged, the last at line {rest[-1].last}")
+            yield LeftOut(self.path, f"{places} in it are damaged, the last at {self._counts} {rest[-1].last}")
         if self._cut_off is not None:
-            yield LeftOut(self.path, "it is cut off in the middle, and the file ends there", self._cut_off)
+            yield LeftOut(
+                self.path, "it is cut off in the middle, and the file ends there", self._cut_off, self._counts
+            )
 
 
 def _lines(file: Opened) -> Iterator[tuple[int, bytes, bool]]:

@@ -13,8 +13,10 @@ from harness.field.homecoming.flights import put_together
 from harness.field.homecoming.glance import Glance, glance
 from harness.field.homecoming.homecoming import Homecoming, LeftOut, Remark
 from harness.field.homecoming.lives import Life, read_lives
+from harness.field.homecoming.logged import read_logged
 from harness.gc_pause import gc_paused
 from harness.packets.pcap import MAGICS
+from ucp.events import LoggableEvent
 from ucp.export import SCHEMA as EXPORT_SCHEMA
 
 MAX_DOCUMENTS = 1000
@@ -31,22 +33,30 @@ def sort_out(paths: Iterable[Path]) -> Homecoming:
     Raises FieldError if a path does not exist. What cannot be used is told in `left_out`, and nothing else is raised.
     """
     left_out: list[LeftOut] = []
-    remarks: list[Remark] = []
-    sorter = _Sorter(left_out)
+    sorter = Sorter(left_out)
     for path in files_of(paths, left_out):
         sorter.take(path)
-    flights = put_together(sorter.lives, sorter.exports, sorter.captures, left_out, remarks)
-    return Homecoming(flights, [*_summed_up(left_out)], remarks)
+    return sorter.sorted_out()
 
 
-class _Sorter:
+class Sorter:
+    """Takes files one after another, and what adapters make of others'."""
+
     def __init__(self, left_out: list[LeftOut]) -> None:
         self.lives: list[Life] = []
         self.exports: list[tuple[Path, Export]] = []
         self.captures: list[Glance] = []
+        self.logged: list[tuple[Path, int, LoggableEvent]] = []
         self._left_out = left_out
 
+    def sorted_out(self) -> Homecoming:
+        """What all of that makes."""
+        remarks: list[Remark] = []
+        flights = put_together(self.lives, self.exports, self.captures, self.logged, self._left_out, remarks)
+        return Homecoming(flights, [*_summed_up(self._left_out)], remarks)
+
     def take(self, path: Path) -> None:
+        """Recognise a file, and read it."""
         try:
             with Opened(path) as file:
                 begins = file.peek(4096)[:4096]
@@ -55,6 +65,8 @@ class _Sorter:
                 self.captures += [seen] if seen else []
             elif lives := read_lives(path, self._left_out):
                 self.lives += lives
+            elif logged := read_logged(path, self._left_out):
+                self.logged += [(path, agent_id, event) for agent_id, event in logged]
             else:
                 self._take_exports(path)
         except OSError as error:
@@ -75,17 +87,21 @@ class _Sorter:
         if not text.startswith(("{", "[")):
             self._drop(path, _what_else(data))
             return
+        self.take_exports(path, text)
+
+    def take_exports(self, path: Path, text: str, line: int | None = None, counts: str = "line") -> None:
+        """The exports in a text; `line` is where it stands in the file, if it is not all of it."""
         try:
-            for document in _documents(text):
+            for document in _documents(text.strip(_BLANK)):
                 self.exports.append((path, export_of(path, document)))
         except ExportError as error:
-            self._drop(path, str(error).removeprefix(f"{path}: "))
+            self._drop(path, str(error).removeprefix(f"{path}: "), line, counts)
         except (ValueError, RecursionError) as error:
             what = "a chain export, but " if EXPORT_SCHEMA in text else ""
-            self._drop(path, what + str(not_json(path, error)).removeprefix(f"{path}: "))
+            self._drop(path, what + str(not_json(path, error)).removeprefix(f"{path}: "), line, counts)
 
-    def _drop(self, path: Path, why: str) -> None:
-        self._left_out.append(LeftOut(path, why))
+    def _drop(self, path: Path, why: str, line: int | None = None, counts: str = "line") -> None:
+        self._left_out.append(LeftOut(path, why, line, counts))
 
 
 def _documents(text: str) -> Iterator[Any]:

@@ -1,0 +1,65 @@
+"""`ucp-harness import`: records of other implementations, of recorders and of ours, as the house has them."""
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from harness.commands.terminal import complain, print_lines
+from harness.errors import FieldError
+from harness.field.adapters import bring_in
+from harness.field.adapters.adapter import Adapter
+from harness.field.adapters.comma_separated import CommaSeparated
+from harness.field.adapters.loading import load_adapter
+from harness.field.adapters.record import ImportedFlight
+from harness.field.adapters.rosbag import RosBag
+
+
+class Format(Enum):
+    """What comes along."""
+
+    CSV = "csv"
+    ROSBAG = "rosbag"
+
+
+ADAPTERS: dict[Format, type[Adapter]] = {Format.CSV: CommaSeparated, Format.ROSBAG: RosBag}
+
+
+def import_command(
+    sources: Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files and directories, of any kind mixed.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="An empty directory, or a new one.")],
+    adapter: Annotated[
+        str | None, typer.Option(metavar="MODULE:CLASS", help="What reads a format of your own: see docs/adapters.md.")
+    ] = None,
+    format_: Annotated[
+        Format | None, typer.Option("--format", help="What all sources are; else each is recognised by its content.")
+    ] = None,
+) -> None:
+    """Bring records of any kind into one directory that `check`, `replay`, `reconstruct` and `packets` read.
+
+    Everything usable is used; what is left out is named here and in import.json.
+    """
+    if adapter is not None and format_ is not None:
+        raise FieldError("--adapter and --format are two ways to say the same: give one of them")
+    if format_ is not None:
+        record = bring_in(sources, [ADAPTERS[format_]()], out, by_content=False)
+    else:
+        own = [load_adapter(adapter)] if adapter else []
+        record = bring_in(sources, [*own, *(kind() for kind in ADAPTERS.values())], out)
+    for remark in (*record.left_out, *record.remarks):
+        complain(remark.sentence)
+    print_lines(_told(flight, out) for flight in record.flights)
+
+
+def _told(flight: ImportedFlight, out: Path) -> str:
+    agents = flight.agents.values()
+    runs = sum(agent.handler_runs for agent in agents)
+    kinds = {
+        f"trace(s) with {runs} handler runs": sum(agent.trace is not None for agent in agents),
+        "export(s)": sum(agent.export is not None for agent in agents),
+        "capture(s)": sum(agent.capture is not None for agent in agents) + len(flight.more_captures),
+        "list(s) of events": sum(agent.events is not None for agent in agents),
+    }
+    what = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
+    return f"{out / flight.directory}: agents {', '.join(map(str, flight.agents)) or 'unknown'}: {what}"

@@ -1,0 +1,31 @@
+"""Records of other implementations, brought into the house's formats: by an adapter that knows them.
+
+adapter.py          what an adapter is, and what it yields
+comma_separated.py  CSV, one record in a row
+rosbag.py, bags.py  ROS bags of version 1 and 2
+loading.py          a user's own adapter, by its name
+bring_in.py         reads sources, each by the adapter that knows it
+write.py, record.py what comes of it: traces, exports, captures, and import.json
+"""
+
+from harness.field.adapters.adapter import (
+    Adapter,
+    ChainExport,
+    Datagram,
+    LoggedEvent,
+    Observation,
+    TraceLine,
+    Unusable,
+)
+from harness.field.adapters.bring_in import bring_in
+
+__all__ = [
+    "Adapter",
+    "ChainExport",
+    "Datagram",
+    "LoggedEvent",
+    "Observation",
+    "TraceLine",
+    "Unusable",
+    "bring_in",
+]

@@ -1,0 +1,127 @@
+"""Writes what came home as the house's own files: of each flight its traces, exports and captures, by agent ID."""
+
+import json
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from harness.archive.directory import claim
+from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
+from harness.archive.opened import Opened
+from harness.archive.traces import SUFFIX as TRACE_SUFFIX
+from harness.archive.traces import Header, Trace, gap_line
+from harness.errors import RunDirectoryError
+from harness.field.adapters.record import FILE, ImportedAgent, ImportedFlight, ImportRecord, ImportRemark
+from harness.field.homecoming.homecoming import Flight, Homecoming, Remark
+from harness.field.homecoming.logged import SUFFIX as LOGGED_SUFFIX
+from harness.field.homecoming.logged import EventLine
+from harness.packets.files import DIRECTORY as CAPTURES
+from harness.packets.pcap import PCAPNG_MAGIC
+
+AGENTS = "agents"
+CUT_OFF = '{"lost_lines":'
+"""Half a line, as a trace ends that was cut off."""
+_HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clock")
+_COPIED_AT_ONCE = 1024 * 1024
+
+
+def write_import(homecoming: Homecoming, sources: Sequence[Path], out: Path) -> ImportRecord:
+    """The largest flight into `out`, further ones into directories in it. Raises RunDirectoryError."""
+    claim(out)
+    try:
+        flights = []
+        for number, flight in enumerate(homecoming.flights, 1):
+            directory = out if number == 1 else out / f"flight-{number}"
+            flights.append(_write(flight, directory, "." if number == 1 else directory.name))
+        record = ImportRecord(
+            sources=[str(source) for source in sources],
+            flights=flights,
+            left_out=[_remark(left_out) for left_out in homecoming.left_out],
+            remarks=[_remark(remark) for remark in homecoming.remarks],
+        )
+        text = json.dumps(record.to_json(), indent=1) + "\n"
+        (out / FILE).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RunDirectoryError(f"{out} cannot be written: {error.strerror}; choose another -o") from None
+    return record
+
+
+def _remark(remark: Remark) -> ImportRemark:
+    return ImportRemark(path=_printable(remark.path), line=remark.line, counts=remark.counts, why=remark.why)
+
+
+def _printable(path: Path) -> str:
+    return str(path).encode("utf-8", "replace").decode()
+
+
+def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
+    agents = {agent_id: ImportedAgent() for agent_id in flight.agents}
+    (directory / AGENTS).mkdir(parents=True)
+    for agent_id, trace in flight.traces.items():
+        agent = agents[agent_id]
+        agent.trace = f"{AGENTS}/{agent_id}{TRACE_SUFFIX}"
+        with (directory / agent.trace).open("w", encoding="utf-8", errors="replace") as file:
+            file.writelines(_lines(trace))
+        agent.handler_runs, agent.lives = len(trace.runs), len(trace.starts) + 1
+        agent.gaps, agent.clock_jumps = len(trace.gaps), len(trace.jumps)
+        agent.trace_from = [_printable(path) for path in flight.sources.get(agent_id, ())]
+    for agent_id, export in flight.exports.items():
+        agents[agent_id].export = path = f"{AGENTS}/{agent_id}{EXPORT_SUFFIX}"
+        text = json.dumps(export.model_dump(mode="json", by_alias=True), indent=1)
+        (directory / path).write_text(text + "\n", encoding="utf-8")
+    for agent_id, events in flight.logged.items():
+        agents[agent_id].events = path = f"{AGENTS}/{agent_id}{LOGGED_SUFFIX}"
+        with (directory / path).open("w", encoding="utf-8") as file:
+            file.writelines(EventLine.of(agent_id, event).to_line() for event in events)
+    if flight.captures or flight.more_captures:
+        (directory / CAPTURES).mkdir()
+    for agent_id, capture in flight.captures.items():
+        agents[agent_id].capture = _copied(capture, directory, str(agent_id))
+    return ImportedFlight(
+        directory=name,
+        initial_data=next((trace.header.initial_data for trace in flight.traces.values()), None)
+        or next((export.inception.block_data for export in flight.exports.values()), None),
+        epoch_us=flight.epoch_us,
+        roster=[*flight.roster],
+        agents=agents,
+        more_captures=[
+            _copied(capture, directory, f"more-{number}") for number, capture in enumerate(flight.more_captures, 1)
+        ],
+    )
+
+
+def _lines(trace: Trace) -> Iterator[str]:
+    """The trace as it is written: what is lost is said where it was."""
+    starts = {0: 1}
+    for start in trace.starts:
+        starts[start] = starts.get(start, 0) + 1
+    gaps = {gap.position: gap for gap in trace.gaps}
+    asides = [position for position, _ in trace.asides]
+    header, next_aside = _header_line(trace.header), 0
+    for position in range(len(trace.runs) + 1):
+        yield from [header] * starts.get(position, 0)
+        if position in gaps:
+            yield gap_line(gaps[position])
+        until = bisect_left(asides, position + 1, next_aside)
+        yield from (aside.to_line() for _, aside in trace.asides[next_aside:until])
+        next_aside = until
+        if position < len(trace.runs):
+            yield trace.runs[position].to_line()
+    if trace.cut_off:
+        yield CUT_OFF
+
+
+def _header_line(header: Header) -> str:
+    said = header.model_dump(by_alias=True)
+    in_order = {name: said[name] for name in _HEADER_KEYS if said[name] is not None}
+    return json.dumps(in_order, separators=(",", ":")) + "\n"
+
+
+def _copied(capture: Path, directory: Path, name: str) -> str:
+    with Opened(capture) as file:
+        suffix = "pcapng" if file.peek(4)[:4] == PCAPNG_MAGIC else "pcap"
+        path = f"{CAPTURES}/{name}.{suffix}"
+        with (directory / path).open("wb") as copy:
+            while part := file.read(_COPIED_AT_ONCE):
+                copy.write(part)
+    return path

@@ -1,0 +1,202 @@
+"""Records of others are brought into the house's formats: nothing is made up, and nothing is left out unnamed."""
+
+import re
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+
+from harness import checker
+from harness.archive.archive import RunArchive
+from harness.archive.traces import read_trace
+from harness.errors import FieldError, MachineError
+from harness.field.adapters import bring_in
+from harness.field.adapters.comma_separated import CommaSeparated
+from harness.field.adapters.record import ImportRecord
+from harness.field.adapters.rosbag import RosBag
+from harness.field.homecoming import sort_out
+from harness.packets.files import capture_files, read_captures
+from tests.harness.field.flights import flown, trace_of
+from tests.harness.field.recordings import of_run, write_bag1, write_bag2, write_csv
+
+WRITERS: dict[str, Callable[..., Path]] = {
+    "csv": write_csv,
+    "bag1": write_bag1,
+    "bag1 bz2": lambda path, records: write_bag1(path, records, "BZ2"),
+    "bag1 lz4": lambda path, records: write_bag1(path, records, "LZ4"),
+    "bag2 sqlite3": write_bag2,
+    "bag2 mcap": lambda path, records: write_bag2(path, records, "mcap"),
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return flown(tmp_path_factory.mktemp("whole") / "run", capture=True, quirks={"ignore_commit": 0.3})
+
+
+def imported(out: Path, *sources: Path) -> ImportRecord:
+    return bring_in(sources, [CommaSeparated(), RosBag()], out)
+
+
+def told(record: ImportRecord) -> str:
+    return "\n".join(remark.sentence for remark in (*record.left_out, *record.remarks))
+
+
+def verdicts(directory: Path) -> Any:
+    result = checker.check(checker.gather(RunArchive(directory)))
+    return {key: (judgement.verdict, judgement.reason) for key, judgement in result.judgements.items()}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_our_own_records_come_back_as_they_were(run: Path, tmp_path: Path, writer: str) -> None:
+    source = WRITERS[writer](tmp_path / "recording", of_run(run))
+    record = imported(tmp_path / "out", source)
+    assert not told(record)
+    bare = tmp_path / "bare"
+    shutil.copytree(run / "agents", bare)
+    assert verdicts(tmp_path / "out") == verdicts(bare)
+    for path in bare.iterdir():
+        assert (tmp_path / "out" / "agents" / path.name).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_what_was_only_heard_is_a_capture_and_no_trace(run: Path, tmp_path: Path, writer: str) -> None:
+    source = WRITERS[writer](tmp_path / "recording", of_run(run, ("sent",)))
+    record = imported(tmp_path / "out", source)
+    assert not told(record)
+    (flight,) = record.flights
+    assert [agent.trace for agent in flight.agents.values()] == [None] * 3
+    heard, were = (read_captures(capture_files([directory])) for directory in (tmp_path / "out", run))
+    assert [capture.vehicle for capture in heard.used] == [1, 2, 3]
+    assert len(heard.datagrams) == len(were.datagrams)
+    assert not sort_out([tmp_path / "out"]).left_out
+
+
+def test_sources_are_mixed(run: Path, tmp_path: Path) -> None:
+    records = [*of_run(run)]
+    write_csv(tmp_path / "1.csv", iter(said for said in records if said.agent == 1))
+    write_bag1(tmp_path / "2.bag", iter(said for said in records if said.agent == 2))
+    shutil.copy(trace_of(run, 3), tmp_path / "3.log")
+    (tmp_path / "letter.txt").write_text("Dear all,")
+    record = imported(tmp_path / "out", *(path for path in tmp_path.iterdir()))
+    assert list(record.flights[0].agents) == [1, 2, 3]
+    assert re.fullmatch(r".*letter\.txt: it is no trace.*", told(record))
+
+
+@pytest.mark.parametrize("writer", [writer for writer in WRITERS if writer != "csv"])
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_a_bag_that_was_cut_is_used_up_to_there(run: Path, tmp_path: Path, writer: str, share: float) -> None:
+    path = WRITERS[writer](tmp_path / "recording", of_run(run))
+    if path.is_dir():
+        (path / "metadata.yaml").unlink()
+        (path,) = path.iterdir()
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    try:
+        record = imported(tmp_path / "out", path)
+    except FieldError as error:
+        assert "what is packed here" in str(error) or "cannot be read" in str(error)
+        return
+    assert re.search("breaks off|not closed|cannot be read", told(record)), told(record)
+    assert sum(agent.handler_runs for agent in record.flights[0].agents.values()) > 5
+
+
+def test_a_recorder_that_was_killed_leaves_its_last_messages_in_a_journal(run: Path, tmp_path: Path) -> None:
+    (path,) = write_bag2(tmp_path / "bag", of_run(run)).glob("*.db3")
+    database = sqlite3.connect(path)
+    database.execute("PRAGMA journal_mode=WAL")
+    database.execute("UPDATE messages SET timestamp = timestamp + 1")
+    database.execute("DELETE FROM messages WHERE id > 20")
+    database.commit()
+    left = tmp_path / "left"
+    left.mkdir()
+    for each in path.parent.glob(f"{path.name}*"):
+        shutil.copy(each, left)
+    database.close()
+    assert (left / f"{path.name}-wal").exists()
+    record = imported(tmp_path / "out", left)
+    assert record.flights[0].agents[1].handler_runs == 19
+    assert not told(record)
+
+
+def test_rows_that_are_damaged_take_no_others_along(run: Path, tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "records.csv", of_run(run, ("trace",)))
+    rows = path.read_text().splitlines(keepends=True)
+    first = [number for number, row in enumerate(rows) if ",1,trace" in row]
+    rows[first[5]] = rows[first[5]][:80] + "\n"  # its quote is never closed
+    rows[first[8]] = "nonsense\n"
+    rows[first[9]] = rows[first[9]].replace(",1,trace", ",x,trace")
+    path.write_text("\ufeff" + "".join(rows).replace("\n", "\r\n"))
+    record = imported(tmp_path / "out", path)
+    assert record.flights[0].agents[1].handler_runs == len(first) - 4
+    gaps = sort_out([tmp_path / "out"]).largest().traces[1].gaps
+    assert [gap.position for gap in gaps] == [4, 6], "the latter also for an agent that nobody knows"
+    for said in ("row 7: it is damaged", "row 10: the row is damaged", "row 11: its agent is 'x'"):
+        assert said in told(record)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_json_that_nobody_has_quoted_is_read(run: Path, tmp_path: Path, separator: str) -> None:
+    lines = trace_of(run, 1).read_text().splitlines()
+    rows = [separator.join(("agent", "kind", "data")), *(f"1{separator}trace{separator}{line}" for line in lines)]
+    (tmp_path / "1.csv").write_text("\n".join(rows))
+    record = imported(tmp_path / "out", tmp_path / "1.csv")
+    assert record.flights[0].agents[1].handler_runs == len(lines) - 1
+
+
+def test_events_that_an_agent_was_given_are_kept(tmp_path: Path) -> None:
+    (tmp_path / "events.csv").write_text("time_s,agent,kind,event,data\n1790000000.5,7,event,3,YWJj\n,7,event,3,YWJj\n")
+    record = imported(tmp_path / "out", tmp_path / "events.csv")
+    assert record.flights[0].agents[7].events == "agents/7.events.jsonl"
+    assert "row 3: its time_s is '', and not seconds since the Unix epoch" in told(record)
+    (event,) = sort_out([tmp_path / "out"]).largest().logged[7]
+    assert (event.timestamp_us, event.event_id, event.data) == (1790000000500000, 3, b"abc")
+
+
+def test_a_gap_stays_one(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run / "agents", tmp_path / "home")
+    path = tmp_path / "home" / "1.trace.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines[:6], b"?\n", *lines[7:-1], lines[-1][:30]]))
+    imported(tmp_path / "out", tmp_path / "home")
+    before, after = (sort_out([directory]).largest().traces[1] for directory in (tmp_path / "home", tmp_path / "out"))
+    assert (after.gaps, after.runs, after.cut_off) == (before.gaps, before.runs, True)
+    strict = read_trace(tmp_path / "out" / "agents" / "1.trace.jsonl")
+    assert strict and strict.problem == "lines are lost at 7" and len(strict.runs) == 5
+
+
+def test_other_topics_are_a_subclass_away(run: Path, tmp_path: Path) -> None:
+    class OurBags(RosBag):
+        topics: ClassVar = {"/ucp/{agent}/trace": "trace"}
+
+    bag = write_bag2(tmp_path / "bag", of_run(run))
+    record = bring_in([bag], [OurBags()], tmp_path / "out")
+    assert all(agent.trace and not agent.export for agent in record.flights[0].agents.values())
+    assert "3 messages are on other topics than those of agents: /ucp/1/chain, " in told(record)
+
+
+def test_messages_of_another_type_are_named(run: Path, tmp_path: Path) -> None:
+    class Wrong(RosBag):
+        topics: ClassVar = {"/ucp/{agent}/trace": "sent", "/ucp/{agent}/chain": "chain"}
+
+    record = bring_in([write_bag1(tmp_path / "a.bag", of_run(run))], [Wrong()], tmp_path / "out")
+    assert "it is no UCP datagram (" in told(record)
+
+
+def test_without_the_package_it_is_said_what_is_missing(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
+    with pytest.raises(MachineError, match=r"pip install ucp-harness\[ros\]") as caught:
+        imported(tmp_path / "out", write_bag1(tmp_path / "a.bag", of_run(run)))
+    assert caught.value.exit_status == 3 and not (tmp_path / "out").exists()
+
+
+def test_nothing_usable_makes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    with pytest.raises(FieldError, match="nothing of this is a usable"):
+        imported(tmp_path / "out", tmp_path / "a.bag")
+    assert not (tmp_path / "out").exists()
