@@ -45,7 +45,7 @@ def test_what_the_scenario_expects_is_judged_with_the_test(pytester: pytest.Pyte
     [
         ("", "the fixture `scenario` needs a marker that says which, *"),
         ('@pytest.mark.scenario("s.yaml", agents=3)', "the fixture `scenario` needs a marker that says which, *"),
-        ('@pytest.mark.scenario("none.yaml")', "*none.yaml: cannot be read: No such file or directory"),
+        ('@pytest.mark.scenario("none.yaml")', "*none.yaml: there is no such file or scenario*"),
         ('@pytest.mark.scenario("s.yaml", seed="one")', "`seed` is 'one': it should be a number, 0 or more"),
         ('@pytest.mark.scenario("fates.yaml", backend="process")', "`fates` needs virtual time: use --backend sim"),
     ],
