@@ -24,6 +24,10 @@ COMMANDS = {
         "harness.commands.scenarios:scenarios_command",
         "List the scenarios that come along: `ucp-harness run loss_15` plays one.",
     ),
+    "runs": (
+        "harness.commands.runs:runs_command",
+        "List what was run, the newest first, with its verdict; or open a report in the browser.",
+    ),
     "check": (
         "harness.commands.check:check_command",
         "Decide the six characteristics from exported chains, and from traces beside them.",

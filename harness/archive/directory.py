@@ -23,6 +23,7 @@ from harness.archive import traces
 from harness.archive.connectivity import NETWORK_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
 from harness.archive.record import RunRecord
+from harness.archive.runs import RUNS
 from harness.archive.tracks import TRACKS_FILE
 from harness.errors import MachineError, RunDirectoryError
 from netem.radio import Place
@@ -150,7 +151,7 @@ def claim(directory: Path, *inner: Path) -> None:
 def default_path(name: str) -> Path:
     """`runs/<scenario's name>-<local time>` under the current directory; a number is added if it exists."""
     words = "".join(character if character.isalnum() else " " for character in name).split()
-    base = Path("runs") / f"{'_'.join(words).lower()[:60] or 'run'}-{time.strftime('%Y%m%d-%H%M%S')}"
+    base = RUNS / f"{'_'.join(words).lower()[:60] or 'run'}-{time.strftime('%Y%m%d-%H%M%S')}"
     candidate, number = base, 2
     while candidate.exists():
         candidate, number = base.with_name(f"{base.name}-{number}"), number + 1

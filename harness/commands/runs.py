@@ -1,0 +1,94 @@
+"""`ucp-harness runs`: what was run, and its reports."""
+
+import webbrowser
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from harness.archive.record import RunRecord
+from harness.archive.runs import RUNS, PastRun, past_runs
+from harness.commands.terminal import MARKS, STYLES, complain, print_json
+from harness.errors import RunDirectoryError
+from harness.scenario.verdicts import BAD_IN_WORDS, Kind, kind_of
+
+
+def runs_command(
+    folder: Annotated[Path, typer.Argument(help="The folder of run directories.")] = RUNS,
+    most: Annotated[int, typer.Option("--last", min=1, help="List so many.")] = 20,
+    opened: Annotated[int | None, typer.Option("--open", min=1, metavar="N", help="Open the Nth one's report.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The list as JSON on standard output.")] = False,
+) -> None:
+    """List what was run, the newest first, with its verdict; or open a report in the browser."""
+    runs = list(past_runs(folder, max(most, opened or 0)))
+    if opened is not None:
+        _open(runs, opened, folder)
+    elif as_json:
+        print_json([_document(run) for run in runs])
+    else:
+        Console().print(_table(runs) if runs else f"there are no runs in {folder}", highlight=False)
+    for run in runs:
+        if run.problem:
+            complain(run.problem)
+
+
+def _open(runs: list[PastRun], number: int, folder: Path) -> None:
+    if number > len(runs):
+        raise RunDirectoryError(f"there are {len(runs)} runs in {folder}, and no {number}")
+    report = runs[number - 1].report
+    if not report.exists():
+        raise RunDirectoryError(f"{report} is not there: `ucp-harness report {report.parent}` writes it")
+    typer.echo(report)
+    webbrowser.open(report.absolute().as_uri())
+
+
+def _table(runs: list[PastRun]) -> Table:
+    table = Table("", "began", "scenario", "seed", "backend", "verdict", "directory", box=None, padding=(0, 2, 0, 0))
+    for number, run in enumerate(runs, 1):
+        record, (kind, words) = run.record, _verdict(run.record)
+        verdict = Text(f"{MARKS[kind]} {words}", style=STYLES[kind])
+        seed = "" if record.seed is None else str(record.seed)
+        name = record.scenario.name if record.scenario else ""
+        began, backend = Text(_local(record.started_at), no_wrap=True), record.backend or ""
+        table.add_row(str(number), began, Text(name), seed, backend, verdict, Text(run.path.name))
+    return table
+
+
+def _verdict(record: RunRecord) -> tuple[Kind, str]:
+    """What it amounts to, in a few words."""
+    kinds = {key: kind_of(judgement.verdict) for key, judgement in record.judgements.items()}
+    bad = [BAD_IN_WORDS[key] for key, kind in kinds.items() if kind == "bad" and key in BAD_IN_WORDS]
+    if bad:
+        return "bad", ", ".join(bad)
+    if record.outcome != "completed":
+        return "unknown", record.outcome
+    open_ones = [key for key, kind in kinds.items() if kind == "unknown"]
+    if open_ones or not kinds:
+        return "unknown", f"not judged: {', '.join(open_ones)}" if open_ones else "not judged"
+    return "good", "all good"
+
+
+def _local(started_at: str | None) -> str:
+    try:
+        return datetime.fromisoformat(started_at or "").astimezone().strftime("%d %b %H:%M")
+    except (ValueError, OverflowError, OSError):
+        return ""
+
+
+def _document(run: PastRun) -> dict[str, Any]:
+    record = run.record
+    return {
+        "directory": str(run.path),
+        "report": str(run.report) if run.report.exists() else None,
+        "started_at": record.started_at,
+        "scenario": record.scenario.name if record.scenario else None,
+        "seed": record.seed,
+        "backend": record.backend,
+        "outcome": record.outcome,
+        "verdicts": {key: judgement.verdict for key, judgement in record.judgements.items()},
+        "problem": run.problem,
+    }

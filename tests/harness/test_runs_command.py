@@ -1,0 +1,60 @@
+"""`ucp-harness runs` lists what was run, and opens its reports."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.harness.command import harness, sentences
+from tests.harness.mission import CONNECTED, fly, write_run
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Two runs: the newer one is damaged."""
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    air = fly(agents=3, duration_s=400)
+    for name, at_s in (("older", 1), ("newer", 2)):
+        write_run(air, folder / name, CONNECTED)
+        os.utime(folder / name / "run.json", (at_s, at_s))
+    return folder
+
+
+def test_the_newest_is_first(runs: Path) -> None:
+    listed = harness("runs", cwd=runs.parent)
+    assert listed.returncode == 0
+    newer, older = (next(line for line in listed.stdout.splitlines() if name in line) for name in ("newer", "older"))
+    assert newer.split()[0] == "1"
+    assert older.split()[0] == "2"
+    (only,) = json.loads(harness("runs", runs, "--last", "1", "--json").stdout)
+    assert only["directory"] == str(runs / "newer")
+
+
+def test_a_damaged_record_is_named_and_the_others_are_listed(runs: Path) -> None:
+    (runs / "older" / "run.json").write_text("{")
+    listed = harness("runs", runs)
+    assert "newer" in listed.stdout
+    assert sentences(listed.stderr) == [f"{runs / 'older' / 'run.json'}: truncated or damaged: not a JSON document"]
+
+
+def test_a_report_is_opened_or_it_is_said_how_it_comes_about(runs: Path, tmp_path: Path) -> None:
+    missing = harness("runs", runs, "--open", "2")
+    assert missing.returncode == 2
+    assert sentences(missing.stderr) == [
+        f"{runs / 'older' / 'report.html'} is not there: `ucp-harness report {runs / 'older'}` writes it"
+    ]
+    (runs / "older" / "report.html").write_text("<html>")
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$1" > {tmp_path / "opened"}\n')
+    browser.chmod(0o755)
+    assert harness("runs", runs, "--open", "2", env={**os.environ, "BROWSER": str(browser)}).returncode == 0
+    assert (tmp_path / "opened").read_text() == f"{(runs / 'older' / 'report.html').as_uri()}\n"
+    assert "there are 2 runs" in harness("runs", runs, "--open", "3").stderr
+
+
+def test_no_folder_is_one_sentence(tmp_path: Path) -> None:
+    refused = harness("runs", tmp_path / "none")
+    assert refused.returncode == 2
+    assert "`ucp-harness run` makes it" in refused.stderr
