@@ -1,7 +1,7 @@
 """Following one life of an agent: the reference core is given what the agent was given, a handler at a time."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from typing import Any, NamedTuple
 
@@ -130,6 +130,11 @@ class Follower:
             self.deviations.append(deviation)
         self._began = True
         self._adopt(line, run, before)
+
+    def begin_at(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
+        """The agent is idle, with this chain, the block that it builds, and the number of what it sends next."""
+        self._core.be_idle_with(chain, current_block, sequence)
+        self._began = True
 
     @property
     def state(self) -> AgentState:

@@ -48,6 +48,16 @@ class ReferenceCore(Core):
         yield from (self.settings, self.chain.inception, self._moved, *self._moved.values(), *HANDLERS.values())
         yield from (message for _, message in self.outbox)
 
+    def be_idle_with(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
+        """Be, from the beginning, what an agent is that holds no more than these, and waits for nothing."""
+        for block in chain:
+            self.commit(block)
+            if block.agent_id == self.agent_id:
+                self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
+        self.current_block += current_block
+        self._sequence = sequence
+        self.step_is_over()
+
     def before(self, run: HandlerRun) -> Before | None:
         """What `undo` needs to take back the step that the run is compared with; None if its changes are all."""
         logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline

@@ -3,16 +3,15 @@
 Going back is exact: it plays again, from a checkpoint shortly before.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
-from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded
+from harness.field.replay.blocks import RecordedBlocks
 from harness.field.replay.record import Entry, Record
-from ucp.block import Block
-from ucp.messages import MalformedDatagramError
+from harness.field.replay.resumption import Resumption
 from ucp.state import AgentState
 from ucp.trace import HandlerRun
 
@@ -37,8 +36,7 @@ class Found:
 
     @property
     def first(self) -> Deviation | None:
-        """The difference that stands first in the record."""
-        return min(self.deviations, key=lambda deviation: deviation.line, default=None)
+        return self.deviations[0] if self.deviations else None
 
 
 @dataclass(frozen=True)
@@ -62,6 +60,7 @@ class Player:
         self.found = Found()
         self._tells = Tells.of(record.trace)
         self._blocks = RecordedBlocks(record)
+        self._resumption = Resumption(record, self._blocks)
         self._follower, self._life = self._born(), 1
         self._checkpoints = {0: _Checkpoint(self._follower.copy(), 1, self.found.copy())}
 
@@ -130,54 +129,29 @@ class Player:
 
     def _follow(self, entry: Entry, run: HandlerRun) -> None:
         follower, found = self._follower, self.found
+        if entry.gap is not None and follower.lost is None:
+            follower.lost = f"before line {entry.line} {entry.gap}, and what the agent held then is not on record"
+            found.lost.append(follower.lost)
         if follower.lost is not None:
             found.unjudged += 1
+            resumed = self._born()
+            if self._resumption.goes_on(resumed, self.position):
+                found.lost[-1] += f"; on from line {entry.line}, after which it was idle with a chain that is"
+                self._follower = resumed
             return
         follower.follow(entry.line, run)
         found.steps += 1
-        if follower.deviations:
-            found.deviations += follower.deviations
+        if follower.deviations and (why := self.record.unwritten.get(self.position)) is not None:
             follower.deviations.clear()
+            follower.lost = f"before line {entry.line} {why}"
+            found.steps, found.unjudged = found.steps - 1, found.unjudged + 1
+        found.deviations += follower.deviations
+        follower.deviations.clear()
         if follower.lost is not None:
             found.lost.append(follower.lost)
 
     def _born(self) -> Follower:
         return Follower(self.record.header, self._tells, self._blocks, self.record.was_paused)
-
-
-class RecordedBlocks(Blocks):
-    """Blocks by hash, wherever they are on record: what was played by now makes no difference."""
-
-    def __init__(self, record: Record) -> None:
-        super().__init__(())
-        self._record = record
-        self._looked = False
-
-    def get(self, block_hash: str) -> Block:
-        try:
-            return super().get(block_hash)
-        except NotOnRecordError:
-            if self._looked:
-                raise
-        self._looked = True
-        for block in self._everywhere():
-            self.add(block)
-        return super().get(block_hash)
-
-    def _everywhere(self) -> Iterator[Block]:
-        for export in self._record.beside.exports.values():
-            for exported in export.blocks():
-                yield Block(exported.agent_id, exported.timestamp_us, exported.event_bytes)
-        for trace in (self._record.trace, *self._record.beside.traces.values()):
-            for run in trace.runs:
-                datagrams = [run.input] if "message" in run.trigger else []
-                for datagram in (*datagrams, *(sent.datagram for sent in run.sent)):
-                    try:
-                        message = decoded(datagram).message
-                    except MalformedDatagramError:
-                        continue
-                    if (block := getattr(message, "block", None)) is not None:
-                        yield block
 
 
 def _later_than(entries: Iterable[Entry], until_s: float) -> int:

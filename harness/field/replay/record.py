@@ -1,25 +1,27 @@
 """One agent's record as it is played: its lines in order, and what lies beside it."""
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from heapq import merge
-from itertools import pairwise
-from operator import attrgetter
 from pathlib import Path
 from typing import Protocol
 
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE, Export, agents_directory
 from harness.archive.record import JudgedRecord
-from harness.archive.traces import SUFFIX, Trace, read_trace, why_none
+from harness.archive.traces import SUFFIX, Header, Trace, read_trace
 from harness.checker.evidence import Evidence
 from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, checked
-from harness.errors import FieldError, RunDirectoryError
+from harness.errors import FieldError
+from harness.field.homecoming import Flight, sort_out
 from harness.gc_pause import gc_paused
 from ucp.clock import MICROSECONDS
 from ucp.trace import Commanded, Dropped, HandlerRun
+
+AGENTS = "agents"
+"""Directory in a run's with what the agents left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +52,14 @@ class Beside(Protocol):
 
 
 class Record:
-    """The trace of one agent; `path` is where it is from. Raises FieldError if nothing of it can be played."""
+    """The trace of one agent; `path` is where it is from, and `named` how the command line names it.
 
-    def __init__(self, path: Path, trace: Trace, beside: Beside, problems: list[str]) -> None:
+    Raises FieldError if nothing of it can be played.
+    """
+
+    def __init__(self, path: Path, named: str, trace: Trace, beside: Beside, problems: list[str]) -> None:
         self.path = path
+        self.named = named
         self.trace = trace
         self.beside = beside
         self.problems = problems
@@ -73,11 +79,30 @@ class Record:
 
     def position_of_line(self, line: int) -> int:
         """How many entries stand before this line of the file."""
-        return bisect_left(self.entries, line, key=attrgetter("line"))
+        return next((number for number, entry in enumerate(self.entries) if entry.line >= line), len(self.entries))
 
     def position_of_second(self, at_s: float) -> int:
         """How many entries stand before the first that is not before this mission second."""
         return next((number for number, entry in enumerate(self.entries) if entry.what.t >= at_s), len(self.entries))
+
+    @cached_property
+    def unwritten(self) -> dict[int, str]:
+        """Entries before which lines are missing without a trace, by the numbers of what the agent sent; and why.
+
+        Of the entries since it sent anything before that, nobody knows before which.
+        """
+        unwritten: dict[int, str] = {}
+        life, expected, sent_at = 1, 0, 0
+        for position, entry in enumerate(self.entries):
+            if entry.life != life or entry.gap is not None:
+                life, expected, sent_at = entry.life, 0 if entry.gap is None else -1, position
+            if isinstance(entry.what, HandlerRun) and entry.what.sent:
+                first = entry.what.sent[0].seq
+                if 0 <= expected < first:
+                    why = f"lines are missing (no line has its message{_numbers(expected, first - 1)})"
+                    unwritten.update(dict.fromkeys(range(sent_at, position + 1), why))
+                expected, sent_at = entry.what.sent[-1].seq + 1, position + 1
+        return unwritten
 
     @property
     def ends_s(self) -> float:
@@ -120,86 +145,135 @@ class Record:
 
 def _entries(trace: Trace) -> Iterator[Entry]:
     """The lines of a trace in their order."""
-    gaps = {gap.position: gap.lines for gap in getattr(trace, "gaps", ())}
-    positions = [0, *trace.starts, len(trace.runs)]
-    runs = (
-        Entry(line, life, run, _missing(gaps[position]) if position in gaps else None)
-        for life, ((start, _), of_life) in enumerate(zip(pairwise(positions), trace.lives(), strict=True), 1)
-        for position, (line, run) in enumerate(of_life, start)
-    )
-    asides = (Entry(line, 0, aside) for line, aside in trace.numbered_asides())
-    return merge(runs, asides, key=attrgetter("line"))
+    missing = {gap.position: _missing(gap.lines) for gap in trace.gaps}
+    missing |= dict.fromkeys(trace.jumps, "the agent's clock was set")
+    asides = deque(zip((position for position, _ in trace.asides), trace.numbered_asides(), strict=True))
+    position = 0
+    for life, of_life in enumerate(trace.lives(), 1):
+        for line, run in of_life:
+            while asides and asides[0][0] <= position:
+                yield Entry(asides[0][1][0], life, asides.popleft()[1][1])
+            yield Entry(line, life, run, missing.get(position))
+            position += 1
+    for _, (line, aside) in asides:
+        yield Entry(line, len(trace.starts) + 1, aside)
+
+
+def _numbers(first: int, last: int) -> str:
+    return f" {first}" if first == last else f"s {first} to {last}"
 
 
 def _missing(lines: int) -> str:
     return "lines are missing" if not lines else "a line is damaged" if lines == 1 else f"{lines} lines are damaged"
 
 
-class _InDirectory:
-    """What lies in the directory of a run, or beside a trace."""
+class _Run:
+    """What the directory of a run holds."""
 
     def __init__(self, directory: Path) -> None:
-        self._directory = directory
-
-    @cached_property
-    def _archive(self) -> RunArchive | None:
-        try:
-            return RunArchive(self._directory)
-        except RunDirectoryError:
-            return None
+        self._archive = RunArchive(directory)
 
     @property
     def exports(self) -> Mapping[int, Export]:
-        return self._archive.exports.by_agent if self._archive else {}
+        return self._archive.exports.by_agent
 
-    @cached_property
+    @property
+    @gc_paused()
     def traces(self) -> Mapping[int, Trace]:
-        read = (_read(path) for path in agents_directory(self._directory).glob(f"*{SUFFIX}"))
-        return {trace.header.agent_id: trace for trace in read if trace is not None}
+        return self._archive.traces
 
     @property
     def record(self) -> JudgedRecord | None:
-        return self._archive.judged_record if self._archive else None
+        return self._archive.judged_record
+
+
+class _Flight:
+    """What came home of the flight that a trace is of: of what is in a directory, or has been sorted out already."""
+
+    record = None
+
+    def __init__(self, trace: Trace, directory: Path, flight: Flight | None = None) -> None:
+        self._trace = trace
+        self._directory = directory
+        if flight is not None:
+            self._flight = flight
+
+    @cached_property
+    def _flight(self) -> Flight:
+        flights = sort_out([self._directory]).flights
+        same = (flight for flight in flights if self._trace.header in _headers(flight))
+        return next(same, Flight(None))
+
+    @property
+    def exports(self) -> Mapping[int, Export]:
+        return self._flight.exports
+
+    @property
+    def traces(self) -> Mapping[int, Trace]:
+        return self._flight.traces
+
+
+def _headers(flight: Flight) -> Iterator[Header]:
+    return (trace.header for trace in flight.traces.values())
 
 
 def open_record(path: Path, agent_id: int | None = None) -> Record:
-    """The record in a trace file, or that of an agent in a directory. Raises FieldError if there is none to play."""
-    if path.is_dir():
-        file = _file_of(path, agent_id)
-        directory = path
-    else:
-        file = path
-        run = path.parent.parent
-        directory = run if (run / RUN_FILE).is_file() and path.parent.name == "agents" else path.parent
-    trace = _read(file)
-    if trace is None:
-        raise FieldError(f"{file}: {why_none(file)}; give a trace (*{SUFFIX}), or a directory of them and --agent")
+    """The record in a trace, or that of an agent in a directory. Raises FieldError if there is none to play."""
+    file, directory = (_file_of_run(path, agent_id), path) if path.is_dir() else (path, _directory_of(path))
+    trace = _read(file) if file is not None else None
+    if file is None or trace is None or trace.problem or trace.cut_off:
+        return _sorted_out(path, agent_id)
     if agent_id is not None and trace.header.agent_id != agent_id:
         raise FieldError(f"{file}: the trace is of agent {trace.header.agent_id}, not of agent {agent_id}")
-    problems = [f"{file}: {trace.problem}; what is before that is played"] if trace.problem else []
-    if trace.cut_off:
-        problems.append(f"{file}: it ends in half a line, which is left out")
-    return Record(file, trace, _InDirectory(directory), problems)
+    run = (directory / RUN_FILE).is_file()
+    return Record(file, _named(path, agent_id), trace, _Run(directory) if run else _Flight(trace, directory), [])
+
+
+def _named(path: Path, agent_id: int | None) -> str:
+    return f"{path}" if agent_id is None else f"{path} --agent {agent_id}"
 
 
 @gc_paused()
-def _read(path: Path) -> Trace | None:
-    return read_trace(path)
+def _read(file: Path) -> Trace | None:
+    return read_trace(file)
 
 
-def _file_of(directory: Path, agent_id: int | None) -> Path:
-    agents = agents_directory(directory)
-    there = sorted(
-        (path for path in agents.glob(f"*{SUFFIX}") if path.is_file()), key=lambda path: (len(path.name), path.name)
-    )
-    if not there:
-        raise FieldError(f"{directory}: it has no traces (*{SUFFIX}): give a trace, or a directory of them")
-    if agent_id is None and len(there) == 1:
-        return there[0]
-    names = ", ".join(path.name.removesuffix(SUFFIX) for path in there)
-    if agent_id is None:
-        raise FieldError(f"{directory}: whose record is to be played? Choose with --agent: {names}")
-    path = agents / f"{agent_id}{SUFFIX}"
-    if path not in there:
-        raise FieldError(f"{directory}: there is no trace of agent {agent_id}, but of {names}")
-    return path
+def _directory_of(file: Path) -> Path:
+    """That of the run that left the file, or the one that it is in."""
+    run = file.parent.parent
+    return run if file.parent.name == AGENTS and (run / RUN_FILE).is_file() else file.parent
+
+
+def _file_of_run(directory: Path, agent_id: int | None) -> Path | None:
+    """The trace of an agent in the directory of a run; None in any other, where names say nothing."""
+    if not (directory / RUN_FILE).is_file() or agent_id is None:
+        return None
+    file = agents_directory(directory) / f"{agent_id}{SUFFIX}"
+    return file if file.is_file() else None
+
+
+def _sorted_out(path: Path, agent_id: int | None) -> Record:
+    """The record in files of any kind and in any state."""
+    homecoming = sort_out([path])
+    flights = [flight for flight in homecoming.flights if flight.traces]
+    if not flights:
+        why = f": {homecoming.left_out[0].why}" if homecoming.left_out else ""
+        raise FieldError(f"{path}: nothing of it is a trace that can be played{why}; give one, or a directory of them")
+    whose = sorted({agent for flight in flights for agent in flight.traces})
+    if agent_id is None and len(whose) > 1:
+        names = ", ".join(map(str, whose))
+        raise FieldError(f"{path}: whose record is to be played? Choose with --agent: {names}")
+    chosen = whose[0] if agent_id is None else agent_id
+    of_agent = next((flight for flight in flights if chosen in flight.traces), None)
+    if of_agent is None:
+        raise FieldError(f"{path}: there is no trace of agent {chosen}, but of {', '.join(map(str, whose))}")
+    trace, files, directory = of_agent.traces[chosen], of_agent.sources[chosen], _directory_of(path)
+    of_others = {file for agent, sources in of_agent.sources.items() if agent != chosen for file in sources}
+    remarks = [remark for remark in (*homecoming.left_out, *homecoming.remarks) if remark.path not in of_others]
+    if path.is_dir():
+        directory = path
+    if (directory / RUN_FILE).is_file():
+        beside: Beside = _Run(directory)
+    else:
+        beside = _Flight(trace, directory, of_agent if path.is_dir() else None)
+    return Record(files[0], _named(path, agent_id), trace, beside, [remark.sentence for remark in remarks])

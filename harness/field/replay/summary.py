@@ -33,14 +33,15 @@ def summary(record: Record, found: Found, names: Names) -> Iterator[Text]:
     steps = f"{found.steps:,} handler run{'s' if found.steps != 1 else ''}"
     match verdict(found):
         case "as specified":
-            words = "all" if not found.unjudged else "as far as it could be played"
+            words = "all" if not found.unjudged else "as far as it could be played,"
             yield Text(f"✔ no difference: {steps}, {words} as Algorithms 1 to 20 say", style="green")
         case "not judged":
             yield Text("- nothing could be judged", style="yellow")
         case "deviates":
             yield from _differences(record, found, steps, names)
     if found.unjudged:
-        yield Text(f"- {found.unjudged:,} handler runs could not be judged", style="yellow")
+        runs = "handler run" if found.unjudged == 1 else "handler runs"
+        yield Text(f"- {found.unjudged:,} {runs} could not be judged:", style="yellow")
         for sentence in found.lost[:LOST_SHOWN]:
             yield Text(f"  {sentence}", style="yellow")
 
@@ -52,7 +53,7 @@ def _differences(record: Record, found: Found, steps: str, names: Names) -> Iter
     yield Text(f"✘ {count:,} difference{'s' if count > 1 else ''} in {steps}; the first:", style="bold red")
     yield Text(f"  line {first.line}, t={first.t:g} s: {title(first)}")
     yield Text(f"  {first.difference(names.of)}", style="red")
-    yield Text(f"  ucp-harness replay {record.path} --break {first.line}", style="dim")
+    yield Text(f"  ucp-harness replay {record.named} --break {first.line}", style="dim")
     if count > 1:
         yield Text("By handler, with the line of the first:")
         of_handler: dict[str, list[Deviation]] = {}

@@ -122,10 +122,10 @@ def test_what_is_no_place_is_said_to_be_none(words: str, right: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("a.trace.jsonl", "", "not a trace"),
-        ("a.trace.jsonl", "no trace\n", "not a trace"),
-        ("a.chain.json", "{}", "not a trace"),
-        ("a.trace.jsonl", None, "cannot be read: No such file"),
+        ("a.trace.jsonl", "", "it is empty"),
+        ("a.trace.jsonl", "no trace\n", "nothing of it is a trace"),
+        ("a.chain.json", "{}", "nothing of it is a trace"),
+        ("a.trace.jsonl", None, "does not exist"),
     ],
 )
 def test_what_cannot_be_played_is_one_sentence_and_status_2(

@@ -1,0 +1,131 @@
+"""Records as they come home: what is left of them is played, and nobody is charged with what is missing."""
+
+import gzip
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.field.replay import Player, open_record
+from tests.harness.command import harness, sentences
+from tests.harness.field.flights import flown, trace_of
+
+
+@pytest.fixture(scope="module")
+def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return flown(tmp_path_factory.mktemp("right") / "run", agents=4, duration_s=900)
+
+
+@pytest.fixture
+def home(run_directory: Path, tmp_path: Path) -> Path:
+    """The traces, and nothing else."""
+    directory = tmp_path / "home"
+    directory.mkdir()
+    for agent in (1, 2, 3, 4):
+        shutil.copy(trace_of(run_directory, agent), directory)
+    return directory
+
+
+def change(path: Path, edit: Callable[[list[str]], Any]) -> None:
+    lines = path.read_text().splitlines(keepends=True)
+    edit(lines)
+    path.write_text("".join(lines))
+
+
+def damage(*numbers: int) -> Callable[[list[str]], None]:
+    def edit(lines: list[str]) -> None:
+        for number in numbers:
+            lines[number] = lines[number][: len(lines[number]) // 2] + "\n"
+
+    return edit
+
+
+def remove(first: int, last: int) -> Callable[[list[str]], None]:
+    def edit(lines: list[str]) -> None:
+        del lines[first:last]
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        damage(40),
+        damage(30, 31, 32, 60),
+        damage(0),
+        damage(0, 1),
+        damage(1),
+        remove(0, 1),
+        remove(0, 30),
+        remove(40, 60),
+    ],
+    ids=["a line", "lines", "header", "beginning", "first line", "no header", "no beginning", "lines without a sign"],
+)
+def test_what_is_missing_is_no_difference_and_what_is_left_is_played(
+    home: Path, edit: Callable[[list[str]], None]
+) -> None:
+    change(home / "2.trace.jsonl", edit)
+    ended = harness("replay", home, "--agent", 2, "--json")
+    document = json.loads(ended.stdout)
+    assert (ended.returncode, document["verdict"], document["differences"]) == (0, "as specified", [])
+    assert document["steps"] > 30
+    assert document["unjudged"] == 0 or document["unjudged_because"]
+    sentences(ended.stderr)
+
+
+def test_a_difference_after_a_gap_is_found(home: Path) -> None:
+    record = open_record(home / "2.trace.jsonl")
+    positions = [
+        number for number, entry in enumerate(record.entries) if getattr(entry.what, "branch", "") == "approve"
+    ]
+    line = record.entries[positions[-1]].line
+
+    def disapprove(lines: list[str]) -> None:
+        lines[line - 1] = lines[line - 1].replace('"branch":"approve"', '"branch":"disapprove"')
+        damage(30)(lines)
+
+    change(home / "2.trace.jsonl", disapprove)
+    found = Player(open_record(home, 2)).to_end()
+    assert found.unjudged and found.lost
+    assert [(deviation.line, deviation.handler) for deviation in found.deviations] == [
+        (line, "receive_request_add_block")
+    ]
+
+
+def test_the_same_in_a_zip_twice_and_among_other_files(home: Path) -> None:
+    whole = Player(open_record(home, 2)).to_end().steps
+    content = (home / "2.trace.jsonl").read_bytes()
+    (home / "2.trace.jsonl").unlink()
+    (home / "two.gz").write_bytes(gzip.compress(content))
+    (home / "copy of two.jsonl").write_bytes(content)
+    (home / "holiday.jpg").write_bytes(b"\xff\xd8\xff\xe0 no trace")
+    found = Player(open_record(home, 2)).to_end()
+    assert (found.steps, found.deviations) == (whole, [])
+    assert Player(open_record(home / "two.gz")).to_end().steps == whole
+
+
+def test_a_record_cut_off_is_played_up_to_there(home: Path) -> None:
+    path = home / "2.trace.jsonl"
+    path.write_bytes(path.read_bytes()[:20_000])
+    ended = harness("replay", path)
+    assert ended.returncode == 0
+    (said,) = sentences(ended.stderr)
+    assert "cut off" in said
+
+
+def test_nothing_usable_is_status_2(tmp_path: Path) -> None:
+    (tmp_path / "1.trace.jsonl").write_bytes(bytes(range(256)) * 50)
+    for path in (tmp_path, tmp_path / "1.trace.jsonl", tmp_path / "none"):
+        ended = harness("replay", path)
+        assert ended.returncode == 2
+        assert len(sentences(ended.stderr)) == 1
+
+
+def test_of_the_old_version_nothing_can_be_played(home: Path) -> None:
+    change(home / "2.trace.jsonl", lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")))
+    ended = harness("replay", home / "2.trace.jsonl")
+    assert ended.returncode == 2
+    assert "lacks what the agent received" in sentences(ended.stderr)[-1]
