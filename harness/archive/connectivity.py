@@ -18,6 +18,7 @@ from harness.archive.jsonlines import JsonLines
 from harness.archive.tracks import MissionSeconds
 from harness.scenario.faults import named
 from netem.conditions import NetworkConditions
+from netem.link import GilbertElliott, LinkConditions
 from netem.radio import components
 
 NETWORK_FILE = "network.jsonl"
@@ -36,12 +37,26 @@ class Topology:
     components: Components
 
 
+@dataclass(frozen=True, slots=True)
+class Losses:
+    """From `at_s` on links between living vehicles lost this share of messages, on average and at worst, 0..1.
+
+    Links that lose everything are none.
+    """
+
+    at_s: float
+    mean: float
+    worst: float
+
+
 @dataclass(frozen=True)
 class Connectivity:
     """The states of the network, no two in a row alike; none if there is no record of it."""
 
     vehicles: tuple[int, ...]
     states: list[Topology]
+    losses: list[Losses]
+    """Likewise, to a tenth of a per cent."""
     reboots: list[tuple[float, int]]
     """When an agent went down, while its vehicle flew on."""
     problems: list[str]
@@ -81,6 +96,9 @@ class _Network:
         self._pairs = {f"{low}-{high}": (low, high) for low, high in combinations(self.vehicles, 2)}
         self._out_of_range: set[Pair] = set()
         self._cut_off: set[Pair] = set()
+        self._asked: dict[Pair, tuple[float, float]] = {}
+        """What each pair loses in either direction, over which the radio loses more."""
+        self._over_the_radio: dict[Pair, float] = {}
 
     @property
     def cut(self) -> set[Pair]:
@@ -92,12 +110,28 @@ class _Network:
         if line.asked is not None:
             conditions = NetworkConditions.from_json(line.asked)
             self._cut_off = {pair for pair in self._pairs.values() if len(components(conditions, pair)) > 1}
+            self._asked = {
+                (low, high): (_loss(conditions.link(low, high)), _loss(conditions.link(high, low)))
+                for low, high in self._pairs.values()
+            }
+        self._over_the_radio |= losses
         self._out_of_range -= losses.keys()
         self._out_of_range |= {pair for pair, loss in losses.items() if loss == 1.0}
         if (fault := named(line.what)).takes_the_vehicle:
             self.lost |= set(line.agents) & set(self.vehicles)
         elif fault.brings_a_vehicle:
             self.lost -= set(line.agents)
+
+    def losses(self, at_s: float) -> Losses:
+        """What the links lose now."""
+        lost = [
+            1 - (1 - asked) * (1 - self._over_the_radio.get(pair, 0.0))
+            for pair, directions in self._asked.items()
+            if pair not in self.cut and not self.lost & {*pair}
+            for asked in directions
+        ]
+        mean = sum(lost) / len(lost) if lost else 0.0
+        return Losses(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def components(self) -> Components:
         left = set(self.vehicles) - self.lost
@@ -118,11 +152,17 @@ class _Network:
         return tuple(sorted(groups, key=lambda group: (-len(group), min(group))))
 
 
+def _loss(link: LinkConditions) -> float:
+    """The share of messages that it loses in the long run."""
+    return link.loss.mean if isinstance(link.loss, GilbertElliott) else link.loss
+
+
 def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectivity:
     """The network among `vehicles`. A line that means nothing, or comes before the first conditions, is left out."""
     lines = JsonLines(path, _Line)
     network = _Network(vehicles)
     states: list[Topology] = []
+    losses: list[Losses] = []
     reboots: list[tuple[float, int]] = []
     cut: dict[Pair, list[float]] = {}
     lost: dict[int, list[float]] = {}
@@ -142,9 +182,12 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
         _switch(lost, fallen, now_s)
         if (fault := named(line.what)).ends_a_life and not fault.takes_the_vehicle:
             reboots += [(now_s, vehicle) for vehicle in line.agents if vehicle in network.vehicles]
+        lost_now = network.losses(now_s)
+        if not losses or (lost_now.mean, lost_now.worst) != (losses[-1].mean, losses[-1].worst):
+            losses.append(lost_now)
         if switched or fallen or not states:
             _enter(states, Topology(now_s, line.what, network.components()))
-    return Connectivity(network.vehicles, states, reboots, lines.problems(), cut, lost)
+    return Connectivity(network.vehicles, states, losses, reboots, lines.problems(), cut, lost)
 
 
 def _enter(states: list[Topology], state: Topology) -> None:

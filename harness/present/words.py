@@ -27,8 +27,8 @@ def started(text: Any) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Mission or wall time: 45 s, 20 min, 90.5 min."""
-    return f"{_shortest(seconds)}\u00a0s" if seconds < 120 else f"{_shortest(seconds / 60)}\u00a0min"
+    """Mission or wall time, in the unit of everything else: 45 s, 1200 s."""
+    return f"{_shortest(seconds)}\u00a0s"
 
 
 def percent(share: float) -> str:

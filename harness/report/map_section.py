@@ -128,7 +128,7 @@ def _legend(flown: Sequence[Life], *, rebooted: bool) -> list[tuple[Markup, str]
             parts.setdefault(map_svg.look(stretch.division, life.vehicle), set()).update(
                 () if part is None else (part,)
             )
-    means = {"whole": "connected to all", "unknown": "network not on record", "alone": "alone, cut off from all"}
+    means = {"whole": "in one part with all", "unknown": "network not on record", "alone": "alone, cut off from all"}
     entries = [
         (which, means.get(which) or f"part {', '.join(map(letter, sorted(parts[which])))}")
         for which in map_svg.LOOKS

@@ -200,7 +200,7 @@ def _whereabouts(division: Division | None, vehicle: int) -> str:
     others = listed(fellows - {vehicle})
     if not others:
         return "alone"
-    return f"connected to all, {others}" if part is None else f"part {letter(part)}, with {others}"
+    return f"in one part with all, {others}" if part is None else f"part {letter(part)}, with {others}"
 
 
 def _marks(

@@ -1,63 +1,36 @@
-"""What the network was set to and what happened to it, from the scenario and the recorded faults."""
+"""What the network was set to, what it did, and what happened to it, as it is on record."""
 
 from collections.abc import Sequence
 
 from markupsafe import Markup
 
+from harness.archive.connectivity import Connectivity, Losses
 from harness.archive.record import FaultRecord, NetworkState
 from harness.present import words
 from harness.report import network_strip
-from harness.report.chain_tree import ranges
-from harness.scenario import Scenario
-from harness.scenario.network import Bursts, Loss
-
-Change = tuple[float, float, tuple[str, float]]
-"""From when to when something is so, and what, in words and as a level."""
+from harness.report.map_parts import divisions
 
 
-def strip(scenario: Scenario | None, faults: Sequence[FaultRecord]) -> Markup | None:
-    """The network along mission time, as the scenario asked for it; None if that is not on record."""
-    if scenario is None:
+def strip(network: Connectivity, faults: Sequence[FaultRecord], end_s: float) -> Markup | None:
+    """What the network did up to `end_s`, as it is on record; None if it is not."""
+    if not network.states:
         return None
-    end_s = scenario.duration_s
-    losses, partitions = [(0.0, end_s, _loss(scenario.network.loss))], [(0.0, end_s, ("", 0.0))]
-    for entry in scenario.timeline_in_order():
-        until_s = end_s if entry.for_s is None else entry.at_s + entry.for_s
-        loss = entry.loss if entry.loss is not None or entry.network is None else entry.network.loss
-        if loss is not None:
-            losses.append((entry.at_s, until_s, _loss(loss)))
-        elif entry.partition:
-            text = " | ".join(", ".join(ranges(sorted(group))) for group in entry.partition)
-            partitions.append((entry.at_s, until_s, (text, 1.0)))
-        elif entry.heal:
-            partitions.append((entry.at_s, until_s, ("", 0.0)))
+    partitions = [
+        (division.at_s, *(("", 0.0) if division.together else (division.in_words(), 1.0)))
+        for division in divisions(network.states)
+    ]
+    losses = [(losses.at_s, _in_words(losses), losses.mean) for losses in network.losses]
     lanes = [
-        ("partition", network_strip.steps(_one_after_another(partitions, end_s), end_s)),
-        ("loss", network_strip.steps(_one_after_another(losses, end_s), end_s)),
+        ("partition", network_strip.steps(partitions, end_s)),
+        ("loss", network_strip.steps(losses, end_s)),
     ]
     ticks = [(fault.at_s, f"{words.duration(fault.at_s)}: {fault.what}") for fault in faults]
     return network_strip.draw(lanes, ticks, end_s)
 
 
-def _one_after_another(changes: list[Change], end_s: float) -> list[tuple[float, str, float]]:
-    """When which of them stands; after one that passes the one that stood before."""
-    steps = []
-    for place, (at_s, until_s, state) in enumerate(changes):
-        steps.append((at_s, *state))
-        if until_s < end_s:
-            beneath = (
-                other_state for _, other_until_s, other_state in reversed(changes[:place]) if other_until_s > until_s
-            )
-            steps.append((until_s, *next(beneath, ("", 0.0))))
-    return steps
-
-
-def _loss(loss: Loss) -> tuple[str, float]:
-    """In words, and its share of all messages in the long run."""
-    if not isinstance(loss, Bursts):
-        return words.percent(loss), loss
-    mean = loss.loss_good if loss.p == 0 else (loss.p * loss.loss_bad + loss.r * loss.loss_good) / (loss.p + loss.r)
-    return f"{words.percent(mean)} in bursts", mean
+def _in_words(losses: Losses) -> str:
+    mean, worst = words.percent(losses.mean), words.percent(losses.worst)
+    return mean if mean == worst else f"{mean}, the worst link {worst}"
 
 
 def start(states: Sequence[NetworkState]) -> str | None:

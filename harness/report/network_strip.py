@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from harness.present import words
+from harness.present.svg import linear_axis
+from harness.report.timeline_plot import short
 
 _LANE = 24
-_AXIS_MARKS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,15 +55,11 @@ def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, s
                     x=_share(at_s, end_s), height=height, text=text
                 )
             )
-    unit = words.duration(end_s).split("\u00a0")[-1]
-    for mark in range(_AXIS_MARKS + 1):
-        anchor = "start" if mark == 0 else "end" if mark == _AXIS_MARKS else "middle"
-        text = words.duration(end_s * mark / _AXIS_MARKS)
-        if mark < _AXIS_MARKS:  # on a phone there is no room to say it each time
-            text = text.removesuffix(f"\u00a0{unit}")
+    for tick in linear_axis(0.0, end_s, (0.0, 100.0)).ticks:
+        anchor = "end" if tick > 0.95 * end_s else "middle" if tick else "start"
         parts.append(
             Markup('<text class="axis" x="{}" y="{}" text-anchor="{}">{}</text>').format(
-                _share(mark, _AXIS_MARKS), height + 14, anchor, text if mark else "0"
+                _share(tick, end_s), height + 14, anchor, short(tick)
             )
         )
     return Markup(

@@ -48,7 +48,7 @@ def draw(left: ReportSource) -> str:
         pictures=_pictures(exports.by_agent, left.archive.before_final_reconcile, ink),
         blocks=swarm.block_rows(exports.by_agent, ink),
         timeline=timeline_section,
-        strip=network.strip(record.scenario, record.faults),
+        strip=network.strip(left.network, record.faults, timeline.end_s(left)),
         network=network.start(record.network),
         faults=network.faults(record.faults),
         rogue=rogue.section(record.rogue),

@@ -72,9 +72,9 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
         return None
     notes = []
     faults = possible(left.record.faults)
-    end_s = max(ends_at(traces), *(fault.at_s for fault in faults), _planned_s(left.record), 1.0)
-    course = history_of(traces, faults, end_s, whole=not left.archive.large)
-    shades, shades_left_out = _shades(left.network, end_s)
+    ends_s = end_s(left)
+    course = history_of(traces, faults, ends_s, whole=not left.archive.large)
+    shades, shades_left_out = _shades(left.network, ends_s)
     if shades_left_out:
         notes.append(f"{shades_left_out} shorter stretches of a parted network are not shaded")
     if len(faults) > MAX_FAULTS:
@@ -83,24 +83,30 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
     agents = [(agent, ink[agent]) for agent in sorted(traces)]
     messages, without = _messages(course.messages, [agent for agent, _ in agents], names)
     picture = timeline_lanes.draw(
-        course, faults, shades, [agent for agent, _ in agents], names, end_s, _in_words(course, len(agents), end_s)
+        course, faults, shades, [agent for agent, _ in agents], names, ends_s, _in_words(course, len(agents), ends_s)
     )
     drawn = Drawn(
-        end_s,
+        ends_s,
         agents,
         picture.lane_height,
         picture.drawing,
         picture.legend,
         [
-            *([timeline_cycle.row(left.record.cycle, end_s)] if left.record.cycle else []),
-            *timeline_charts.draw(replication_of(traces, faults), faults, shades, end_s),
+            *([timeline_cycle.row(left.record.cycle, ends_s)] if left.record.cycle else []),
+            *timeline_charts.draw(replication_of(traces, faults), faults, shades, ends_s),
         ],
-        axis(end_s),
+        axis(ends_s),
         messages,
         _table(course.votes, lambda vote: _vote_row(vote, names)),
         _table(course.reconciles, _reconcile_row),
     )
     return Section(drawn, [*notes, *without, *picture.notes])
+
+
+def end_s(left: ReportSource) -> float:
+    """When what is drawn of a run is over, in mission seconds."""
+    faults = possible(left.record.faults)
+    return max(ends_at(left.traces), *(fault.at_s for fault in faults), _planned_s(left.record), 1.0)
 
 
 def _planned_s(record: RunRecord) -> float:

@@ -24,7 +24,7 @@ def test_it_says_how_the_run_went_in_little_more_than_a_screen(tmp_path: Path) -
     assert "| 1 | distributed | \u2713 holds | Looked at every export and every trace. |" in lines
     assert "blocks in the mutual chain **39**" in "\n".join(lines)
     assert "- at 300 s vehicle 3 was lost (crash), and with it 1 of 12 completed blocks" in lines
-    assert "| 10\u00a0min | heal |  |" in lines
+    assert "| 600\u00a0s | heal |  |" in lines
     assert lines[-1] == "<sub>ucp-harness 0.1.0, python 3.11.2, kernel 6.18</sub>"
     assert len(lines) < 40
 

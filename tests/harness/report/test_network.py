@@ -1,30 +1,51 @@
-"""The strip of what the network did along mission time, from the scenario of a run."""
+"""The strip of what the network did along mission time, as it is on record."""
 
+import json
 import re
+from pathlib import Path
+from typing import Any
 
+from harness.archive.connectivity import read_connectivity
 from harness.report.network import strip
-from tests.harness.virtual import scenario
 
 
-def test_what_is_for_a_while_passes_and_shows_what_stood_before() -> None:
-    one = scenario(
-        duration_s=600,
-        network={"loss": 0.1},
-        timeline=[
-            {"at_s": 300, "network": {"loss": 0.5}, "for_s": 60},
-            {"at_s": 60, "loss": 0.2},
-            {"at_s": 120, "partition": [[1, 2]], "for_s": 240},
-            {"at_s": 180, "partition": [[3]], "for_s": 60},
-            {"at_s": 400, "network": {"links": [{"from": 1, "to": 2, "loss": 0.9}]}},
-        ],
-    )
-    drawn = strip(one, [])
-    assert re.findall(r"<title>((?:loss|partition): .*?)</title>", str(drawn).replace("\u00a0", " ")) == [
-        "partition: 1, 2, 2 min to 3 min",
-        "partition: 3, 3 min to 4 min",
-        "partition: 1, 2, 4 min to 6 min",
+def drawn(path: Path, *lines: dict[str, Any]) -> list[str]:
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    picture = str(strip(read_connectivity(path, (1, 2, 3)), [], 600.0)).replace("\u00a0", " ")
+    return re.findall(r"<title>((?:loss|partition): .*?)</title>", picture)
+
+
+def asked(at_s: float, loss: float, *groups: list[int]) -> dict[str, Any]:
+    conditions = {"default": {"loss": loss}, "receivers": {}, "links": {}, "partition": list(groups)}
+    return {"at_s": at_s, "what": "network", "detail": "", "fully_connected": False, "asked": conditions}
+
+
+def test_partitions_and_loss_are_those_on_record(tmp_path: Path) -> None:
+    lines = (asked(0, 0.1), asked(60, 0.2), asked(120, 0.2, [1, 2], [3]), asked(180, 0.2, [1], [2], [3]), asked(240, 0))
+    assert drawn(tmp_path / "network.jsonl", *lines) == [
+        "partition: A 1, 2; alone 3, 120 s to 180 s",
+        "partition: alone 1–3, 180 s to 240 s",
         "loss: 10 %, 0 s to 60 s",
-        "loss: 20 %, 60 s to 5 min",
-        "loss: 50 %, 5 min to 6 min",
-        "loss: 20 %, 6 min to 10 min",
+        "loss: 20 %, 60 s to 180 s",
     ]
+
+
+def test_what_distance_loses_is_added_and_what_is_out_of_range_is_a_partition(tmp_path: Path) -> None:
+    def flown(at_s: float, **losses: float) -> dict[str, Any]:
+        return {
+            "at_s": at_s,
+            "what": "range",
+            "losses": {name.replace("_", "-")[1:]: loss for name, loss in losses.items()},
+        }
+
+    lines = (asked(0, 0.1), flown(100, _1_2=0.5), flown(200, _1_2=1.0, _1_3=1.0))
+    assert drawn(tmp_path / "network.jsonl", *lines) == [
+        "partition: A 2, 3; alone 1, 200 s to 600 s",
+        "loss: 10 %, 0 s to 100 s",
+        "loss: 25 %, the worst link 55 %, 100 s to 200 s",
+        "loss: 10 %, 200 s to 600 s",
+    ]
+
+
+def test_without_a_record_there_is_no_strip(tmp_path: Path) -> None:
+    assert strip(read_connectivity(tmp_path / "network.jsonl", (1, 2)), [], 600.0) is None
