@@ -24,7 +24,7 @@ def test_partitions_and_loss_are_those_on_record(tmp_path: Path) -> None:
     lines = (asked(0, 0.1), asked(60, 0.2), asked(120, 0.2, [1, 2], [3]), asked(180, 0.2, [1], [2], [3]), asked(240, 0))
     assert drawn(tmp_path / "network.jsonl", *lines) == [
         "partition: A 1, 2; alone 3, 120 s to 180 s",
-        "partition: alone 1–3, 180 s to 240 s",
+        "partition: alone 1\u20133, 180 s to 240 s",
         "loss: 10 %, 0 s to 60 s",
         "loss: 20 %, 60 s to 180 s",
     ]
