@@ -60,6 +60,10 @@ COMMANDS = {
         "harness.commands.mission:app",
         "Make the mission files of a swarm, and compare those on its vehicles.",
     ),
+    "consolidate": (
+        "harness.commands.consolidate:consolidate_command",
+        "Merge what vehicles brought home into one record: every event once, who holds what, what was lost with whom.",
+    ),
     "reconstruct": (
         "harness.commands.reconstruct:reconstruct_command",
         "Make a scenario that flies what came home again, in virtual time: exit status 1, and where, if it cannot.",

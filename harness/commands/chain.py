@@ -1,6 +1,5 @@
 """`ucp-harness chain`: what the chains say, for people, programs and maps."""
 
-import contextlib
 import json
 from pathlib import Path
 from typing import Annotated
@@ -9,8 +8,9 @@ import typer
 
 from harness import logbook
 from harness.archive.archive import RunArchive
+from harness.commands.new_file import write_new
 from harness.commands.terminal import complain, print_lines
-from harness.errors import WRONG_REQUEST, ExportError, MachineError, RunDirectoryError
+from harness.errors import WRONG_REQUEST, ExportError
 from harness.logbook.geojson import geojson
 from harness.logbook.kml import kml
 from harness.logbook.positions import Track, tracks
@@ -47,26 +47,9 @@ def _write_maps(made: list[Track], telemetry: bool, geojson_file: Path | None, k
         why = "no vehicle logged one" if telemetry else "the events are not those of vehicles"
         raise ExportError(f"there is no position in these chains ({why}), so there is no map")
     if geojson_file is not None:
-        _write_new(geojson_file, json.dumps(geojson(made), ensure_ascii=False) + "\n")
+        write_new(geojson_file, [json.dumps(geojson(made), ensure_ascii=False) + "\n"])
     if kml_file is not None:
-        _write_new(kml_file, kml(made))
+        write_new(kml_file, [kml(made)])
     written = " and ".join(str(path) for path in (geojson_file, kml_file) if path is not None)
     positions = sum(len(track.fixes) for track in made)
     print_lines([f"{positions} positions of {len(made)} vehicles: {written}"])
-
-
-def _write_new(path: Path, text: str) -> None:
-    """Raises RunDirectoryError if the file is there already or cannot be made, MachineError if the disk refuses."""
-    try:
-        file = path.open("x", encoding="utf-8")
-    except FileExistsError:
-        raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten") from None
-    except OSError as error:
-        raise RunDirectoryError(f"{path} cannot be made: {error.strerror}; choose another file") from None
-    try:
-        with file:
-            file.write(text)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            path.unlink()
-        raise MachineError(f"{path} cannot be written: {error.strerror}") from None

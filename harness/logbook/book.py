@@ -48,13 +48,13 @@ def read(archive: RunArchive) -> Logbook:
     return Logbook(
         exports.by_agent,
         name_blocks(exports.by_agent),
-        telemetry=_logged_telemetry(record),
+        telemetry=logged_telemetry(record),
         absent={agent_id: _absent(agent_id, record.agents.get(str(agent_id))) for agent_id in absent},
         errors=[*archive.record_problems, *exports.errors],
     )
 
 
-def _logged_telemetry(record: RunRecord) -> bool:
+def logged_telemetry(record: RunRecord) -> bool:
     """Events are random where no vehicle flies; those of exports that came without a run are taken for telemetry."""
     asked = record.scenario
     if asked is None:

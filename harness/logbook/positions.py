@@ -48,7 +48,7 @@ def tracks(logbook: Logbook) -> list[Track]:
     for export in logbook.exports.values():
         for block in export.blocks():
             blocks.setdefault(block.agent_id, {})[block.timestamp_us, block.event_data] = block
-    made = (_track(agent_id, _events(logbook, blocks[agent_id].values())) for agent_id in sorted(blocks))
+    made = (track_of(agent_id, _events(logbook, blocks[agent_id].values())) for agent_id in sorted(blocks))
     return [track for track in made if track.fixes]
 
 
@@ -64,7 +64,7 @@ def utc(timestamp_us: int) -> str:
 
 
 def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[LoggableEvent, str]]:
-    """Events and the names of their blocks, oldest first. A block that cannot be read has none."""
+    """Events and the names of their blocks. A block that cannot be read has none."""
     logged = []
     for block in blocks:
         try:
@@ -72,13 +72,15 @@ def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[Log
         except MalformedEventsError:
             continue
         name = logbook.name(block.block_hash)
-        logged += [(event, name) for event in events if event.timestamp_us <= LAST_TIMESTAMP_US]
-    return sorted(logged, key=lambda pair: pair[0].timestamp_us)
+        logged += [(event, name) for event in events]
+    return logged
 
 
-def _track(agent_id: int, logged: list[tuple[LoggableEvent, str]]) -> Track:
+def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Track:
+    """A track of events, with the names of their blocks, in whatever order; an impossible time is left out."""
     track = Track(agent_id, [], [])
-    for event, block in logged:
+    possible = [pair for pair in logged if pair[0].timestamp_us <= LAST_TIMESTAMP_US]
+    for event, block in sorted(possible, key=lambda pair: pair[0].timestamp_us):
         own = position_of(event.event_id, event.data)
         if own is not None:
             track.fixes.append((event.timestamp_us, own))

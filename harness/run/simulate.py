@@ -5,7 +5,7 @@ The checker is that of any other run; the evidence comes straight from the agent
 
 from collections.abc import Coroutine, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from harness import checker
 from harness.archive.exports import Export, ExportMaker
@@ -22,6 +22,8 @@ from harness.play.simulation.virtual_time import VirtualTime
 from harness.scenario import Scenario
 from netem.radio import Place
 from ucp.trace import SCHEMA, Entry, in_base64
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -47,18 +49,19 @@ def simulate_in_memory(memory: "InMemory", scenario: Scenario, seed: int, **opti
     """As `simulate`; `memory` keeps the run, and `options` are the simulation's."""
     VirtualTime().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
-    _without_waiting(mission.play(simulation, scenario))
+    without_waiting(mission.play(simulation, scenario))
     simulation.end()
     evidence = memory.evidence(simulation)
     return Simulated(simulation.played, evidence, checker.check(evidence))
 
 
-def _without_waiting(story: Coroutine[Any, Any, None]) -> None:
+def without_waiting(story: Coroutine[Any, Any, Result]) -> Result:
     """Run a coroutine that waits for nothing, as virtual time does not, without an event loop."""
     try:
         story.send(None)
-    except StopIteration:
-        return
+    except StopIteration as end:
+        result: Result = end.value
+        return result
     raise AssertionError("virtual time waits for nothing")
 
 

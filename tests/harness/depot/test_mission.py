@@ -141,7 +141,7 @@ def test_a_file_of_a_vehicle_that_no_longer_flies_is_not_left_among_the_others(d
         (("--agents", "2", "--address", "1=here"), "`network.address` must be an IPv4 address"),
         (("--agents", "2", "--broadcast", "all"), "`network.broadcast` must be an IPv4 address"),
         (("--agents", "2", "--initial-data", "@/does/not/exist"), "cannot be read"),
-        (("--scenario", "/does/not/exist"), "cannot be read"),
+        (("--scenario", "/does/not/exist"), "/does/not/exist"),
     ],
 )
 def test_what_makes_no_mission_is_one_sentence(tmp_path: Path, options: tuple[str, ...], sentence: str) -> None:

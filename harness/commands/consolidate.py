@@ -1,0 +1,111 @@
+"""`ucp-harness consolidate`: what the vehicles brought home as one ordered record."""
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from harness.archive.directory import claim
+from harness.commands.new_file import refuse_existing, write_new
+from harness.commands.terminal import complain, print_lines
+from harness.depot import outputs
+from harness.depot.came_home import came_home
+from harness.depot.consolidation import Consolidation, consolidate
+from harness.depot.lines import Reconciled
+from harness.depot.words import in_words
+from harness.errors import ExportError
+from harness.logbook.geojson import geojson
+from harness.logbook.kml import kml
+from harness.logbook.positions import Track
+
+FINDING = 1
+MOST_TOLD = 20
+RECORD = ".jsonl"
+
+
+def consolidate_command(
+    paths: Annotated[list[Path], typer.Argument(help="Chain exports, and directories of them; whatever came home.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The record, ucp-consolidated/1, as NAME.jsonl; must be new.")
+    ] = None,
+    html_file: Annotated[
+        Path | None, typer.Option("--html", help="A page with a map, and all along time; must be new.")
+    ] = None,
+    kml_file: Annotated[Path | None, typer.Option("--kml", help="Tracks for Google Earth; must be new.")] = None,
+    geojson_file: Annotated[Path | None, typer.Option("--geojson", help="Tracks for maps; must be new.")] = None,
+    csv_file: Annotated[Path | None, typer.Option("--csv", help="A row for each event; must be new.")] = None,
+    final_reconcile: Annotated[
+        bool,
+        typer.Option(
+            "--reconcile",
+            help="Also let the exports reconcile with each other, into NAME.reconciled/.",
+        ),
+    ] = False,
+) -> None:
+    """Merge what vehicles brought home into one record: every event once, who holds what, what was lost with whom.
+
+    Exit status 0: all was usable. 1: a file was left out, or an export was edited or damaged, or chains that were to be
+    reconciled did not become one. 2: nothing was usable.
+    """
+    refuse_existing(path for path in (out, html_file, kml_file, geojson_file, csv_file) if path is not None)
+    if out is not None and out.suffix != RECORD:
+        raise ExportError(f"{out}: the record is a *{RECORD} file; other forms have options of their own, as --kml")
+    if final_reconcile and out is None:
+        raise ExportError("--reconcile puts the exports beside the record: say where that is by -o NAME.jsonl")
+    record = consolidate(came_home(paths))
+    reconciled = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
+    print_lines(in_words(record, reconciled))
+    print_lines(_written(record, reconciled, out, html_file, kml_file, geojson_file, csv_file))
+    findings = [*record.home.problems, *record.home.left_out]
+    for sentence in findings[:MOST_TOLD]:
+        complain(sentence)
+    if len(findings) > MOST_TOLD:
+        complain(f"and {len(findings) - MOST_TOLD} findings more, all of which are in the record's header")
+    if findings or (reconciled is not None and not reconciled.uniform):
+        raise typer.Exit(FINDING)
+
+
+def _reconcile(record: Consolidation, directory: Path) -> Reconciled:
+    from harness.depot.reconcile import reconcile, write  # what plays a swarm takes its time to import
+
+    claim(directory)
+    reconciliation = reconcile(record)
+    write(reconciliation, directory)
+    return reconciliation.line
+
+
+def _written(
+    record: Consolidation,
+    reconciled: Reconciled | None,
+    out: Path | None,
+    html_file: Path | None,
+    kml_file: Path | None,
+    geojson_file: Path | None,
+    csv_file: Path | None,
+) -> Iterator[str]:
+    """Write what is asked for; the name of each file."""
+    if out is not None:
+        write_new(out, outputs.lines(record, reconciled))
+        yield str(out)
+    if reconciled is not None and out is not None:
+        yield f"{out.with_suffix('.reconciled')}: the exports of {len(reconciled.vehicles)} vehicles, reconciled"
+    if csv_file is not None:
+        write_new(csv_file, [outputs.table(record)])
+        yield str(csv_file)
+    if kml_file is not None or geojson_file is not None:
+        yield from _maps(outputs.tracks(record), {kml_file: kml, geojson_file: _geojson})
+
+
+def _maps(tracks: list[Track], forms: dict[Path | None, Callable[[Iterable[Track]], str]]) -> Iterator[str]:
+    if not tracks:
+        raise ExportError("no vehicle logged a position, so there is no map; leave --kml and --geojson out")
+    for path, form in forms.items():
+        if path is not None:
+            write_new(path, [form(tracks)])
+            yield f"{path}: {sum(len(track.fixes) for track in tracks)} positions of {len(tracks)} vehicles"
+
+
+def _geojson(tracks: Iterable[Track]) -> str:
+    return json.dumps(geojson(tracks), ensure_ascii=False) + "\n"

@@ -1,0 +1,38 @@
+"""A swarm in virtual time that is made of what agents held, instead of beginning with nothing."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from harness.play.simulation.backend import Recorder, Simulation
+from harness.scenario import Scenario
+from ucp.store import StoredState
+
+
+class Restored(Simulation):
+    """Agents boot with what is `stored` of them, but for their deques, which each is given when it is its turn.
+
+    Agents that all propose at once answer nobody while they reconcile, and may go on so for ever. Who is on the
+    scenario's roster and has nothing stored is not there.
+    """
+
+    def __init__(self, scenario: Scenario, stored: Mapping[int, StoredState], recorder: Recorder) -> None:
+        super().__init__(scenario, 0, recorder)
+        self._stored = stored
+        self._generating = False
+
+    async def give_deque(self, agent_id: int) -> None:
+        """The agent boots again with what it holds now, and with the deque that it came with."""
+        life = self._alive[self._number[agent_id]]
+        assert life is not None, "it booted at the beginning"
+        now = StoredState.of(life.agent.state)
+        deque = [block for block in self._stored[agent_id].deque if not life.agent.state.holds(block.block_hash)]
+        await self.end_life(agent_id)
+        self._disks[self._number[agent_id]] = replace(now, deque=[*now.deque, *deque])
+        await self.begin_life(agent_id)
+
+    def _start(self, number: int, stored: StoredState | None = None) -> None:
+        first = self._stored.get(self.roster[number])
+        if stored is not None:
+            super()._start(number, stored)
+        elif first is not None:
+            super()._start(number, replace(first, deque=[]))
