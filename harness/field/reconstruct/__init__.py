@@ -1,5 +1,8 @@
 """A flight flown again in virtual time, from whatever came home of it.
 
+told        what the agents were told before the flight
+elsewhere   what is not in an agent's own trace, and is on record elsewhere
+inferring   what reached an agent that left no trace, by its capture
 inputs      a trace, taken apart into what reached the agent
 rehearsal   one agent alone: how far its record is what the protocol does
 clocks      what the agents' clocks show beside each other, from messages alone

@@ -3,11 +3,13 @@
 import base64
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from harness.archive.traces import Trace
 from harness.checker.steps.header import CheckedHeader
 from harness.checker.steps.inputs import event_of
 from ucp.events import LoggableEvent, MalformedEventsError
+from ucp.messages import decode
 from ucp.trace import HandlerRun
 
 
@@ -62,43 +64,75 @@ class Input:
     runs: list[HandlerRun] = field(default_factory=list)
 
 
-def lives_of(trace: Trace, header: CheckedHeader) -> list[list[Input]]:
+class Missing(Protocol):
+    """Where to look for what a trace of version 1 does not have."""
+
+    def datagrams(self, sender: int, sequence: int) -> list[bytes]: ...
+
+    def events(self, agent_id: int) -> list[LoggableEvent]: ...
+
+
+def lives_of(trace: Trace, header: CheckedHeader, missing: Missing) -> list[list[Input]]:
     """The inputs of each life of the agent. Raises UnusableInputError, naming the line."""
-    return [list(_inputs(life, header)) for life in trace.lives()]
+    reader = _Reader(header, missing)
+    return [list(reader.inputs(life)) for life in trace.lives()]
 
 
-def _inputs(life: Iterator[tuple[int, HandlerRun]], header: CheckedHeader) -> Iterator[Input]:
-    current: Input | None = None
-    last_s = float("-inf")
-    for line, run in life:
-        if "local" in run.trigger:
-            if current is None:
-                raise UnusableInputError(f"line {line}: {run.handler} ran for a local event before anything had come")
-            current.runs.append(run)
-            continue
+class _Reader:
+    def __init__(self, header: CheckedHeader, missing: Missing) -> None:
+        self._header = header
+        self._missing = missing
+        self._events: Iterator[LoggableEvent] | None = None
+
+    def inputs(self, life: Iterator[tuple[int, HandlerRun]]) -> Iterator[Input]:
+        current: Input | None = None
+        last_s = float("-inf")
+        for line, run in life:
+            if "local" in run.trigger:
+                if current is None:
+                    raise UnusableInputError(f"line {line}: {run.handler} ran for a local event before anything came")
+                current.runs.append(run)
+                continue
+            if current is not None:
+                yield current
+            last_s = max(last_s, self._header.local(run.t))
+            current = Input(last_s, line, self._what(line, run), [run])
         if current is not None:
             yield current
-        last_s = max(last_s, header.local(run.t))
-        current = Input(last_s, line, _what(line, run), [run])
-    if current is not None:
-        yield current
 
+    def _what(self, line: int, run: HandlerRun) -> What:
+        trigger = run.trigger
+        try:
+            if "message" in trigger:
+                return Heard(self._datagram(line, run))
+            if "event" in trigger:
+                return Logged(event_of(run.input) if run.input is not None else self._event(line, trigger["event"]))
+        except (ValueError, MalformedEventsError):
+            raise UnusableInputError(f"line {line}: the input of {run.handler} is damaged") from None
+        if "timer" in trigger:
+            return TimerEnded(str(trigger["timer"]))
+        if "operator" in trigger:
+            return Asked()
+        if "boot" in trigger:
+            return Booted()
+        raise UnusableInputError(f"line {line}: {run.handler} ran without a trigger that there is")
 
-def _what(line: int, run: HandlerRun) -> What:
-    trigger = run.trigger
-    try:
-        if "message" in trigger:
-            if run.input is None:
-                raise UnusableInputError(f"line {line}: the datagram that {run.handler} was given is not on record")
-            return Heard(base64.b64decode(run.input.text, validate=True))
-        if "event" in trigger:
-            return Logged(event_of(run.input))
-    except (ValueError, MalformedEventsError):
-        raise UnusableInputError(f"line {line}: the input of {run.handler} is damaged") from None
-    if "timer" in trigger:
-        return TimerEnded(str(trigger["timer"]))
-    if "operator" in trigger:
-        return Asked()
-    if "boot" in trigger:
-        return Booted()
-    raise UnusableInputError(f"line {line}: {run.handler} ran without a trigger that there is")
+    def _datagram(self, line: int, run: HandlerRun) -> bytes:
+        if run.input is not None:
+            return base64.b64decode(run.input.text, validate=True)
+        sender, sequence = run.trigger.get("from"), run.trigger.get("seq")
+        if isinstance(sender, int) and isinstance(sequence, int):
+            for datagram in self._missing.datagrams(sender, sequence):
+                if run.trigger["message"] == decode(datagram).message.NAME:
+                    return datagram
+        raise UnusableInputError(
+            f"line {line}: datagram {sequence} of agent {sender} is on no record: bring its trace, or a capture"
+        )
+
+    def _event(self, line: int, event_id: int | str) -> LoggableEvent:
+        if self._events is None:
+            self._events = iter(self._missing.events(self._header.agent_id))
+        event = next(self._events, None)
+        if event is None or event.event_id != event_id:
+            raise UnusableInputError(f"line {line}: the event that was logged is in no block that came home")
+        return event

@@ -1,20 +1,23 @@
 """From what came home to a scenario that flies it again, and whether it does."""
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from harness.archive.exports import Export
 from harness.checker import Evidence, steps
-from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, checked
+from harness.checker.judgement import agents
+from harness.checker.steps.header import CheckedHeader
 from harness.errors import FieldError
 from harness.field.homecoming import Flight
 from harness.field.reconstruct.comparing import FirstDifference, first_difference
+from harness.field.reconstruct.elsewhere import Elsewhere
+from harness.field.reconstruct.inferring import infer
 from harness.field.reconstruct.inputs import UnusableInputError, lives_of
 from harness.field.reconstruct.rehearsal import Rehearsal, rehearse
-from harness.field.reconstruct.script import Mission, scenario_of
+from harness.field.reconstruct.script import scenario_of
 from harness.field.reconstruct.timetable import Timetable, timetable
+from harness.field.reconstruct.told import NOTHING, told
 from harness.run.simulate import InMemory, Simulated, simulate_in_memory
 from harness.scenario.load import parse
 from harness.scenario.write import Document
@@ -23,8 +26,6 @@ from ucp.quirks import QUIRKS
 
 SEED = 1
 """Of the reconstruction, in which nothing is left to chance."""
-
-NOTHING = "no agent's record says in full what reached it (ucp-trace/2), so nothing can be flown again"
 
 Tell = Callable[[str], None]
 
@@ -112,30 +113,26 @@ def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -
     """Fly it again. `tell` is told what is being done. Raises FieldError if there is nothing to fly it by."""
     tell("reading what each agent was told")
     remarks: list[str] = []
-    headers = _headers(flight, remarks)
-    mission = _mission(flight, headers, name, remarks)
+    elsewhere = Elsewhere(flight)
+    remarks += elsewhere.problems
+    mission, headers = told(flight, elsewhere, name, remarks)
     rehearsals: dict[int, Rehearsal] = {}
     why: dict[int, str] = {}
+    by_captures: list[int] = []
     for agent_id, header in headers.items():
         tell(f"agent {agent_id} alone")
-        try:
-            lives = lives_of(flight.traces[agent_id], header)
-        except UnusableInputError as error:
-            why[agent_id] = f"cannot be played: {error}"
-            continue
         if header.settings != mission.settings:
             why[agent_id] = "was set otherwise than the others, and a scenario has one set of settings"
             continue
-        rehearsal = rehearse(header, lives)
-        if rehearsal.parting:
-            rehearsal = _with_a_quirk(header, lives, rehearsal, remarks)
-        if rehearsal.parting:
-            why[agent_id] = _parted(flight, agent_id, rehearsal)
-        if rehearsal.played:
+        rehearsal = _rehearsed(flight, elsewhere, header, remarks, why, by_captures)
+        if rehearsal is not None and rehearsal.played:
             rehearsals[agent_id] = rehearsal
     if not rehearsals:
-        first = next((f": agent {agent_id} {words}" for agent_id, words in why.items()), "")
-        raise FieldError(NOTHING + first)
+        first = next((f"agent {agent_id} {words}; " for agent_id, words in why.items()), "")
+        raise FieldError(first + NOTHING)
+    if by_captures:
+        which = agents(by_captures)
+        remarks.append(f"what reached {which} is from captures and blocks, and when timers ended there is inferred")
     tell("putting everything in order")
     table = timetable(rehearsals)
     document = scenario_of(mission, table, rehearsals)
@@ -147,38 +144,55 @@ def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -
     for agent_id in came_home:
         if agent_id not in rehearsals and agent_id not in why:
             why[agent_id] = "has left no trace, and what reached it is not on record"
-    for agent_id in sorted(set(mission.roster) - set(rehearsals)):
-        remarks.append(f"agent {agent_id} is not played: what others heard of it is put on the air as they heard it")
+    if absent := set(mission.roster) - set(rehearsals):
+        remarks.append(f"{agents(absent)} not played: what others heard of them is put on the air as they heard it")
     remarks += table.impossible
     remarks += _clocks_in_words(table)
-    agents = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in came_home]
+    outcomes = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in came_home]
     document["expect"] = _expected(simulated, rehearsals)
-    return Reconstruction(document, agents, remarks, difference, simulated, table)
+    return Reconstruction(document, outcomes, remarks, difference, simulated, table)
 
 
-def _headers(flight: Flight, remarks: list[str]) -> dict[int, CheckedHeader]:
-    headers: dict[int, CheckedHeader] = {}
-    for agent_id, trace in sorted(flight.traces.items()):
-        if not trace.header.has_inputs:
-            remarks.append(f"agent {agent_id}: its trace is of ucp-trace/1, which lacks what it received")
-            continue
+def _rehearsed(
+    flight: Flight,
+    elsewhere: Elsewhere,
+    header: CheckedHeader,
+    remarks: list[str],
+    why: dict[int, str],
+    by_captures: list[int],
+) -> Rehearsal | None:
+    """The agent alone, by its trace; or, if that does not lead to its export, by its capture if that does."""
+    agent_id = header.agent_id
+    by_trace: Rehearsal | None = None
+    if agent_id in flight.traces:
         try:
-            headers[agent_id] = checked(trace.header)
-        except ImpossibleHeaderError as error:
-            remarks.append(f"agent {agent_id}: {error}")
-    return headers
+            by_trace = _by_trace(flight, elsewhere, header, remarks)
+        except UnusableInputError as error:
+            why[agent_id] = f"cannot be played by its trace: {error}"
+    if by_trace is not None and by_trace.parting:
+        why[agent_id] = _parted(flight, agent_id, by_trace)
+        return by_trace
+    home = flight.exports.get(agent_id)
+    captured = elsewhere.captured.get(agent_id)
+    if captured is None or home is None or (by_trace and by_trace.chain == list(home.chain_of_block_hashes)):
+        return by_trace
+    inferred = infer(header, captured, elsewhere.events(agent_id))
+    by_capture = rehearse(header, [inferred.inputs])
+    if by_trace is not None and len(by_trace.played) > len(by_capture.played):
+        return by_trace
+    why.pop(agent_id, None)
+    if inferred.problem:
+        why[agent_id] = inferred.problem
+        by_capture.broken_off = True
+    by_captures.append(agent_id)
+    return by_capture
 
 
-def _mission(flight: Flight, headers: Mapping[int, CheckedHeader], name: str, remarks: list[str]) -> Mission:
-    """What most agents were told."""
-    if not headers:
-        raise FieldError(NOTHING)
-    settings, _ = Counter(header.settings for header in headers.values()).most_common(1)[0]
-    initial_data, _ = Counter(header.initial_data for header in headers.values()).most_common(1)[0]
-    if flight.initial_data is not None:
-        initial_data = flight.initial_data
-    roster = sorted({*flight.roster, *headers, *(agent for header in headers.values() for agent in header.roster)})
-    return Mission(name, tuple(roster), initial_data, settings)
+def _by_trace(flight: Flight, elsewhere: Elsewhere, header: CheckedHeader, remarks: list[str]) -> Rehearsal:
+    """Raises UnusableInputError."""
+    lives = lives_of(flight.traces[header.agent_id], header, elsewhere)
+    rehearsal = rehearse(header, lives)
+    return _with_a_quirk(header, lives, rehearsal, remarks) if rehearsal.parting else rehearsal
 
 
 def _with_a_quirk(header: CheckedHeader, lives: Any, parted: Rehearsal, remarks: list[str]) -> Rehearsal:

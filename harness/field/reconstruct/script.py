@@ -10,6 +10,7 @@ from itertools import pairwise
 from harness.field.reconstruct.inputs import Asked, Heard, Logged
 from harness.field.reconstruct.rehearsal import Rehearsal
 from harness.field.reconstruct.timetable import APART_S, DIGITS, Happening, Life, Timetable
+from harness.field.reconstruct.told import Mission
 from harness.scenario.numbered import in_text
 from harness.scenario.write import Document
 from ucp.messages import MalformedDatagramError, decode
@@ -19,16 +20,6 @@ from ucp.settings import Settings
 MOMENT_S = APART_S / 2
 LONG_S = 0.5
 """A timer that is so late was not only waiting for its turn: its agent stood still."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Mission:
-    """What all agents of a flight were told."""
-
-    name: str
-    roster: tuple[int, ...]
-    initial_data: bytes
-    settings: Settings
 
 
 def scenario_of(mission: Mission, table: Timetable, rehearsals: Mapping[int, Rehearsal]) -> Document:
