@@ -34,15 +34,12 @@ from harness.field.adapters.adapter import (
     Unusable,
 )
 from harness.field.adapters.bags import (
-    MCAP_MAGIC,
-    ROS1_MAGIC,
-    SQLITE_MAGIC,
-    ZSTD_MAGIC,
+    MAGICS,
     BagMessage,
-    BrokenBagError,
-    message_data,
     messages,
 )
+from harness.field.adapters.bags.found import Broken
+from harness.field.adapters.bags.packed import message_data
 
 METADATA = "metadata.yaml"
 _METADATA_BEGINS = b"rosbag2_bagfile_information"
@@ -66,7 +63,7 @@ class RosBag(Adapter):
             return _METADATA_BEGINS in beginning
         if source.name.endswith(_JOURNALS):
             return source.with_name(source.name[:-4]).is_file()
-        return beginning.startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC, ZSTD_MAGIC))
+        return beginning.startswith(MAGICS)
 
     def part_of(self, source: Path) -> Path:
         """A bag of version 2 is a directory."""
@@ -80,17 +77,17 @@ class RosBag(Adapter):
         _types("ROS2_HUMBLE")  # to say at once that the package is missing
         others: Counter[str] = Counter()
         number = 0
-        try:
-            for message in messages(source):
-                number = message.number
-                named = next((topic for topic in self._patterns if topic.fullmatch(message.topic)), None)
-                agent = named and named.fullmatch(message.topic)
-                if named is None or agent is None:
-                    others[message.topic] += 1
-                else:
-                    yield from self._said(message, int(agent[1]), self._patterns[named])
-        except BrokenBagError as broken:
-            yield Unusable(f"{broken}; what is before that is used", number + 1, of_a_trace=True)
+        for message in messages(source):
+            if isinstance(message, Broken):
+                yield Unusable(message.why, number + 1, of_a_trace=True)
+                continue
+            number = message.number
+            named = next((topic for topic in self._patterns if topic.fullmatch(message.topic)), None)
+            agent = named and named.fullmatch(message.topic)
+            if named is None or agent is None:
+                others[message.topic] += 1
+            else:
+                yield from self._said(message, int(agent[1]), self._patterns[named])
         if others:
             names = ", ".join(topic[:60] for topic, _ in others.most_common(_OTHERS_TOLD))
             more = ", ..." if len(others) > _OTHERS_TOLD else ""
@@ -115,8 +112,7 @@ class RosBag(Adapter):
         except MachineError:
             raise
         except Exception as error:  # rosbags has many ways to say that bytes are no message of a type
-            what = "" if isinstance(error, BrokenBagError) else f": {type(error).__name__}"
-            why = f"it is no sound message of {message.type_name[:40] or 'any known type'}{what}"
+            why = f"it is no sound {message.type_name[:40] or 'message of a known type'} ({type(error).__name__})"
             yield Unusable(why, number, kind == "trace", agent)
             return
         text, data = (content, content.encode()) if isinstance(content, str) else ("", content)

@@ -23,6 +23,7 @@ MAX_DOCUMENTS = 1000
 """Exports in one file."""
 ALIKE_TOLD = 3
 """Of files of one directory that are left out for the same reason."""
+_BAGS = (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd")
 _BLANK = " \t\r\n\0\ufeff"
 
 
@@ -60,7 +61,9 @@ class Sorter:
         try:
             with Opened(path) as file:
                 begins = file.peek(4096)[:4096]
-            if begins[:4] in MAGICS:
+            if begins.startswith(_BAGS):
+                self._drop(path, "a ROS bag, or what a recorder packed: `ucp-harness import` reads it")
+            elif begins[:4] in MAGICS:
                 seen = glance(path, self._left_out)
                 self.captures += [seen] if seen else []
             elif lives := read_lives(path, self._left_out):

@@ -1,0 +1,78 @@
+"""The files of ROS bags, message by message in the order of recording: version 1, and the two storages of version 2.
+
+An index is not asked for, nor `metadata.yaml`: a bag whose recorder was killed, or whose vehicle lost power, has none.
+What is behind a damaged place is used. Sizes that a file claims are believed up to a bound. What the messages mean is
+for the package rosbags to say (harness.field.adapters.rosbag).
+
+found.py      what is found in a bag: messages, and places that cannot be read
+version_1.py  version 1
+mcap.py       version 2 in MCAP
+sqlite.py     version 2 in SQLite
+packed.py     what is packed in any of them
+"""
+
+import mmap
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+from harness.archive.opened import Opened
+from harness.field.adapters.bags import mcap, sqlite, version_1
+from harness.field.adapters.bags.found import MAX_FILE_BYTES, Broken, Found, Item
+from harness.field.adapters.bags.packed import ZSTD_MAGIC, unpacked_file
+
+MAGICS = (version_1.MAGIC, mcap.MAGIC, sqlite.MAGIC, ZSTD_MAGIC)
+"""What a bag begins with."""
+
+
+class BagMessage(NamedTuple):
+    """`number` counts the messages of the file from 1; `time_ns` is that of recording, since the Unix epoch."""
+
+    number: int
+    topic: str
+    type_name: str
+    time_ns: int
+    data: bytes
+
+
+def messages(path: Path) -> Iterator[BagMessage | Broken]:
+    """All messages, and between them the places that cannot be read. Raises OSError."""
+    number = 0
+    with TemporaryDirectory(prefix="ucp-bag-") as directory:
+        for item in _items(path, Path(directory)):
+            if isinstance(item, Found):
+                number += 1
+                yield BagMessage(number, *item)
+            else:
+                yield item
+
+
+def _items(path: Path, scratch: Path) -> Iterator[Item]:
+    trouble = ""
+    with Opened(path, MAX_FILE_BYTES) as file:
+        if file.packed:
+            path = scratch / "unpacked"
+            with path.open("wb") as copy:
+                shutil.copyfileobj(file, copy)
+            trouble = file.trouble
+    if _magic(path) == ZSTD_MAGIC:
+        packed, path = path, scratch / "unzstd"
+        trouble = unpacked_file(packed, path)
+    magic = _magic(path)
+    if magic == sqlite.MAGIC:
+        yield from sqlite.items(path, scratch)
+    elif magic in (version_1.MAGIC, mcap.MAGIC):
+        with path.open("rb") as bag, mmap.mmap(bag.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            yield from (version_1 if magic == version_1.MAGIC else mcap).items(content)
+    else:
+        yield Broken("it is no ROS bag")
+    if trouble:
+        yield Broken(trouble)
+
+
+def _magic(path: Path) -> bytes | None:
+    with path.open("rb") as file:
+        begins = file.read(max(map(len, MAGICS)))
+    return next((magic for magic in MAGICS if begins.startswith(magic)), None)
