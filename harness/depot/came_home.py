@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
@@ -212,7 +212,7 @@ class _Damaged(Export):
     """What can be read of an export by itself."""
 
     agent_id: AgentId | None = None  # type: ignore[assignment]
-    exported_at_us: int = 0
+    exported_at_us: Annotated[int, Field(ge=0, strict=True)] = 0
     inception: ExportedInception | None = None  # type: ignore[assignment]
     chain: list[ExportedBlock] = []  # noqa: RUF012 - pydantic copies it
     blocks_to_be_committed: list[ExportedBlock] = []  # noqa: RUF012
@@ -334,7 +334,8 @@ def _what_is_whole(path: Path, data: bytes, problems: list[str]) -> Export:
         document = _up_to(text[:damage])
         if isinstance(document, dict):
             after = [*_whole_blocks(text[damage:])]
-            document["chain"] = [*document.get("chain", []), *after]
+            before = document.get("chain")
+            document["chain"] = [*(before if isinstance(before, list) else ()), *after]
         problems.append(f"{path}: cut off or damaged at {_place(text, damage)}: what is whole of it is used; {AGAIN}")
     if not isinstance(document, dict):
         raise ExportError(f"{path}: nothing of it is whole")
