@@ -1,5 +1,6 @@
 """From what came home to a scenario that flies it again, and whether it does."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -192,7 +193,12 @@ def _by_trace(flight: Flight, elsewhere: Elsewhere, header: CheckedHeader, remar
     """Raises UnusableInputError."""
     lives = lives_of(flight.traces[header.agent_id], header, elsewhere)
     rehearsal = rehearse(header, lives)
-    return _with_a_quirk(header, lives, rehearsal, remarks) if rehearsal.parting else rehearsal
+    if rehearsal.parting:
+        rehearsal = _with_a_quirk(header, lives, rehearsal, remarks)
+    if rehearsal.parting and (whole := rehearse(header, lives, early_s=math.inf)).parting is None:
+        remarks.append(f"agent {header.agent_id} had timers end too early by its clock, as if that had been set back")
+        return whole
+    return rehearsal
 
 
 def _with_a_quirk(header: CheckedHeader, lives: Any, parted: Rehearsal, remarks: list[str]) -> Rehearsal:

@@ -79,13 +79,23 @@ class Rehearsal:
     """Whether the record ends in the middle of what its last input led to; the input is played to its end."""
 
 
-def rehearse(header: CheckedHeader, lives: Sequence[Sequence[Input]], quirks: Quirks | None = None) -> Rehearsal:
-    """Give the agent all that is on record, up to where it did not do what is on record."""
+def rehearse(
+    header: CheckedHeader,
+    lives: Sequence[Sequence[Input]],
+    quirks: Quirks | None = None,
+    *,
+    early_s: float | None = None,
+) -> Rehearsal:
+    """Give the agent all that is on record, up to where it did not do what is on record.
+
+    A timer may end so early: as a program may read its clock, unless `early_s` says otherwise.
+    """
+    early_s = header.early_s if early_s is None else early_s
     rehearsal = Rehearsal(header.agent_id, quirks or {})
     stored: StoredState | None = None
     timers = LateTimers()
     for life, inputs in enumerate(lives):
-        one_life = _Life(header, rehearsal, life, timers)
+        one_life = _Life(header, rehearsal, life, timers, early_s)
         for index, given in enumerate(inputs):
             is_last = life == len(lives) - 1 and index == len(inputs) - 1
             if parting := one_life.give(index, given, stored, is_last=is_last):
@@ -102,7 +112,9 @@ def rehearse(header: CheckedHeader, lives: Sequence[Sequence[Input]], quirks: Qu
 
 
 class _Life:
-    def __init__(self, header: CheckedHeader, rehearsal: Rehearsal, life: int, timers: LateTimers) -> None:
+    def __init__(
+        self, header: CheckedHeader, rehearsal: Rehearsal, life: int, timers: LateTimers, early_s: float
+    ) -> None:
         self.agent = Agent(
             header.agent_id,
             header.roster,
@@ -114,6 +126,7 @@ class _Life:
         self._hears_all = bool(rehearsal.quirks)
         self._life = life
         self._timers = timers
+        self._early_s = early_s
         self._started: dict[int, Started] = {}
         """The timers that run, by number."""
         timers.look(self.agent.state)
@@ -168,6 +181,8 @@ class _Life:
                 timer = next((timer for timer in agent.state.timers if timer.name == name), None)
                 if timer is None or timer.deadline is None:
                     return f"had its {name[:MAX_NAME]} timer end, which was not running"
+                if now < timer.deadline - self._early_s:
+                    return f"had its {name} timer end {timer.deadline - now:.3g} s early"
                 agent.end_timer(timer, max(now, timer.deadline))
             case Asked():
                 agent.begin_reconcile(now)
