@@ -55,18 +55,49 @@ class Dot:
     tip: str
 
 
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A panel in the picture: the `id` of its drawing, and where in the picture it is."""
+
+    id: str
+    panel: Panel
+    area: Area
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """`name` is empty if there is only one; it stands above its panels, at `top`."""
+
+    name: str
+    cells: list[Cell]
+    top: float
+    panels: list[Placed]
+
+
+def series_of(record: MatrixRecord) -> list[Series]:
+    """What the picture is made of, from top to bottom."""
+    top: float = HEAD
+    made = []
+    for number, cells in enumerate(_series(record)):
+        name, begins = _name(record, cells), top
+        top += SERIES_HEAD if name else 0
+        areas = svg.grid(len(PANELS), COLUMNS, top, PANEL_HEIGHT)
+        panels = [Placed(f"panel-{number}-{at}", panel, areas[at]) for at, panel in enumerate(PANELS)]
+        made.append(Series(name, cells, begins, panels))
+        top += math.ceil(len(PANELS) / COLUMNS) * PANEL_HEIGHT
+    return made
+
+
 def draw(record: MatrixRecord) -> str:
     """A file of its own."""
-    top: float = HEAD
+    rows = series_of(record)
     parts = []
-    for cells in _series(record):
-        if name := _name(record, cells):
-            parts.append(_heading(name, top))
-            top += SERIES_HEAD
-        areas = svg.grid(len(PANELS), COLUMNS, top, PANEL_HEIGHT)
-        parts += [_panel(panel, cells, area) for panel, area in zip(PANELS, areas, strict=True)]
-        top += math.ceil(len(PANELS) / COLUMNS) * PANEL_HEIGHT
-    return svg.document(top + FOOT, record.matrix.name, _about(record), description(record), parts, _legend(record))
+    for row in rows:
+        parts += [_heading(row.name, row.top)] if row.name else []
+        parts += [_panel(placed, row.cells) for placed in row.panels]
+    last = rows[-1].panels[-1].area
+    bottom = last.y + last.height + FOOT
+    return svg.document(bottom, record.matrix.name, _about(record), description(record), parts, _legend(record))
 
 
 def _heading(name: str, top: float) -> Markup:
@@ -119,7 +150,8 @@ def _legend(record: MatrixRecord) -> str:
     return f"Over packet loss at each receiver. Dots and lines: means of {runs} runs; bands: their 95 % intervals."
 
 
-def _panel(panel: Panel, cells: Sequence[Cell], area: Area) -> Markup:
+def _panel(placed: Placed, cells: Sequence[Cell]) -> Markup:
+    panel, area = placed.panel, placed.area
     across, up = _loss_axis([cell.loss for cell in cells], area), _value_axis(panel, cells, area)
     frame = svg.frame(
         panel.title,
@@ -129,7 +161,7 @@ def _panel(panel: Panel, cells: Sequence[Cell], area: Area) -> Markup:
         (f"{100 * tick:.0f}\u00a0%" if panel.shares else words.value(round(tick, 6)) for tick in up.ticks),
     )
     lines = [_line(number, name, label, cells, across, up) for number, (name, label) in enumerate(panel.lines) if cells]
-    return Markup('<g class="panel">{}{}</g>\n').format(frame, Markup("").join(lines))
+    return Markup('<g class="panel" id="{}">{}{}</g>\n').format(placed.id, frame, Markup("").join(lines))
 
 
 def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axis, up: Axis) -> Markup:

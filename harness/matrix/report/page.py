@@ -5,7 +5,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from harness.matrix.nights import Nights
-from harness.matrix.picture import draw
+from harness.matrix.picture import draw, series_of
 from harness.matrix.record import MatrixRecord
 from harness.matrix.report import figures, heatmap, trend
 from harness.matrix.report.drilldown import drilldown
@@ -45,6 +45,7 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
         nights=nights,
         drawn=drawn,
         trends=[(figure, trend.trend(drawn, record, figure)) for figure in shown] if len(drawn) > 1 else [],
+        series=series_of(record),
         picture=Markup(draw(record)),  # noqa: S704 - it has escaped what is not ours
     )
 

@@ -41,6 +41,16 @@ def test_it_fits_the_screen_and_the_console_is_silent(
     assert browser.complaints == []
 
 
+def test_on_a_phone_heatmap_and_panels_are_whole(browser: Browser, page: Path) -> None:
+    browser.show(page, width=390, scheme="light")
+    right = SHOWN.format(".tile, .one-by-one svg", "getBoundingClientRect().right")
+    edges = browser.evaluate(right)
+    assert len(edges) == 2 * 4 + 2 * 6
+    assert max(edges) <= 390
+    boxes = "[...document.querySelectorAll('.one-by-one use')].map(one => one.getBoundingClientRect().width)"
+    assert min(browser.evaluate(boxes)) > 300  # each shows a panel
+
+
 def test_a_click_on_a_cell_shows_its_runs_and_no_others(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     assert browser.evaluate(RUNS) == []
