@@ -29,7 +29,7 @@ from ucp.quirks import QUIRKS
 PAGE = Path(__file__).parent / "AT_THE_DESK.md"
 MISSION = Path(__file__).parent / "desk.yaml"
 JOBS = 2
-MOST_RUNS = 4
+MOST_RUNS = 8
 """If no record of the first differs: a mistake may need what has not happened there."""
 SHOWN = 160
 HEADER = (

@@ -23,7 +23,10 @@ EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted", "block", "tie: block"))
 """Branches that begin a tally, count in it, or choose from it; after others it may be what it likes."""
 
-TOUCH_A_TIMER = frozenset(("receive_response_block_for_hash",))
+PAUSES = "receive_response_block_for_hash"
+"""Pauses the timer of phase 3, and lets it run on. No record shows that."""
+
+TOUCH_A_TIMER = frozenset((PAUSES,))
 """Other handlers of messages commit, send, count and trigger: their changes tell what it takes to undo their steps."""
 
 Paused = Callable[[float, float], bool]
@@ -78,6 +81,8 @@ class Follower:
         self._began = False
         self._none_ends_before = math.inf
         """No timer of the reference's ends sooner, by the agent's clock."""
+        self._paused = 0, -math.inf
+        """Where the timer of phase 3 was paused last, to run on: trace line, and when, by the agent's clock."""
         self._top, self._top_hex = b"", ""
         self._state: StateSummary | None = None
         """What the agent said last of itself, while the reference is still in this state."""
@@ -119,6 +124,8 @@ class Follower:
             self._differ(line, run.t, run.handler, "it ran in a state in which the protocol does not run it")
         else:
             self._began = True
+            if branch == "another block" and run.handler == PAUSES:
+                self._paused = line, now
             if core.started:
                 self._none_ends_before = min(self._none_ends_before, self._soonest_end())
             if not self._differs(run, handler, branch, may_touch_timers):
@@ -207,9 +214,18 @@ class Follower:
                 ended_s = at_s - (now - timer.deadline) / self._header.rate
                 if not self._was_paused(ended_s, at_s):
                     what = f"it had not run by then, and the {timer.name} timer ended at t={ended_s:g} s"
+                    if timer is self._core.phase_three_timer:
+                        what += self._after_a_pause(timer.deadline)
                     self._differ(line, at_s, ON_TIMER[timer.name].name, what)
                     timer.stop()
         self._none_ends_before = self._soonest_end()
+
+    def _after_a_pause(self, deadline: float) -> str:
+        """Who may have stopped the timer of phase 3, if it was paused since it was started."""
+        line, paused_at = self._paused
+        if paused_at < deadline - self._header.settings.phase3_timeout_s:
+            return ""
+        return f"; Algorithm 18, {PAUSES}, paused it in line {line}"
 
     def _soonest_end(self) -> float:
         return min((timer.deadline for timer in self._core.timers if timer.deadline is not None), default=math.inf)

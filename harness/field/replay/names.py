@@ -32,10 +32,12 @@ class Names:
     @cached_property
     def _names(self) -> dict[str, str]:
         names: dict[str, str] = {}
-        for trace in (self._record.trace, *self._record.beside.traces.values()):
+        exports = self._record.beside.exports
+        others = () if exports else self._record.beside.traces.values()
+        for trace in (self._record.trace, *others):
             completed = dict.fromkeys(trace.completed())
             names.update((block, f"{trace.header.agent_id}.{count}") for count, block in enumerate(completed, 1))
-        return names | name_blocks(self._record.beside.exports)
+        return names | name_blocks(exports)
 
     @cached_property
     def _hashes(self) -> dict[str, str]:

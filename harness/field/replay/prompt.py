@@ -181,7 +181,9 @@ class Prompt(cmd.Cmd):
 
     def do_others(self, arg: str) -> None:
         """others (o): what the other agents did at this moment, and who heard what this one sent"""
-        self._print(*self._others.at(self._player))
+        with self._console.status("reading the records of the others"):
+            shown = [*self._others.at(self._player)]
+        self._print(*shown)
 
     def do_list(self, arg: str) -> None:
         """list (l): the lines around this one"""

@@ -11,10 +11,10 @@ from typing import Protocol
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE, Export, agents_directory
 from harness.archive.record import JudgedRecord
-from harness.archive.traces import SUFFIX, Header, Trace, read_trace
+from harness.archive.traces import HEADER, MAX_LINE_BYTES, SUFFIX, Trace, read_trace
 from harness.checker.evidence import Evidence
 from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, checked
-from harness.errors import FieldError
+from harness.errors import FieldError, RunDirectoryError
 from harness.field.homecoming import Flight, sort_out
 from harness.gc_pause import gc_paused
 from ucp.clock import MICROSECONDS
@@ -187,46 +187,51 @@ class _Run:
         return self._archive.judged_record
 
 
-class _Flight:
-    """What came home of the flight that a trace is of: of what is in a directory, or has been sorted out already."""
+class _Around:
+    """What lies around a trace in its directory, of the same mission."""
 
     record = None
 
-    def __init__(self, trace: Trace, directory: Path, flight: Flight | None = None) -> None:
-        self._trace = trace
+    def __init__(self, trace: Trace, directory: Path) -> None:
+        self._header = trace.header
         self._directory = directory
-        if flight is not None:
-            self._flight = flight
 
     @cached_property
-    def _flight(self) -> Flight:
-        flights = sort_out([self._directory]).flights
-        same = (flight for flight in flights if self._trace.header in _headers(flight))
-        return next(same, Flight(None))
-
-    @property
     def exports(self) -> Mapping[int, Export]:
-        return self._flight.exports
+        try:
+            exports = RunArchive(self._directory).exports.by_agent
+        except RunDirectoryError:
+            return {}
+        ours = self._header.initial_data
+        return {agent_id: export for agent_id, export in exports.items() if export.inception.block_data == ours}
 
-    @property
+    @cached_property
     def traces(self) -> Mapping[int, Trace]:
-        return self._flight.traces
+        flights = sort_out([self._directory]).flights
+        ours = (flight for flight in flights if self._header in (trace.header for trace in flight.traces.values()))
+        return next(ours, Flight(None)).traces
 
 
-def _headers(flight: Flight) -> Iterator[Header]:
-    return (trace.header for trace in flight.traces.values())
+class _OfFlight:
+    """What has been sorted out already."""
+
+    record = None
+
+    def __init__(self, flight: Flight) -> None:
+        self.exports = flight.exports
+        self.traces = flight.traces
 
 
 def open_record(path: Path, agent_id: int | None = None) -> Record:
     """The record in a trace, or that of an agent in a directory. Raises FieldError if there is none to play."""
-    file, directory = (_file_of_run(path, agent_id), path) if path.is_dir() else (path, _directory_of(path))
+    file, directory = (_file_in(path, agent_id), path) if path.is_dir() else (path, _directory_of(path))
     trace = _read(file) if file is not None else None
     if file is None or trace is None or trace.problem or trace.cut_off:
         return _sorted_out(path, agent_id)
     if agent_id is not None and trace.header.agent_id != agent_id:
         raise FieldError(f"{file}: the trace is of agent {trace.header.agent_id}, not of agent {agent_id}")
     run = (directory / RUN_FILE).is_file()
-    return Record(file, _named(path, agent_id), trace, _Run(directory) if run else _Flight(trace, directory), [])
+    return Record(file, _named(path, agent_id), trace, _Run(directory) if run else _Around(trace, file.parent), [])
 
 
 def _named(path: Path, agent_id: int | None) -> str:
@@ -244,12 +249,31 @@ def _directory_of(file: Path) -> Path:
     return run if file.parent.name == AGENTS and (run / RUN_FILE).is_file() else file.parent
 
 
-def _file_of_run(directory: Path, agent_id: int | None) -> Path | None:
-    """The trace of an agent in the directory of a run; None in any other, where names say nothing."""
-    if not (directory / RUN_FILE).is_file() or agent_id is None:
+def _file_in(directory: Path, agent_id: int | None) -> Path | None:
+    """The trace of an agent, if it is where a run leaves it, and nothing else there can be of this agent.
+
+    None if all has to be sorted out, which takes as long as reading all.
+    """
+    agents = agents_directory(directory)
+    file = agents / f"{agent_id}{SUFFIX}"
+    if agent_id is None or not file.is_file():
         return None
-    file = agents_directory(directory) / f"{agent_id}{SUFFIX}"
-    return file if file.is_file() else None
+    if (directory / RUN_FILE).is_file() or all(
+        _is_of_another(path, agent_id) for path in agents.iterdir() if path != file
+    ):
+        return file
+    return None
+
+
+def _is_of_another(path: Path, agent_id: int) -> bool:
+    """Whether a file can be no record of the agent, by its name or its beginning."""
+    if path.name.endswith((".chain.json", ".mission.json", ".log", ".store")):
+        return True
+    try:
+        with path.open("rb") as other:
+            return HEADER.validate_json(other.readline(MAX_LINE_BYTES)).agent_id != agent_id
+    except (OSError, ValueError):
+        return False
 
 
 def _sorted_out(path: Path, agent_id: int | None) -> Record:
@@ -267,13 +291,13 @@ def _sorted_out(path: Path, agent_id: int | None) -> Record:
     of_agent = next((flight for flight in flights if chosen in flight.traces), None)
     if of_agent is None:
         raise FieldError(f"{path}: there is no trace of agent {chosen}, but of {', '.join(map(str, whose))}")
-    trace, files, directory = of_agent.traces[chosen], of_agent.sources[chosen], _directory_of(path)
+    trace, files = of_agent.traces[chosen], of_agent.sources[chosen]
     of_others = {file for agent, sources in of_agent.sources.items() if agent != chosen for file in sources}
     remarks = [remark for remark in (*homecoming.left_out, *homecoming.remarks) if remark.path not in of_others]
-    if path.is_dir():
-        directory = path
+    directory = path if path.is_dir() else _directory_of(path)
+    beside: Beside
     if (directory / RUN_FILE).is_file():
-        beside: Beside = _Run(directory)
+        beside = _Run(directory)
     else:
-        beside = _Flight(trace, directory, of_agent if path.is_dir() else None)
+        beside = _OfFlight(of_agent) if path.is_dir() else _Around(trace, directory)
     return Record(files[0], _named(path, agent_id), trace, beside, [remark.sentence for remark in remarks])

@@ -1,0 +1,24 @@
+"""The table of wrong agents at the desk is whole, and its rows say what replay said."""
+
+from harness.wrong_agents.at_the_desk import PAGE, AtTheDesk, Named, row
+from harness.wrong_agents.page import rows_of
+from ucp.quirks import QUIRKS
+
+ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
+
+
+def test_every_quirk_has_a_row() -> None:
+    assert list(ROWS) == list(QUIRKS), "write it again: python -m harness.wrong_agents.at_the_desk"
+
+
+def test_no_wrong_agent_passes_for_a_right_one() -> None:
+    assert not [quirk for quirk, line in ROWS.items() if "no difference" in line]
+
+
+def test_a_row_has_the_earliest_difference_and_how_many_records_name_the_handler_rightly() -> None:
+    late = Named(120.0, "vote_timer_expiration", "it sent nothing; it should have sent Commit Block about block 2.1")
+    early = Named(60.0, "receive_commit_block", "it took the branch 'a|b'")
+    assert row("hide_commits", AtTheDesk(2, 5, (late, early))) == (
+        "| `hide_commits` | 5 | `receive_commit_block` | 1 of 2 | 1.0 | 2 | it took the branch 'a\\|b' |\n"
+    )
+    assert "no difference" in row("hide_commits", AtTheDesk(8, 5, ()))
