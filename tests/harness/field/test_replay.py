@@ -67,9 +67,14 @@ def test_programs_are_told_the_same(wrong: Path) -> None:
 
 
 def test_every_handler_is_where_it_is_said_to_be() -> None:
+    """At its first statement: a breakpoint at its `def` stops when the module is imported."""
     for name in HANDLERS:
         path, _, line = source_of(name).rpartition(":")
-        assert (Path.cwd() / path).read_text().splitlines()[int(line) - 1].startswith(f"def {name}(")
+        lines = (Path.cwd() / path).read_text().splitlines()
+        before = "\n".join(lines[: int(line) - 1])
+        assert before[before.rindex("\ndef ") :].startswith(f"\ndef {name}(")
+        assert before.endswith('"""')
+        assert lines[int(line) - 1].startswith("    ")
 
 
 @pytest.mark.parametrize("mission", ["right", "wrong"])
