@@ -11,7 +11,7 @@ from importlib.metadata import version
 from typing import Annotated, Any, NoReturn
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from harness.errors import HarnessError, MachineError
 
@@ -68,6 +68,14 @@ COMMANDS = {
         "harness.commands.reconstruct:reconstruct_command",
         "Make a scenario that flies what came home again, in virtual time: exit status 1, and where, if it cannot.",
     ),
+    "bisect": (
+        "harness.commands.bisect:bisect_command",
+        "Play a scenario or record at commit after commit; name the first at which its outcome changes.",
+    ),
+    "again": (
+        "harness.commands.again:app",
+        "Play a scenario or record once more: exit status 0 as it was, 1 changed, 125 cannot be tried, 128 stop.",
+    ),
     "matrix": (
         "harness.commands.matrix:matrix_command",
         "Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated.",
@@ -109,6 +117,8 @@ def loaded(name: str) -> Any:
     """The command in full, or the group of commands."""
     module, _, attribute = COMMANDS[name][0].partition(":")
     command = getattr(import_module(module), attribute)
+    if isinstance(command, TyperCommand):
+        return command
     if isinstance(command, typer.Typer):
         return typer.main.get_group(command)
     alone = typer.Typer(add_completion=False)

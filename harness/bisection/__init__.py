@@ -1,0 +1,27 @@
+"""It worked last week: what came of a scenario or a record with another state of the code, or with another agent.
+
+subject.py      what is played: a scenario, a run that is played again, or records from the field
+outcome.py      what came of it, and in what two outcomes differ
+code.py         a directory with a state of the code, and what runs in it
+playing.py      the subject, played with a state of the code or with an agent command
+record_core.py  the process in which another state's core is given records
+history.py      the commits between a good one and a bad one, in a clone that nobody else sees
+bisecting.py    the first commit at which the outcome changes
+"""
+
+from harness.bisection.bisecting import Found, Tried, bisect
+from harness.bisection.outcome import Outcome, differences
+from harness.bisection.playing import CannotBeTriedError, Workshop
+from harness.bisection.subject import Subject, subject_of
+
+__all__ = [
+    "CannotBeTriedError",
+    "Found",
+    "Outcome",
+    "Subject",
+    "Tried",
+    "Workshop",
+    "bisect",
+    "differences",
+    "subject_of",
+]
