@@ -46,7 +46,7 @@ def checked(header: Header) -> CheckedHeader:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
         settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
     except (ValueError, TypeError) as error:
-        raise ImpossibleHeaderError(f"its trace begins with settings that cannot be: {error}") from None
+        raise ImpossibleHeaderError(f"its trace begins with settings that cannot be: {str(error)[:200]}") from None
     if not 1 <= header.agent_id <= MAX_AGENT_ID:
         raise ImpossibleHeaderError(f"its trace begins with an agent ID that cannot be: {str(header.agent_id)[:20]}")
     speedup, drift = _clock(header, "speedup", 1.0), _clock(header, "drift", 0.0)

@@ -2,6 +2,7 @@
 
 import filecmp
 import os
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -17,6 +18,9 @@ _BY_THE_HARNESS = {
     *("report.html", "report.md", "junit.xml", "chains.svg"),
 }
 """What the harness itself writes into a run directory: no agent left it."""
+_NO_RECORD = re.compile(r"(\d+|capture|lab|rogue)\.(log|mission\.json|control|store)")
+"""What else is in a run directory, and is no record of an agent."""
+_LIFE = re.compile(r"\d+-\d+")
 
 
 def files_of(paths: Iterable[Path], left_out: list[LeftOut]) -> list[Path]:
@@ -40,6 +44,8 @@ def files_of(paths: Iterable[Path], left_out: list[LeftOut]) -> list[Path]:
                 why = getattr(error, "strerror", None) or "its links lead in a circle"
                 left_out.append(LeftOut(file, f"it cannot be read: {why}"))
                 continue
+            if twin is not None and is_of_a_life(file):
+                continue
             if twin is not None:
                 left_out.append(LeftOut(file, f"it is the same as {twin}, byte by byte"))
                 continue
@@ -48,7 +54,14 @@ def files_of(paths: Iterable[Path], left_out: list[LeftOut]) -> list[Path]:
     return [*files.values()]
 
 
-def _walk(path: Path, left_out: list[LeftOut], *, named: bool = False, depth: int = 0) -> Iterator[Path]:
+def is_of_a_life(path: Path) -> bool:
+    """Whether a run put it aside for one life of an agent: it is among those of all lives, too, as a rule."""
+    return path.parent.parent.name == "agents" and _LIFE.fullmatch(path.parent.name) is not None
+
+
+def _walk(
+    path: Path, left_out: list[LeftOut], *, named: bool = False, depth: int = 0, of_run: bool = False
+) -> Iterator[Path]:
     """Links that were not named themselves are not followed: what they lead to is here by itself, or not meant."""
     try:
         if path.is_symlink() and not named:
@@ -57,10 +70,11 @@ def _walk(path: Path, left_out: list[LeftOut], *, named: bool = False, depth: in
             if depth > MAX_DEPTH:
                 left_out.append(LeftOut(path, f"it is more than {MAX_DEPTH} directories deep"))
                 return
-            not_here = _BY_THE_HARNESS if (path / RUN_FILE).is_file() else {_IMPORT_FILE}
-            for inner in sorted(path.iterdir(), key=_by_number):
-                if inner.name not in not_here:
-                    yield from _walk(inner, left_out, depth=depth + 1)
+            of_run = of_run or (path / RUN_FILE).is_file()
+            not_here = _BY_THE_HARNESS if of_run else {_IMPORT_FILE}
+            for inner in sorted(path.iterdir(), key=_files_first):
+                if inner.name not in not_here and not (of_run and _NO_RECORD.fullmatch(inner.name)):
+                    yield from _walk(inner, left_out, depth=depth + 1, of_run=of_run)
         elif path.is_file():
             yield path
         else:
@@ -69,5 +83,6 @@ def _walk(path: Path, left_out: list[LeftOut], *, named: bool = False, depth: in
         left_out.append(LeftOut(path, f"it cannot be read: {error.strerror}"))
 
 
-def _by_number(path: Path) -> tuple[int, str]:
-    return len(path.name), path.name
+def _files_first(path: Path) -> tuple[bool, int, str]:
+    """And 9 before 10."""
+    return path.is_dir(), len(path.name), path.name

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from harness.archive.exports import Export
 from harness.archive.traces import Header, Trace
+from harness.field.homecoming.files import is_of_a_life
 from harness.field.homecoming.glance import Glance
 from harness.field.homecoming.homecoming import Flight, LeftOut, Remark
 from harness.field.homecoming.lives import Life
@@ -126,7 +127,7 @@ def _told_apart(lives: list[Life], left_out: list[LeftOut]) -> Iterator[list[Lif
     for life in sorted(lives, key=lambda each: len(each.runs), reverse=True):
         twin = next((other for flight in flights for other in flight if _is_copy(life, other)), None)
         if twin is not None:
-            if life.runs or life.path != twin.path:
+            if (life.runs or life.path != twin.path) and not is_of_a_life(life.path):
                 left_out.append(LeftOut(life.path, _copy_of(life, twin), life.first_line, life.counts))
             continue
         room = next((flight for flight in flights if not any(_overlap(life, other) for other in flight)), None)
@@ -153,6 +154,8 @@ def _is_copy(life: Life, other: Life) -> bool:
         return not other.runs and life.path != other.path
     if life.runs == other.runs[: len(life.runs)]:
         return True
+    if not _overlap(life, other, anywhere=True):
+        return False
     known = set(map(_key, other.runs))
     return 2 * sum(_key(run) in known for run in life.runs) > len(life.runs)
 
@@ -164,12 +167,12 @@ def _copy_of(life: Life, twin: Life) -> str:
     return f"what begins here stands {where}, from {twin.counts} {twin.first_line} on, with more of it left"
 
 
-def _overlap(life: Life, other: Life) -> bool:
+def _overlap(life: Life, other: Life, *, anywhere: bool = False) -> bool:
     """Whether both cannot be lives of one agent on one flight: neither ended before the other began.
 
-    In one file a life ends where the next begins, whatever its clock says.
+    In one file, unless `anywhere` counts, a life ends where the next begins, whatever its clock says.
     """
-    if life.path == other.path or not life.runs or not other.runs:
+    if (life.path == other.path and not anywhere) or not life.runs or not other.runs:
         return False
     return life.runs[0].t < other.runs[-1].t and other.runs[0].t < life.runs[-1].t
 

@@ -24,7 +24,7 @@ class Remark:
     @property
     def sentence(self) -> str:
         where = f"{self.path}" if self.line is None else f"{self.path}, {self.counts} {self.line}"
-        return f"{where}: {self.why}"
+        return "".join(letter if letter.isprintable() else "?" for letter in f"{where}: {self.why}")
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,9 @@ from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 
 MAX_TRACE_BYTES = 256 * 1024 * 1024
 """Of a larger file the beginning is read."""
+MAX_LIVES = 1000
+MAX_PLACES = 1000
+"""Damaged places that are kept apart."""
 MAX_RUNS = 1_000_000
 """Of one file. Of 20 agents that hear everything, each has about a tenth of it in 2 hours."""
 NOTHING_WITHIN_BYTES = 8 * 1024 * 1024
@@ -129,12 +132,17 @@ class TraceReader:
         """The line with this number; one that did not end may be cut off."""
         self._read_bytes += len(line)
         self.hopeless = not self.lives and self._read_bytes > NOTHING_WITHIN_BYTES
-        if self._runs == MAX_RUNS:
+        if self._runs == MAX_RUNS or len(self.lives) > MAX_LIVES:
+            if not self.hopeless:
+                what = f"it and all after it are beyond {MAX_RUNS} handler runs, or {MAX_LIVES} lives of agents"
+                self._damaged = [*self._damaged[:_PLACES_TOLD], _Damage(number, number, what)]
             self.hopeless = True
-            self._damaged.append(_Damage(number, number, f"it and all after it are beyond {MAX_RUNS} handler runs"))
             return
         if number == 1:
             line = line.removeprefix(_BOM)
+        if entry := _entry(line):
+            self._add(entry, number)
+            return
         pieces = [piece for piece in _NULS.split(line) if piece.strip()]
         for piece in pieces:
             if piece.startswith(b"\0"):
@@ -172,7 +180,10 @@ class TraceReader:
             self.lives.append(self._life(None, number))  # that was a header, whatever else it said
         elif self.lives:
             self.lives[-1].lose(0 if text.startswith(b"\0") else 1, len(text))
-        if self._damaged and self._damaged[-1].goes_on(number, why):
+        self._say(number, why)
+
+    def _say(self, number: int, why: str) -> None:
+        if self._damaged and (self._damaged[-1].goes_on(number, why) or len(self._damaged) > MAX_PLACES):
             self._damaged[-1].last = number
         else:
             self._damaged.append(_Damage(number, number, why))
@@ -187,7 +198,7 @@ class TraceReader:
         if self.lives:
             self.lives[-1].lose(lines, lost_bytes)
         what = "what was before this" if not lines else "a line" if lines == 1 else f"{lines} lines"
-        self._damaged.append(_Damage(number, number, f"{what} was lost already when this file was made"))
+        self._say(number, f"{what} was lost already when this file was made")
 
     def ended(self, left_out: list[LeftOut]) -> list[Life]:
         """The lives; what was damaged is told if there are any."""

@@ -201,10 +201,10 @@ def test_other_peoples_files_are_named(home: Path) -> None:
 
 def test_many_alike_are_summed_up(home: Path) -> None:
     for number in range(200):
-        (home / f"{number}.log").write_text(f"{number}")
+        (home / f"{number}.txt").write_text(f"{number}")
     homecoming = sort_out([home])
     assert len(homecoming.left_out) == 4
-    assert "197 more files (3.log, " in why(homecoming)
+    assert "197 more files (3.txt, " in why(homecoming)
 
 
 def test_an_agent_that_is_not_of_the_mission_is_named(home: Path, tmp_path: Path) -> None:
