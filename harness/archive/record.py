@@ -292,6 +292,16 @@ class JudgedRecord(_Model):
     engine: str | None = None
     counters: Counters | None = None
 
+    @property
+    def switched_off(self) -> dict[int, float]:
+        """Agents that ended in order before the run did, and when, in mission seconds: their exports are of then."""
+        off = (fault for fault in self.faults if fault.kind.leaves_an_export)
+        return {agent_id: fault.at_s for fault in off for agent_id in fault.agents or ()}
+
+    def end_of(self, agent_id: int) -> float | None:
+        """When the run ended for this agent, in mission seconds; None if it is not on record."""
+        return self.switched_off.get(agent_id, self.mission_s)
+
 
 class RunRecord(JudgedRecord):
     """All of a record. Times are mission seconds except `wall_s`; what is not known, or not yet, is null or empty."""

@@ -181,12 +181,8 @@ class Evidence:
 
     @cached_property
     def switched_off(self) -> dict[int, float]:
-        """Agents that ended in order before the run did, and when, in mission seconds: their exports are of then."""
-        return {
-            agent_id: fault.at_s
-            for fault in (self.record.faults if self.record else ())
-            for agent_id in (fault.agents or () if fault.kind.leaves_an_export else ())
-        }
+        """Agents that ended in order before the run did, and when, in mission seconds."""
+        return self.record.switched_off if self.record else {}
 
     @property
     def present(self) -> dict[int, Export]:
@@ -204,7 +200,7 @@ class Evidence:
 
     def end_of(self, agent_id: int) -> float | None:
         """When the run ended for this agent; None if it is not on record."""
-        return self.switched_off.get(agent_id, self.ended_at_s)
+        return self.record.end_of(agent_id) if self.record else None
 
     @property
     def busy(self) -> list[int]:

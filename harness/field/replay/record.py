@@ -118,7 +118,7 @@ class Record:
         if self.trace.cut_off or self.trace.problem or self.agent_id not in self.beside.exports:
             return None
         if self.beside.record is not None:
-            return Evidence({}, record=self.beside.record).end_of(self.agent_id)
+            return self.beside.record.end_of(self.agent_id)
         epoch_us = self.trace.header.clock.get("epoch_us")
         if not isinstance(epoch_us, int):
             return None

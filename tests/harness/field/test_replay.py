@@ -19,6 +19,7 @@ from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun
 
 REPOSITORY = Path(__file__).parents[3]
+SLOW_VOTES = {"vote_timeout_s": 150}
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +55,15 @@ def test_the_first_difference_is_shown_with_its_handler_and_where_its_code_is(wr
     assert "the first:" in ended.stdout
     assert "Algorithm 18, receive_response_block_for_hash (" in ended.stdout
     assert "it had the top chain hash" in ended.stdout
+
+
+def test_whoever_was_switched_off_in_the_middle_of_a_vote_owes_no_more(tmp_path: Path) -> None:
+    run = flown(tmp_path / "run", timeline=[{"at_s": 200, "switch_off": [1, 2]}], settings=SLOW_VOTES)
+    ends = [json.loads(trace_of(run, agent).read_text().splitlines()[-1])["state"] for agent in (1, 2)]
+    assert not all(state["idle"] for state in ends)
+    for agent in (1, 2):
+        ended = harness("replay", run, "--agent", agent)
+        assert ended.returncode == 0, ended.stdout
 
 
 def test_programs_are_told_the_same(wrong: Path) -> None:
