@@ -11,11 +11,12 @@ from harness.explore.recording import Logged, Lost
 from harness.scenario import Scenario
 from harness.scenario.faults import ASKED_FOR
 from harness.scenario.injection import INJECTIONS
+from harness.scenario.numbered import in_text, numbered
 
 Document = dict[str, Any]
 
-UNPLAYED = ("about", "speedup")
-"""Keys that change nothing in virtual time."""
+UNPLAYED = ("about", "speedup", "expect")
+"""Keys that change nothing in virtual time, or that are of a run that is not smaller."""
 FLIGHT = ("vehicles", "flight", "network.radio")
 """Keys that say which messages are lost to distance, and nothing else in virtual time."""
 NEVER_IN_BURSTS = {"p": 0.0, "r": 1.0}
@@ -142,7 +143,9 @@ def with_agents(document: Document, kept: Collection[int]) -> Document:
     document = with_key(document, "flight", [flight for flight in flights if flight["vehicles"]])
     quirks = {name: _of_kept(value, kept) for name, value in document.get("quirks", {}).items()}
     document = with_key(document, "quirks", {name: value for name, value in quirks.items() if value is not None})
-    for key in ("clocks", "vehicles.types"):
+    datagrams = [_datagram(datagram, kept) for datagram in document.get("datagrams", [])]
+    document = with_key(document, "datagrams", [datagram for datagram in datagrams if datagram["reaches"]])
+    for key in ("clocks", "lateness", "vehicles.types"):
         named = at(document, key) or {}
         document = with_key(document, key, {name: value for name, value in named.items() if int(name) in kept})
     return with_key(document, "network", _network(document.get("network", {}), kept))
@@ -190,6 +193,13 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
     faults = [kind.what for kind in ASKED_FOR]
     entry = _of(entry, faults, kept)
     return entry if all(entry.get(fault) != [] for fault in faults) else None
+
+
+def _datagram(datagram: Document, kept: Collection[int]) -> Document:
+    """One that reaches these agents only; nobody, if it is from another."""
+    from_kept = datagram["source"] in kept
+    reaches = {agent: at_s for agent, at_s in datagram["reaches"].items() if from_kept and int(agent) in kept}
+    return {**datagram, "reaches": reaches}
 
 
 def _of_kept(quirk: Any, kept: Collection[int]) -> Any:
@@ -245,7 +255,20 @@ def moved(document: Document, to: Callable[[float], float]) -> Document:
     """Everything that happens happens at another time."""
     for key in ("events.script", "timeline"):
         document = with_key(document, key, [_moved(entry, to) for entry in at(document, key) or []])
+    document = with_key(document, "fates", [_moved_fate(fate, to) for fate in document.get("fates", [])])
+    document = with_key(document, "datagrams", [_moved_datagram(heard, to) for heard in document.get("datagrams", [])])
     return {**document, "duration_s": max(1.0, to(document.get("duration_s", 1200.0)))}
+
+
+def _moved_fate(fate: Document, to: Callable[[float], float]) -> Document:
+    """Of fates those whose messages arrive at given times; the windows of others are as they are."""
+    if "arrivals" not in fate:
+        return fate
+    return {**fate, "arrivals": in_text(((number, to(at_s)) for number, at_s in numbered(fate["arrivals"])), "@")}
+
+
+def _moved_datagram(datagram: Document, to: Callable[[float], float]) -> Document:
+    return {**datagram, "reaches": {agent: to(at_s) for agent, at_s in datagram["reaches"].items()}}
 
 
 def _moved(entry: Document, to: Callable[[float], float]) -> Document:

@@ -126,11 +126,11 @@ def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
 
 def _fewer_of_each(shrinker: Shrinker) -> None:
     wrong = [f"quirks.{name}.agents" for name in shrinker.best.get("quirks", {})]
-    for key in ("timeline", "schedule", "events.script", "fates", "network.links", *wrong):
+    for key in ("timeline", "schedule", "events.script", "fates", "datagrams", "network.links", *wrong):
         document = shrinker.best
         if at(document, key):
             shrinker.fewest(at(document, key), lambda kept, d=document, k=key: with_key(d, k, list(kept)))  # type: ignore[misc]
-    for key in ("clocks", "network.receivers"):
+    for key in ("clocks", "lateness", "network.receivers"):
         document = shrinker.best
         named: dict[str, Any] = at(document, key) or {}
         shrinker.fewest(list(named.items()), lambda kept, d=document, k=key: with_key(d, k, dict(kept)))  # type: ignore[misc]
@@ -138,7 +138,7 @@ def _fewer_of_each(shrinker: Shrinker) -> None:
 
 def _plainer(shrinker: Shrinker) -> None:
     """What can be as by default; and if not, one latency for all messages."""
-    for key in ("settings", "quirks", "network", "settle", "timeline", "schedule"):
+    for key in ("initial_data", "lateness", "settings", "quirks", "network", "settle", "timeline", "schedule"):
         shrinker.first([with_key(shrinker.best, key, None)])
     for part in ("settings", "quirks", "network"):
         for key in list(at(shrinker.best, part) or ()):
@@ -188,9 +188,11 @@ def size(document: Document) -> str:
         "event": len(script(document)),
         "fate": len(document.get("fates", [])),
         "fault": len(timeline(document)),
+        "datagram": len(document.get("datagrams", [])),
     }
+    always = ("agent", "event", "fate")
     return ", ".join(
-        f"{count} {word}{'' if count == 1 else 's'}" for word, count in counts.items() if count or word != "fault"
+        f"{count} {word}{'' if count == 1 else 's'}" for word, count in counts.items() if count or word in always
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-MAX_BYTES = 1024 * 1024
+MAX_BYTES = 8 * 1024 * 1024
 TOP_LEVEL_KEY = re.compile(rb"^([A-Za-z_][\w-]*)[ \t]*:", re.MULTILINE)
 PLACES: pytest.StashKey[list[Path]] = pytest.StashKey()
 EXPECTED = re.compile(rb"\b(?:characteristics|figures|chains|backends|seeds)[\"']?[ \t]*:")

@@ -13,7 +13,8 @@ from harness.scenario import library
 from harness.scenario.model import BOUNDED
 from harness.scenario.scenario import Scenario
 
-MAX_SCENARIO_BYTES = 1024 * 1024
+MAX_SCENARIO_BYTES = 8 * 1024 * 1024
+"""A flight of two hours with twenty vehicles, word for word, is half of that."""
 
 
 def load_scenario(path: Path) -> Scenario:

@@ -45,7 +45,7 @@ class Settle(Model):
 class Clock(Model):
     """An agent's own clock: at mission second t it shows offset_s + (1 + drift) * t seconds."""
 
-    offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    offset_s: Annotated[float, Field(ge=-1e10, le=1e10)] = 0.0
     drift: Annotated[float, Field(gt=-0.5, le=1.0)] = 0.0
 
 

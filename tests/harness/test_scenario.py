@@ -144,7 +144,7 @@ def test_a_missing_or_oversized_file_is_told(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="there is no such file or scenario; `ucp-harness scenarios` lists"):
         load_scenario(tmp_path / "none.yaml")
     with pytest.raises(ScenarioError, match="larger than"):
-        load_scenario(write(tmp_path, "#" * 2_000_000))
+        load_scenario(write(tmp_path, "#" * 9_000_000))
 
 
 def test_the_timeline_is_the_sequence_of_network_states() -> None:

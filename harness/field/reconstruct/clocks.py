@@ -13,7 +13,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-MAX_DRIFT = 0.9
+SLOWEST, FASTEST = 0.55, 1.8
+"""Rates beyond these are no clock's."""
 SEARCH_STEPS = 100
 POINTS_FOR_DRIFT = 8
 """Messages each way that it takes to speak of drift."""
@@ -118,7 +119,7 @@ def fit(above: list[Point], below: list[Point]) -> Line:
 
     rate = 1.0
     if min(len(above), len(below)) >= POINTS_FOR_DRIFT and room(1.0) < 0:
-        low, high = 1 - MAX_DRIFT, 1 / (1 - MAX_DRIFT)
+        low, high = SLOWEST, FASTEST
         for _ in range(SEARCH_STEPS):  # room is concave
             third = (high - low) / 3
             if room(low + third) < room(high - third):

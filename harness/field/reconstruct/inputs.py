@@ -1,6 +1,7 @@
 """What reached an agent, in order, and what it did then: a trace, taken apart into inputs."""
 
 import base64
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -95,6 +96,8 @@ class _Reader:
                 continue
             if current is not None:
                 yield current
+            if not math.isfinite(run.t):
+                raise UnusableInputError(f"line {line}: {run.handler} ran at no time")
             last_s = max(last_s, self._header.local(run.t))
             current = Input(last_s, line, self._what(line, run), [run])
         if current is not None:

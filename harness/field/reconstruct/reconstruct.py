@@ -126,7 +126,7 @@ def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -
             why[agent_id] = "was set otherwise than the others, and a scenario has one set of settings"
             continue
         rehearsal = _rehearsed(flight, elsewhere, header, remarks, why, by_captures)
-        if rehearsal is not None and rehearsal.played:
+        if rehearsal is not None and (rehearsal.played or rehearsal.parting is None):
             rehearsals[agent_id] = rehearsal
     if not rehearsals:
         first = next((f"agent {agent_id} {words}; " for agent_id, words in why.items()), "")

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
-from harness.field.reconstruct.clocks import Delivery, Line, estimate
+from harness.field.reconstruct.clocks import FASTEST, SLOWEST, Delivery, Line, estimate
 from harness.field.reconstruct.inputs import Booted, Heard
 from harness.field.reconstruct.rehearsal import Played, Rehearsal, Started
 
@@ -22,6 +22,8 @@ APART_S = 2e-5
 """Two inputs of an agent, and a message's leaving and its arrival, are at least so far apart."""
 DIGITS = 6
 MILLION = 10.0**DIGITS
+LONG_BEFORE_S = 86400.0
+"""Nobody waits so long for a mission's first event: its clocks count from something else."""
 WITHIN_S = 1.0
 """Of two equal datagrams one is meant that was sent no later than that after it was received, for clocks differ."""
 
@@ -90,15 +92,15 @@ def timetable(rehearsals: Mapping[int, Rehearsal]) -> Timetable:
 
 
 def _from_zero(clocks: Mapping[int, Line], rehearsals: Mapping[int, Rehearsal]) -> dict[int, Line]:
-    """Mission second 0 is when the first clock shows 0, or when the first input comes if that is sooner."""
-    firsts = [
-        clocks[agent].at(rehearsal.played[0].input.at_s) for agent, rehearsal in rehearsals.items() if rehearsal.played
-    ]
-    start = min([*(line.at(0.0) for line in clocks.values()), *(first - APART_S for first in firsts)], default=0.0)
+    """Mission second 0 is when the first clock shows 0; if the first input comes sooner, or much later, it is then."""
+    played = {agent: rehearsal.played[0] for agent, rehearsal in rehearsals.items() if rehearsal.played}
+    first = min((clocks[agent].at(of_agent.input.at_s) for agent, of_agent in played.items()), default=0.0)
+    zero = min(line.at(0.0) for line in clocks.values())
+    start = zero if APART_S < first - zero < LONG_BEFORE_S else first - APART_S
     begin = Line(start)
     rounded = {}
     for agent, line in clocks.items():
-        line = line.after(begin)
+        line = line.after(begin) if SLOWEST <= line.rate <= FASTEST else Line().after(begin)
         rounded[agent] = Line(round(line.offset_s, DIGITS), 1 + round(line.rate - 1, 9))
     return rounded
 

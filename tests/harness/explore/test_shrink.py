@@ -2,9 +2,10 @@
 
 import pytest
 
-from harness.explore.document import Document, script, with_key
+from harness.explore.document import Document, document_of, moved, script, with_agents, with_key
 from harness.explore.shrink import BudgetSpentError, Shrinker
 from harness.scenario import Scenario
+from tests.harness.virtual import scenario
 
 START: Document = {
     "name": "test",
@@ -56,3 +57,25 @@ def test_the_number_of_runs_is_bounded_and_the_best_so_far_stays() -> None:
         shrink(it)
     assert it.runs == 9
     assert violates(Scenario.model_validate(it.best))
+
+
+def test_a_flight_that_was_flown_again_is_shrunk_without_what_only_made_it_the_same() -> None:
+    flight = {
+        "agents": [1, 2],
+        "duration_s": 60,
+        "initial_data": "AAAA",
+        "events": {"source": "scripted", "script": [{"at_s": 10, "agent": 1, "data": "AQ==", "event_id": 7}]},
+        "settings": {"max_block_bytes": 267},
+        "fates": [{"sender": 1, "receiver": 2, "arrivals": "0@10.5"}],
+        "lateness": {1: "0+0.25", 2: "0+0.5"},
+        "datagrams": [{"source": 2, "datagram": "AAAA", "reaches": {"1": 20}}],
+    }
+    document = document_of(scenario(**flight, expect={"seeds": [1]}))
+    assert "expect" not in document
+    alone = with_agents(document, {1})
+    assert alone["lateness"] == {"1": "0+0.25"}
+    assert "datagrams" not in alone
+    assert "fates" not in alone
+    later = moved(document, lambda at_s: at_s + 100)
+    assert later["fates"][0]["arrivals"] == "0@110.5"
+    assert later["datagrams"][0]["reaches"] == {"1": 120}
