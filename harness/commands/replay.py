@@ -2,6 +2,7 @@
 
 import os
 import sys
+from bdb import BdbQuit
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -36,6 +37,10 @@ def replay_command(
     as_json: Annotated[bool, typer.Option("--json", help="What differs, as JSON on standard output.")] = False,
 ) -> None:
     """Feed what one agent saw into the reference core, step by step: exit status 1 if it did anything else."""
+    if as_json and (step or breaks):
+        raise typer.BadParameter("--json is for programs, which play the whole record: leave out --step and --break")
+    if debug and not breaks:
+        raise typer.BadParameter("--debug calls the debugger at each --break: name one, such as --break 812")
     opened = open_record(record, agent)
     for sentence in opened.problems:
         complain(sentence)
@@ -54,7 +59,7 @@ def replay_command(
             if prompt.quit:
                 raise typer.Exit(VIOLATED if player.found.deviations else 0)
         found = player.to_end()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, BdbQuit):
         raise InterruptedRunError(f"interrupted at line {player.entry.line if player.entry else 1}") from None
     if as_json:
         print_json(document(opened, found, names))

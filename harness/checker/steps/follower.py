@@ -155,6 +155,13 @@ class Follower:
         memo[id(self.deviations)] = []
         return deepcopy(self, memo)
 
+    def foresee(self, line: int, run: HandlerRun) -> list[Deviation]:
+        """What the run that comes next shows to be wrong of those before it: what they triggered. Nothing is run."""
+        foreseeing = self.copy()
+        if foreseeing.lost is None:
+            foreseeing._triggered(line, run, run.trigger.get("local"))
+        return foreseeing.deviations
+
     def end(self, at_s: float | None) -> None:
         """See what should have come by the end of the run, at `at_s`, of an agent that was there to the end."""
         if self.lost is not None:

@@ -8,6 +8,7 @@ from itertools import accumulate
 from rich.text import Text
 
 from harness.archive.traces import Trace
+from harness.field.reconstruct.clocks import Delivery, Line, estimate
 from harness.field.replay.player import Player
 from harness.field.replay.record import Record
 from ucp.clock import MICROSECONDS
@@ -22,8 +23,8 @@ STEPS_SHOWN = 2
 class Others:
     """Reads their records when it is first asked.
 
-    Traces have mission seconds. Where agents began to count at different moments, by their own clocks, that is reckoned
-    with; clocks that are wrong are not.
+    The agents of a run share one clock. What came home from the field has clocks of its own, which the messages between
+    two agents tell apart.
     """
 
     def __init__(self, record: Record) -> None:
@@ -31,11 +32,11 @@ class Others:
 
     @cached_property
     def _traces(self) -> dict[int, "_Other"]:
-        ours = self._record.trace
+        record = self._record
+        others = {agent_id: trace for agent_id, trace in record.beside.traces.items() if agent_id != record.agent_id}
         return {
-            agent_id: _Other(trace, _ahead_s(ours, trace))
-            for agent_id, trace in sorted(self._record.beside.traces.items())
-            if agent_id != self._record.agent_id
+            agent_id: _Other(record.trace, trace, record.beside.record is not None)
+            for agent_id, trace in others.items()
         }
 
     def at(self, player: Player) -> Iterator[Text]:
@@ -56,7 +57,7 @@ class Others:
                 yield from other.has_to_do_with(self._record.agent_id, agent_id, run)
             for number in other.near(now):
                 line, theirs = other.runs[number]
-                after_s = theirs.t - other.ahead_s - now
+                after_s = other.clock.at(theirs.t) - now
                 words = (
                     f"{after_s:+8.3f} s  line {line}: A{theirs.algorithm} {theirs.handler[:40]}: {theirs.branch[:40]}"
                 )
@@ -64,12 +65,29 @@ class Others:
 
 
 class _Other:
-    """`ahead_s`: so much more its clock shows at the same moment."""
+    """`clock` is what its clock shows beside ours."""
 
-    def __init__(self, trace: Trace, ahead_s: float) -> None:
-        self.ahead_s = ahead_s
+    def __init__(self, ours: Trace, trace: Trace, one_clock: bool) -> None:
         self.runs = [numbered for life in trace.lives() for numbered in life]
-        self._times = [*accumulate((run.t - ahead_s for _, run in self.runs), max)]
+        self._agents = ours.header.agent_id, trace.header.agent_id
+        self.clock = Line() if one_clock else self._estimated(ours, trace)
+        self._times = [*accumulate((self.clock.at(run.t) for _, run in self.runs), max)]
+
+    def _estimated(self, ours: Trace, trace: Trace) -> Line:
+        own, other = self._agents
+        deliveries = []
+        for run in ours.runs:
+            sent = self._sent.get((run.trigger.get("message"), run.trigger.get("seq")), [])
+            if run.trigger.get("from") == other and len(sent) == 1:
+                deliveries.append(Delivery(other, own, self.runs[sent[0]][1].t, run.t))
+            for message in run.sent:
+                heard = self._heard.get((own, message.message, message.seq), [])
+                if len(heard) == 1:
+                    deliveries.append(Delivery(own, other, run.t, self.runs[heard[0]][1].t))
+        if not deliveries:
+            return Line(_ahead_s(ours, trace))
+        clocks = estimate(self._agents, deliveries)
+        return clocks[other].after(clocks[own].inverse())
 
     @cached_property
     def _sent(self) -> dict[tuple[object, object], list[int]]:
@@ -128,7 +146,7 @@ class _Other:
     def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
         """The sequence numbers of a new life begin anew: it is the run nearest in time."""
         runs = (self.runs[number] for number in numbers)
-        return sorted(runs, key=lambda numbered: abs(numbered[1].t - self.ahead_s - at_s))[:1]
+        return sorted(runs, key=lambda numbered: abs(self.clock.at(numbered[1].t) - at_s))[:1]
 
 
 def _ahead_s(ours: Trace, theirs: Trace) -> float:

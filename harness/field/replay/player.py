@@ -3,6 +3,7 @@
 Going back is exact: it plays again, from a checkpoint shortly before.
 """
 
+from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -30,9 +31,16 @@ class Found:
     lost: list[str] = field(default_factory=list)
     """Why not: sentences."""
     deviations: list[Deviation] = field(default_factory=list)
+    positions: list[int] = field(default_factory=list)
+    """After which entry each of these was found: what is missing shows when the next comes."""
 
     def copy(self) -> "Found":
-        return Found(self.steps, self.unjudged, list(self.lost), list(self.deviations))
+        return Found(self.steps, self.unjudged, list(self.lost), list(self.deviations), list(self.positions))
+
+    def differ(self, position: int, deviations: Iterable[Deviation]) -> None:
+        for deviation in deviations:
+            self.deviations.append(deviation)
+            self.positions.append(position)
 
     @property
     def first(self) -> Deviation | None:
@@ -84,9 +92,15 @@ class Player:
         return self.position == len(self.entries)
 
     def deviations_here(self) -> list[Deviation]:
-        """Where the entry played last differs."""
-        line = self.entry.line if self.entry else 0
-        return [deviation for deviation in self.found.deviations if deviation.line == line]
+        """What the entry played last shows to be wrong, and what the next will show to be wrong of it."""
+        found = self.found
+        here = found.deviations[bisect_left(found.positions, self.position) :]
+        upcoming = None if self.at_end else self.entries[self.position]
+        if upcoming is None or not isinstance(upcoming.what, HandlerRun) or upcoming.life != self._life or upcoming.gap:
+            return here
+        if self.position in self.record.unwritten:
+            return here
+        return here + self._follower.foresee(upcoming.line, upcoming.what)
 
     def forward(self, *, into_debugger: bool = False) -> Entry:
         """Play the next entry; `into_debugger` calls `breakpoint()` right before its handler runs."""
@@ -100,16 +114,16 @@ class Player:
             finally:
                 self._follower.stops_before_handler = False
         elif (deviation := wrongly_dropped(self.record.header, entry.line, entry.what)) is not None:
-            self.found.deviations.append(deviation)
+            self.found.differ(self.position + 1, [deviation])
         self.position += 1
         if self.position % CHECKPOINT_STEPS == 0 and self.position not in self._checkpoints:
             self._checkpoints[self.position] = _Checkpoint(self._follower.copy(), self._life, self.found.copy())
         return entry
 
-    def to(self, position: int) -> None:
-        """Go there, forward or back."""
+    def to(self, position: int, *, anew: bool = False) -> None:
+        """Go there, forward or back; `anew`, by playing again even if it is there already."""
         position = max(0, min(position, len(self.entries)))
-        if position < self.position:
+        if position < self.position or anew:
             nearest = max(known for known in self._checkpoints if known <= position)
             checkpoint = self._checkpoints[nearest]
             self._follower, self._life = checkpoint.follower.copy(), checkpoint.life
@@ -121,10 +135,11 @@ class Player:
         """Play the rest; what has come of the whole record, also of what should have come after its last line."""
         self.to(len(self.entries))
         found = self.found.copy()
-        if len(self.entries) == len(self.record.entries) and (until_s := self.record.was_there_until_s) is not None:
+        whole = len(self.entries) == len(self.record.entries) and self._life == self.record.lives
+        if whole and (until_s := self.record.was_there_until_s) is not None:
             follower = self._follower.copy()
             follower.end(until_s)
-            found.deviations += follower.deviations
+            found.differ(self.position, follower.deviations)
         return found
 
     def _follow(self, entry: Entry, run: HandlerRun) -> None:
@@ -145,8 +160,9 @@ class Player:
             follower.deviations.clear()
             follower.lost = f"before line {entry.line} {why}"
             found.steps, found.unjudged = found.steps - 1, found.unjudged + 1
-        found.deviations += follower.deviations
-        follower.deviations.clear()
+        if follower.deviations:
+            found.differ(self.position + 1, follower.deviations)
+            follower.deviations.clear()
         if follower.lost is not None:
             found.lost.append(follower.lost)
 

@@ -2,6 +2,7 @@
 
 import cmd
 import sys
+from bdb import BdbQuit
 from collections.abc import Callable, Sequence
 
 from rich.console import Console, RenderableType
@@ -109,16 +110,19 @@ class Prompt(cmd.Cmd):
         """continue (c): play up to the next break or difference, or to the end"""
         player = self._player
         while not player.at_end:
-            entry = player.forward()
-            if self._stops_at(entry):
+            if self._stops_at(player.forward()):
                 break
         self._show()
 
     def do_reverse_continue(self, arg: str) -> None:
         """reverse-continue (rc): go back to the break or difference before, or to the start"""
-        player = self._player
+        player, differing = self._player, {*self._player.found.positions}
         earlier = next(
-            (at for at in range(player.position - 1, 0, -1) if self._stops_at(player.entries[at - 1])),
+            (
+                at
+                for at in range(player.position - 1, 0, -1)
+                if at in differing or self._breaks_at(player.entries[at - 1])
+            ),
             0,
         )
         player.to(earlier)
@@ -157,8 +161,12 @@ class Prompt(cmd.Cmd):
         player = self._player
         if not player.position:
             raise FieldError("nothing has been played yet: next, and then debug")
-        player.to(player.position - 1)
-        player.forward(into_debugger=True)
+        position = player.position
+        player.to(position - 1)
+        try:
+            player.forward(into_debugger=True)
+        except BdbQuit:
+            player.to(position, anew=True)
         self._show()
 
     # Looking
@@ -191,7 +199,7 @@ class Prompt(cmd.Cmd):
         first = max(0, player.position - 1 - AROUND)
         for number, entry in enumerate(player.entries[first : player.position + AROUND], first + 1):
             mark = "→" if number == player.position else " "
-            self._print(self._words.line(entry), before=mark)
+            self._print(self._words.line(number, entry), before=mark)
 
     def do_quit(self, arg: str) -> bool:
         """quit (q): end here"""
@@ -221,28 +229,28 @@ class Prompt(cmd.Cmd):
 
     def _go_to_difference(self, backward: bool) -> None:
         player = self._player
+        positions = player.found.positions
         if backward:
-            lines = [deviation.line for deviation in player.found.deviations]
-            earlier = [line for line in lines if player.entry and line < player.entry.line]
-            if earlier:
-                player.to(player.record.position_of_line(max(earlier) + 1))
-                self._show()
-            else:
+            earlier = [position for position in positions if position < player.position]
+            if not earlier:
                 self._say("there is no difference before this")
-            return
-        while not player.at_end:
-            entry = player.forward()
-            if self._differs(entry):
-                break
+                return
+            player.to(earlier[-1])
         else:
-            self._say("there is no difference after this")
+            known = len(positions)
+            while not player.at_end and len(player.found.positions) == known:
+                player.forward()
+            if len(player.found.positions) == known:
+                self._say("there is no difference after this")
         self._show()
 
     def _stops_at(self, entry: Entry) -> bool:
-        return self._differs(entry) or any(at(entry) for at in self._breaks.values())
+        """Whether `continue` stops at the entry played last."""
+        positions = self._player.found.positions
+        return positions[-1:] == [self._player.position] or self._breaks_at(entry)
 
-    def _differs(self, entry: Entry) -> bool:
-        return any(deviation.line == entry.line for deviation in self._player.found.deviations)
+    def _breaks_at(self, entry: Entry) -> bool:
+        return any(at(entry) for at in self._breaks.values())
 
     def _show(self) -> None:
         self._print(*self._words.step(), self._words.in_short())

@@ -30,8 +30,8 @@ class Words:
 
     # A step
 
-    def line(self, entry: Entry) -> Text:
-        """An entry in a line: "  212   604.278 s  A18 receive_response_block_for_hash: committed"."""
+    def line(self, number: int, entry: Entry) -> Text:
+        """The entry of this number, from 1: "  212   604.278 s  A18 receive_response_block_for_hash: committed"."""
         where = f"{entry.line:>7} {entry.what.t:>10.3f} s  "
         match entry.what:
             case HandlerRun() as run:
@@ -40,7 +40,7 @@ class Words:
                 words = f"    dropped a datagram: {aside.dropped[:60]}"
             case aside:
                 words = f"    command {aside.command[:40]}"
-        differs = any(deviation.line == entry.line for deviation in self._player.found.deviations)
+        differs = number in self._player.found.positions
         return Text(f"{'✘' if differs else ' '}{where}{words}", style="red" if differs else "")
 
     def step(self) -> Iterator[Text]:
@@ -88,10 +88,10 @@ class Words:
             yield _row("counted", ", ".join(self._counted(key, count) for key, count in run.tally.items()))
 
     def deviation(self, deviation: Deviation) -> Text:
-        """Whose it is is said where it is not the step's own handler's."""
+        """Which step it is of is said where that is another than the one played last."""
         entry = self._player.entry
-        own = entry is not None and isinstance(entry.what, HandlerRun) and entry.what.handler == deviation.handler
-        whose = "" if own or deviation.handler is None else f"{deviation.handler}: "
+        own = entry is not None and entry.line == deviation.line and isinstance(entry.what, HandlerRun)
+        whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "
         return Text(f"  ✘ {whose}{deviation.difference(self._names.of)}", style="bold red")
 
     def beside(self, deviation: Deviation) -> Table | Text:

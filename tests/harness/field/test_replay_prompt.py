@@ -1,7 +1,9 @@
 """Stepping through a record: the commands, as a user pipes them in or types them."""
 
+import json
 import os
 import pty
+import shutil
 import signal
 import subprocess
 import time
@@ -78,6 +80,51 @@ def test_the_others_are_shown_as_they_were_at_that_moment(wrong: Path) -> None:
     assert any(line.startswith("  agent 1: ") for line in said["others"])
     assert any("sent it at line " in line for line in said["others"])
     assert any("heard Block Add Request" in line for line in said["o"])
+
+
+def test_what_a_step_failed_to_trigger_is_shown_with_that_step(tmp_path: Path) -> None:
+    wrong = flown(tmp_path / "run", quirks={"give_up_unfinished": True}, duration_s=900, network={"loss": 0.4})
+    line = first_difference(wrong)
+    shown = told(wrong, "q", options=("--break", str(line)))[""]
+    assert any(
+        row.startswith("  ✘ it triggered nothing, and should have triggered Reconcile Finalize") for row in shown
+    )
+    went_on = told(wrong, "c", "rc", "next difference", "q")
+    assert went_on["c"] == went_on["next difference"]
+    assert went_on["rc"][0].startswith("before line 1")
+
+
+def test_the_others_are_found_by_the_messages_where_clocks_are_wrong(tmp_path: Path) -> None:
+    directory = flown(tmp_path / "run", clocks={1: {"offset_s": 120.0}, 3: {"offset_s": -30.0, "drift": 0.01}})
+    late = {1: (120.0, 1.0), 3: (-30.0, 1.01)}
+    for agent in (1, 2, 3):
+        offset_s, rate = late.get(agent, (0.0, 1.0))
+        lines = [json.loads(line) for line in trace_of(directory, agent).read_text().splitlines()]
+        lines[0]["clock"] = {"epoch_us": 0, "speedup": 1}  # the clock is wrong, and nobody knows
+        for line in lines[1:]:
+            line["t"] = round(offset_s + rate * line["t"], 6)
+        (tmp_path / f"{agent}.trace.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    shutil.rmtree(directory)
+    said = told(tmp_path, "n receive_vote_add_block", "others", "q")["others"]
+    sending = next(number for number, row in enumerate(said) if "sent it at line" in row)
+    around = next(row for row in said[sending + 1 :] if row.split()[3] == said[sending].split()[4].replace(",", ":"))
+    assert -0.2 < float(around.split()[0]) < 0
+
+
+def test_leaving_the_debugger_leaves_the_record_as_it_was(wrong: Path) -> None:
+    ended = harness("replay", wrong, "--agent", 2, "--step", input="n 20\ns\ndebug\nq\ns\nb\nn\ns\nq\n")
+    assert sentences(ended.stderr) == []
+    first, second, third = (text.split("\n> ")[0] for text in ended.stdout.split("\n> s\n")[1:])
+    assert first == second == third
+
+
+@pytest.mark.parametrize(
+    "options", [("--json", "--step"), ("--json", "--break", "A2"), ("--debug",), ("--break", "A99")]
+)
+def test_what_makes_no_sense_together_is_refused(options: tuple[str, ...], wrong: Path) -> None:
+    ended = harness("replay", wrong, "--agent", 2, *options, input="")
+    assert ended.returncode == 2
+    assert "Traceback" not in ended.stderr
 
 
 def test_what_cannot_be_done_is_said(wrong: Path) -> None:
