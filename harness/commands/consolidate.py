@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +19,9 @@ from harness.errors import ExportError
 from harness.logbook.geojson import geojson
 from harness.logbook.kml import kml
 from harness.logbook.positions import Track
+
+if TYPE_CHECKING:
+    from harness.depot.reconcile import Reconciliation
 
 FINDING = 1
 MOST_TOLD = 20
@@ -55,9 +58,15 @@ def consolidate_command(
     if final_reconcile and out is None:
         raise ExportError("--reconcile puts the exports beside the record: say where that is by -o NAME.jsonl")
     record = consolidate(came_home(paths))
-    reconciled = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
+    reconciliation = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
+    reconciled = reconciliation.line if reconciliation else None
     print_lines(in_words(record, reconciled))
-    print_lines(_written(record, reconciled, out, html_file, kml_file, geojson_file, csv_file))
+    print_lines(_written(record, reconciled, out, kml_file, geojson_file, csv_file))
+    if html_file is not None:
+        from harness.depot.page import draw
+
+        write_new(html_file, [draw(record, reconciliation)])
+        print_lines([str(html_file)])
     findings = [*record.home.problems, *record.home.left_out]
     for sentence in findings[:MOST_TOLD]:
         complain(sentence)
@@ -67,20 +76,19 @@ def consolidate_command(
         raise typer.Exit(FINDING)
 
 
-def _reconcile(record: Consolidation, directory: Path) -> Reconciled:
+def _reconcile(record: Consolidation, directory: Path) -> "Reconciliation":
     from harness.depot.reconcile import reconcile, write  # what plays a swarm takes its time to import
 
     claim(directory)
     reconciliation = reconcile(record)
     write(reconciliation, directory)
-    return reconciliation.line
+    return reconciliation
 
 
 def _written(
     record: Consolidation,
     reconciled: Reconciled | None,
     out: Path | None,
-    html_file: Path | None,
     kml_file: Path | None,
     geojson_file: Path | None,
     csv_file: Path | None,

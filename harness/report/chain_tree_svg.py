@@ -37,13 +37,20 @@ _DOTS_LENGTH = 2 * _DOT_SPACING + 1  # three dots, one of them just before the e
 class ChainTreePicture:
     """The tree of these exports, ready to be drawn abridged or with every block.
 
-    `key` keeps the identifiers of several pictures on one page apart.
+    `key` keeps the identifiers of several pictures on one page apart. `names` are those of the blocks, if whoever asks
+    knows more of them than these exports say.
     """
 
-    def __init__(self, exports: Mapping[int, Export], ink: Mapping[int, Ink], key: str = "chains") -> None:
+    def __init__(
+        self,
+        exports: Mapping[int, Export],
+        ink: Mapping[int, Ink],
+        key: str = "chains",
+        names: Mapping[str, str] | None = None,
+    ) -> None:
         self.key = key
         self._ink = ink
-        self._names = name_blocks(exports)
+        self._names = name_blocks(exports) if names is None else names
         self._held_by = holders(exports)
         self._tree = chain_tree(exports)
         self._abridged = lay_out(marks(self._tree, self._names, abridged=True))

@@ -63,7 +63,7 @@ def draw_tracks(
         h=n(_TOP + to_px.height + _BOTTOM),
         font=FONT,
         desc=description,
-        frame=_frame(to_px),
+        frame=frame(to_px),
         ways=_ways([stretch for life in lives for stretch in life.stretches], to_px),
         marks=_marks(lives, reboots, to_px, ink),
     )
@@ -127,9 +127,9 @@ def sample(which: str) -> Markup:
     place = (17.0, 8.0)
     match which:
         case "start":
-            shape = _start(place, "start", "currentColor", "currentColor")
+            shape = start_mark(place, "start", "currentColor", "currentColor")
         case "end":
-            shape = _end(place, "end", "currentColor", "currentColor")
+            shape = end_mark(place, "end", "currentColor", "currentColor")
         case "lost":
             shape = _cross(place, "lost")
         case "reboot":
@@ -139,7 +139,7 @@ def sample(which: str) -> Markup:
     return Markup('<svg width="34" height="16" aria-hidden="true">{}</svg>').format(shape)
 
 
-def _frame(to_px: Projection) -> Markup:
+def frame(to_px: Projection) -> Markup:
     """A rule and a tick for each round metre, the scale bar, and where north is."""
     left, top = to_px.left, to_px.top
     right, bottom = left + to_px.width, top + to_px.height
@@ -212,21 +212,23 @@ def _marks(
         colours, start, end = ink[life.vehicle], life.start, life.end
         begins = f"vehicle {life.vehicle} starts at {words.duration(start.at_s)}"
         ends = f"vehicle {life.vehicle} {'is lost' if life.lost else 'ends'} at {words.duration(end.at_s)}"
-        parts.append(_start(to_px(start), begins, colours.fill, colours.stroke))
-        parts.append(_cross(to_px(end), ends) if life.lost else _end(to_px(end), ends, colours.fill, colours.stroke))
+        parts.append(start_mark(to_px(start), begins, colours.fill, colours.stroke))
+        parts.append(
+            _cross(to_px(end), ends) if life.lost else end_mark(to_px(end), ends, colours.fill, colours.stroke)
+        )
     parts += [
         _diamond(to_px(fix), f"agent {vehicle} reboots at {words.duration(fix.at_s)}") for fix, vehicle in reboots
     ]
     return Markup("").join(parts) + tags([(life.vehicle, to_px(life.end)) for life in lives], [], to_px, ink)
 
 
-def _start(place: Point, tip: str, fill: str, stroke: str) -> Markup:
+def start_mark(place: Point, tip: str, fill: str, stroke: str) -> Markup:
     return Markup('<rect x="{}" y="{}" width="7" height="7" fill="{}" stroke="{}"><title>{}</title></rect>').format(
         n(place[0] - 3.5), n(place[1] - 3.5), fill, stroke, tip
     )
 
 
-def _end(place: Point, tip: str, fill: str, stroke: str) -> Markup:
+def end_mark(place: Point, tip: str, fill: str, stroke: str) -> Markup:
     return Markup('<circle cx="{}" cy="{}" r="4.5" fill="{}" stroke="{}"><title>{}</title></circle>').format(
         n(place[0]), n(place[1]), fill, stroke, tip
     )
