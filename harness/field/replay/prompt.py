@@ -69,6 +69,8 @@ class Prompt(cmd.Cmd):
         """Run a command; a short form or the beginning of a name will do. An empty line is the last command again."""
         name, argument, _ = self.parseline(line)
         if line == "EOF":
+            if self._terminal:
+                self._console.print()
             return True
         if not line.strip():
             return self.emptyline()

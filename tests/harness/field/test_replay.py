@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 
+from harness import checker
+from harness.archive.archive import RunArchive
+from harness.checker import steps
 from harness.errors import FieldError
 from harness.field.replay import Player, open_record
 from harness.field.replay import player as player_module
@@ -16,6 +19,7 @@ from harness.field.replay.source import source_of
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
 from ucp.agent import HANDLERS
+from ucp.quirks import QUIRKS
 from ucp.trace import HandlerRun
 
 REPOSITORY = Path(__file__).parents[3]
@@ -64,6 +68,22 @@ def test_whoever_was_switched_off_in_the_middle_of_a_vote_owes_no_more(tmp_path:
     for agent in (1, 2):
         ended = harness("replay", run, "--agent", agent)
         assert ended.returncode == 0, ended.stdout
+
+
+@pytest.mark.parametrize(
+    "quirk", ["stale_chain_hash", "give_up_unfinished", "hide_commits", "leave_flag_set", "hasty_vote"]
+)
+def test_it_finds_what_the_judge_of_a_run_finds(quirk: str, tmp_path: Path) -> None:
+    directory = flown(tmp_path / "run", quirks={quirk: True}, duration_s=900, network={"loss": 0.4})
+    judgement = steps.check(checker.gather(RunArchive(directory)))
+    players = {agent: Player(open_record(directory, agent)) for agent in (1, 2, 3)}
+    deviations = [deviation for player in players.values() for deviation in player.to_end().deviations]
+    first = min(deviations, key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
+    assert judgement.evidence[0].agent_id == first.agent_id
+    assert judgement.evidence[0].detail.startswith(f"trace line {first.line}, t={first.t:g} s: ")
+    assert judgement.reason.startswith(f"{len(deviations)} difference")
+    assert first.handler is not None
+    assert HANDLERS[first.handler].algorithm in QUIRKS[quirk].algorithms
 
 
 def test_programs_are_told_the_same(wrong: Path) -> None:
