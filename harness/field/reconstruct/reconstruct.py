@@ -1,7 +1,6 @@
 """From what came home to a scenario that flies it again, and whether it does."""
 
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,8 +13,8 @@ from harness.field.homecoming import Flight
 from harness.field.reconstruct.comparing import FirstDifference, first_difference
 from harness.field.reconstruct.elsewhere import Elsewhere
 from harness.field.reconstruct.inferring import infer
-from harness.field.reconstruct.inputs import UnusableInputError, lives_of
-from harness.field.reconstruct.rehearsal import Rehearsal, rehearse
+from harness.field.reconstruct.inputs import Input, UnusableInputError, lives_of
+from harness.field.reconstruct.rehearsal import Allowed, Rehearsal, rehearse
 from harness.field.reconstruct.script import scenario_of
 from harness.field.reconstruct.timetable import Timetable, timetable
 from harness.field.reconstruct.told import NOTHING, told
@@ -29,6 +28,7 @@ SEED = 1
 """Of the reconstruction, in which nothing is left to chance."""
 
 Tell = Callable[[str], None]
+Lives = Sequence[Sequence[Input]]
 
 
 @dataclass(frozen=True)
@@ -193,34 +193,59 @@ def _by_trace(flight: Flight, elsewhere: Elsewhere, header: CheckedHeader, remar
     """Raises UnusableInputError."""
     lives = lives_of(flight.traces[header.agent_id], header, elsewhere)
     rehearsal = rehearse(header, lives)
-    if rehearsal.parting:
-        rehearsal = _with_a_quirk(header, lives, rehearsal, remarks)
-    if rehearsal.parting and (whole := rehearse(header, lives, early_s=math.inf)).parting is None:
-        remarks.append(f"agent {header.agent_id} had timers end too early by its clock, as if that had been set back")
-        return whole
-    return rehearsal
+    if rehearsal.parting is None:
+        if not rehearsal.to_the_word and (words := _judged(flight, header.agent_id)):
+            remarks.append(f"agent {header.agent_id} is wrong to no effect: {words}")
+        return rehearsal
+    explained = _with_a_quirk(header, lives, remarks) or _with_what_is_not_right(header, lives, remarks)
+    return explained or rehearsal
 
 
-def _with_a_quirk(header: CheckedHeader, lives: Any, parted: Rehearsal, remarks: list[str]) -> Rehearsal:
-    """The rehearsal with a known mistake that explains the whole record; `parted` if none does."""
+def _with_a_quirk(header: CheckedHeader, lives: Lives, remarks: list[str]) -> Rehearsal | None:
+    """The rehearsal with a known mistake that explains the whole record, if possible to the word."""
+    explaining: dict[str, Rehearsal] = {}
     for name, quirk in QUIRKS.items():
-        if quirk.chance:
-            continue
-        rehearsal = rehearse(header, lives, {name: True})
-        if rehearsal.parting is None:
-            remarks.append(f"agent {header.agent_id} behaves as with {name}: {quirk.sentence}")
-            return rehearsal
-    return parted
+        if not quirk.chance:
+            rehearsal = rehearse(header, lives, {name: True})
+            if rehearsal.parting is None:
+                explaining[name] = rehearsal
+    if not explaining:
+        return None
+    name = max(explaining, key=lambda name: explaining[name].to_the_word)
+    remarks.append(f"agent {header.agent_id} behaves as with {name}: {QUIRKS[name].sentence}")
+    return explaining[name]
+
+
+def _with_what_is_not_right(header: CheckedHeader, lives: Lives, remarks: list[str]) -> Rehearsal | None:
+    """The rehearsal of an agent whose mistakes a scenario can do without: its chain comes out all the same."""
+    ignoring = rehearse(header, lives, allowed=Allowed(ignoring=True))
+    if ignoring.parting is None:
+        first = ignoring.ignored[0]
+        many = f"{len(ignoring.ignored)} messages" if len(ignoring.ignored) > 1 else "a message"
+        remarks.append(
+            f"agent {header.agent_id} did nothing with {many} with which it should have done something, "
+            f"the first on trace line {first.line} ({first.runs[0].handler}): lost on their way here"
+        )
+        return ignoring
+    early = rehearse(header, lives, allowed=Allowed(early_timers=True))
+    if early.parting is None:
+        remarks.append(f"agent {header.agent_id} had timers end too early by its clock, as if that had been set back")
+        return early
+    return None
 
 
 def _parted(flight: Flight, agent_id: int, rehearsal: Rehearsal) -> str:
-    """Why the agent cannot be played any further: the step judge's word, if it has one."""
+    """Why the agent cannot be played any further."""
     assert rehearsal.parting is not None, "it has parted"
-    judgement = steps.check(Evidence(flight.exports, {agent_id: flight.traces[agent_id]}))
-    findings = [finding.detail for finding in judgement.evidence if finding.agent_id == agent_id]
     parting = rehearsal.parting
-    words = findings[0] if findings else f"trace line {parting.line}, t={parting.at_s:g} s: it {parting.what}"
-    return f"does not do what the protocol says, and is played up to there: {words}"
+    words = _judged(flight, agent_id) or f"trace line {parting.line}, t={parting.at_s:g} s: it {parting.what}"
+    return f"does not do what the protocol says, and is played up to trace line {parting.line}: {words}"
+
+
+def _judged(flight: Flight, agent_id: int) -> str | None:
+    """The first step of the agent that the step judge finds wrong, in its words; None if it finds none."""
+    judgement = steps.check(Evidence(flight.exports, {agent_id: flight.traces[agent_id]}))
+    return next((finding.detail for finding in judgement.evidence if finding.agent_id == agent_id), None)
 
 
 def _compare_chains(

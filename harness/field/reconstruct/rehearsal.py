@@ -5,6 +5,7 @@ to be what is on record. So the first step of a wrong agent is found before any 
 is known which datagrams mattered, which timer was started when, and what was sent.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
@@ -14,8 +15,9 @@ from harness.checker.steps.header import CheckedHeader
 from harness.field.reconstruct.inputs import Asked, Booted, Heard, Input, Logged, TimerEnded
 from harness.play.simulation.late_timers import LateTimers, Running
 from ucp.agent import Agent, why_not_handled
-from ucp.interest import MATTERS
-from ucp.messages import MalformedDatagramError, decode, encode
+from ucp.block import next_chain_hash
+from ucp.interest import MATTERS, ONLY_COUNTED
+from ucp.messages import CommitBlock, MalformedDatagramError, decode, encode
 from ucp.quirks import Quirks, wrong_handlers
 from ucp.store import StoredState
 from ucp.trace import Entry, HandlerRun, Sent
@@ -77,25 +79,33 @@ class Rehearsal:
     pending: list[list[Started]] = field(default_factory=list)
     broken_off: bool = False
     """Whether the record ends in the middle of what its last input led to; the input is played to its end."""
+    to_the_word: bool = True
+    """Whether the branches that were taken and the votes that were counted are those on record, too."""
+    ignored: list[Input] = field(default_factory=list)
+    """Messages with which it did nothing, and should have done something; they are not played."""
+
+
+@dataclass(frozen=True, slots=True)
+class Allowed:
+    """What an agent is allowed to do although no right one does it: have timers end early, ignore messages."""
+
+    early_timers: bool = False
+    ignoring: bool = False
 
 
 def rehearse(
     header: CheckedHeader,
     lives: Sequence[Sequence[Input]],
     quirks: Quirks | None = None,
-    *,
-    early_s: float | None = None,
+    allowed: Allowed | None = None,
 ) -> Rehearsal:
-    """Give the agent all that is on record, up to where it did not do what is on record.
-
-    A timer may end so early: as a program may read its clock, unless `early_s` says otherwise.
-    """
-    early_s = header.early_s if early_s is None else early_s
+    """Give the agent all that is on record, up to where it did not do what is on record."""
+    allowed = allowed or Allowed()
     rehearsal = Rehearsal(header.agent_id, quirks or {})
     stored: StoredState | None = None
     timers = LateTimers()
     for life, inputs in enumerate(lives):
-        one_life = _Life(header, rehearsal, life, timers, early_s)
+        one_life = _Life(header, rehearsal, life, timers, allowed)
         for index, given in enumerate(inputs):
             is_last = life == len(lives) - 1 and index == len(inputs) - 1
             if parting := one_life.give(index, given, stored, is_last=is_last):
@@ -113,7 +123,7 @@ def rehearse(
 
 class _Life:
     def __init__(
-        self, header: CheckedHeader, rehearsal: Rehearsal, life: int, timers: LateTimers, early_s: float
+        self, header: CheckedHeader, rehearsal: Rehearsal, life: int, timers: LateTimers, allowed: Allowed
     ) -> None:
         self.agent = Agent(
             header.agent_id,
@@ -126,7 +136,8 @@ class _Life:
         self._hears_all = bool(rehearsal.quirks)
         self._life = life
         self._timers = timers
-        self._early_s = early_s
+        self._early_s = math.inf if allowed.early_timers else header.early_s
+        self._ignoring = allowed.ignoring
         self._started: dict[int, Started] = {}
         """The timers that run, by number."""
         timers.look(self.agent.state)
@@ -138,7 +149,10 @@ class _Life:
     def give(self, index: int, given: Input, stored: StoredState | None, *, is_last: bool) -> Parting | None:
         """Where the agent did something else with it than is on record; None if it did not."""
         ends = self._timers.running.get(given.what.name) if isinstance(given.what, TimerEnded) else None
-        matters = self._hears_all or not isinstance(given.what, Heard) or self._matters(given.what.datagram)
+        matters = not isinstance(given.what, Heard) or self._hears_all or self._matters(given.what.datagram)
+        if matters and self._ignoring and self._ignores(given):
+            self._rehearsal.ignored.append(given)
+            matters = False
         problem = self._feed(given, stored if index == 0 else None) if matters else None
         entries = self.agent.trace()
         if is_last and len(given.runs) < len(entries) and not _differs(given.runs, entries[: len(given.runs)]):
@@ -147,6 +161,7 @@ class _Life:
         problem = problem or _differs(given.runs, entries)
         if problem is not None:
             return Parting(self._life, index, given.line, given.runs[0].t, problem)
+        self._rehearsal.to_the_word &= _to_the_word(given.runs, entries)
         sent = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
         played = Played(self._life, given, sent, matters)
         if matters:
@@ -202,6 +217,25 @@ class _Life:
         if why_not_handled(agent.agent_id, agent.roster, sender, message):
             return False
         return MATTERS[type(message)](agent.state, sender, message)
+
+    def _ignores(self, given: Input) -> bool:
+        """Whether nothing came of a message of which something should have come."""
+        if not isinstance(given.what, Heard) or any(run.changes or run.sent for run in given.runs):
+            return False
+        message, state = decode(given.what.datagram).message, self.agent.state
+        if type(message) in ONLY_COUNTED or len(given.runs) > 1:
+            return False
+        if not isinstance(message, CommitBlock):
+            return True
+        succeeds = message.chain_hash == next_chain_hash(state.chain.top_chain_hash, message.block.block_hash)
+        return succeeds and not state.holds(message.block.block_hash)
+
+
+def _to_the_word(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> bool:
+    ours = [(entry.branch, entry.tally) for entry in entries if isinstance(entry, HandlerRun)]
+    return not ours or ours == [
+        (run.branch, our[1] if run.tally is None else run.tally) for run, our in zip(recorded, ours, strict=False)
+    ]
 
 
 def _differs(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | None:

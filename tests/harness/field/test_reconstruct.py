@@ -101,9 +101,22 @@ def test_of_a_wrong_agent_the_first_wrong_step_is_named_or_its_mistake(tmp_path:
     assert any("agent 2 behaves as with approve_everything" in remark for remark in named.remarks)
     ignoring = {"ignore_commit": {"agents": [2], "value": 0.5}}
     parted = again(home(tmp_path / "home2", flown(tmp_path / "run2", quirks=ignoring)))
-    assert parted.reproduced == [1, 3]
-    assert "agent 2 does not do what the protocol says" in parted.problems[0]
-    assert "receive_commit_block" in parted.problems[0]
+    assert parted.problems == []
+    assert any("agent 2 did nothing with" in remark and "receive_commit_block" in remark for remark in parted.remarks)
+
+
+def test_an_agent_that_is_wrong_in_no_known_way_is_played_up_to_its_first_wrong_step(tmp_path: Path) -> None:
+    directory = home(tmp_path / "home", flown(tmp_path / "run"))
+    trace = directory / "2.trace.jsonl"
+    lines = [json.loads(line) for line in trace.read_text().splitlines()]
+    number = next(n for n, line in enumerate(lines) if n > 20 and line.get("branch") == "full")
+    del lines[number]["changes"][-1]
+    trace.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    reconstruction = again(directory)
+    assert reconstruction.reproduced == [1, 3]
+    assert "agent 2 does not do what the protocol says, and is played up to trace line" in reconstruction.problems[0]
+    assert "build_data_block" in reconstruction.problems[0]
+    assert {datagram["source"] for datagram in reconstruction.document["datagrams"]} == {2}
 
 
 def test_a_record_without_the_parts_that_may_be_missing_will_do(tmp_path: Path) -> None:
