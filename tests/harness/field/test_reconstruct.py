@@ -106,7 +106,7 @@ def test_of_a_wrong_agent_the_first_wrong_step_is_named_or_its_mistake(tmp_path:
 
 
 def test_an_agent_that_is_wrong_in_no_known_way_is_played_up_to_its_first_wrong_step(tmp_path: Path) -> None:
-    directory = home(tmp_path / "home", flown(tmp_path / "run"))
+    directory = home(tmp_path / "home", flown(tmp_path / "run", events={"source": "random", "mean_s": 5}))
     trace = directory / "2.trace.jsonl"
     lines = [json.loads(line) for line in trace.read_text().splitlines()]
     number = next(n for n, line in enumerate(lines) if n > 20 and line.get("branch") == "full")
