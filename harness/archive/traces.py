@@ -20,6 +20,8 @@ from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 
 SUFFIX = ".trace.jsonl"
 MAX_LINE_BYTES = 1024 * 1024
+LARGEST = 2**64
+"""No whole number in a header is as large; larger ones are none that a float can hold."""
 PLACES = ("chain", "deque", "stack")
 
 
@@ -42,6 +44,10 @@ class Header(BaseModel):
     def _complete(self) -> "Header":
         if self.has_inputs and self.initial_data is None:
             raise ValueError("initial_data is missing")
+        if any(
+            type(value) is int and abs(value) >= LARGEST for value in (*self.settings.values(), *self.clock.values())
+        ):
+            raise ValueError("a number is larger than any setting or clock can be")
         return self
 
     @property

@@ -1,6 +1,7 @@
 """What the checker looks at: exports, traces where there are any, and what the run's record says of the network."""
 
 import math
+import re
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from harness.checker.cycles import cycle_of
 from harness.checker.replay import Life, replay
 from harness.errors import RunDirectoryError
 from harness.packets.files import DIRECTORY, Captures, capture_files, read_captures
+from ucp.block import HASH_BYTES
 from ucp.trace import Sent
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ Sending = tuple[tuple[float, Sent], ...]
 """What an agent sent when with one type and sequence number: one message in each of its lives, at most."""
 Sendings = dict[Any, dict[Any, Sending]]
 """Of an agent, by type and sequence number."""
+
+_HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
 
 
 class InjectedDatagram(BaseModel):
@@ -108,7 +112,7 @@ class Evidence:
         inception = next((export.inception.chain_hash for export in self.exports.values()), None)
         if inception is None:
             states = (run.state for trace in self.traces.values() for run in trace.runs)
-            inception = next((state.top for state in states if state.chain == 0), None)
+            inception = next((state.top for state in states if state.chain == 0 and _HASH.fullmatch(state.top)), None)
         return {agent_id: replay(trace, inception) for agent_id, trace in self.traces.items()}
 
     @cached_property

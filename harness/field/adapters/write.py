@@ -7,9 +7,11 @@ from pathlib import Path
 
 from harness.archive.directory import claim
 from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
+from harness.archive.exports import Export
 from harness.archive.opened import Opened
 from harness.archive.traces import SUFFIX as TRACE_SUFFIX
-from harness.archive.traces import Header, Trace, gap_line
+from harness.archive.traces import Gap, Header, Trace, gap_line
+from harness.checker.records.clocks import ROUNDED_S, mission_s
 from harness.errors import RunDirectoryError
 from harness.field.adapters.record import FILE, ImportedAgent, ImportedFlight, ImportRecord, ImportRemark
 from harness.field.homecoming.homecoming import Flight, Homecoming, Remark
@@ -61,7 +63,7 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
         agent = agents[agent_id]
         agent.trace = f"{AGENTS}/{agent_id}{TRACE_SUFFIX}"
         with (directory / agent.trace).open("w", encoding="utf-8", errors="replace") as file:
-            file.writelines(_lines(trace))
+            file.writelines(_lines(trace, lived_on=_lived_on(trace, flight.exports.get(agent_id))))
         agent.handler_runs, agent.lives = len(trace.runs), len(trace.starts) + 1
         agent.gaps, agent.clock_jumps = len(trace.gaps), len(trace.jumps)
         agent.trace_from = [_printable(path) for path in flight.sources.get(agent_id, ())]
@@ -90,8 +92,19 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
     )
 
 
-def _lines(trace: Trace) -> Iterator[str]:
-    """The trace as it is written: what is lost is said where it was."""
+def _lived_on(trace: Trace, export: Export | None) -> bool:
+    """Whether the agent was there after the end of its trace: it has left an export since."""
+    if export is None:
+        return False
+    at_s = mission_s(export.exported_at_us, trace.header)
+    return at_s is None or not trace.runs or at_s > trace.runs[-1].t + ROUNDED_S
+
+
+def _lines(trace: Trace, *, lived_on: bool) -> Iterator[str]:
+    """The trace as it is written: what is lost is said where it was.
+
+    An agent whose trace ends in half a line may have been killed over it, unless it `lived_on` and left an export.
+    """
     starts = {0: 1}
     for start in trace.starts:
         starts[start] = starts.get(start, 0) + 1
@@ -108,7 +121,7 @@ def _lines(trace: Trace) -> Iterator[str]:
         if position < len(trace.runs):
             yield trace.runs[position].to_line()
     if trace.cut_off:
-        yield CUT_OFF
+        yield gap_line(Gap(len(trace.runs), 1, 0)) if lived_on else CUT_OFF
 
 
 def _header_line(header: Header) -> str:

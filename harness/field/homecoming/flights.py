@@ -16,12 +16,11 @@ from typing import NamedTuple
 
 from harness.archive.exports import Export
 from harness.archive.traces import Header, Trace
-from harness.field.homecoming.files import is_of_a_life
+from harness.field.homecoming.copies import told_apart
 from harness.field.homecoming.glance import Glance
 from harness.field.homecoming.homecoming import Flight, LeftOut, Remark
 from harness.field.homecoming.lives import Life
 from ucp.events import LoggableEvent
-from ucp.trace import HandlerRun
 
 
 class _Mission(NamedTuple):
@@ -109,7 +108,7 @@ def _by_mission(lives: Iterable[Life], left_out: list[LeftOut]) -> tuple[list[_G
         last = life
     gatherings: dict[_Mission, list[_Gathering]] = defaultdict(list)
     for (mission, agent_id), of_agent in by_header.items():
-        _place(gatherings[mission], mission, agent_id, [*_told_apart(of_agent, left_out)])
+        _place(gatherings[mission], mission, agent_id, [*told_apart(of_agent, left_out)])
     separate = [gathering for of_mission in gatherings.values() for gathering in of_mission]
     return _merged(separate), headless
 
@@ -119,62 +118,6 @@ def _mission_of(header: Header) -> _Mission:
     if not isinstance(epoch, int) or isinstance(epoch, bool) or not 0 <= epoch < 2**63:
         epoch = None
     return _Mission(header.initial_data, tuple(sorted(set(header.roster))), epoch)
-
-
-def _told_apart(lives: list[Life], left_out: list[LeftOut]) -> Iterator[list[Life]]:
-    """The lives of one agent under one header: those that follow each other are of one flight, each once."""
-    flights: list[list[Life]] = []
-    for life in sorted(lives, key=lambda each: len(each.runs), reverse=True):
-        twin = next((other for flight in flights for other in flight if _is_copy(life, other)), None)
-        if twin is not None:
-            if (life.runs or life.path != twin.path) and not is_of_a_life(life.path):
-                left_out.append(LeftOut(life.path, _copy_of(life, twin), life.first_line, life.counts))
-            continue
-        room = next((flight for flight in flights if not any(_overlap(life, other) for other in flight)), None)
-        if room is None:
-            flights.append([life])
-        else:
-            room.append(life)
-    order = {id(life): number for number, life in enumerate(lives)}
-    for flight in flights:
-        if len({life.path for life in flight}) > 1:
-            flight.sort(key=lambda life: (life.runs[0].t if life.runs else 0.0, order[id(life)]))
-        else:
-            flight.sort(key=lambda life: order[id(life)])
-        yield flight
-
-
-def _key(run: HandlerRun) -> tuple[object, ...]:
-    return round(run.t, 3), run.handler, *run.trigger.items()
-
-
-def _is_copy(life: Life, other: Life) -> bool:
-    """Whether `life`, which has no more runs, is the same as the other, or a damaged part of it."""
-    if not life.runs:
-        return not other.runs and life.path != other.path
-    if life.runs == other.runs[: len(life.runs)]:
-        return True
-    if not _overlap(life, other, anywhere=True):
-        return False
-    known = set(map(_key, other.runs))
-    return 2 * sum(_key(run) in known for run in life.runs) > len(life.runs)
-
-
-def _copy_of(life: Life, twin: Life) -> str:
-    where = "in this file, too" if life.path == twin.path else f"in {twin.path}"
-    if len(life.runs) == len(twin.runs):
-        return f"what begins here stands {where}, from {twin.counts} {twin.first_line} on, and is used once"
-    return f"what begins here stands {where}, from {twin.counts} {twin.first_line} on, with more of it left"
-
-
-def _overlap(life: Life, other: Life, *, anywhere: bool = False) -> bool:
-    """Whether both cannot be lives of one agent on one flight: neither ended before the other began.
-
-    In one file, unless `anywhere` counts, a life ends where the next begins, whatever its clock says.
-    """
-    if (life.path == other.path and not anywhere) or not life.runs or not other.runs:
-        return False
-    return life.runs[0].t < other.runs[-1].t and other.runs[0].t < life.runs[-1].t
 
 
 def _place(gatherings: list[_Gathering], mission: _Mission, agent_id: int, flights: list[list[Life]]) -> None:
@@ -260,7 +203,7 @@ def _add_headless(gatherings: list[_Gathering], life: Life, left_out: list[LeftO
     if not own:
         clock = {key: clock[key] for key in ("epoch_us", "speedup") if key in clock}
     life.header = lender.header.model_copy(update={"agent_id": agent_id, "clock": clock})
-    kept = next(_told_apart([*own, life], left_out))
+    kept = next(told_apart([*own, life], left_out))
     if life in kept:
         whose = "another of its files" if own else f"the trace of agent {lender.header.agent_id}"
         remarks.append(Remark(life.path, f"its header is lost; as agent {agent_id}'s it is read with that of {whose}"))

@@ -8,6 +8,7 @@ import binascii
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 from harness.archive.history import LATEST_S
@@ -73,14 +74,16 @@ class Life:
 
     def add(self, entry: HandlerRun | Dropped | Commanded, line: int) -> None:
         if isinstance(entry, HandlerRun):
-            before = self.runs[-1].t if self.runs else entry.t
-            if not before - ROUNDING_S <= entry.t <= before + FAR_AHEAD_S:
+            if self.runs and _jumps(self.runs[-1], entry):
                 self.jumps.append(len(self.runs))
             self.runs.append(entry)
             self.run_lines.append(line)
         else:
             self.asides.append((len(self.runs), entry))
             self.aside_lines.append(line)
+
+    def numbered_asides(self) -> Iterator[tuple[tuple[int, Dropped | Commanded], int]]:
+        return zip(self.asides, self.aside_lines, strict=True)
 
     def lose(self, lines: int, lost_bytes: int) -> None:
         """A line that says nothing; what is lost in a row is one gap."""
@@ -89,6 +92,15 @@ class Life:
             last = self.gaps.pop()
             lines, lost_bytes = lines + last.lines, lost_bytes + last.lost_bytes
         self.gaps.append(Gap(position, lines, lost_bytes))
+
+
+def _jumps(before: HandlerRun, after: HandlerRun) -> bool:
+    return not before.t - ROUNDING_S <= after.t <= before.t + FAR_AHEAD_S
+
+
+def jumps_in(runs: list[HandlerRun]) -> list[int]:
+    """Before which of these the agent's clock was set, as it seems."""
+    return [position for position, pair in enumerate(pairwise(runs), 1) if _jumps(*pair)]
 
 
 def read_lives(path: Path, left_out: list[LeftOut]) -> list[Life]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from harness import checker
 from harness.archive.archive import RunArchive
 from harness.archive.record import RogueInjection
 from harness.archive.trace_lines import read_lines
@@ -155,7 +156,10 @@ def bounded() -> Iterator[None]:
 def _read(path: Path, run: Path, directory: Path, chance: random.Random, outcome: Outcome) -> None:
     homecoming = sort_out([path])
     _named(path, homecoming, outcome)
-    _import(path, directory / "out", outcome)
+    if chance.random() < 0.3:
+        _among_others(path, run, outcome)
+    if _import(path, directory / "out", outcome) and chance.random() < 0.1:
+        _check(directory / "out", outcome)
     if path.name.endswith(".trace.jsonl"):
         _replay(path, outcome)
     place = _in_the_run(path, run)
@@ -183,7 +187,31 @@ def _named(path: Path, homecoming: Homecoming, outcome: Outcome) -> None:
         _require(used >= len(lines), f"{len(lines) - used} lines are not used, and nobody says so")
 
 
-def _import(path: Path, out: Path, outcome: Outcome) -> None:
+def _among_others(path: Path, run: Path, outcome: Outcome) -> None:
+    """A damaged file takes nothing away from the sound ones beside it."""
+    homecoming = sort_out([run, path])
+    for sentence in homecoming.sentences():
+        _sound(sentence)
+    flight = homecoming.largest()
+    _require({1, 2, 3} <= {*flight.traces} & {*flight.exports} & {*flight.captures}, "a sound file is not used")
+    outcome.add("among others", "used in part" if homecoming.left_out else "used")
+
+
+def _check(out: Path, outcome: Outcome) -> None:
+    """What was imported is judged, or not: without a traceback."""
+    try:
+        result = checker.check(checker.gather(RunArchive(out)))
+    except HarnessError as error:  # captures alone are not judged
+        _sound(str(error))
+        outcome.add("check", "nothing usable")
+        return
+    for sentence in result.errors:
+        _sound(sentence)
+    outcome.add("check", "bad" if result.bad else "not bad")
+
+
+def _import(path: Path, out: Path, outcome: Outcome) -> bool:
+    """Whether anything came of it."""
     shutil.rmtree(out, ignore_errors=True)
     try:
         record = bring_in([path], [CommaSeparated(), RosBag()], out)
@@ -191,7 +219,7 @@ def _import(path: Path, out: Path, outcome: Outcome) -> None:
         _sound(str(error))
         _require(not out.exists(), "nothing is used, and yet there is a directory")
         outcome.add(f"import {path.suffix}", "nothing usable")
-        return
+        return False
     for remark in (*record.left_out, *record.remarks):
         _sound(remark.sentence)
     ImportRecord.model_validate_json((out / FILE).read_bytes())
@@ -200,6 +228,7 @@ def _import(path: Path, out: Path, outcome: Outcome) -> None:
     runs = sum(agent.handler_runs for flight in record.flights for agent in flight.agents.values())
     _require(sum(count for count, _ in imported) <= runs, "more is read of an import than was written")
     outcome.add(f"import {path.suffix}", "used in part" if record.left_out else "used")
+    return True
 
 
 def _replay(path: Path, outcome: Outcome) -> None:

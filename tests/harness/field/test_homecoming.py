@@ -154,7 +154,21 @@ def test_the_same_file_twice_is_used_once(home: Path) -> None:
     trace = homecoming.largest().traces[1]
     assert len(homecoming.flights) == 1 and len(trace.runs) == len(lines) - 1 and not trace.starts
     told = why(homecoming)
-    assert "it is the same as" in told and told.count("with more of it left") == 2
+    assert "it is the same as" in told and told.count("on; what stands there is used") == 2
+
+
+def test_what_is_lost_of_one_copy_is_taken_from_another(home: Path) -> None:
+    path = trace_of(home, 1)
+    lines = lines_of(path)
+    whole = sort_out([path]).largest().traces[1]
+    path.write_bytes(b"".join([*lines[:20], b"?\n", *lines[23:50], b"?\n", *lines[51:-9]]))
+    (home / "copy").write_bytes(b"".join([*lines[:48], b"?\n", *lines[54:70], lines[71][:5]]))
+    (home / "end").write_bytes(b"".join([lines[0], *lines[60:]]))
+    homecoming = sort_out([path, home / "copy", home / "end"])
+    trace = homecoming.largest().traces[1]
+    assert trace.runs == [*whole.runs[:49], *whole.runs[50:]] and trace.gaps == [Gap(49, 1, 2)] and not trace.cut_off
+    assert "3 handler runs that are lost there are taken from here" in why(homecoming)
+    assert "9 handler runs that are lost there are taken from here" in why(homecoming)
 
 
 def test_a_trace_that_was_begun_in_another_file_goes_on_in_this_one(home: Path) -> None:
