@@ -3,26 +3,27 @@
 import os
 import sys
 from bdb import BdbQuit
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
-from harness.field.replay import Player, open_record
+from harness.field.replay import Player, Record, open_record, open_records
 from harness.field.replay.document import document
 from harness.field.replay.names import Names
-from harness.field.replay.places import Place, place
+from harness.field.replay.places import place
 from harness.field.replay.prompt import Prompt
 from harness.field.replay.summary import head, summary
 
 
 def replay_command(
     record: Annotated[Path, typer.Argument(help="A trace; or a run directory, or one of field files, and --agent.")],
-    agent: Annotated[int | None, typer.Option(metavar="ID", help="Whose record, if there is more than one.")] = None,
+    agent: Annotated[int | None, typer.Option(metavar="ID", help="Whose record; without it, all of them.")] = None,
     until: Annotated[float | None, typer.Option(metavar="S", help="Play up to this mission second.")] = None,
     step: Annotated[bool, typer.Option("--step", help="Stop at the start, and ask what to do.")] = False,
     breaks: Annotated[
@@ -41,41 +42,65 @@ def replay_command(
         raise typer.BadParameter("--json is for programs, which play the whole record: leave out --step and --break")
     if debug and not breaks:
         raise typer.BadParameter("--debug calls the debugger at each --break: name one, such as --break 812")
-    opened = open_record(record, agent)
-    for sentence in opened.problems:
-        complain(sentence)
-    console, names = Paper(highlight=False), Names(opened)
-    places = [place(words, names) for words in breaks or ()]
-    player = Player(opened, until)
+    console = Paper(highlight=False)
     try:
-        if not as_json:
-            console.print(head(opened), soft_wrap=True)
-        if debug:
-            _into_debugger(player, places)
-        elif step or breaks:
-            prompt = Prompt(player, names, console, breaks or ())
-            prompt.begin(at_start=step)
-            prompt.cmdloop()
-            if prompt.quit:
-                raise typer.Exit(VIOLATED if player.found.deviations else 0)
-        found = player.to_end()
+        if step or breaks:
+            _ask(console, open_record(record, agent), until, step, breaks or [], debug)
+        else:
+            _play(console, open_records(record, agent), until, as_json)
     except (KeyboardInterrupt, BdbQuit):
-        raise InterruptedRunError(f"interrupted at line {player.entry.line if player.entry else 1}") from None
+        raise InterruptedRunError("interrupted") from None
+
+
+def _play(console: Console, records: Sequence[Record], until: float | None, as_json: bool) -> NoReturn:
+    """Play whole records, and say what differs."""
+    documents, differ, judged = [], False, False
+    for record in records:
+        _complain_of(record)
+        player, names = Player(record, until), Names(record)
+        found = player.to_end()
+        differ |= bool(found.deviations)
+        judged |= bool(found.steps)
+        if as_json:
+            documents.append(document(record, found, names))
+        else:
+            _show(console, [head(record), *summary(record, found, names)])
     if as_json:
-        print_json(document(opened, found, names))
+        print_json(documents[0] if len(documents) == 1 else {"records": documents})
+    raise typer.Exit(VIOLATED if differ else 0 if judged else WRONG_REQUEST)
+
+
+def _ask(
+    console: Console, record: Record, until: float | None, at_start: bool, breaks: Sequence[str], debug: bool
+) -> NoReturn:
+    """Step through a record as the user says; when no more is said, play the rest."""
+    _complain_of(record)
+    player, names = Player(record, until), Names(record)
+    if debug:
+        places = [place(words, names) for words in breaks]
+        while not player.at_end:
+            upcoming = player.entries[player.position]
+            player.forward(into_debugger=any(at(upcoming) for at in places))
     else:
-        for line in summary(opened, found, names):
-            console.print(line, soft_wrap=True)
-    if found.deviations:
-        raise typer.Exit(VIOLATED)
-    if not found.steps:
-        raise typer.Exit(WRONG_REQUEST)
+        prompt = Prompt(player, names, console, breaks)
+        _show(console, [head(record)])
+        prompt.begin(at_start)
+        prompt.cmdloop()
+        if prompt.quit:
+            raise typer.Exit(VIOLATED if player.found.deviations else 0)
+    found = player.to_end()
+    _show(console, summary(record, found, names))
+    raise typer.Exit(VIOLATED if found.deviations else 0 if found.steps else WRONG_REQUEST)
 
 
-def _into_debugger(player: Player, places: Sequence[Place]) -> None:
-    while not player.at_end:
-        upcoming = player.entries[player.position]
-        player.forward(into_debugger=any(at(upcoming) for at in places))
+def _complain_of(record: Record) -> None:
+    for sentence in record.problems:
+        complain(sentence)
+
+
+def _show(console: Console, lines: Iterable[Text]) -> None:
+    for line in lines:
+        console.print(line, soft_wrap=True)
 
 
 class Paper(Console):

@@ -15,6 +15,6 @@ prompt.py     the commands of whoever steps through it
 """
 
 from harness.field.replay.player import Player
-from harness.field.replay.record import Record, open_record
+from harness.field.replay.record import Record, open_record, open_records
 
-__all__ = ["Player", "Record", "open_record"]
+__all__ = ["Player", "Record", "open_record", "open_records"]

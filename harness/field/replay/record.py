@@ -2,9 +2,9 @@
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Protocol
 
@@ -15,7 +15,7 @@ from harness.archive.traces import HEADER, MAX_LINE_BYTES, SUFFIX, Trace, read_t
 from harness.checker.evidence import Evidence
 from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError, RunDirectoryError
-from harness.field.homecoming import Flight, sort_out
+from harness.field.homecoming import Flight, Homecoming, sort_out
 from harness.gc_pause import gc_paused
 from ucp.clock import MICROSECONDS
 from ucp.trace import Commanded, Dropped, HandlerRun
@@ -224,18 +224,46 @@ class _OfFlight:
 
 def open_record(path: Path, agent_id: int | None = None) -> Record:
     """The record in a trace, or that of an agent in a directory. Raises FieldError if there is none to play."""
-    file, directory = (_file_in(path, agent_id), path) if path.is_dir() else (path, _directory_of(path))
-    trace = _read(file) if file is not None else None
-    if file is None or trace is None or trace.problem or trace.cut_off:
+    records = open_records(path, agent_id)
+    if len(records) > 1:
+        names = ", ".join(str(record.agent_id) for record in records)
+        raise FieldError(f"{path}: whose record is to be played? Choose with --agent: {names}")
+    return records[0]
+
+
+def open_records(path: Path, agent_id: int | None = None) -> list[Record]:
+    """All records in a trace or a directory, or that of an agent. Raises FieldError if there is none to play."""
+    files = _files_in(path, agent_id) if path.is_dir() else [path]
+    directory = path if path.is_dir() else _directory_of(path)
+    traces = [trace for file in files if (trace := _read(file)) and not trace.problem and not trace.cut_off]
+    if not files or len(traces) < len(files):
         return _sorted_out(path, agent_id)
-    if agent_id is not None and trace.header.agent_id != agent_id:
-        raise FieldError(f"{file}: the trace is of agent {trace.header.agent_id}, not of agent {agent_id}")
-    run = (directory / RUN_FILE).is_file()
-    return Record(file, _named(path, agent_id), trace, _Run(directory) if run else _Around(trace, file.parent), [])
+    if agent_id is not None and traces[0].header.agent_id != agent_id:
+        raise FieldError(f"{files[0]}: the trace is of agent {traces[0].header.agent_id}, not of agent {agent_id}")
+    run = _Run(directory) if (directory / RUN_FILE).is_file() else None
+    found = []
+    for file, trace in zip(files, traces, strict=True):
+        named = _named(path, trace.header.agent_id if path.is_dir() else None)
+        found.append(partial(Record, file, named, trace, run or _Around(trace, file.parent), []))
+    return _playable(found)
+
+
+def _playable(records: Iterable[Callable[[], Record]]) -> list[Record]:
+    """Those that can be played; of the others it is said with the first. Raises FieldError if it is none."""
+    playable, problems = [], []
+    for opened in records:
+        try:
+            playable.append(opened())
+        except FieldError as error:
+            problems.append(str(error))
+    if not playable:
+        raise FieldError("; ".join(problems))
+    playable[0].problems += problems
+    return playable
 
 
 def _named(path: Path, agent_id: int | None) -> str:
-    return f"{path}" if agent_id is None else f"{path} --agent {agent_id}"
+    return f"{path} --agent {agent_id}" if agent_id else f"{path}"
 
 
 @gc_paused()
@@ -249,20 +277,19 @@ def _directory_of(file: Path) -> Path:
     return run if file.parent.name == AGENTS and (run / RUN_FILE).is_file() else file.parent
 
 
-def _file_in(directory: Path, agent_id: int | None) -> Path | None:
-    """The trace of an agent, if it is where a run leaves it, and nothing else there can be of this agent.
+def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
+    """The traces of all agents, or of one, if they are where a run leaves them and nothing else there can be of these.
 
-    None if all has to be sorted out, which takes as long as reading all.
+    Nothing if all has to be sorted out, which takes as long as reading all.
     """
     agents = agents_directory(directory)
+    if (directory / RUN_FILE).is_file():
+        files = [agents / f"{agent_id}{SUFFIX}"] if agent_id is not None else agents.glob(f"*{SUFFIX}")
+        return sorted((file for file in files if file.is_file()), key=lambda file: (len(file.name), file.name))
     file = agents / f"{agent_id}{SUFFIX}"
     if agent_id is None or not file.is_file():
-        return None
-    if (directory / RUN_FILE).is_file() or all(
-        _is_of_another(path, agent_id) for path in agents.iterdir() if path != file
-    ):
-        return file
-    return None
+        return []
+    return [file] if all(_is_of_another(path, agent_id) for path in agents.iterdir() if path != file) else []
 
 
 def _is_of_another(path: Path, agent_id: int) -> bool:
@@ -276,28 +303,41 @@ def _is_of_another(path: Path, agent_id: int) -> bool:
         return False
 
 
-def _sorted_out(path: Path, agent_id: int | None) -> Record:
-    """The record in files of any kind and in any state."""
+def _sorted_out(path: Path, agent_id: int | None) -> list[Record]:
+    """The records in files of any kind and in any state."""
     homecoming = sort_out([path])
     flights = [flight for flight in homecoming.flights if flight.traces]
     if not flights:
         why = f": {homecoming.left_out[0].why}" if homecoming.left_out else ""
         raise FieldError(f"{path}: nothing of it is a trace that can be played{why}; give one, or a directory of them")
     whose = sorted({agent for flight in flights for agent in flight.traces})
-    if agent_id is None and len(whose) > 1:
-        names = ", ".join(map(str, whose))
-        raise FieldError(f"{path}: whose record is to be played? Choose with --agent: {names}")
-    chosen = whose[0] if agent_id is None else agent_id
-    of_agent = next((flight for flight in flights if chosen in flight.traces), None)
-    if of_agent is None:
-        raise FieldError(f"{path}: there is no trace of agent {chosen}, but of {', '.join(map(str, whose))}")
-    trace, files = of_agent.traces[chosen], of_agent.sources[chosen]
-    of_others = {file for agent, sources in of_agent.sources.items() if agent != chosen for file in sources}
-    remarks = [remark for remark in (*homecoming.left_out, *homecoming.remarks) if remark.path not in of_others]
+    if agent_id is not None and agent_id not in whose:
+        raise FieldError(f"{path}: there is no trace of agent {agent_id}, but of {', '.join(map(str, whose))}")
+    chosen = whose if agent_id is None else [agent_id]
     directory = path if path.is_dir() else _directory_of(path)
-    beside: Beside
-    if (directory / RUN_FILE).is_file():
-        beside = _Run(directory)
-    else:
-        beside = _OfFlight(of_agent) if path.is_dir() else _Around(trace, directory)
-    return Record(files[0], _named(path, agent_id), trace, beside, [remark.sentence for remark in remarks])
+    run = _Run(directory) if (directory / RUN_FILE).is_file() else None
+    records = []
+    for agent in chosen:
+        flown = [flight for flight in flights if agent in flight.traces]
+        trace, file = flown[0].traces[agent], flown[0].sources[agent][0]
+        problems = [*_remarks(homecoming, agent)]
+        if len(flown) > 1:
+            problems.append(f"{path}: agent {agent} has flown {len(flown)} flights; that with the most files is played")
+        beside = run or (_OfFlight(flown[0]) if path.is_dir() else _Around(trace, directory))
+        named = _named(path, agent if path.is_dir() or len(whose) > 1 else None)
+        records.append(partial(Record, file, named, trace, beside, problems))
+    return _playable(records)
+
+
+def _remarks(homecoming: Homecoming, agent_id: int) -> Iterator[str]:
+    """What is to say of all files but those of other agents."""
+    of_others = {
+        file
+        for flight in homecoming.flights
+        for agent, sources in flight.sources.items()
+        if agent != agent_id
+        for file in sources
+    }
+    for remark in (*homecoming.left_out, *homecoming.remarks):
+        if remark.path not in of_others:
+            yield remark.sentence

@@ -22,7 +22,7 @@ def head(record: Record) -> Text:
     """Whose record it is, and how much of it there is."""
     lives = f", {record.lives} lives" if record.lives > 1 else ""
     return Text(
-        f"agent {record.agent_id} of {len(record.header.roster)}: {len(record.entries)} lines, "
+        f"agent {record.agent_id}, one of {len(record.header.roster)}: {len(record.entries):,} lines, "
         f"{record.ends_s:,.0f} s of the mission{lives}; {record.path}",
         style="dim",
     )
@@ -54,11 +54,11 @@ def _differences(record: Record, found: Found, steps: str, names: Names) -> Iter
     yield Text(f"  line {first.line}, t={first.t:g} s: {title(first)}")
     yield Text(f"  {first.difference(names.of)}", style="red")
     yield Text(f"  ucp-harness replay {record.named} --break {first.line}", style="dim")
-    if count > 1:
+    of_handler: dict[str, list[Deviation]] = {}
+    for deviation in found.deviations:
+        of_handler.setdefault(title(deviation), []).append(deviation)
+    if len(of_handler) > 1:
         yield Text("By handler, with the line of the first:")
-        of_handler: dict[str, list[Deviation]] = {}
-        for deviation in sorted(found.deviations, key=lambda deviation: deviation.line):
-            of_handler.setdefault(title(deviation), []).append(deviation)
         for name, deviations in islice(of_handler.items(), HANDLERS_SHOWN):
             yield Text(f"  {name}: {times(len(deviations))}, line {deviations[0].line}, t={deviations[0].t:g} s")
 

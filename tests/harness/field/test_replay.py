@@ -1,6 +1,7 @@
 """A record played again: what it finds, that it goes back exactly, and what it makes of what is broken."""
 
 import json
+import shutil
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -174,8 +175,19 @@ def test_what_cannot_be_played_is_one_sentence_and_status_2(
     assert sentence in said
 
 
-def test_whose_record_is_meant_has_to_be_said(right: Path) -> None:
+def test_all_records_of_a_directory_are_played_and_to_step_through_one_it_has_to_be_named(
+    right: Path, wrong: Path, tmp_path: Path
+) -> None:
     ended = harness("replay", right)
+    assert ended.returncode == 0
+    assert ended.stdout.count("✔ no difference: ") == 3
+    for agent in (1, 2, 3):
+        shutil.copy(trace_of(right if agent == 3 else wrong, agent), tmp_path)
+    ended = harness("replay", tmp_path, "--json")
+    assert ended.returncode == 1
+    documents = json.loads(ended.stdout)["records"]
+    assert [document["agent_id"] for document in documents] == [1, 2, 3]
+    ended = harness("replay", right, "--step", input="")
     assert (ended.returncode, sentences(ended.stderr)) == (
         2,
         [f"{right}: whose record is to be played? Choose with --agent: 1, 2, 3"],

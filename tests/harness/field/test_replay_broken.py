@@ -129,3 +129,11 @@ def test_of_the_old_version_nothing_can_be_played(home: Path) -> None:
     ended = harness("replay", home / "2.trace.jsonl")
     assert ended.returncode == 2
     assert "lacks what the agent received" in sentences(ended.stderr)[-1]
+
+
+def test_one_that_cannot_be_played_keeps_nobody_from_the_others(home: Path) -> None:
+    change(home / "2.trace.jsonl", lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")))
+    ended = harness("replay", home)
+    assert ended.returncode == 0
+    assert ended.stdout.count("✔ no difference") == 3
+    assert any("lacks what the agent received" in said for said in sentences(ended.stderr))
