@@ -153,6 +153,10 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
         (lambda runs: expiry(runs).trigger.update(timer="x"), "it ran as the x timer ended, which was not running"),
         (lambda runs: expiry(runs).trigger.clear(), "it ran without a trigger that there is"),
         (lambda runs: first_run(runs, "build_data_block").trigger.update(event=255), "said to have logged event 255"),
+        (
+            lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", {"local": "x"}),
+            "no such event's handler",
+        ),
         (lambda runs: commit(runs).trigger.update(seq=77), "it said to have got Commit Block 77 from agent"),
         (lambda runs: setattr(commit(runs), "input", Recorded("!")), "a datagram that is to be dropped: not base64"),
         (lambda runs: setattr(commit(runs), "input", None), "a datagram that is to be dropped: truncated"),

@@ -23,6 +23,8 @@ EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted", "block", "tie: block"))
 """Branches that begin a tally, count in it, or choose from it; after others it may be what it likes."""
 
+LOGS = ON_LOCAL_EVENT["Build Data Block"].name
+"""Only the vehicle triggers it."""
 PAUSES = "receive_response_block_for_hash"
 """Pauses the timer of phase 3, and lets it run on. No record shows that."""
 
@@ -261,7 +263,7 @@ class Follower:
         return handler, inputs
 
     def _local(self, run: HandlerRun) -> EventHandler[Any]:
-        if run.handler not in EVENT_OF:
+        if run.handler not in EVENT_OF or run.handler == LOGS:
             raise NotHandledError("ran for a local event, which is no such event's handler")
         if self._adopted:
             self._core.go_along(run)
