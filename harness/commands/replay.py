@@ -14,7 +14,7 @@ from rich.text import Text
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
 from harness.field.replay import Player, Record, open_record, open_records
-from harness.field.replay.document import document
+from harness.field.replay.document import ReplayedRecord, document, replayed
 from harness.field.replay.names import Names
 from harness.field.replay.places import place
 from harness.field.replay.prompt import Prompt
@@ -54,7 +54,7 @@ def replay_command(
 
 def _play(console: Console, records: Sequence[Record], until: float | None, as_json: bool) -> NoReturn:
     """Play whole records, and say what differs."""
-    documents, differ, judged = [], False, False
+    told, differ, judged = list[ReplayedRecord](), False, False
     for record in records:
         _complain_of(record)
         player, names = Player(record, until), Names(record)
@@ -62,11 +62,11 @@ def _play(console: Console, records: Sequence[Record], until: float | None, as_j
         differ |= bool(found.deviations)
         judged |= bool(found.steps)
         if as_json:
-            documents.append(document(record, found, names))
+            told.append(replayed(record, found, names))
         else:
             _show(console, [head(record), *summary(record, found, names)])
     if as_json:
-        print_json(documents[0] if len(documents) == 1 else {"records": documents})
+        print_json(document(told))
     raise typer.Exit(VIOLATED if differ else 0 if judged else WRONG_REQUEST)
 
 

@@ -13,6 +13,7 @@ from harness.archive.exports import Export
 from harness.archive.record import RunRecord
 from harness.depot.manifest import Manifest
 from harness.field.adapters.record import ImportRecord
+from harness.field.replay.document import ReplayDocument
 from harness.matrix import MatrixRecord
 from harness.packets.document import PacketsRecord
 from harness.scale import ScaleRecord
@@ -26,6 +27,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "ucp-matrix-1": MatrixRecord,
     "ucp-mission-manifest-1": Manifest,
     "ucp-packets-1": PacketsRecord,
+    "ucp-replay-1": ReplayDocument,
     "ucp-run-1": RunRecord,
     "ucp-scale-1": ScaleRecord,
 }

@@ -89,7 +89,7 @@ def test_it_finds_what_the_judge_of_a_run_finds(quirk: str, tmp_path: Path) -> N
 
 def test_programs_are_told_the_same(wrong: Path) -> None:
     ended = harness("replay", wrong, "--agent", 2, "--json")
-    document = json.loads(ended.stdout)
+    (document,) = json.loads(ended.stdout)["records"]
     assert (ended.returncode, document["verdict"], document["agent_id"]) == (1, "deviates", 2)
     first = document["differences"][0]
     assert (first["handler"], first["algorithm"]) == ("receive_response_block_for_hash", 18)

@@ -69,7 +69,7 @@ def test_what_is_missing_is_no_difference_and_what_is_left_is_played(
 ) -> None:
     change(home / "2.trace.jsonl", edit)
     ended = harness("replay", home, "--agent", 2, "--json")
-    document = json.loads(ended.stdout)
+    (document,) = json.loads(ended.stdout)["records"]
     assert (ended.returncode, document["verdict"], document["differences"]) == (0, "as specified", [])
     assert document["steps"] > 30
     assert document["unjudged"] == 0 or document["unjudged_because"]
