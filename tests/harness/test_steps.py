@@ -155,7 +155,7 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
         (lambda runs: first_run(runs, "build_data_block").trigger.update(event=255), "said to have logged event 255"),
         (
             lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", {"local": "x"}),
-            "no such event's handler",
+            "it ran without having been triggered",
         ),
         (lambda runs: commit(runs).trigger.update(seq=77), "it said to have got Commit Block 77 from agent"),
         (lambda runs: setattr(commit(runs), "input", Recorded("!")), "a datagram that is to be dropped: not base64"),
