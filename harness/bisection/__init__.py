@@ -4,6 +4,8 @@ subject.py      what is played: a scenario, a run that is played again, or recor
 outcome.py      what came of it, and in what two outcomes differ
 code.py         a directory with a state of the code, and what runs in it
 playing.py      the subject, played with a state of the code or with an agent command
+live.py         a record that is given to an agent as a process, by UDP
+peers.py        the process that plays all its peers
 record_core.py  the process in which another state's core is given records
 history.py      the commits between a good one and a bad one, in a clone that nobody else sees
 bisecting.py    the first commit at which the outcome changes

@@ -9,11 +9,15 @@ from pathlib import Path
 from harness import checker
 from harness.archive.archive import RunArchive
 from harness.bisection.code import ROOT, Ended, run_python
+from harness.bisection.live import AgentFailedError, NoAgentError, play_live
 from harness.bisection.outcome import Difference, OfAgent, Outcome, of_run
 from harness.bisection.subject import Subject
 from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED, WRONG_REQUEST, HarnessError, InterruptedRunError
+from harness.field.replay import open_record
 from harness.scenario import Scenario
 
+SPEEDUP = 20.0
+"""Mission seconds in a second, of a record that is given to a process."""
 CODE = "{code}"
 """In an agent command: the directory of the state of the code."""
 
@@ -26,7 +30,8 @@ class Workshop:
     """Plays the subject, each time in a new directory below `directory`; nothing may take longer than `limit_s`.
 
     Without `command` a scenario is played in virtual time, whole, by the state of the code that is tried, and records
-    are given to its core. With it a scenario is played as processes by the harness that runs now.
+    are given to its core. With it a scenario is played as processes by the harness that runs now, and one agent's
+    record is given to the agent as a process.
     """
 
     def __init__(
@@ -50,6 +55,8 @@ class Workshop:
         self._count += 1
         place = self._directory / f"play-{self._count}"
         place.mkdir()
+        if self.subject.scenario is None and self._command is not None:
+            return self._given_by_udp(code, self._command, place), place
         if self.subject.scenario is None:
             return self._given_records(code, place), place
         if self._command is None:
@@ -137,6 +144,17 @@ class Workshop:
         except (ValueError, KeyError, TypeError):
             raise CannotBeTriedError(played.last_words) from None
         return Outcome(subject=self.subject.in_words, agents=agents)
+
+    def _given_by_udp(self, code: Path, command: str, place: Path) -> Outcome:
+        record = open_record(self.subject.path, self.subject.agent)
+        words = _words(command, code)
+        try:
+            said = play_live(record, words, place, speedup=self._speedup or SPEEDUP)
+        except NoAgentError as error:
+            raise CannotBeTriedError(str(error)) from None
+        except AgentFailedError as error:
+            return Outcome(subject=self.subject.in_words, crashed=str(error))
+        return Outcome(subject=self.subject.in_words, agents={record.agent_id: OfAgent(differences=said)})
 
 
 class MachineCannotError(HarnessError):
