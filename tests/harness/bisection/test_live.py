@@ -50,7 +50,7 @@ def test_a_right_agent_says_what_is_in_the_record_and_a_wrong_one_does_not(recor
     none = harness("again", records, *options, "no-such-agent")
     assert none.returncode == 125
     ending = harness("again", records, *options, f"{sys.executable} -c 'raise SystemExit(3)'")
-    assert ending.returncode == 125 and "the agent ended with exit status 3" in ending.stderr
+    assert ending.returncode == 125 and "the agent ended with status 3" in ending.stderr
 
 
 def test_what_an_agent_asked_itself_is_answered_when_it_asks(records: Path) -> None:
