@@ -3,6 +3,8 @@
 record.py     what one agent's trace has to be played: its lines in order, and what lies beside it
 player.py     plays them, and goes back exactly
 blocks.py     blocks by hash, wherever any record has them
+exchanges.py  the messages between the agent and another, as both records have them
+clock_set.py  whether the agent's clock was set while a timer ran
 resumption.py where an agent that was lost can be followed again
 places.py     places to stop at: a line, a handler, a block
 names.py      what blocks are called, from whatever record says it

@@ -8,7 +8,8 @@ from itertools import accumulate
 from rich.text import Text
 
 from harness.archive.traces import Trace
-from harness.field.reconstruct.clocks import Delivery, Line, estimate
+from harness.field.reconstruct.clocks import Line, estimate
+from harness.field.replay.exchanges import Exchanges
 from harness.field.replay.player import Player
 from harness.field.replay.record import Record
 from ucp.clock import MICROSECONDS
@@ -34,10 +35,7 @@ class Others:
     def _traces(self) -> dict[int, "_Other"]:
         record = self._record
         others = {agent_id: trace for agent_id, trace in record.beside.traces.items() if agent_id != record.agent_id}
-        return {
-            agent_id: _Other(record.trace, trace, record.beside.record is not None)
-            for agent_id, trace in others.items()
-        }
+        return {agent_id: _Other(record, trace) for agent_id, trace in others.items()}
 
     def at(self, player: Player) -> Iterator[Text]:
         """What each did around this moment, what it held then, and what it has to do with this step."""
@@ -54,7 +52,7 @@ class Others:
                 continue
             yield Text(f"  agent {agent_id}: ", style="bold").append(other.held(now, top), "not bold")
             if run is not None:
-                yield from other.has_to_do_with(self._record.agent_id, agent_id, run)
+                yield from other.has_to_do_with(agent_id, run)
             for number in other.near(now):
                 line, theirs = other.runs[number]
                 after_s = other.clock.at(theirs.t) - now
@@ -67,46 +65,19 @@ class Others:
 class _Other:
     """`clock` is what its clock shows beside ours."""
 
-    def __init__(self, ours: Trace, trace: Trace, one_clock: bool) -> None:
-        self.runs = [numbered for life in trace.lives() for numbered in life]
-        self._agents = ours.header.agent_id, trace.header.agent_id
-        self.clock = Line() if one_clock else self._estimated(ours, trace)
+    def __init__(self, record: Record, trace: Trace) -> None:
+        self._exchanges = Exchanges(record, trace)
+        self.runs = self._exchanges.runs
+        self.clock = Line() if record.beside.record is not None else self._estimated(record, trace)
         self._times = [*accumulate((self.clock.at(run.t) for _, run in self.runs), max)]
 
-    def _estimated(self, ours: Trace, trace: Trace) -> Line:
-        own, other = self._agents
-        deliveries = []
-        for run in ours.runs:
-            sent = self._sent.get((run.trigger.get("message"), run.trigger.get("seq")), [])
-            if run.trigger.get("from") == other and len(sent) == 1:
-                deliveries.append(Delivery(other, own, self.runs[sent[0]][1].t, run.t))
-            for message in run.sent:
-                heard = self._heard.get((own, message.message, message.seq), [])
-                if len(heard) == 1:
-                    deliveries.append(Delivery(own, other, run.t, self.runs[heard[0]][1].t))
+    def _estimated(self, record: Record, trace: Trace) -> Line:
+        own, other = record.agent_id, trace.header.agent_id
+        deliveries = [exchange.delivery for exchange in self._exchanges]
         if not deliveries:
-            return Line(_ahead_s(ours, trace))
-        clocks = estimate(self._agents, deliveries)
+            return Line(_ahead_s(record.trace, trace))
+        clocks = estimate((own, other), deliveries)
         return clocks[other].after(clocks[own].inverse())
-
-    @cached_property
-    def _sent(self) -> dict[tuple[object, object], list[int]]:
-        """The runs that sent a message, by type and sequence number."""
-        sent: dict[tuple[object, object], list[int]] = {}
-        for number, (_, run) in enumerate(self.runs):
-            for message in run.sent:
-                sent.setdefault((message.message, message.seq), []).append(number)
-        return sent
-
-    @cached_property
-    def _heard(self) -> dict[tuple[object, object, object], list[int]]:
-        """The runs that a message triggered, by sender, type and sequence number."""
-        heard: dict[tuple[object, object, object], list[int]] = {}
-        for number, (_, run) in enumerate(self.runs):
-            if "message" in run.trigger:
-                key = (run.trigger.get("from"), run.trigger["message"], run.trigger.get("seq"))
-                heard.setdefault(key, []).append(number)
-        return heard
 
     def near(self, now: float) -> range:
         """Its last runs before this moment, and the next."""
@@ -127,16 +98,16 @@ class _Other:
             f"{chain}, deque {state.deque}, stack {state.stack}, {doing} since line {line}, {run.t:.3f} s of its clock"
         )
 
-    def has_to_do_with(self, ours: int, theirs: int, run: HandlerRun) -> Iterator[Text]:
+    def has_to_do_with(self, theirs: int, run: HandlerRun) -> Iterator[Text]:
         """Where it sent what triggered our run, and what it made of what our run sent."""
         if run.trigger.get("from") == theirs:
-            numbers = self._sent.get((run.trigger.get("message"), run.trigger.get("seq")), [])
+            numbers = self._exchanges.that_sent(run.trigger.get("message"), run.trigger.get("seq"))
             for line, sending in self._nearest(numbers, run.t):
                 yield Text(
                     f"    sent it at line {line}, by {sending.handler[:40]}: {sending.branch[:40]}", style="green"
                 )
         for message in run.sent:
-            heard = self._nearest(self._heard.get((ours, message.message, message.seq), []), run.t)
+            heard = self._nearest(self._exchanges.that_heard(message.message, message.seq), run.t)
             for line, hearing in heard:
                 words = f"heard {message.message[:60]} {message.seq} at line {line}: {hearing.branch[:40]}"
                 yield Text(f"    {words}", style="green")

@@ -11,13 +11,17 @@ from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
 from harness.field.replay.blocks import RecordedBlocks
+from harness.field.replay.clock_set import ClockSet
 from harness.field.replay.record import Entry, Record
 from harness.field.replay.resumption import Resumption
+from ucp.agent import ON_TIMER
 from ucp.state import AgentState
 from ucp.trace import HandlerRun
 
 CHECKPOINT_STEPS = 1000
 """Between two checkpoints. Going back plays half as many steps in the mean: some milliseconds."""
+
+_OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
 
 @dataclass
@@ -68,6 +72,7 @@ class Player:
         self.found = Found()
         self._tells = Tells.of(record.trace)
         self._blocks = RecordedBlocks(record)
+        self._clock_set = ClockSet(record)
         self._resumption = Resumption(record, self._blocks)
         self._follower, self._life = self._born(), 1
         self._checkpoints = {0: _Checkpoint(self._follower.copy(), 1, self.found.copy())}
@@ -156,15 +161,23 @@ class Player:
             return
         follower.follow(entry.line, run)
         found.steps += 1
-        if follower.deviations and (why := self.record.unwritten.get(self.position)) is not None:
+        if follower.deviations and (why := self._excused(follower.deviations)) is not None:
             follower.deviations.clear()
-            follower.lost = f"before line {entry.line} {why}"
+            follower.lost = f"before line {entry.line} {why} and what the agent held then is not on record"
             found.steps, found.unjudged = found.steps - 1, found.unjudged + 1
         if follower.deviations:
             found.differ(self.position + 1, follower.deviations)
             follower.deviations.clear()
         if follower.lost is not None:
             found.lost.append(follower.lost)
+
+    def _excused(self, deviations: list[Deviation]) -> str | None:
+        """What is to blame in the place of the agent for what was found at the next entry, if anything is."""
+        if (why := self.record.unwritten.get(self.position)) is not None:
+            return f"{why},"
+        if any(deviation.run is None and deviation.handler in _OF_TIMERS for deviation in deviations):
+            return self._clock_set.near(self.position)
+        return None
 
     def _born(self) -> Follower:
         return Follower(self.record.header, self._tells, self._blocks, self.record.was_paused)

@@ -137,3 +137,20 @@ def test_one_that_cannot_be_played_keeps_nobody_from_the_others(home: Path) -> N
     assert ended.returncode == 0
     assert ended.stdout.count("✔ no difference") == 3
     assert any("lacks what the agent received" in said for said in sentences(ended.stderr))
+
+
+@pytest.mark.parametrize("by_s", [30.0, -30.0, 5000.0])
+def test_a_clock_that_was_set_is_nobodys_mistake(by_s: float, home: Path) -> None:
+    """Set while a vote runs, of all moments: the timer ends as it should, and the record says otherwise."""
+    path = home / "2.trace.jsonl"
+    lines = path.read_text().splitlines()
+    votes = [number for number, line in enumerate(lines) if '"branch":"proposed"' in line]
+    for number in range(votes[len(votes) // 2] + 1, len(lines)):
+        entry = json.loads(lines[number])
+        entry["t"] = round(entry["t"] + by_s, 6)
+        lines[number] = json.dumps(entry, separators=(",", ":"))
+    path.write_text("\n".join(lines) + "\n")
+    found = Player(open_record(home, 2)).to_end()
+    assert found.deviations == []
+    assert found.unjudged
+    assert "clock was set" in found.lost[0]
