@@ -70,21 +70,31 @@ def test_replay_calls_the_debugger_right_before_the_handler_of_a_break(
     assert str(expected) in said
 
 
-def test_an_ide_stops_in_a_handler_with_the_state_of_the_agent(record: Path, expected: tuple[float, int]) -> None:
+@pytest.mark.parametrize("calls_it", [False, True], ids=["a breakpoint", "--debug"])
+def test_an_ide_stops_in_a_handler_with_the_state_of_the_agent(
+    calls_it: bool, record: Path, expected: tuple[float, int]
+) -> None:
     pytest.importorskip("debugpy")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     under = ["-Xfrozen_modules=off", "-m", "debugpy", "--listen", f"127.0.0.1:{port}", "--wait-for-client"]
+    line = next(entry.line for entry in open_record(record).entries if getattr(entry.what, "algorithm", 0) == 15)
+    options = ["--break", str(line), "--debug"] if calls_it else []
     with subprocess.Popen(
-        [sys.executable, *under, "-m", "harness.cli", "replay", str(record)],
+        [sys.executable, *under, "-m", "harness.cli", "replay", str(record), *options],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     ) as replaying:
         try:
             ide = Ide(port)
-            ide.attach({SOURCE: LINE})
+            ide.attach({} if calls_it else {SOURCE: LINE})
             frame = ide.stopped_in()
-            assert (frame["name"], frame["line"]) == ("reconcile_phase_2_timer_expiration", LINE)
+            if calls_it:
+                assert frame["name"] == "follow"
+                ide.ask("stepIn", threadId=frame["thread"])
+                frame = ide.stopped_in()
+            assert frame["name"] == "reconcile_phase_2_timer_expiration"
+            assert calls_it or frame["line"] == LINE
             assert Path(frame["source"]["path"]) == SOURCE
             assert ide.value("(core.now, len(core.chain), core.agent_id)", frame) == str((*expected, 2))
             ide.ask("setBreakpoints", source={"path": str(SOURCE)}, breakpoints=[])
