@@ -9,7 +9,7 @@ SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 SCENARIO ?= scenarios/loss_15.yaml
 TESTS ?= -n 2
 
-.PHONY: run test test-netem lint setup clean
+.PHONY: run test test-netem docs lint setup clean
 
 run: setup
 	$(BIN)/ucp-harness run $(SCENARIO)
@@ -20,6 +20,10 @@ test: setup
 # The tests of real tc netem, inside User Mode Linux: for machines whose kernel lacks sch_netem.
 test-netem: setup
 	$(BIN)/python -m tests.netem.uml
+
+# The documentation as a site, in site/index.html.
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: setup
 	$(BIN)/ruff check

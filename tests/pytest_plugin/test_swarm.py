@@ -29,7 +29,8 @@ STORY = """
         assert swarm.figures["mutual_chain"] == len(swarm.chain(1))
 """
 
-README = Path(__file__).parents[2] / "README.md"
+REPOSITORY = Path(__file__).parents[2]
+PAGE = REPOSITORY / "docs" / "pytest.md"
 FORCED_TIE = {
     **yaml.safe_load((SCENARIOS / "forced_tie.yaml").read_text()),
     "quirks": {"crash_on_tie": True},
@@ -74,12 +75,13 @@ def test_the_same_story_is_told_to_processes(pytester: pytest.Pytester) -> None:
     assert not run_directories(pytester)
 
 
-def test_the_tests_in_the_readme_pass(pytester: pytest.Pytester) -> None:
-    (code,) = (it for it in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL) if "def test_" in it)
-    pytester.makepyfile("import pytest\n" + code)
+def test_the_tests_in_the_documentation_pass(pytester: pytest.Pytester) -> None:
+    for number, page in enumerate((REPOSITORY / "README.md", PAGE)):
+        (code,) = (it for it in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) if "def test_" in it)
+        pytester.makepyfile(**{f"test_{number}": "import pytest\n" + code})
     (pytester.path / "scenarios").symlink_to(SCENARIOS)
-    run(pytester).assert_outcomes(passed=3)
-    (expect,) = re.findall(r"```yaml\n(expect:.*?)```", README.read_text(), re.DOTALL)
+    run(pytester).assert_outcomes(passed=4)
+    (expect,) = re.findall(r"```yaml\n(expect:.*?)```", PAGE.read_text(), re.DOTALL)
     scenario, _, _ = (SCENARIOS / "loss_15.yaml").read_text().partition("expect:")
     (pytester.path / "my.yaml").write_text(scenario + expect)
     run(pytester, "my.yaml", "--ucp-backend", "sim").assert_outcomes(passed=3)

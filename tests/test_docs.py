@@ -1,0 +1,71 @@
+"""The documentation: a site without warnings that loads nothing from elsewhere, and examples that do what they say."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from harness.scenario.load import parse
+from tests.pages import play
+
+REPOSITORY = Path(__file__).parents[1]
+PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("site")
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(directory)],
+        cwd=REPOSITORY,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0, built.stderr
+    return directory
+
+
+def test_every_page_and_what_it_links_to_is_on_the_site(site: Path) -> None:
+    for page in PAGES[1:]:
+        assert (site / page.stem / "index.html").exists(), page
+    assert (site / "index.html").exists()
+    assert (site / "ucp" / "CONTRACT" / "index.html").exists()
+    for page in site.rglob("*.html"):
+        for target in re.findall(r'(?:href|src)="(?!https?:)([^"#:]+)', page.read_text()):
+            if not target.startswith(("/", "data")) and page.name != "404.html":
+                assert (page.parent / target).exists(), (page, target)
+
+
+def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        loads = re.findall(
+            r'<(?:script|img|iframe|link rel="(?:stylesheet|icon|preconnect)")[^>]*?(?:src|href)="([^"]+)',
+            page.read_text(),
+        )
+        assert loads
+        assert not [source for source in loads if re.match(r"(?:https?:)?//", source)], page
+
+
+def test_the_reference_has_every_key_of_a_scenario(site: Path) -> None:
+    text = (site / "scenario-reference" / "index.html").read_text()
+    for key in ("final_reconcile", "vote_timeout_s", "hold_until_s", "takeoff_altitude_m", "reboot"):
+        assert f"<code>{key}</code>" in text
+    assert "Any program that follows ucp/CONTRACT.md" in text  # a docstring in the source
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_scenario_that_a_page_shows_is_one(page: Path) -> None:
+    for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
+        document = yaml.safe_load(block)
+        parse({"name": "shown", **document})
+
+
+@pytest.mark.lab
+def test_every_command_of_the_tutorial_prints_what_it_shows(tmp_path: Path) -> None:
+    assert play(REPOSITORY / "docs" / "tutorial.md", tmp_path) > 10
