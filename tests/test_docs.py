@@ -59,6 +59,12 @@ def test_the_reference_has_every_key_of_a_scenario(site: Path) -> None:
     assert "Any program that follows ucp/CONTRACT.md" in text  # a docstring in the source
 
 
+def test_the_picture_of_the_rooms_is_drawn_from_the_imports(site: Path) -> None:
+    text = (site / "architecture" / "index.html").read_text()
+    assert re.search(r"<title>\d+ of the files in report/ use archive/</title>", text)
+    assert "use commands/</title>" not in text  # nobody does
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_scenario_that_a_page_shows_is_one(page: Path) -> None:
     for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):

@@ -1,0 +1,60 @@
+"""Which room of the harness uses which, drawn from the imports: `docs/architecture.md`."""
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[2]
+MARK = "<!-- rooms -->"
+CELL, LEFT, TOP, BOX = 26, 110, 96, 22
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    if MARK not in markdown:
+        return markdown
+    rooms = re.findall(r"\[(\w+)/\]\(\.\./harness/\w+\)", markdown.split("In [harness/](../harness)")[1])
+    return markdown.replace(MARK, picture(rooms, uses(rooms)))
+
+
+def uses(rooms: list[str]) -> Counter[tuple[str, str]]:
+    """(room, another that it uses) -> how many of its files import from there."""
+    counted: Counter[tuple[str, str]] = Counter()
+    for room in rooms:
+        for path in (ROOT / "harness" / room).rglob("*.py"):
+            counted.update((room, other) for other in set(_imported(path)) & {*rooms} - {room})
+    return counted
+
+
+def _imported(path: Path) -> Iterator[str]:
+    """The rooms that a file imports from."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("harness."):
+            yield node.module.split(".")[1]
+
+
+def picture(rooms: list[str], counted: Counter[tuple[str, str]]) -> str:
+    """A row for each room: in which others its files look, the more the darker."""
+    size = len(rooms) * CELL
+    most = max(counted.values())
+    parts = []
+    for at, room in enumerate(rooms):
+        y = TOP + at * CELL
+        parts.append(f'<text x="{LEFT - 8}" y="{y + 15}" text-anchor="end">{room}</text>')
+        x = LEFT + at * CELL + 14
+        parts.append(f'<text transform="translate({x},{TOP - 8}) rotate(-60)">{room}</text>')
+        parts.append(f'<rect x="{LEFT + at * CELL}" y="{y}" width="{BOX}" height="{BOX}" class="self"/>')
+        for other, name in enumerate(rooms):
+            if number := counted[room, name]:
+                shade = 0.25 + 0.75 * number / most
+                title = f"{number} of the files in {room}/ use {name}/"
+                place = f'x="{LEFT + other * CELL}" y="{y}" width="{BOX}" height="{BOX}"'
+                parts.append(f'<rect {place} class="uses" fill-opacity="{shade:.2f}"><title>{title}</title></rect>')
+    frame = f'viewBox="0 0 {LEFT + size + 60} {TOP + size}" style="max-width: {LEFT + size + 60}px"'
+    label = f"Of {len(rooms)} rooms each uses some of those before it, and none after it"
+    return f'<svg class="rooms" role="img" aria-label="{label}" {frame}>{"".join(parts)}</svg>'
