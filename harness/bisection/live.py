@@ -12,10 +12,11 @@ import json
 import os
 import sys
 import time
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,13 @@ class Script:
     expected: list[Said]
     finished: list[float]
     """When a reconcile ended."""
+    lines: list[tuple[float, int]]
+    """When which line of the record was."""
     ends_s: float
+
+    def line_at(self, at_s: float) -> int:
+        """The record's last line by then."""
+        return self.lines[max(0, bisect_right(self.lines, at_s, key=itemgetter(0)) - 1)][1] if self.lines else 0
 
     def is_close(self, at_s: float, slack_s: float) -> bool:
         """Whether that is so near to the end of a reconcile that a process may, or may not yet, answer."""
@@ -134,7 +141,15 @@ def script_of(record: Record) -> Script:
                 elif not isinstance(message, BlockAddRequest):
                     expected.append(Said(run.t, line, run.handler, message))
     datagrams.sort(key=lambda given: given.t)
-    return Script(datagrams, asked, reconciles, expected, finished, runs[-1][1].t if runs else 0.0)
+    return Script(
+        datagrams,
+        asked,
+        reconciles,
+        expected,
+        finished,
+        [(run.t, line) for line, run in runs],
+        runs[-1][1].t if runs else 0.0,
+    )
 
 
 def _question(message: Message) -> tuple[type, bytes] | None:
@@ -180,7 +195,8 @@ def play_live(record: Record, command: Sequence[str], place: Path, *, speedup: f
         raise MachineError(str(error)) from None
     except NetemError as error:
         raise MachineError(f"the lab failed: {error}") from None
-    return list(_compare(script, heard, SLACK_S + SLACK_WALL_S * speedup))
+    found = sorted(_compare(script, heard, SLACK_S + SLACK_WALL_S * speedup), key=itemgetter(0))
+    return [difference for _, difference in found]
 
 
 class _Air:
@@ -314,8 +330,8 @@ def _last_line(log: Path) -> str:
     return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "it said nothing")
 
 
-def _compare(script: Script, heard: list[tuple[float, Message]], slack_s: float) -> Iterator[Difference]:
-    """What is lacking, or said otherwise, in the order of the record; then what nobody should have heard.
+def _compare(script: Script, heard: list[tuple[float, Message]], slack_s: float) -> Iterator[tuple[float, Difference]]:
+    """What is lacking, or said otherwise, and what nobody should have heard, with the mission second of each.
 
     Who reconciles answers nobody: what is, or is not, answered around the end of a reconcile is no difference.
     """
@@ -332,17 +348,12 @@ def _compare(script: Script, heard: list[tuple[float, Message]], slack_s: float)
         elif script.is_close(said.t, slack_s):
             continue
         did = f"it sent {_words(other[1])}" if other is not None else "it sent nothing of that"
-        yield Difference(
-            line=said.line,
-            handler=said.handler,
-            detail=f"{did}; the record sent {_words(said.message)}, at {said.t:g} s",
-        )
+        detail = f"{did}; the record sent {_words(said.message)}, at {said.t:g} s"
+        yield said.t, Difference(line=said.line, handler=said.handler, detail=detail)
     for t, message in left:
-        if script.is_close(t, slack_s):
-            continue
-        yield Difference(
-            line=0, handler=None, detail=f"it sent {_words(message)} at {t:.1f} s, which the record did not"
-        )
+        if not script.is_close(t, slack_s):
+            detail = f"it sent {_words(message)} at {t:.1f} s, which the record did not"
+            yield t, Difference(line=script.line_at(t), handler=None, detail=detail)
 
 
 def _about(message: Message) -> tuple[type, Any]:

@@ -81,7 +81,7 @@ class Outcome(_Model):
 
 def _first(of: OfAgent) -> str:
     first = (of.differences or [])[0]
-    return f"{first.line}, in {first.handler or 'no handler'}"
+    return f"{first.line}{f', in {first.handler}' if first.handler else ''}"
 
 
 def of_run(subject: str, result: Result, exports: dict[int, Export], *, exact: bool) -> Outcome:
@@ -140,7 +140,7 @@ def _of_agent(was: OfAgent, now: OfAgent) -> Iterator[str]:
         new_ones = [each for each in new_differences if (each.line, each.handler, each.detail) not in known]
         if new_ones:
             first = new_ones[0]
-            yield f"line {first.line}, {first.handler or 'no known handler'}: {first.detail}"
+            yield f"line {first.line}{f', {first.handler}' if first.handler else ''}: {first.detail}"
         else:
             gone = len(old_differences) - len(new_differences)
             yield f"{gone} differences from the record are no longer there"
