@@ -3,6 +3,7 @@
 told        what the agents were told before the flight
 elsewhere   what is not in an agent's own trace, and is on record elsewhere
 inferring   what reached an agent that left no trace, by its capture
+readings    which settings agents had that left no trace
 inputs      a trace, taken apart into what reached the agent
 rehearsal   one agent alone: how far its record is what the protocol does
 clocks      what the agents' clocks show beside each other, from messages alone

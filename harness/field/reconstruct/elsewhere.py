@@ -72,6 +72,15 @@ class Elsewhere:
         """Whose datagrams there are."""
         return {sender for sender, _ in self._datagrams}
 
+    def all_datagrams(self) -> Iterator[bytes]:
+        """All that there are, each once."""
+        for datagrams in self._datagrams.values():
+            yield from datagrams
+
+    def event_data(self) -> list[bytes]:
+        """The data of all blocks that are known."""
+        return [block.event_data for block in self._blocks.values()]
+
     def events(self, agent_id: int) -> list[LoggableEvent]:
         """The events of an agent as far as they are known, in order: those of its blocks, and of the one it builds."""
         export = self._exports.get(agent_id)

@@ -178,7 +178,7 @@ def _rehearsed(
     if captured is None or home is None or (by_trace and by_trace.chain == list(home.chain_of_block_hashes)):
         return by_trace
     inferred = infer(header, captured, elsewhere.events(agent_id))
-    by_capture = rehearse(header, [inferred.inputs])
+    by_capture = rehearse(header, inferred.lives)
     if by_trace is not None and len(by_trace.played) > len(by_capture.played):
         return by_trace
     why.pop(agent_id, None)

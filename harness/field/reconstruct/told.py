@@ -3,7 +3,8 @@
 import base64
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
 
 from harness.archive.traces import Header
 from harness.checker.judgement import agents
@@ -11,6 +12,7 @@ from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, c
 from harness.errors import FieldError
 from harness.field.homecoming import Flight
 from harness.field.reconstruct.elsewhere import Elsewhere
+from harness.field.reconstruct.readings import likely
 from ucp.settings import Settings
 
 NOTHING = (
@@ -46,17 +48,26 @@ def told(
     roster = {*flight.roster, *flight.agents, *(member for header in headers.values() for member in header.roster)}
     roster |= {*elsewhere.senders()}
     common = Counter(header.settings for header in headers.values()).most_common(1)
-    settings = common[0][0] if common else Settings()
-    untraced = sorted({*flight.captures} & {*flight.exports} - {*headers})
+    untraced = sorted({*elsewhere.captured} & {*flight.exports} - {*headers})
     if untraced and initial_data is not None:
-        headers |= {agent_id: _assumed(agent_id, roster, initial_data, settings) for agent_id in untraced}
-        whose = "as the others'" if common else "as the thesis has them"
+        whole = partial(_assumed, roster=roster, initial_data=initial_data)
+        captured = {agent_id: elsewhere.captured[agent_id] for agent_id in untraced}
+        settings = common[0][0] if common else likely(elsewhere, captured, whole)
+        headers |= {agent_id: whole(agent_id, settings) for agent_id in untraced}
+        whose = "as the others'" if common else f"those that explain the most: {_in_words(settings)}"
         remarks.append(f"settings of {agents(untraced)} are not on record, and assumed to be {whose}")
+    settings = Counter(header.settings for header in headers.values()).most_common(1)[0][0] if headers else Settings()
     if not headers:
         raise FieldError(NOTHING)
     of_all = Counter(header.initial_data for header in headers.values()).most_common(1)[0][0]
     data = of_all if initial_data is None else base64.b64decode(initial_data)
     return Mission(name, tuple(sorted(roster)), data, settings), headers
+
+
+def _in_words(settings: Settings) -> str:
+    usual = asdict(Settings())
+    unusual = [f"{name} {value}" for name, value in asdict(settings).items() if value != usual[name]]
+    return ", ".join(unusual) or "the thesis's"
 
 
 def _initial_data(flight: Flight) -> str | None:
@@ -66,7 +77,7 @@ def _initial_data(flight: Flight) -> str | None:
     return next((export.inception.block_data for export in flight.exports.values()), None)
 
 
-def _assumed(agent_id: int, roster: Iterable[int], initial_data: str, settings: Settings) -> CheckedHeader:
+def _assumed(agent_id: int, settings: Settings, *, roster: Iterable[int], initial_data: str) -> CheckedHeader:
     header = Header(agent_id=agent_id, roster=sorted(roster), settings={}, clock={}, initial_data=initial_data)
     made = checked(header)
     return CheckedHeader(**{**vars(made), "settings": settings})

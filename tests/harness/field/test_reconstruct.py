@@ -178,3 +178,16 @@ def test_what_a_trace_of_version_1_lacks_is_found_in_others(tmp_path: Path) -> N
             del sent["datagram"]
     trace.write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert again(directory).problems == []
+
+
+def test_settings_and_a_life_of_which_nothing_is_on_record_are_inferred(tmp_path: Path) -> None:
+    flight = {"capture": True, "events": {"source": "random", "mean_s": 8}, "settings": {"vote_names_chain": True}}
+    reboot = [{"at_s": 150, "reboot": [2], "down_s": 20, "disk": "kept"}]
+    run = flown(tmp_path / "run", network={"loss": 0.1}, timeline=reboot, **flight)
+    directory = home(tmp_path / "home", run, *(f"{agent}.trace.jsonl" for agent in (1, 2, 3)))
+    for path in (run / "capture").glob("*.pcapng"):
+        shutil.copy(path, directory)
+    reconstruction = again(directory)
+    assert reconstruction.problems == []
+    assert any("vote_names_chain True" in remark for remark in reconstruction.remarks)
+    assert any("reboot" in entry for entry in reconstruction.document["timeline"])
