@@ -102,7 +102,11 @@ class Told:
         notice that its chain is another than the others' (Section 3.2).
         """
         end_s = swarm.now() + limit_s
-        while any(blocks <= self._completed.get(agent, 0) for agent, blocks in (await swarm.completed()).items()):
+        while any(
+            blocks <= self._completed.get(agent, 0)
+            for agent, blocks in (await swarm.completed()).items()
+            if agent not in self._silent()
+        ):
             if swarm.now() >= end_s:
                 return None
             await self.until(swarm, min(end_s, swarm.now() + LOOK_EVERY_S))
@@ -113,6 +117,16 @@ class Told:
             if not busy and await swarm.top_chain_hashes() == chains:
                 return played
         return None
+
+    def _silent(self) -> set[int]:
+        """Agents that log nothing more, and so will never vote on a block of their own."""
+        silent: set[int] = set()
+        for fault in self.scenario.faults_in_order():
+            if fault.stops_events:
+                silent.update(fault.agents)
+            elif fault.begins_a_life:
+                silent.difference_update(fault.agents)
+        return silent
 
     async def reconcile(self, swarm: mission.Swarm, agent: int) -> None:
         awake = await swarm.completed()

@@ -131,6 +131,20 @@ def test_agents_are_killed_paused_rebooted_and_come_back(pytester: pytest.Pytest
     assert [(one["restarts"], one["reboots"]) for one in record["agents"].values()] == [(1, 0), (0, 0), (0, 1), (1, 0)]
 
 
+def test_whoever_has_landed_or_is_switched_off_is_not_waited_for(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+    def test_landing(swarm):
+        swarm.run_for(200)
+        swarm.stop_events(1)
+        swarm.switch_off(2)
+        swarm.wait_idle()
+        swarm.run_for(60)
+        assert len(swarm.chain(1)) > len(swarm.chain(2)) > 0
+        assert swarm.characteristic(6).holds
+    """)
+    run(pytester).assert_outcomes(passed=1)
+
+
 @pytest.mark.lab
 def test_processes_are_killed_paused_rebooted_and_come_back(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(FAULTS)

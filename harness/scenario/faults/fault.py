@@ -87,6 +87,8 @@ class Fault:
     """Another one, in the place of one that was taken."""
     stands_still: ClassVar[bool] = False
     """The agent lives and does nothing until the next fault."""
+    stops_events: ClassVar[bool] = False
+    """The agent logs nothing more in this life."""
     keys_in_words: ClassVar[str] = ""
     """What its further keys have to be, for whoever has left one out."""
     unless_told: ClassVar[Mapping[str, Any]] = {}

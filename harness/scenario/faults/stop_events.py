@@ -8,6 +8,7 @@ class StopEvents(Fault):
 
     what = "stop_events"
     needs = (RUNNING,)
+    stops_events = True
     mark = BAR
     meaning = "logs no more events"
 
