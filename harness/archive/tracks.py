@@ -24,6 +24,7 @@ class Fix(NamedTuple):
     at_s: float
     north_m: float
     east_m: float
+    up_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ def between(before: Fix, after: Fix, at_s: float) -> Fix:
         at_s,
         before.north_m + share * (after.north_m - before.north_m),
         before.east_m + share * (after.east_m - before.east_m),
+        before.up_m + share * (after.up_m - before.up_m),
     )
 
 
@@ -67,8 +69,8 @@ def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
         if not line.places.keys() <= known:
             lines.leave_out()
             continue
-        for vehicle, (north_m, east_m, _) in line.places.items():
-            fixes.setdefault(vehicle, []).append(Fix(line.at_s, north_m, east_m))
+        for vehicle, place in line.places.items():
+            fixes.setdefault(vehicle, []).append(Fix(line.at_s, *place))
     for track in fixes.values():
         track.sort(key=attrgetter("at_s"))
     return Tracks(dict(sorted(fixes.items())), lines.problems())

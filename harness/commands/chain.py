@@ -11,6 +11,7 @@ from harness.archive.archive import RunArchive
 from harness.commands.new_file import write_new
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST, ExportError
+from harness.logbook.flown import flown
 from harness.logbook.geojson import geojson
 from harness.logbook.kml import kml
 from harness.logbook.positions import Track, tracks
@@ -28,10 +29,13 @@ def chain_command(
     kml_file: Annotated[Path | None, typer.Option("--kml", help="The same for Google Earth; must be new.")] = None,
 ) -> None:
     """Print each agent's chain, block by block; or put what the vehicles logged on a map."""
-    whole = logbook.read(RunArchive(*paths))
+    archive = RunArchive(*paths)
+    whole = logbook.read(archive)
     shown = whole if agent is None else whole.only(agent)
     if geojson_file is not None or kml_file is not None:
-        _write_maps(tracks(shown), shown.telemetry, geojson_file, kml_file)
+        recorded = archive.tracks(shown.exports if agent is not None else archive.origin.known_agents)
+        made = tracks(shown) or flown(archive.origin, recorded)
+        _write_maps(made, shown.telemetry, geojson_file, kml_file)
     elif as_json:
         print_lines([json.dumps(document(shown, decode), indent=1)])
     else:
@@ -44,7 +48,9 @@ def chain_command(
 
 def _write_maps(made: list[Track], telemetry: bool, geojson_file: Path | None, kml_file: Path | None) -> None:
     if not made:
-        why = "no vehicle logged one" if telemetry else "the events are not those of vehicles"
+        why = (
+            "no vehicle logged one" if telemetry else "the events are not those of vehicles, and no track is on record"
+        )
         raise ExportError(f"there is no position in these chains ({why}), so there is no map")
     if geojson_file is not None:
         write_new(geojson_file, [json.dumps(geojson(made), ensure_ascii=False) + "\n"])

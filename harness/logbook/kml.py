@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from xml.etree import ElementTree
 
-from harness.logbook.positions import Entry, Track, coordinates, utc
-from ucp.telemetry import Position, describe
+from harness.logbook.positions import Entry, Track, Whereabouts, coordinates, utc
+from ucp.telemetry import describe
 
 _KML, _GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 ElementTree.register_namespace("", _KML)
@@ -55,7 +55,7 @@ def _placemark(folder: ElementTree.Element, entry: Entry) -> None:
     _add(point, "coordinates", _numbers(entry.position, ","))
 
 
-def _numbers(position: Position, separator: str) -> str:
+def _numbers(position: Whereabouts, separator: str) -> str:
     lon, lat, alt = coordinates(position)
     return f"{lon:.7f}{separator}{lat:.7f}{separator}{alt:.3f}"
 

@@ -7,14 +7,26 @@ the logbook. A vehicle that was lost is on the map as far as others hold its blo
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Protocol
 
 from harness.archive.exports import ExportedBlock
 from harness.logbook.book import Logbook
 from ucp.events import LoggableEvent, MalformedEventsError, decode_events
-from ucp.telemetry import Position, position_of
+from ucp.telemetry import position_of
 
 LAST_TIMESTAMP_US = 253_402_300_799_999_999
 """The end of the year 9999: a later time is nobody's, and no map can show it."""
+
+
+class Whereabouts(Protocol):
+    """A place, in 1e-7 degrees, and in millimetres above mean sea level."""
+
+    @property
+    def lat_e7(self) -> int: ...
+    @property
+    def lon_e7(self) -> int: ...
+    @property
+    def alt_mm(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -27,7 +39,7 @@ class Entry:
     block: str
     event: LoggableEvent
     is_position: bool
-    position: Position | None
+    position: Whereabouts | None
     position_age_s: float | None
 
 
@@ -37,7 +49,7 @@ class Track:
 
     agent_id: int
     entries: list[Entry]
-    fixes: list[tuple[int, Position]]
+    fixes: list[tuple[int, Whereabouts]]
 
 
 def tracks(logbook: Logbook) -> list[Track]:
@@ -52,7 +64,7 @@ def tracks(logbook: Logbook) -> list[Track]:
     return [track for track in made if track.fixes]
 
 
-def coordinates(position: Position) -> tuple[float, float, float]:
+def coordinates(position: Whereabouts) -> tuple[float, float, float]:
     """Longitude and latitude in degrees, altitude in metres above mean sea level."""
     return position.lon_e7 / 1e7, position.lat_e7 / 1e7, position.alt_mm / 1e3
 

@@ -456,3 +456,17 @@ def test_without_positions_there_is_no_map(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "the events are not those of vehicles" in sentences(done.stderr)[0]
     assert not (tmp_path / "map").exists()
+
+
+def test_a_flight_in_virtual_time_is_on_the_map_by_the_runs_own_record(tmp_path: Path) -> None:
+    run = write_run(fly(agents=2), tmp_path / "run", CONNECTED, **{**FLOWN, "backend": "sim"})
+    places = ({"1": [0.0, 0.0, 0.0], "2": [0.0, 111.3195, 0.0]}, {"1": [1113.195, 0.0, 30.0]})
+    lines = (json.dumps({"at_s": float(at_s), "places": place}) for at_s, place in enumerate(places))
+    (run / "tracks.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    assert harness("chain", run, "--geojson", tmp_path / "map").returncode == 0
+    (line,) = json.loads((tmp_path / "map").read_text())["features"]  # vehicle 2 has been in one place only
+    (east, south, low), (still, north, high) = line["geometry"]["coordinates"]
+    assert line["properties"] == {"agent": 1, "times": ["1970-01-01T00:00:00.000Z", "1970-01-01T00:00:01.000Z"]}
+    assert (east, round(north - south, 6), high - low) == (still, 0.01, 30)
+    assert harness("chain", run, "--agent", "2", "--kml", tmp_path / "kml").returncode == 0
+    assert "vehicle 1" not in (tmp_path / "kml").read_text()

@@ -22,17 +22,17 @@ def tracks_file(directory: Path, *lines: str | dict[str, Any]) -> Path:
 def test_places_come_back_in_order_of_time(tmp_path: Path) -> None:
     later = {"at_s": 2.0, "places": {"1": [12.0, 24.0, 5.0]}}
     tracks = read_tracks(tracks_file(tmp_path, later, GOOD), [1, 2, 3])
-    assert tracks.by_vehicle == {1: [Fix(1.0, 10.0, 20.0), Fix(2.0, 12.0, 24.0)], 2: [Fix(1.0, -1.0, 0.0)]}
+    assert tracks.by_vehicle == {1: [Fix(1.0, 10.0, 20.0, 5.0), Fix(2.0, 12.0, 24.0, 5.0)], 2: [Fix(1.0, -1.0, 0.0)]}
     assert tracks.problems == []
 
 
 def test_between_two_looks_a_vehicle_flew_straight_and_outside_them_it_stood(tmp_path: Path) -> None:
     later = {"at_s": 3.0, "places": {"1": [20.0, 0.0, 5.0]}}
     tracks = read_tracks(tracks_file(tmp_path, GOOD, later), [1, 2])
-    assert tracks.at(1, 1.5) == Fix(1.5, 12.5, 15.0)
-    assert tracks.at(1, 0.0) == Fix(0.0, 10.0, 20.0)
-    assert tracks.at(1, 3.0) == Fix(3.0, 20.0, 0.0)
-    assert tracks.at(1, 9.0) == Fix(9.0, 20.0, 0.0)
+    assert tracks.at(1, 1.5) == Fix(1.5, 12.5, 15.0, 5.0)
+    assert tracks.at(1, 0.0) == Fix(0.0, 10.0, 20.0, 5.0)
+    assert tracks.at(1, 3.0) == Fix(3.0, 20.0, 0.0, 5.0)
+    assert tracks.at(1, 9.0) == Fix(9.0, 20.0, 0.0, 5.0)
 
 
 def test_without_a_file_there_are_no_tracks(tmp_path: Path) -> None:

@@ -12,14 +12,14 @@ from itertools import pairwise
 from markupsafe import Markup
 
 from harness.archive.tracks import Fix
-from harness.logbook.positions import Entry, Track
+from harness.logbook.positions import Entry, Track, Whereabouts
 from harness.present import words
 from harness.present.colours import Ink
 from harness.present.svg import FONT, n
 from harness.report.map_geometry import Point, Projection, extent, thinned
 from harness.report.map_svg import end_mark, frame, start_mark
 from harness.report.map_tags import tags
-from ucp.telemetry import Position, describe
+from ucp.telemetry import describe
 
 METRES_PER_DEGREE = 111_195.0
 """Of latitude, on a sphere of 6,371 km."""
@@ -84,7 +84,7 @@ class _Field:
         self._first_us = min(at_us for track in tracks for at_us, _ in track.fixes)
         self.far = 0
 
-    def fix(self, at_us: int, position: Position) -> Fix:
+    def fix(self, at_us: int, position: Whereabouts) -> Fix:
         north_m = (position.lat_e7 / 1e7 - self._lat) * METRES_PER_DEGREE
         east_m = ((position.lon_e7 / 1e7 - self._lon + 180) % 360 - 180) * self._east
         self.far += max(abs(north_m), abs(east_m)) > FARTHEST_M
