@@ -21,6 +21,7 @@ from harness.report.capture import gaps
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import explain
+from harness.scenario.quirks import in_words
 
 
 class Vehicles(StrEnum):
@@ -70,6 +71,8 @@ def run_command(
         console.print("Booting User Mode Linux.", style="dim")
         raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
+    if wrong := ", ".join(in_words(request.quirks)):
+        console.print(f"wrong on purpose: {wrong}", style="dim", highlight=False)
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
     shown = progress.for_console(console)

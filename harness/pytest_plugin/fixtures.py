@@ -33,7 +33,7 @@ def swarm_for(node: pytest.Item) -> Iterator[SwarmInTest]:
         scenario = options.at_speedup(parse(keys))
         directory = new_directory(node, options)
         swarm = SwarmInTest(scenario, seed, backend, directory)
-    trial = node.stash[TRIAL] = Trial(scenario.expect, swarm.finish)
+    trial = node.stash[TRIAL] = Trial(scenario, swarm.finish)
     try:
         yield swarm
     finally:
@@ -51,7 +51,7 @@ def scenario_for(node: pytest.Item) -> Iterator[Findings]:
         scenario = options.at_speedup(load_scenario(path))
         directory = new_directory(node, options)
         finished = play(scenario, seed, backend, directory)
-    trial = node.stash[TRIAL] = Trial(scenario.expect, lambda _: finished)
+    trial = node.stash[TRIAL] = Trial(scenario, lambda _: finished)
     yield Findings(directory, finished.result)
     if trial.passed:
         discard(directory, options)

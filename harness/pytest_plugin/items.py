@@ -47,7 +47,7 @@ class ScenarioItem(pytest.Item):
         with one_sentence():
             self._directory = new_directory(self, Options.of(self.config))
             finished = play(self._scenario, self._seed, self._backend, self._directory)
-        self.stash[TRIAL] = Trial(self._scenario.expect, lambda _: finished)
+        self.stash[TRIAL] = Trial(self._scenario, lambda _: finished)
 
     def teardown(self) -> None:
         if self._directory is not None and TRIAL in self.stash and self.stash[TRIAL].passed:

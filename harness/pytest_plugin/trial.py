@@ -9,14 +9,17 @@ from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, MachineError
 from harness.pytest_plugin.findings import JudgementInTest
 from harness.run.run import Run
+from harness.scenario import Scenario
 from harness.scenario.expect import Expect
+from harness.scenario.quirks import in_words
 
 
 class Trial:
     """`finish` ends the run, once the agents have settled if its argument says so, and judges it."""
 
-    def __init__(self, expect: Expect | None, finish: Callable[[bool], Run]) -> None:
-        self._expect = expect or Expect()
+    def __init__(self, scenario: Scenario, finish: Callable[[bool], Run]) -> None:
+        self._expect = scenario.expect or Expect()
+        self._quirks = scenario.quirks
         self._finish = finish
         self.passed = False
 
@@ -52,7 +55,9 @@ class Trial:
         lines += self._expect.out_of_range(finished.result.figures)
         lines += self._expect.other_common(finished.result.chains)
         lines += self._expect.other_deviations(deviating)
-        return [*lines, *self._other_chains(finished)]
+        lines += self._other_chains(finished)
+        wrong = ", ".join(in_words(self._quirks))
+        return [*lines, f"wrong on purpose: {wrong}"] if lines and wrong else lines
 
     def _other_chains(self, finished: Run) -> list[str]:
         if not self._expect.chains:

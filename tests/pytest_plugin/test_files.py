@@ -67,6 +67,7 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
             "steps: deviates: 1 difference in *",
             "    agent 1: *Algorithm 15, reconcile_phase_2_timer_expiration: it took the branch 'crashed by *",
             "liveness: never finishes: agent 1 hangs since 42 s: not idle, and no timer runs that would end that",
+            "wrong on purpose: crash_on_tie (all agents)",
             "report: *",
             "*_ expected.yaml::sim-seed1 _*",
             "characteristic 5, all committed everywhere: violated: fully connected, and yet agent 1 hangs since 42 s",
