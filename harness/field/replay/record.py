@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, c
 from harness.errors import FieldError, RunDirectoryError
 from harness.field.homecoming import Flight, Homecoming, sort_out
 from harness.gc_pause import gc_paused
+from harness.packets.pcap import MAGICS
 from ucp.clock import MICROSECONDS
 from ucp.trace import Commanded, Dropped, HandlerRun
 
@@ -236,8 +237,10 @@ def open_records(path: Path, agent_id: int | None = None) -> list[Record]:
     files = _files_in(path, agent_id) if path.is_dir() else [path]
     directory = path if path.is_dir() else _directory_of(path)
     traces = [trace for file in files if (trace := _read(file)) and not trace.problem and not trace.cut_off]
-    if not files or len(traces) < len(files):
-        return _sorted_out(path, agent_id)
+    if len(traces) < len(files):
+        return _sorted_out(path, agent_id, files) or _sorted_out(path, agent_id, [path])
+    if not files:
+        return _sorted_out(path, agent_id, [path])
     if agent_id is not None and traces[0].header.agent_id != agent_id:
         raise FieldError(f"{files[0]}: the trace is of agent {traces[0].header.agent_id}, not of agent {agent_id}")
     run = _Run(directory) if (directory / RUN_FILE).is_file() else None
@@ -298,15 +301,18 @@ def _is_of_another(path: Path, agent_id: int) -> bool:
         return True
     try:
         with path.open("rb") as other:
-            return HEADER.validate_json(other.readline(MAX_LINE_BYTES)).agent_id != agent_id
+            begins = other.readline(MAX_LINE_BYTES)
+            return begins[:4] in MAGICS or HEADER.validate_json(begins).agent_id != agent_id
     except (OSError, ValueError):
         return False
 
 
-def _sorted_out(path: Path, agent_id: int | None) -> list[Record]:
-    """The records in files of any kind and in any state."""
-    homecoming = sort_out([path])
+def _sorted_out(path: Path, agent_id: int | None, sources: Sequence[Path]) -> list[Record]:
+    """The records in files of any kind and in any state; none if only a part of `path` was looked at, and has none."""
+    homecoming = sort_out(sources)
     flights = [flight for flight in homecoming.flights if flight.traces]
+    if path not in sources and len({agent for flight in flights for agent in flight.traces}) < len(sources):
+        return []
     if not flights:
         why = f": {homecoming.left_out[0].why}" if homecoming.left_out else ""
         raise FieldError(f"{path}: nothing of it is a trace that can be played{why}; give one, or a directory of them")
@@ -323,7 +329,7 @@ def _sorted_out(path: Path, agent_id: int | None) -> list[Record]:
         problems = [*_remarks(homecoming, agent)]
         if len(flown) > 1:
             problems.append(f"{path}: agent {agent} has flown {len(flown)} flights; that with the most files is played")
-        beside = run or (_OfFlight(flown[0]) if path.is_dir() else _Around(trace, directory))
+        beside = run or (_OfFlight(flown[0]) if path.is_dir() and path in sources else _Around(trace, file.parent))
         named = _named(path, agent if path.is_dir() or len(whose) > 1 else None)
         records.append(partial(Record, file, named, trace, beside, problems))
     return _playable(records)

@@ -18,6 +18,9 @@ from ucp.block import HASH_BYTES, Block, InceptionBlock, next_chain_hash
 from ucp.events import MalformedEventsError
 from ucp.trace import HandlerRun
 
+_Below = dict[bytes, tuple[bytes, str]]
+"""Chain hash -> the chain hash below it, and the block between."""
+
 
 class Resumption:
     """Knows all chains that any record of the flight shows."""
@@ -37,7 +40,9 @@ class Resumption:
         if not state.idle or state.reconciling or state.deque or state.stack:
             return False
         try:
-            chain = self._chain(state.top)
+            chain = self._chain(state.top, self._own)
+            if chain is None:
+                chain = self._chain(state.top, self._everybody)
             building = self._building(position)
         except (NotOnRecordError, MalformedEventsError):
             return False
@@ -46,33 +51,39 @@ class Resumption:
         newborn.begin_at(chain, building, self._sequence(position))
         return True
 
-    def _chain(self, top: str) -> list[Block] | None:
+    def _chain(self, top: str, below: _Below) -> list[Block] | None:
         """The blocks of the chain with this top chain hash, oldest first. Raises NotOnRecordError."""
         blocks: list[Block] = []
         chain_hash = bytes.fromhex(top) if len(top) == 2 * HASH_BYTES and _is_hex(top) else b""
         while chain_hash != self._inception:
-            step = self._before.get(chain_hash)
-            if step is None:
+            if chain_hash not in below:
                 return None
-            chain_hash, block_hash = step
+            chain_hash, block_hash = below[chain_hash]
             blocks.append(self._blocks.get(block_hash))
         return blocks[::-1]
 
     @cached_property
-    def _before(self) -> dict[bytes, tuple[bytes, str]]:
-        """Chain hash -> the chain hash below it, and the block between."""
-        before: dict[bytes, tuple[bytes, str]] = {}
+    def _own(self) -> _Below:
+        """By the record itself, and by exports."""
+        steps: _Below = {}
         for export in self._record.beside.exports.values():
             below = self._inception
             for block in export.chain:
                 chain_hash = next_chain_hash(below, bytes.fromhex(block.block_hash))
-                before[chain_hash] = below, block.block_hash
+                steps[chain_hash] = below, block.block_hash
                 below = chain_hash
-        for trace in (self._record.trace, *self._record.beside.traces.values()):
-            self._take_down(trace, before)
-        return before
+        self._take_down(self._record.trace, steps)
+        return steps
 
-    def _take_down(self, trace: Trace, before: dict[bytes, tuple[bytes, str]]) -> None:
+    @cached_property
+    def _everybody(self) -> _Below:
+        """By all records, which takes a while to read."""
+        steps = self._own.copy()
+        for trace in self._record.beside.traces.values():
+            self._take_down(trace, steps)
+        return steps
+
+    def _take_down(self, trace: Trace, steps: _Below) -> None:
         for life in trace.lives():
             top: bytes | None = self._inception
             for _, run in life:
@@ -81,10 +92,10 @@ class Resumption:
                         continue
                     if operation == "chain+":
                         chain_hash = next_chain_hash(top, bytes.fromhex(block_hash))
-                        before.setdefault(chain_hash, (top, block_hash))
+                        steps.setdefault(chain_hash, (top, block_hash))
                         top = chain_hash
                     elif operation == "chain-":
-                        top = before[top][0] if top in before else None
+                        top = steps[top][0] if top in steps else None
                 top = bytes.fromhex(run.state.top) if _is_hex(run.state.top) else None
 
     def _building(self, position: int) -> bytes | None:
