@@ -14,7 +14,7 @@ from harness.field.reconstruct.comparing import FirstDifference, first_differenc
 from harness.field.reconstruct.elsewhere import Elsewhere
 from harness.field.reconstruct.inferring import infer
 from harness.field.reconstruct.inputs import Input, UnusableInputError, lives_of
-from harness.field.reconstruct.rehearsal import Allowed, Rehearsal, rehearse
+from harness.field.reconstruct.rehearsal import Allowed, Parting, Rehearsal, rehearse
 from harness.field.reconstruct.script import scenario_of
 from harness.field.reconstruct.timetable import Timetable, timetable
 from harness.field.reconstruct.told import NOTHING, told
@@ -197,18 +197,25 @@ def _by_trace(flight: Flight, elsewhere: Elsewhere, header: CheckedHeader, remar
         if not rehearsal.to_the_word and (words := _judged(flight, header.agent_id)):
             remarks.append(f"agent {header.agent_id} is wrong to no effect: {words}")
         return rehearsal
-    explained = _with_a_quirk(header, lives, remarks) or _with_what_is_not_right(header, lives, remarks)
+    explained = _with_a_quirk(header, lives, rehearsal.parting, remarks) or _with_what_is_not_right(
+        header, lives, remarks
+    )
     return explained or rehearsal
 
 
-def _with_a_quirk(header: CheckedHeader, lives: Lives, remarks: list[str]) -> Rehearsal | None:
-    """The rehearsal with a known mistake that explains the whole record, if possible to the word."""
+def _with_a_quirk(header: CheckedHeader, lives: Lives, at: Parting, remarks: list[str]) -> Rehearsal | None:
+    """The rehearsal with a known mistake that explains the whole record, if possible to the word.
+
+    Those of the handlers are tried first that ran where the agent parts from the protocol.
+    """
     explaining: dict[str, Rehearsal] = {}
-    for name, quirk in QUIRKS.items():
-        if not quirk.chance:
-            rehearsal = rehearse(header, lives, {name: True})
-            if rehearsal.parting is None:
-                explaining[name] = rehearsal
+    certain = (quirk for quirk in QUIRKS.values() if not quirk.chance)
+    for quirk in sorted(certain, key=lambda quirk: at.algorithms.isdisjoint(quirk.algorithms)):
+        rehearsal = rehearse(header, lives, {quirk.name: True})
+        if rehearsal.parting is None:
+            explaining[quirk.name] = rehearsal
+            if rehearsal.to_the_word:
+                break
     if not explaining:
         return None
     name = max(explaining, key=lambda name: explaining[name].to_the_word)

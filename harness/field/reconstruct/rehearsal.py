@@ -44,6 +44,8 @@ class Parting:
     at_s: float
     what: str
     """Completes "agent 32 ..."."""
+    algorithms: frozenset[int]
+    """What ran there, by the record."""
 
 
 @dataclass(slots=True)
@@ -160,7 +162,8 @@ class _Life:
             given.runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
         problem = problem or _differs(given.runs, entries)
         if problem is not None:
-            return Parting(self._life, index, given.line, given.runs[0].t, problem)
+            algorithms = frozenset(run.algorithm for run in given.runs)
+            return Parting(self._life, index, given.line, given.runs[0].t, problem, algorithms)
         self._rehearsal.to_the_word &= _to_the_word(given.runs, entries)
         sent = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
         played = Played(self._life, given, sent, matters)
