@@ -33,8 +33,9 @@ def chain_command(
     whole = logbook.read(archive)
     shown = whole if agent is None else whole.only(agent)
     if geojson_file is not None or kml_file is not None:
-        recorded = archive.tracks(shown.exports if agent is not None else archive.origin.known_agents)
-        made = tracks(shown) or flown(archive.origin, recorded)
+        record = archive.origin
+        recorded = flown(record, archive.tracks(record.known_agents))
+        made = tracks(shown) or [track for track in recorded if agent in (None, track.agent_id)]
         _write_maps(made, shown.telemetry, geojson_file, kml_file)
     elif as_json:
         print_lines([json.dumps(document(shown, decode), indent=1)])
