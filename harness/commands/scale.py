@@ -32,4 +32,4 @@ def scale_command(
     claim(directory)
     finished = scale.run_scale(request, jobs or cores(), shown=True)
     outputs.write(finished, directory)
-    end_sweep(finished.record, None if as_json else table.render(finished.record), directory / "scale.svg")
+    end_sweep(finished.record, None if as_json else table.render(finished.record), directory / "report.html")

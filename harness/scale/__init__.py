@@ -3,7 +3,7 @@
 model.py     what is asked              metrics.py   what is measured of each run
 run.py       the runs themselves        cell.py      all runs of one size, summed up
 growth.py    fits of power laws         record.py    scale.json
-outputs.py   the files     table.py  the terminal    picture.py  scale.svg
+outputs.py   the files     table.py  the terminal    picture.py  scale.svg   page.py  report.html
 complexity.py  COMPLEXITY.md: the figures beside what they mean
 """
 

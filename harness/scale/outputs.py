@@ -3,6 +3,7 @@
 scale.json   all of it, schema `ucp-scale/1`
 scale.csv    one row a run; the last two columns are what it cost this machine
 scale.svg    the picture
+report.html  all of it to look at
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,6 +14,7 @@ from harness.errors import MachineError
 from harness.matrix.outputs import to_csv
 from harness.scale.cell import Run
 from harness.scale.metrics import MACHINE_METRICS
+from harness.scale.page import to_html
 from harness.scale.picture import draw
 from harness.scale.run import Finished
 from ucp.files import write_atomically, write_json_atomically
@@ -24,6 +26,7 @@ def write(finished: Finished, directory: Path) -> None:
         write_json_atomically(directory / "scale.json", finished.record.to_json())
         write_atomically(directory / "scale.csv", to_csv(_rows(finished.runs)))
         write_atomically(directory / "scale.svg", draw(finished.record))
+        write_atomically(directory / "report.html", to_html(finished.record))
     except OSError as error:
         raise MachineError(f"{error.filename or directory} cannot be written: {error.strerror}") from None
 

@@ -35,7 +35,7 @@ def render(record: ScaleRecord) -> RenderableType:
         if grown := rows(record, loss):
             parts += [_exponents(grown), Text()]
     parts.append(Text(explanation(record), style="dim"))
-    return Group(*parts, *(Text(note, style="yellow") for note in unsettled(record)), *_blemishes(record))
+    return Group(*parts, *(Text(note, style="yellow") for note in unsettled(record)), *blemishes(record))
 
 
 def rows(record: ScaleRecord, loss: float) -> list[tuple[str, Variable, dict[str, Law]]]:
@@ -151,7 +151,8 @@ def _table(headers: Iterable[str]) -> Table:
     return table
 
 
-def _blemishes(record: ScaleRecord) -> Iterable[Text]:
+def blemishes(record: ScaleRecord) -> Iterable[Text]:
+    """A line for each run without a result, or with a bad one, up to a number."""
     for run in record.blemishes[:NAMED]:
         what = f"failed: {run.failed}" if run.failed else f"{', '.join(BAD_IN_WORDS[key] for key in run.violated)}"
         size = f"{words.percent(run.loss)} loss, {run.minutes:g} min, {run.agents} agents"

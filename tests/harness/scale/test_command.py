@@ -19,7 +19,7 @@ def test_a_sweep_ends_in_a_table_and_files(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert not sentences(done.stderr)
     assert "exponent of" in done.stdout
-    assert str(tmp_path / "out" / "scale.svg") in done.stdout
+    assert str(tmp_path / "out" / "report.html") in done.stdout
     record = ScaleRecord.model_validate_json((tmp_path / "out" / "scale.json").read_text())
     assert [(cell.loss, cell.agents) for cell in record.cells] == [
         *((0, n) for n in (2, 3, 5)),

@@ -82,7 +82,7 @@ def test_the_longest_come_first_and_results_are_in_order() -> None:
 def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> None:
     finished = run_scale(scale(), 1, judge)
     outputs.write(finished, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"scale.json", "scale.csv", "scale.svg"}
+    assert {path.name for path in tmp_path.iterdir()} == {"scale.json", "scale.csv", "scale.svg", "report.html"}
     document = json.loads((tmp_path / "scale.json").read_text())
     assert document["schema"] == "ucp-scale/1"
     assert ScaleRecord.model_validate(document) == finished.record
@@ -109,6 +109,10 @@ def test_an_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
     outputs.write(finished, tmp_path)
     assert json.loads((tmp_path / "scale.json").read_text())["outcome"] == "interrupted"
     assert "interrupted: 12 were asked for" in (tmp_path / "scale.svg").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "This was interrupted: 5 of 12 runs had ended." in page
+    assert page.count('<section aria-labelledby="loss-') == len(finished.record.scale.loss)
+    assert page.count("<script") == 0
 
 
 def test_an_interrupt_before_the_first_run_ended_leaves_files_all_the_same(tmp_path: Path) -> None:
@@ -118,6 +122,7 @@ def test_an_interrupt_before_the_first_run_ended_leaves_files_all_the_same(tmp_p
     finished = run_scale(scale(), 1, interrupted)
     outputs.write(finished, tmp_path)
     parsed((tmp_path / "scale.svg").read_text())
+    assert "0 of 12 runs had ended" in (tmp_path / "report.html").read_text()
     assert ScaleRecord.model_validate_json((tmp_path / "scale.json").read_text()).cells == []
     assert shown(finished.record)
 
