@@ -136,7 +136,10 @@ def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -
         remarks.append(f"what reached {which} is from captures and blocks, and when timers ended there is inferred")
     tell("putting everything in order")
     table = timetable(rehearsals)
-    document = scenario_of(mission, table, rehearsals)
+    lost = {agent_id for agent_id in rehearsals if flight.exports and agent_id not in flight.exports}
+    if lost:
+        remarks.append(f"no export of {agents(lost)}: taken to have been lost with the end of the trace")
+    document = scenario_of(mission, table, rehearsals, lost)
     tell("flying it again")
     simulated = simulate_in_memory(InMemory(tracing=True), parse(document), SEED)
     difference = first_difference(table, rehearsals, simulated)

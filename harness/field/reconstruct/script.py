@@ -4,7 +4,7 @@ import base64
 import dataclasses
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from harness.field.reconstruct.inputs import Asked, Heard, Logged
@@ -22,12 +22,17 @@ LONG_S = 0.5
 """A timer that is so late was not only waiting for its turn: its agent stood still."""
 
 
-def scenario_of(mission: Mission, table: Timetable, rehearsals: Mapping[int, Rehearsal]) -> Document:
-    """The scenario, as a document. An agent of the roster that was not rehearsed has no part in it."""
+def scenario_of(
+    mission: Mission, table: Timetable, rehearsals: Mapping[int, Rehearsal], lost: Collection[int]
+) -> Document:
+    """The scenario, as a document. An agent of the roster that was not rehearsed has no part in it.
+
+    Those that were `lost` are switched off with the last thing on record; so is who had more to do then.
+    """
     lives = {agent: _lives(table.lives(agent), len(rehearsal.pending)) for agent, rehearsal in rehearsals.items()}
     strays = _Strays()
     fates = [*_fates(mission.roster, table, lives, strays)]
-    entries = [*_entries(mission.roster, table, rehearsals, lives)]
+    entries = [*_entries(mission.roster, table, rehearsals, lives, lost)]
     last_s = max([at_s for at_s, _ in entries], default=0.0)
     last_s = max([last_s, *(happenings[-1].at_s for happenings in table.happenings.values() if happenings)])
     document: Document = {
@@ -169,6 +174,7 @@ def _entries(
     table: Timetable,
     rehearsals: Mapping[int, Rehearsal],
     lives: Mapping[int, Sequence[Life]],
+    lost: Collection[int],
 ) -> Iterator[tuple[float, Document]]:
     """What happened to agents, and what the operator asked."""
     yield from _pauses(table)
@@ -187,7 +193,7 @@ def _entries(
             else:
                 yield died_s, {"kill": [agent]}
                 yield birth_s, {"restart": [agent]}
-        if rehearsal.parting is not None or rehearsal.broken_off or rehearsal.pending[-1]:
+        if agent in lost or rehearsal.parting is not None or rehearsal.broken_off or rehearsal.pending[-1]:
             yield round(lives[agent][-1].ended_s + MOMENT_S, DIGITS), {"switch_off": [agent]}
 
 

@@ -69,6 +69,14 @@ def test_the_file_is_a_scenario_that_comes_to_the_same_and_to_what_it_expects(tm
     assert all(scenario.expect.as_expected(key, of.verdict) for key, of in simulated.result.judgements.items())
 
 
+def test_who_left_a_trace_and_no_export_was_lost_as_it_ends(tmp_path: Path) -> None:
+    run = flown(tmp_path / "run", events={"source": "random", "mean_s": 8}, timeline=[{"at_s": 200, "kill": [3]}])
+    reconstruction = again(home(tmp_path / "home", run))
+    assert reconstruction.reproduced == [1, 2, 3]
+    (off,) = [entry for entry in reconstruction.document["timeline"] if entry.get("switch_off") == [3]]
+    assert off["at_s"] < 200
+
+
 def test_clocks_come_out_beside_each_other(tmp_path: Path) -> None:
     clocks = again(home(tmp_path / "home", flown(tmp_path / "run", **FIELD))).table.clocks
     beside = clocks[28].after(clocks[10].inverse())
