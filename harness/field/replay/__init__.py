@@ -11,6 +11,7 @@ names.py      what blocks are called, from whatever record says it
 source.py     where a handler's code is
 summary.py    what came of a whole record, for people
 document.py   the same for programs
+shown.py      words for a terminal, whatever a record has for words
 words.py      a step, a state and a difference, for people
 others.py     what the other agents did at that moment
 prompt.py     the commands of whoever steps through it

@@ -12,6 +12,7 @@ from harness.field.reconstruct.clocks import Line, estimate
 from harness.field.replay.exchanges import Exchanges
 from harness.field.replay.player import Player
 from harness.field.replay.record import Record
+from harness.field.replay.shown import shown
 from ucp.clock import MICROSECONDS
 from ucp.trace import HandlerRun
 
@@ -44,13 +45,13 @@ class Others:
         top = player.state.chain.top_chain_hash.hex()
         run = entry.what if entry and isinstance(entry.what, HandlerRun) else None
         if not self._traces:
-            yield Text("  no other agent's record lies beside this one", style="yellow")
+            yield shown("  no other agent's record lies beside this one", style="yellow")
         for agent_id in sorted({*self._record.header.roster, *self._traces} - {self._record.agent_id}):
             other = self._traces.get(agent_id)
             if other is None:
-                yield Text(f"  agent {agent_id}: its record is not here", style="dim")
+                yield shown(f"  agent {agent_id}: its record is not here", style="dim")
                 continue
-            yield Text(f"  agent {agent_id}: ", style="bold").append(other.held(now, top), "not bold")
+            yield shown(f"  agent {agent_id}: ", style="bold").append(shown(other.held(now, top), "not bold"))
             if run is not None:
                 yield from other.has_to_do_with(agent_id, run)
             for number in other.near(now):
@@ -59,7 +60,7 @@ class Others:
                 words = (
                     f"{after_s:+8.3f} s  line {line}: A{theirs.algorithm} {theirs.handler[:40]}: {theirs.branch[:40]}"
                 )
-                yield Text(f"    {words}", style="dim")
+                yield shown(f"    {words}", style="dim")
 
 
 class _Other:
@@ -103,16 +104,16 @@ class _Other:
         if run.trigger.get("from") == theirs:
             numbers = self._exchanges.that_sent(run.trigger.get("message"), run.trigger.get("seq"))
             for line, sending in self._nearest(numbers, run.t):
-                yield Text(
+                yield shown(
                     f"    sent it at line {line}, by {sending.handler[:40]}: {sending.branch[:40]}", style="green"
                 )
         for message in run.sent:
             heard = self._nearest(self._exchanges.that_heard(message.message, message.seq), run.t)
             for line, hearing in heard:
                 words = f"heard {message.message[:60]} {message.seq} at line {line}: {hearing.branch[:40]}"
-                yield Text(f"    {words}", style="green")
+                yield shown(f"    {words}", style="green")
             if not heard:
-                yield Text(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
+                yield shown(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
 
     def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
         """The sequence numbers of a new life begin anew: it is the run nearest in time."""

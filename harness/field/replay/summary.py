@@ -11,6 +11,7 @@ from harness.field.replay.document import verdict
 from harness.field.replay.names import Names
 from harness.field.replay.player import Found
 from harness.field.replay.record import Record
+from harness.field.replay.shown import shown
 from harness.field.replay.source import source_of
 from ucp.agent import HANDLERS
 
@@ -21,7 +22,7 @@ LOST_SHOWN = 5
 def head(record: Record) -> Text:
     """Whose record it is, and how much of it there is."""
     lives = f", {record.lives} lives" if record.lives > 1 else ""
-    return Text(
+    return shown(
         f"agent {record.agent_id}, one of {len(record.header.roster)}: {len(record.entries):,} lines, "
         f"{record.ends_s:,.0f} s of the mission{lives}; {record.path}",
         style="dim",
@@ -34,33 +35,33 @@ def summary(record: Record, found: Found, names: Names) -> Iterator[Text]:
     match verdict(found):
         case "as specified":
             words = "all" if not found.unjudged else "as far as it could be played,"
-            yield Text(f"✔ no difference: {steps}, {words} as Algorithms 1 to 20 say", style="green")
+            yield shown(f"✔ no difference: {steps}, {words} as Algorithms 1 to 20 say", style="green")
         case "not judged":
-            yield Text("- nothing could be judged", style="yellow")
+            yield shown("- nothing could be judged", style="yellow")
         case "deviates":
             yield from _differences(record, found, steps, names)
     if found.unjudged:
         runs = "handler run" if found.unjudged == 1 else "handler runs"
-        yield Text(f"- {found.unjudged:,} {runs} could not be judged:", style="yellow")
+        yield shown(f"- {found.unjudged:,} {runs} could not be judged:", style="yellow")
         for sentence in found.lost[:LOST_SHOWN]:
-            yield Text(f"  {sentence}", style="yellow")
+            yield shown(f"  {sentence}", style="yellow")
 
 
 def _differences(record: Record, found: Found, steps: str, names: Names) -> Iterator[Text]:
     first = found.first
     assert first is not None, "it deviates"
     count = len(found.deviations)
-    yield Text(f"✘ {count:,} difference{'s' if count > 1 else ''} in {steps}; the first:", style="bold red")
-    yield Text(f"  line {first.line}, t={first.t:g} s: {title(first)}")
-    yield Text(f"  {first.difference(names.of)}", style="red")
-    yield Text(f"  ucp-harness replay {record.named} --break {first.line}", style="dim")
+    yield shown(f"✘ {count:,} difference{'s' if count > 1 else ''} in {steps}; the first:", style="bold red")
+    yield shown(f"  line {first.line}, t={first.t:g} s: {title(first)}")
+    yield shown(f"  {first.difference(names.of)}", style="red")
+    yield shown(f"  ucp-harness replay {record.named} --break {first.line}", style="dim")
     of_handler: dict[str, list[Deviation]] = {}
     for deviation in found.deviations:
         of_handler.setdefault(title(deviation), []).append(deviation)
     if len(of_handler) > 1:
-        yield Text("By handler, with the line of the first:")
+        yield shown("By handler, with the line of the first:")
         for name, deviations in islice(of_handler.items(), HANDLERS_SHOWN):
-            yield Text(f"  {name}: {times(len(deviations))}, line {deviations[0].line}, t={deviations[0].t:g} s")
+            yield shown(f"  {name}: {times(len(deviations))}, line {deviations[0].line}, t={deviations[0].t:g} s")
 
 
 def title(deviation: Deviation) -> str:

@@ -11,6 +11,7 @@ from harness.checker.steps.inputs import decoded
 from harness.field.replay.names import SHOWN, Names
 from harness.field.replay.player import Player
 from harness.field.replay.record import Entry
+from harness.field.replay.shown import shown
 from harness.field.replay.source import source_of
 from ucp.agent import HANDLERS
 from ucp.block import Block
@@ -41,36 +42,36 @@ class Words:
             case aside:
                 words = f"    command {aside.command[:40]}"
         differs = number in self._player.found.positions
-        return Text(f"{'✘' if differs else ' '}{where}{words}", style="red" if differs else "")
+        return shown(f"{'✘' if differs else ' '}{where}{words}", style="red" if differs else "")
 
     def step(self) -> Iterator[Text]:
         """What was played last: why, what the algorithm says of it, what came of it, and where that is wrong."""
         player = self._player
         entry = player.entry
         if entry is None:
-            yield Text(f"before line 1: agent {player.record.agent_id} as it begins", style="bold")
+            yield shown(f"before line 1: agent {player.record.agent_id} as it begins", style="bold")
             return
         life = f", life {entry.life}" if player.record.lives > 1 and entry.life else ""
         place = f"line {entry.line}{life}, t={entry.what.t:.3f} s"
         if entry.gap is not None:
-            yield Text(f"before this {entry.gap}", style="yellow")
+            yield shown(f"before this {entry.gap}", style="yellow")
         match entry.what:
             case HandlerRun() as run:
                 yield from self._run(run, place)
             case Dropped() as aside:
-                yield Text(f"{place}: dropped, {aside.dropped[:60]}", style="bold")
+                yield shown(f"{place}: dropped, {aside.dropped[:60]}", style="bold")
                 yield _row("came", self._datagram(aside.datagram))
             case aside:
-                yield Text(f"{place}: command {aside.command[:60]}", style="bold")
+                yield shown(f"{place}: command {aside.command[:60]}", style="bold")
         for deviation in player.deviations_here():
             yield self.deviation(deviation)
         if player.lost is not None:
-            yield Text(f"  - {player.lost}", style="yellow")
+            yield shown(f"  - {player.lost}", style="yellow")
 
     def _run(self, run: HandlerRun, place: str) -> Iterator[Text]:
         handler = HANDLERS.get(run.handler)
         source = f"  {source_of(handler.name)}" if handler else ""
-        yield Text(f"{place}: Algorithm {run.algorithm}, {run.handler[:60]}", style="bold").append(
+        yield shown(f"{place}: Algorithm {run.algorithm}, {run.handler[:60]}", style="bold").append(
             source, "not bold dim"
         )
         yield _row("because", self._trigger(run))
@@ -92,7 +93,7 @@ class Words:
         entry = self._player.entry
         own = entry is not None and entry.line == deviation.line and isinstance(entry.what, HandlerRun)
         whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "
-        return Text(f"  ✘ {whose}{deviation.difference(self._names.of)}", style="bold red")
+        return shown(f"  ✘ {whose}{deviation.difference(self._names.of)}", style="bold red")
 
     def beside(self, deviation: Deviation) -> Table | Text:
         """The agent's own record of a step beside what the reference does; what differs is marked."""
@@ -101,7 +102,7 @@ class Words:
         table = Table("", "the agent's record", "the reference", box=None, padding=(0, 2, 0, 0))
         for label, own, right in self._sides(deviation.run, deviation.expected):
             style = "" if own == right else "red"
-            table.add_row(label, Text(own, style), Text(right, style))
+            table.add_row(label, shown(own, style), shown(right, style))
         return table
 
     def _sides(self, *runs: HandlerRun) -> Iterator[tuple[str, str, str]]:
@@ -182,14 +183,14 @@ class Words:
     def in_short(self) -> Text:
         """The state in a line."""
         if self._player.lost is not None:
-            return Text("  what the agent holds now is not known", style="yellow")
+            return shown("  what the agent holds now is not known", style="yellow")
         state = self._player.state
         held = (
             f"chain {len(state.chain)}, deque {len(state.blocks_to_be_committed)}, stack {len(state.reconcile_stack)}"
         )
         doing = "reconciling" if state.reconcile_in_progress else "idle" if state.idle else "voting"
         timers = "".join(f", {words}" for words in self._timers())
-        return Text(f"  {held}, {doing}{timers}", style="cyan")
+        return shown(f"  {held}, {doing}{timers}", style="cyan")
 
     def state(self) -> Iterator[Text]:
         """All that the agent holds, asks and counts after the step."""
@@ -246,8 +247,8 @@ class Words:
 
 
 def _row(label: str, words: str, style: str = "") -> Text:
-    return Text(f"  {label:<10}", style="dim").append(
-        Text(words, style=f"not dim {style}" if style != "dim" else "dim")
+    return shown(f"  {label:<10}", style="dim").append(
+        shown(words, style=f"not dim {style}" if style != "dim" else "dim")
     )
 
 

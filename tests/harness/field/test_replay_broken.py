@@ -154,3 +154,19 @@ def test_a_clock_that_was_set_is_nobodys_mistake(by_s: float, home: Path) -> Non
     assert found.deviations == []
     assert found.unjudged
     assert "clock was set" in found.lost[0]
+
+
+def test_what_a_record_has_for_words_does_nothing_to_a_terminal(home: Path) -> None:
+    evil = "\x1b]0;title\x07\x1b[2J[bold]"
+
+    def swear(lines: list[str]) -> None:
+        entry = json.loads(lines[20])
+        entry["branch"], entry["trigger"] = evil, {"message": evil, "from": 1, "seq": 2}
+        lines[20] = json.dumps(entry) + "\n"
+
+    change(home / "2.trace.jsonl", swear)
+    commands = "goto 21\ns\ncompare\nl\no\n"
+    ended = harness("replay", home, "--agent", 2, "--step", input=commands)
+    assert ended.returncode == 1
+    assert "[bold]" in ended.stdout
+    assert not any(character in ended.stdout + ended.stderr for character in "\x1b\x07")
