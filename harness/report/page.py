@@ -46,6 +46,7 @@ def draw(left: ReportSource) -> str:
         figures=facts.figures(record),
         survival=survival.section(record.survival, ink),
         pictures=_pictures(exports.by_agent, left.archive.before_final_reconcile, ink),
+        counts=swarm.counts(exports.by_agent, record),
         blocks=swarm.block_rows(exports.by_agent, ink),
         timeline=timeline_section,
         strip=network.strip(left.network, record.faults, timeline.end_s(left)),

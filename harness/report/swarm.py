@@ -7,7 +7,7 @@ from typing import Any
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
-from harness.archive.record import AgentRecord
+from harness.archive.record import AgentRecord, RunRecord
 from harness.present import words
 from harness.present.colours import Ink, inks
 from harness.report.chain_tree import holders, ranges
@@ -78,6 +78,31 @@ def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
     if agent.dropped:
         cells["dropped"] = ", ".join(f"{words.value(count)} {reason}" for reason, count in agent.dropped.items())
     return cells
+
+
+def counts(exports: Mapping[int, Export], record: RunRecord) -> str | None:
+    """Where the blocks are that were completed and are in no chain, and whose those are that are in one all the same.
+
+    None if the blocks that were completed are those in the chains.
+    """
+    completed = {block for export in exports.values() for block in export.completed}
+    completed |= {block for agent in record.agents.values() for block in agent.completed_before}
+    in_chains = {block.block_hash for export in exports.values() for block in export.chain}
+    aside = {block.block_hash for export in exports.values() for block in export.blocks()} - in_chains
+    if completed == in_chains:
+        return None
+    parts = [f"of {len(completed)} completed blocks {_are(len(completed & in_chains))} in a chain"]
+    if waiting := len(completed & aside):
+        parts.append(f"{_are(waiting)} in a deque or on a reconcile stack")
+    if gone := len(completed - in_chains - aside):
+        parts.append(f"{_are(gone)} held by nobody whose export is here")
+    if strange := len((in_chains | aside) - completed):
+        parts.append(f"beside them {_are(strange)} held whose makers do not say here what they completed")
+    return "; ".join(parts).capitalize() + "."
+
+
+def _are(count: int) -> str:
+    return f"{count} is" if count == 1 else f"{count} are"
 
 
 def block_rows(exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> list[BlockRow]:

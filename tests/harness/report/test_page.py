@@ -14,9 +14,11 @@ from hypothesis import strategies as st
 
 from harness.archive.archive import RunArchive
 from harness.archive.exports import BEFORE_FINAL_RECONCILE
+from harness.archive.record import AgentRecord, RunRecord
 from harness.errors import RunDirectoryError
 from harness.report import write_report
-from tests.harness.report.runs import result_of, write_exports, write_run
+from harness.report.swarm import counts
+from tests.harness.report.runs import exports, result_of, write_exports, write_run
 
 HOSTILE = "</title></style><script>alert(1)</script><img src=x onerror=alert(2)>\"'{{ 7 * 7 }}"
 CHAINS = {1: "1.1 2.1 3.1", 2: "1.1 2.1", 3: "1.1 2.1 3.1"}
@@ -194,7 +196,16 @@ def test_agents_without_a_usable_export_are_said_and_the_rest_is_drawn(tmp_path:
     assert "agent 4: no usable export (hung)" in page.text
     assert "agents/2.chain.json: truncated or damaged" in page.text
     assert str(tmp_path) not in page.text
-    assert "The 3 blocks as a table" in page.text
+    assert "The 3 blocks in chains as a table" in page.text
+
+
+def test_it_says_why_more_blocks_were_completed_than_are_in_chains() -> None:
+    assert counts(exports({1: "1.1 2.1", 2: "1.1 2.1"}), RunRecord()) is None
+    lost = RunRecord(agents={"3": AgentRecord(outcome="killed", completed_before=["a", "b"])})
+    assert counts(exports({1: "1.2 2.1"}), lost) == (
+        "Of 4 completed blocks 1 is in a chain; 3 are held by nobody whose export is here; "
+        "beside them 1 is held whose makers do not say here what they completed."
+    )
 
 
 def test_a_run_without_any_export_is_still_reported(tmp_path: Path) -> None:
