@@ -66,14 +66,15 @@ def main() -> None:
             write_exports(directory / "exports", agents, blocks, shape)
             mebibytes = sum(path.stat().st_size for path in (directory / "exports").iterdir()) / 2**20
             command = [sys.executable, "-m", "harness.cli", "consolidate", str(directory / "exports")]
-            began = time.perf_counter()
+            began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
             subprocess.run([*command, "-o", str(directory / "mission.jsonl")], check=True, stdout=subprocess.DEVNULL)
-            seconds = time.perf_counter() - began
-            peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+            seconds, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+            processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            peak = after.ru_maxrss / 1024
             record = (directory / "mission.jsonl").stat().st_size / 2**20
             sys.stdout.write(
                 f"{shape} ({words}): {agents} exports of {blocks} blocks, {mebibytes:.0f} MiB: {seconds:.1f} s, "
-                f"peak {peak:.0f} MiB so far, record {record:.0f} MiB\n"
+                f"{processor:.1f} s of processor time, peak {peak:.0f} MiB so far, record {record:.0f} MiB\n"
             )
 
 

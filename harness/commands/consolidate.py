@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 
 from harness.archive.directory import claim
 from harness.commands.new_file import refuse_existing, write_new
@@ -80,7 +81,8 @@ def _reconcile(record: Consolidation, directory: Path) -> "Reconciliation":
     from harness.depot.reconcile import reconcile, write  # what plays a swarm takes its time to import
 
     claim(directory)
-    reconciliation = reconcile(record)
+    with Console(stderr=True).status("reconciling", spinner="line") as status:
+        reconciliation = reconcile(record, status.update)
     write(reconciliation, directory)
     return reconciliation
 

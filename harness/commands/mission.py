@@ -1,5 +1,6 @@
 """`ucp-harness mission`: what every vehicle is given before it takes off, and whether all of them have it."""
 
+import base64
 import ipaddress
 import json
 from datetime import UTC, datetime
@@ -59,7 +60,7 @@ def new_command(
         complain(f"{scenario}: its quirks ({', '.join(in_words(asked.quirks))}) are left out: a mission asks for none")
     plan = Plan(
         asked,
-        _initial_data(initial_data, asked.name),
+        _initial_data(initial_data, asked),
         settings=_pairs("--setting", settings),
         events=_events(_pairs("--event", events)),
         subnet=_subnet(subnet),
@@ -102,7 +103,12 @@ def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenar
     asked = load_scenario(path)
     roster = {} if agents is None else {"agents": _roster(agents)}
     chosen = {"name": name or asked.name, "agents": list(asked.roster), **roster}
-    kept = {"settings": asked.settings, "events": asked.events, "quirks": asked.quirks}
+    kept = {
+        "settings": asked.settings,
+        "events": asked.events,
+        "quirks": asked.quirks,
+        "initial_data": asked.initial_data,
+    }
     return parse({**chosen, **kept})
 
 
@@ -113,9 +119,11 @@ def _roster(text: str) -> int | list[int]:
     return int(parts[0]) if len(parts) == 1 else [int(part) for part in parts]
 
 
-def _initial_data(text: str | None, name: str) -> bytes:
+def _initial_data(text: str | None, asked: Scenario) -> bytes:
+    if text is None and asked.initial_data is not None:
+        return base64.b64decode(asked.initial_data)
     if text is None:
-        return f"{name}, made {datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%fZ}".encode()
+        return f"{asked.name}, made {datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%fZ}".encode()
     if not text.startswith("@"):
         return text.encode(errors="surrogateescape")
     try:

@@ -29,11 +29,13 @@ def ordered(blocks: Mapping[str, ExportedBlock], chains: Sequence[Sequence[str]]
     mutual = mutual_chain(chains)
     first = set(mutual)
     after: dict[str, set[str]] = {block_hash: set() for block_hash in blocks if block_hash not in first}
-    for chain in chains:
-        for below, above in pairwise(chain[len(mutual) :]):
+    tails = [chain[len(mutual) :] for chain in dict.fromkeys(map(tuple, chains))]
+    for tail in tails:
+        for below, above in pairwise(tail):
             if below != above and below in after and above in after:
                 after[below].add(above)
-    component = _components(after)
+    apart = sum(map(len, tails)) == len(set().union(*tails))  # then no two of them can contradict each other
+    component = {block_hash: number for number, block_hash in enumerate(after)} if apart else _components(after)
     members: dict[int, list[str]] = {}
     for block_hash, number in component.items():
         members.setdefault(number, []).append(block_hash)

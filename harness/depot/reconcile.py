@@ -8,7 +8,7 @@ it was building stays as it was: no events come any more.
 """
 
 import base64
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from harness.depot.consolidation import Consolidation
 from harness.depot.lines import Reconciled, Vehicle
 from harness.errors import MachineError
 from harness.play.mission import reconcile_finally
+from harness.play.simulation.backend import Simulation
 from harness.play.simulation.restored import Restored
 from harness.run.simulate import InMemory, without_waiting
 from harness.scenario import Scenario
@@ -41,11 +42,16 @@ class Reconciliation:
     line: Reconciled
 
 
-def reconcile(record: Consolidation) -> Reconciliation:
-    """Reconcile the exports of a record with each other."""
+def reconcile(record: Consolidation, say: Callable[[str], None] = lambda words: None) -> Reconciliation:
+    """Reconcile the exports of a record with each other. `say` is told again and again how far it is."""
     home = record.home
     stored = _stored(home)
-    swarm = Restored(_scenario(record), stored, InMemory(tracing=False))
+
+    async def breathe(simulation: Simulation) -> None:
+        tops = await simulation.top_chain_hashes()
+        say(f"reconciling, {simulation.now():.0f} s in virtual time: {len({*tops.values()})} distinct chains")
+
+    swarm = Restored(_scenario(record), stored, InMemory(tracing=False), breathe=breathe)
     rounds = without_waiting(_put_together(swarm, [agent_id for agent_id, held in stored.items() if held.deque]))
     swarm.end()
     at_us = max(export.exported_at_us for export in home.exports.values()) + round(swarm.now() * MICROSECONDS)

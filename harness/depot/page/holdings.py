@@ -1,7 +1,10 @@
 """Who holds what: a row for each vehicle, a column for each block in the order of the record, and what was lost."""
 
+import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from typing import NamedTuple
 
 from markupsafe import Markup
 
@@ -11,6 +14,8 @@ from harness.present.svg import n
 
 WIDTH, LEFT, RIGHT, TOP, BOTTOM = 900, 76, 12, 26, 8
 ROW, GAP = 22, 6
+FINEST = 1.0
+"""Pixels that anybody can tell apart."""
 WIDEST = 14.0
 """Pixels of a column, however few there are."""
 
@@ -74,6 +79,16 @@ Column = tuple[str, str, Mapping[int, str]]
 """Group, name, and where each vehicle holds the block."""
 
 
+class _Stretch(NamedTuple):
+    """From column `begin` up to `end`: where the agent holds them; `share` is "part" if it does not hold all."""
+
+    place: str
+    share: str
+    begin: int
+    end: int
+    names: str
+
+
 def _columns(record: Consolidation) -> list[Column]:
     columns = [(_group_of(block), block.line.name, _places(block)) for block in record.blocks]
     columns += [("lost", lost.block or "", {}) for lost in record.lost_blocks]
@@ -118,29 +133,51 @@ def _group(
                 looks, n(left), top, n(width), ROW - 2
             )
         )
-        for place, begin, end, names in _stretches(members, agent_id):
+        for stretch in _stretches(members, agent_id, each):
             parts.append(
                 Markup('<rect class="{}" x="{}" y="{}" width="{}" height="{}"><title>{}</title></rect>').format(
-                    f"at-{place.replace(' ', '-')}",
-                    n(left + begin * each),
+                    f"at-{stretch.place.replace(' ', '-')} {stretch.share}".rstrip(),
+                    n(left + stretch.begin * each),
                     top,
-                    n(max(0.8, (end - begin) * each)),
+                    n(max(0.8, (stretch.end - stretch.begin) * each)),
                     ROW - 2,
-                    f"vehicle {agent_id}: {names} {PLACES[place]}",
+                    f"vehicle {agent_id}: {stretch.names} {PLACES[stretch.place]}",
                 )
             )
     return Markup("").join(parts)
 
 
-def _stretches(members: Sequence[Column], agent_id: int) -> Iterator[tuple[str, int, int, str]]:
-    """Blocks in a row that the agent holds in the same place: where, from and to which column, and their names."""
+def _stretches(members: Sequence[Column], agent_id: int, each: float) -> Iterator[_Stretch]:
+    """Blocks in a row that the agent holds in the same place; of columns that nobody could tell apart, most of them.
+
+    Each cell is a column, or as many as make a pixel, and has the place where most of its blocks are that the agent
+    holds, and how many these are of all: none, some, or all.
+    """
+    together = max(1, math.ceil(FINEST / each))
+    cells = [members[at : at + together] for at in range(0, len(members), together)]
+    kinds = (_kind(cell, agent_id) for cell in cells)
     at = 0
-    for place, alike in groupby(members, key=lambda column: column[2].get(agent_id)):
-        names = [name for _, name, _ in alike]
+    for (place, share), alike in groupby(kinds):
+        begin, at = at, at + len(list(alike))
         if place is not None:
-            named = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}, {len(names)} blocks,"
-            yield place, at, at + len(names), named
-        at += len(names)
+            held = members[begin * together : at * together]
+            yield _Stretch(place, share, begin * together, begin * together + len(held), _named(held, share))
+
+
+def _kind(cell: Sequence[Column], agent_id: int) -> tuple[str | None, str]:
+    """Where the agent holds these blocks, and whether all of them."""
+    places = Counter(place for _, _, held in cell if (place := held.get(agent_id)) is not None)
+    if not places:
+        return None, ""
+    (place, _), *_ = places.most_common(1)
+    return place, "" if places.total() == len(cell) else "part"
+
+
+def _named(held: Sequence[Column], share: str) -> str:
+    first, last = held[0][1], held[-1][1]
+    if share:
+        return f"some of {len(held)} blocks from {first} to {last}"
+    return first if len(held) == 1 else f"{first} to {last}, {len(held)} blocks,"
 
 
 def _heading(group: str, count: int, left: float, width: float) -> Markup:

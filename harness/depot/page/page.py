@@ -24,8 +24,7 @@ from harness.report.map_svg import STYLE as MAP_STYLE
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 _STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
 MAX_ROWS = 3_000
-MAX_TREE_BLOCKS = 20_000
-"""In all chains together."""
+MAX_TREE_BLOCKS = 10_000
 MAX_TITLE = 100
 
 
@@ -124,7 +123,7 @@ def _trees(
 ) -> list[tuple[str, Markup]] | None:
     """The chains as they came home, and as the reconcile left them; None if nobody could look at so many."""
     exports = record.home.exports
-    if sum(len(export.chain) for export in exports.values()) > MAX_TREE_BLOCKS * len(exports):
+    if len(record.blocks) > MAX_TREE_BLOCKS:
         return None
     drawn = [("As they came home" if reconciliation else "", _tree(exports, record, ink, "home"))]
     if reconciliation is not None:

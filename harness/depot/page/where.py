@@ -25,6 +25,7 @@ METRES_PER_DEGREE = 111_195.0
 """Of latitude, on a sphere of 6,371 km."""
 FARTHEST_M = 1e6
 MAX_POINTS = 20_000
+MAX_FIXES = 50_000
 MAX_EVENTS = 2_000
 _LEFT, _TOP, _RIGHT, _BOTTOM = 62, 14, 14, 62
 _WIDTH, _HEIGHT = 900, 560
@@ -47,11 +48,12 @@ def draw(
     """
     field = _Field(tracks)
     ways = {track.agent_id: [field.fix(at_us, position) for at_us, position in track.fixes] for track in tracks}
+    far = field.far
     land = extent([fix for way in ways.values() for fix in way])
     to_px = Projection(land, _LEFT, _TOP, _WIDTH, _HEIGHT)
     alone = set(rare)
-    marks = [mark for track in tracks for mark in _events(track, alone, field, to_px, ink[track.agent_id])]
-    shown = _shown(marks)
+    logged = [event for track in tracks for event in _logged(track, alone)]
+    shown = sorted(logged[:: -(-len(logged) // MAX_EVENTS) or 1], key=lambda event: event[0])  # the rare ones on top
     drawing = Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
         ' aria-labelledby="map-title map-desc" font-family="{font}" font-size="12">'
@@ -64,12 +66,16 @@ def draw(
         desc=f"Positions of {len(tracks)} vehicles, {land.width_m:.0f} m from west to east.",
         frame=frame(to_px),
         ways=_ways(tracks, ways, lost, to_px, ink),
-        marks=Markup("").join(drawn for _, drawn in shown),
+        marks=Markup("").join(
+            _mark(to_px(field.fix(entry.event.timestamp_us, entry.position)), entry, rare, ink[agent_id])
+            for rare, agent_id, entry in shown
+            if entry.position is not None
+        ),
         ends=_ends(ways, to_px, ink),
     )
-    notes = [] if len(shown) == len(marks) else [f"Of {len(marks)} events the map has {len(shown)}."]
-    if field.far:
-        notes.append(f"{field.far} positions more than {FARTHEST_M / 1000:.0f} km away are at the edge.")
+    notes = [] if len(shown) == len(logged) else [f"Of {len(logged)} events the map has {len(shown)}."]
+    if far:
+        notes.append(f"{far} positions more than {FARTHEST_M / 1000:.0f} km away are at the edge.")
     return Map(drawing, notes)
 
 
@@ -100,7 +106,8 @@ def _ways(
     ink: Mapping[int, Ink],
 ) -> Markup:
     pieces = [(track, gap, piece) for track in tracks for gap, piece in _pieces(track, ways[track.agent_id], lost)]
-    lines = thinned([[to_px(fix) for fix in piece] for _, _, piece in pieces], MAX_POINTS)
+    every = sum(map(len, ways.values())) // MAX_FIXES + 1  # thinning looks at each point many times
+    lines = thinned([[to_px(fix) for fix in (*piece[:-1:every], piece[-1])] for _, _, piece in pieces], MAX_POINTS)
     drawn = []
     for (track, gap, _), line in zip(pieces, lines, strict=True):
         path = "M" + "L".join(f"{n(x)} {n(y)}" for x, y in line)
@@ -134,14 +141,12 @@ def _ordinal(name: str) -> int | None:
     return int(ordinal) if ordinal.isdecimal() else None
 
 
-def _events(track: Track, alone: set[str], field: _Field, to_px: Projection, ink: Ink) -> Iterable[tuple[bool, Markup]]:
-    """A mark for each event but positions, and for positions that one vehicle alone has: whether it is one of these."""
+def _logged(track: Track, alone: set[str]) -> Iterable[tuple[bool, int, Entry]]:
+    """Each event but positions, and positions that one vehicle alone has: whether it is one of these, and whose."""
     for entry in track.entries:
         rare = entry.block in alone
-        if entry.position is None or (entry.is_position and not rare):
-            continue
-        place = to_px(field.fix(entry.event.timestamp_us, entry.position))
-        yield rare, _mark(place, entry, rare, ink)
+        if entry.position is not None and (rare or not entry.is_position):
+            yield rare, track.agent_id, entry
 
 
 def _mark(place: Point, entry: Entry, rare: bool, ink: Ink) -> Markup:
@@ -153,12 +158,6 @@ def _mark(place: Point, entry: Entry, rare: bool, ink: Ink) -> Markup:
     return Markup('<circle class="{}" cx="{}" cy="{}" r="{}" fill="{}"><title>{}</title></circle>').format(
         "logged rare" if rare else "logged", n(place[0]), n(place[1]), 3 if rare else 2.5, ink.fill, "\n".join(tip)
     )
-
-
-def _shown(marks: Sequence[tuple[bool, Markup]]) -> list[tuple[bool, Markup]]:
-    """Those that there is room for: evenly chosen, the rare ones drawn last."""
-    every = -(-len(marks) // MAX_EVENTS) or 1
-    return sorted(marks[::every], key=lambda mark: mark[0])
 
 
 def _ends(ways: Mapping[int, Sequence[Fix]], to_px: Projection, ink: Mapping[int, Ink]) -> Markup:

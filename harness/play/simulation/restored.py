@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from harness.play.simulation.backend import Recorder, Simulation
 from harness.scenario import Scenario
@@ -15,8 +16,11 @@ class Restored(Simulation):
     scenario's roster and has nothing stored is not there.
     """
 
-    def __init__(self, scenario: Scenario, stored: Mapping[int, StoredState], recorder: Recorder) -> None:
-        super().__init__(scenario, 0, recorder)
+    def __init__(
+        self, scenario: Scenario, stored: Mapping[int, StoredState], recorder: Recorder, **options: Any
+    ) -> None:
+        """`options` are the simulation's."""
+        super().__init__(scenario, 0, recorder, **options)
         self._stored = stored
         self._generating = False
 

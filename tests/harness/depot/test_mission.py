@@ -89,12 +89,14 @@ def test_what_is_asked_for_is_in_every_file(tmp_path: Path) -> None:
 def test_a_scenario_gives_roster_and_settings_but_no_mistakes(tmp_path: Path) -> None:
     path = tmp_path / "scenario.yaml"
     asked = {"name": "s", "agents": [3, 4], "settings": {"vote_timeout_s": 7}, "quirks": {"ignore_commit": 0.5}}
+    asked["initial_data"] = "QkQgMA=="
     path.write_text(json.dumps(asked))
     done = harness("mission", "new", "--scenario", path, "--out", tmp_path / "m")
     assert done.returncode == 0
     (sentence,) = sentences(done.stderr)
     assert "ignore_commit" in sentence
-    assert load_mission(tmp_path / "m" / "4.mission.json").settings.vote_timeout_s == 7
+    four = load_mission(tmp_path / "m" / "4.mission.json")
+    assert (four.settings.vote_timeout_s, four.initial_data) == (7, b"BD 0")
     assert harness("mission", "verify", tmp_path / "m").returncode == 0
 
 

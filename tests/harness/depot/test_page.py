@@ -103,6 +103,13 @@ def test_clocks_that_are_far_off_do_not_hide_the_others(tmp_path: Path) -> None:
     assert "1 events are outside" in Reader(draw(consolidate(came_home([tmp_path])))).text
 
 
+def test_of_columns_that_nobody_could_tell_apart_a_page_stays_small(tmp_path: Path) -> None:
+    chains = {agent: " ".join(f"{agent}.{number}" for number in range(1, 250)) for agent in range(1, 9)}
+    page = draw(brought(tmp_path, *(document(agent, chain) for agent, chain in chains.items())))
+    assert page.count('class="at-chain part"') < 8 * 900
+    assert "some of" in page
+
+
 # In a browser
 
 
