@@ -5,6 +5,7 @@ to be what is on record. So the first step of a wrong agent is found before any 
 is known which datagrams mattered, which timer was started when, and what was sent.
 """
 
+import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from itertools import zip_longest
 from random import Random
 
 from harness.checker.steps.header import CheckedHeader
+from harness.checker.steps.inputs import decoded
 from harness.field.reconstruct.inputs import Asked, Booted, Heard, Input, Logged, TimerEnded
 from harness.play.simulation.late_timers import LateTimers, Running
 from ucp.agent import Agent, why_not_handled
@@ -165,12 +167,19 @@ class _Life:
             algorithms = frozenset(run.algorithm for run in given.runs)
             return Parting(self._life, index, given.line, given.runs[0].t, problem, algorithms)
         self._rehearsal.to_the_word &= _to_the_word(given.runs, entries)
-        sent = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
+        sent = self._sent(given)
         played = Played(self._life, given, sent, matters)
         if matters:
             self._follow_timers(played, ends)
         self._rehearsal.played.append(played)
         return None
+
+    def _sent(self, given: Input) -> list[bytes]:
+        """The datagrams that left, as they are on record; as the reference makes them where they are not."""
+        encoded = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
+        recorded = [sent.datagram for run in given.runs for sent in run.sent]
+        both = zip(encoded, recorded, strict=False)
+        return [our if their is None else base64.b64decode(their.text) for our, their in both]
 
     def _follow_timers(self, played: Played, ended: Running | None) -> None:
         """Which timers the input has started, and which run no longer."""
@@ -258,11 +267,16 @@ def _differs(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | 
 
 
 def same_sent(ours: Sequence[Sent], theirs: Sequence[Sent]) -> bool:
+    """Whether the messages are the same; their sequence numbers mean nothing to the protocol."""
     if len(ours) != len(theirs):
         return False
-    for our, their in zip(ours, theirs, strict=True):
-        if (our.message, our.seq, our.block) != (their.message, their.seq, their.block):
-            return False
-        if their.datagram is not None and our.datagram != their.datagram:
-            return False
-    return True
+    return all(_same_message(our, their) for our, their in zip(ours, theirs, strict=True))
+
+
+def _same_message(ours: Sent, theirs: Sent) -> bool:
+    if (ours.message, ours.block) != (theirs.message, theirs.block):
+        return False
+    try:
+        return theirs.datagram is None or decoded(ours.datagram).message == decoded(theirs.datagram).message
+    except MalformedDatagramError:
+        return False

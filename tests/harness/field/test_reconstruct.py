@@ -1,5 +1,6 @@
 """A flight flown again: from what came home of runs in virtual time."""
 
+import base64
 import json
 import shutil
 from pathlib import Path
@@ -14,6 +15,8 @@ from harness.run.simulate import simulate
 from harness.scenario import load_scenario
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
+from ucp.messages import decode, encode
+from ucp.trace import in_base64
 
 FIELD: dict[str, Any] = {
     "agents": [10, 28, 32, 118, 120],
@@ -199,3 +202,26 @@ def test_settings_and_a_life_of_which_nothing_is_on_record_are_inferred(tmp_path
     assert reconstruction.problems == []
     assert any("vote_names_chain True" in remark for remark in reconstruction.remarks)
     assert any("reboot" in entry for entry in reconstruction.document["timeline"])
+
+
+def test_how_an_agent_counts_its_datagrams_is_its_own_affair(tmp_path: Path) -> None:
+    directory = home(tmp_path / "home", flown(tmp_path / "run", network={"loss": 0.2}))
+
+    def recounted(text: str) -> str:
+        sender, sequence, message = decode(base64.b64decode(text))
+        return in_base64(encode(sender, sequence + 5 * (sender == 2), message))
+
+    for path in directory.glob("*.trace.jsonl"):
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        for line in lines[1:]:
+            if line["trigger"].get("from") == 2:
+                line["trigger"]["seq"] += 5
+            if "from" in line["trigger"]:
+                line["input"] = recounted(line["input"])
+            for sent in line["sent"]:
+                sent["seq"] += 5 * path.name.startswith("2.")
+                sent["datagram"] = recounted(sent["datagram"])
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    reconstruction = again(directory)
+    assert reconstruction.problems == []
+    assert "datagrams" not in reconstruction.document
