@@ -36,6 +36,8 @@ from ucp.messages import PORT, MalformedDatagramError, decode
 
 MAX_AGENTS = 1000
 LAST_NS = 2**63 - 1
+MAX_DROPPED = 200_000
+"""Of one file, places that say nothing usable: more are in none that is what it is taken for."""
 _PLACES_TOLD = 10
 
 
@@ -95,6 +97,7 @@ class _Stream:
         self._before = 0  # places in the files before this one
         self._said = False
         self._unusable: list[LeftOut] = []
+        self._dropped = 0
 
     def take(self, path: Path, sorter: Sorter) -> None:
         """The next file."""
@@ -102,6 +105,11 @@ class _Stream:
         try:
             for observation in self._adapter.observations(path):
                 last = max(last, observation.where or 0)
+                if self._dropped > MAX_DROPPED or any(reader.hopeless for reader in self._readers.values()):
+                    self._drop(
+                        f"there are too many {self._adapter.counts}s without use: what follows is not read", None
+                    )
+                    break
                 self._take(observation, self._before + observation.where if observation.where else None, sorter)
         except MachineError:
             raise
@@ -165,16 +173,23 @@ class _Stream:
             capture.close()
             seen = glance(self._scratch / f"{agent_id}.pcapng", self._left_out)
             sorter.captures += [replace(seen, source=self._path)] if seen else []
-        for reader in self._readers.values():
-            sorter.lives += reader.ended(self._left_out)
-        if not self._said and not self._unusable:
+        for agent_id, reader in self._readers.items():
+            lives = reader.ended(self._left_out)
+            sorter.lives += lives
+            if not lives:
+                self._drop(
+                    f"none of the {self._lines[agent_id]} lines of a trace of agent {agent_id} says anything", None
+                )
+        if not self._said and not self._dropped:
             self._drop("there is nothing in it that is of an agent", None)
-        self._left_out += self._unusable[:_PLACES_TOLD]
-        if rest := self._unusable[_PLACES_TOLD:]:
-            self._left_out.append(LeftOut(self._path, f"{len(rest)} more places in it say nothing usable"))
+        self._left_out += self._unusable
+        if rest := self._dropped - len(self._unusable):
+            self._left_out.append(LeftOut(self._path, f"{rest} more places in it say nothing usable"))
 
     def _drop(self, why: str, where: int | None) -> None:
-        self._unusable.append(LeftOut(self._path, why, where, self._adapter.counts))
+        self._dropped += 1
+        if len(self._unusable) < _PLACES_TOLD:
+            self._unusable.append(LeftOut(self._path, why, where, self._adapter.counts))
 
 
 def _text(text: str | bytes) -> str:

@@ -22,11 +22,12 @@ from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 MAX_TRACE_BYTES = 256 * 1024 * 1024
 """Of a larger file the beginning is read."""
 MAX_LIVES = 1000
+MAX_LOST = 1_000_000
 MAX_PLACES = 1000
 """Damaged places that are kept apart."""
 MAX_RUNS = 1_000_000
 """Of one file. Of 20 agents that hear everything, each has about a tenth of it in 2 hours."""
-NOTHING_WITHIN_BYTES = 8 * 1024 * 1024
+NOTHING_WITHIN_BYTES, NOTHING_WITHIN_LINES = 8 * 1024 * 1024, 100_000
 """A file that holds no line of a trace so far is none."""
 ROUNDING_S = 2e-3
 """How far time may go back from line to line: a trace may have its times to the millisecond."""
@@ -136,17 +137,21 @@ class TraceReader:
         self._agent_id, self._counts = agent_id, counts
         self.lives: list[Life] = []
         self.hopeless = False
-        self._read_bytes = self._runs = 0
+        self._read_bytes = self._lines = self._runs = self._lost = 0
         self._damaged: list[_Damage] = []
         self._cut_off: int | None = None
 
     def take(self, number: int, line: bytes, ended: bool = True) -> None:
         """The line with this number; one that did not end may be cut off."""
         self._read_bytes += len(line)
-        self.hopeless = not self.lives and self._read_bytes > NOTHING_WITHIN_BYTES
-        if self._runs == MAX_RUNS or len(self.lives) > MAX_LIVES:
+        self._lines += 1
+        self.hopeless = not self.lives and (
+            self._read_bytes > NOTHING_WITHIN_BYTES or self._lines > NOTHING_WITHIN_LINES
+        )
+        if self._runs == MAX_RUNS or len(self.lives) > MAX_LIVES or self._lost == MAX_LOST:
             if not self.hopeless:
-                what = f"it and all after it are beyond {MAX_RUNS} handler runs, or {MAX_LIVES} lives of agents"
+                limit = f"{MAX_RUNS} handler runs, {MAX_LIVES} lives of agents, or {MAX_LOST} damaged lines"
+                what = f"it and all after it are not read: more than {limit} are in no trace"
                 self._damaged = [*self._damaged[:_PLACES_TOLD], _Damage(number, number, what)]
             self.hopeless = True
             return
@@ -192,6 +197,7 @@ class TraceReader:
             self.lives.append(self._life(None, number))  # that was a header, whatever else it said
         elif self.lives:
             self.lives[-1].lose(0 if text.startswith(b"\0") else 1, len(text))
+        self._lost += 1
         self._say(number, why)
 
     def _say(self, number: int, why: str) -> None:

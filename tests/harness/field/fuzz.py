@@ -178,7 +178,7 @@ def _named(path: Path, homecoming: Homecoming, outcome: Outcome) -> None:
         return
     outcome.add(f"sort_out {path.suffix}", "used in part" if dropped else "used")
     if not dropped and path.suffix == ".jsonl":
-        lines = [line for line in path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines() if line.strip()]
+        lines = [line for line in path.read_bytes().removeprefix(b"\xef\xbb\xbf").split(b"\n") if line.strip()]
         used = sum(
             len(trace.runs) + len(trace.asides) + len(trace.starts) + 1
             for flight in homecoming.flights

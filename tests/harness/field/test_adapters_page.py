@@ -15,6 +15,8 @@ from tests.harness.field.flights import flown, trace_of
 
 PAGE = (Path(__file__).parents[3] / "docs" / "adapters.md").read_text()
 TEXTS = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
+LOG = "".join(line for line in TEXTS[0].splitlines(keepends=True) if " STEP " not in line)
+"""Its step is an abridged one."""
 PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
@@ -26,12 +28,12 @@ def swarmlog(tmp_path: Path) -> Path:
 
 
 def test_the_worked_example_reads_the_log_beside_it(swarmlog: Path, tmp_path: Path) -> None:
-    (tmp_path / "flight.log").write_text(TEXTS[0] + "1790000015.0 ??? 12\n")
+    (tmp_path / "flight.log").write_text(LOG + "1790000015.0 ??? 12\n")
     done = harness("import", "--adapter", f"{swarmlog}:SwarmLog", tmp_path / "flight.log", "-o", tmp_path / "home")
     assert done.returncode == 0
     assert f"{tmp_path / 'home'}: agents 7: 1 capture(s), 1 list(s) of events\n" == done.stdout
     assert sentences(done.stderr) == [
-        f"{tmp_path / 'flight.log'}, line 6: the log is damaged here: '???' is no kind of line"
+        f"{tmp_path / 'flight.log'}, line 5: the log is damaged here: '???' is no kind of line"
     ]
     captures = read_captures(capture_files([tmp_path / "home"]))
     assert captures.used[0].vehicle == 7 and [each.sender for each in captures.datagrams] == [7, 28]
@@ -67,9 +69,9 @@ def test_an_adapter_that_is_none_is_said_in_a_sentence(swarmlog: Path, name: str
 
 def test_an_adapter_that_fails_keeps_what_it_had(swarmlog: Path, tmp_path: Path) -> None:
     swarmlog.write_text(PROGRAMS[0].replace("except ValueError", "except KeyError"))
-    (tmp_path / "flight.log").write_text(TEXTS[0] + "nonsense\n")
+    (tmp_path / "flight.log").write_text(LOG + "nonsense\n")
     out = tmp_path / "home"
     record = bring_in([tmp_path / "flight.log"], [load_adapter(f"{swarmlog}:SwarmLog")], out)
     assert record.flights[0].agents[7].capture
     (left_out,) = record.left_out
-    assert "reading it broke off after line 5: ValueError: not enough values to unpack" in left_out.sentence
+    assert "reading it broke off after line 4: ValueError: not enough values to unpack" in left_out.sentence

@@ -226,6 +226,12 @@ def test_without_the_package_it_is_said_what_is_missing(
     assert caught.value.exit_status == 3 and not (tmp_path / "out").exists()
 
 
+def test_lines_of_a_trace_of_which_none_says_anything_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("agent,kind,data\n" + "7,trace,hello\n" * 3)
+    with pytest.raises(FieldError, match="none of the 3 lines of a trace of agent 7 says anything"):
+        imported(tmp_path / "out", tmp_path / "a.csv")
+
+
 def test_nothing_usable_makes_nothing(tmp_path: Path) -> None:
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
     with pytest.raises(FieldError, match="nothing of this is a usable"):

@@ -11,6 +11,7 @@ MAX_MESSAGE_BYTES = 64 * 1024 * 1024
 """A chain export of some 35,000 blocks."""
 MAX_CHUNK_BYTES = 256 * 1024 * 1024
 MAX_FILE_BYTES = 1024 * 1024 * 1024
+MAX_RECORDS = 5_000_000
 MAX_TRIES = 2_000_000
 """Places at which a record may begin behind a damaged one, of a file."""
 

@@ -4,7 +4,7 @@ import re
 import struct
 from collections.abc import Iterator
 
-from harness.field.adapters.bags.found import MAX_CHUNK_BYTES, MAX_TRIES, Broken, Buffer, Item, Topics
+from harness.field.adapters.bags.found import MAX_CHUNK_BYTES, MAX_RECORDS, MAX_TRIES, Broken, Buffer, Item, Topics
 from harness.field.adapters.bags.packed import unpacked
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -22,7 +22,9 @@ def items(bag: Buffer) -> Iterator[Item]:
     topics = Topics()
     reader = _Reader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
-    if not reader.closed:
+    if next(reader.records, None) is None:
+        yield Broken(f"what is beyond {MAX_RECORDS} records is not read")
+    elif not reader.closed:
         yield Broken("it was not closed, and breaks off")
     yield from topics.rest()
 
@@ -31,12 +33,17 @@ class _Reader:
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
         self._tries = iter(range(MAX_TRIES))
+        self.records = iter(range(MAX_RECORDS))
         self._types: dict[int, str] = {}
         self.closed = False
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
         """Messages of the bag, or of a chunk; a part of a last record is no damage if the chunk is not `whole`."""
-        while position < len(buffer) and not (self.closed and buffer[position : position + len(MAGIC)] == MAGIC):
+        while (
+            position < len(buffer)
+            and next(self.records, None) is not None
+            and not (self.closed and buffer[position : position + len(MAGIC)] == MAGIC)
+        ):
             operation, begins, ends = _record_at(buffer, position)
             if not operation:
                 following = self._next(buffer, position + 1)

@@ -4,7 +4,7 @@ import re
 import struct
 from collections.abc import Iterator
 
-from harness.field.adapters.bags.found import MAX_CHUNK_BYTES, MAX_TRIES, Broken, Buffer, Item, Topics
+from harness.field.adapters.bags.found import MAX_CHUNK_BYTES, MAX_RECORDS, MAX_TRIES, Broken, Buffer, Item, Topics
 from harness.field.adapters.bags.packed import unpacked
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -23,7 +23,10 @@ _Record = tuple[dict[str, bytes], bytes, int]
 
 def items(bag: Buffer) -> Iterator[Item]:
     topics = Topics()
-    yield from _Reader(topics).items(bag, len(MAGIC), 0)
+    reader = _Reader(topics)
+    yield from reader.items(bag, len(MAGIC), 0)
+    if next(reader.records, None) is None:
+        yield Broken(f"what is beyond {MAX_RECORDS} records is not read")
     yield from topics.rest()
 
 
@@ -31,10 +34,11 @@ class _Reader:
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
         self._tries = iter(range(MAX_TRIES))
+        self.records = iter(range(MAX_RECORDS))
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
         """Messages of the bag, or of a chunk; a part of a last record is no damage if the chunk is not `whole`."""
-        while position < len(buffer):
+        while position < len(buffer) and next(self.records, None) is not None:
             record = _record_at(buffer, position)
             if record is None:
                 following = self._next(buffer, position + 1)
