@@ -125,5 +125,7 @@ class History:
             raise RepositoryError(f"{where}: not a directory") from None
         if ended.returncode not in accept:
             said = " ".join((ended.stderr.strip() or ended.stdout.strip()).split())
+            if "not a git repository" in said:
+                raise RepositoryError(f"{where}: not in a git repository; name one with --repository")
             raise RepositoryError(f"{where}: git {arguments[0]}: {said[:300] or f'ended with {ended.returncode}'}")
         return ended.stdout + (ended.stderr if arguments[0] == "bisect" else "")

@@ -103,13 +103,14 @@ class Workshop:
         """By the judge that runs now, whichever state of the code was played. Raises CannotBeTriedError."""
         if played.status is None:
             raise CannotBeTriedError(f"it had not ended after {self._limit_s:g} s; --limit-s gives it longer")
+        said = played.last_words.replace(f"{run_dir.parent}/", "")
         if played.status == INTERRUPTED:
             raise InterruptedRunError("interrupted")
         if played.status == CANNOT_HERE:
-            raise MachineCannotError(played.last_words)
+            raise MachineCannotError(said)
         archive = RunArchive(run_dir) if (run_dir / "run.json").is_file() else None
         if played.status not in (0, VIOLATED, WRONG_REQUEST) or archive is None or not archive.exports.by_agent:
-            raise CannotBeTriedError(played.last_words)
+            raise CannotBeTriedError(said)
         return of_run(
             self.subject.in_words, checker.check(checker.gather(archive)), archive.exports.by_agent, exact=exact
         )
