@@ -29,6 +29,7 @@ from harness.archive.exports import (
 )
 from harness.archive.lenient import fit
 from harness.archive.opened import Opened
+from harness.archive.traces import read_trace
 from harness.depot.same_mission import INCEPTION, ROSTER, Carried, UnreadableFileError
 from harness.depot.same_mission import read as read_carried
 from harness.errors import ExportError
@@ -78,6 +79,8 @@ class CameHome:
     remarks: list[str]
     roster: set[int] = field(default_factory=set)
     """Agents that mission files, traces, a manifest or a run's record beside the exports name."""
+    traced: dict[int, list[str]] = field(default_factory=dict)
+    """Hashes of the blocks that agents without an export completed, by their traces."""
     telemetry: bool = True
     """Whether events are those of vehicles, as far as anything says otherwise."""
 
@@ -139,6 +142,9 @@ def came_home(paths: Iterable[Path]) -> CameHome:
 def _look_beside(home: CameHome, carried: Iterable[Carried]) -> None:
     """Who flew, and what their events are, as other files of the mission say it."""
     for each in carried:
+        if each.kind == "trace" and each.agent_id is not None and each.agent_id not in home.latest:
+            trace = read_trace(each.path, skim=True)
+            home.traced.setdefault(each.agent_id, []).extend(trace.completed() if trace else ())
         if ROSTER in each.shared:
             home.roster.update(each.shared[ROSTER].value)  # type: ignore[arg-type]
         if each.mission is not None and each.mission.events.source == "random":

@@ -178,6 +178,10 @@ def _names(home: CameHome) -> dict[str, str]:
                 "reconcile_stack": [],
             }
         )
+    for agent_id, completed in home.traced.items():
+        exports[agent_id] = Export.model_construct(
+            agent_id=agent_id, completed=completed, chain=[], blocks_to_be_committed=[], reconcile_stack=[]
+        )
     names = name_blocks(exports)
     edited = {true: f"{names.get(claimed, claimed[:12])} (edited)" for true, claimed in claims.items()}
     return {**edited, **names}
@@ -289,6 +293,13 @@ def _lost_blocks(
                 agents=[*absent] or [agent_id],
                 why=why,
             )
+    for agent_id, completed in home.traced.items():
+        for block_hash in completed:
+            if block_hash not in blocks:
+                why = f"agent {agent_id} completed it, by its trace, and nobody has it"
+                lost[block_hash] = Lost(
+                    agent_id=agent_id, block=names[block_hash], block_hash=block_hash, agents=[agent_id], why=why
+                )
     return [*lost.values()]
 
 

@@ -20,7 +20,7 @@ from harness.depot.lines import Block, ConsolidatedLine, Event, Header, Lost, Re
 from harness.depot.outputs import lines
 from harness.depot.words import in_words
 from harness.errors import ExportError, FieldError
-from tests.harness.command import harness, sentences
+from tests.harness.command import harness, sentences, write_scenario
 from tests.harness.depot.exports import DATA, brought, document, made, names, write
 from ucp.block import Block as UcpBlock
 from ucp.block import InceptionBlock
@@ -128,6 +128,27 @@ def test_who_flew_is_known_from_mission_files_beside_the_exports(tmp_path: Path)
     assert record.header.roster == [1, 2, 9]
     assert [missing.agent_id for missing in record.missing] == [9]
     assert record.header.left_out == []
+
+
+def test_what_a_vehicle_had_that_did_not_come_home_its_trace_says(tmp_path: Path) -> None:
+    exports = simulate_into(tmp_path / "run")
+    (tmp_path / "run" / "agents" / "2.chain.json").unlink()
+    record = consolidate(came_home([tmp_path / "run"]))
+    assert [missing.agent_id for missing in record.missing] == [2]
+    assert record.lost_blocks
+    held = {block.block_hash for agent_id in (1, 3) for block in exports[agent_id].blocks()}
+    assert {lost.block_hash for lost in record.lost_blocks} == {*exports[2].completed} - held
+    assert all(lost.agents == [2] for lost in record.lost_blocks)
+    names = {block_hash: f"2.{number}" for number, block_hash in enumerate(exports[2].completed, 1)}
+    assert all(lost.block == names[str(lost.block_hash)] for lost in record.lost_blocks)
+
+
+def simulate_into(directory: Path) -> dict[int, Export]:
+    """The run directory of three agents that hear little of each other."""
+    lossy = {"agents": 3, "duration_s": 400, "network": {"loss": 0.95}, "settle": {"limit_s": 1}}
+    path = write_scenario(directory.parent, **lossy, events={"source": "random", "mean_s": 5})
+    harness("run", path, "--backend", "sim", "--out", directory)
+    return {agent_id: read_export(directory / "agents" / f"{agent_id}.chain.json") for agent_id in (1, 2, 3)}
 
 
 # Whatever has become of the files
