@@ -41,6 +41,9 @@ def check(evidence: Evidence) -> Judgement:
                     untraced.add(sender)
                     continue
                 wrong = _wrong_trigger(run, ran, sent)
+                if wrong and sender in evidence.injected.heard_of:
+                    untraced.add(sender)
+                    continue
                 if wrong and not (isinstance(sender, int) and evidence.traces[sender].problem):
                     findings.append(Finding(agent_id, f"trace line {line}, t={run.t:g} s: {run.handler} {wrong}"))
     findings += waited_too_long(evidence)

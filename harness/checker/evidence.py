@@ -19,6 +19,7 @@ from harness.checker.cycles import cycle_of
 from harness.checker.replay import Life, replay
 from harness.errors import RunDirectoryError
 from harness.packets.files import DIRECTORY, Captures, capture_files, read_captures
+from harness.play.rogue.line import OF_NO_INJECTION
 from ucp.block import HASH_BYTES
 from ucp.trace import Sent
 
@@ -42,6 +43,7 @@ class InjectedDatagram(BaseModel):
     sender: int | None = None
     sequence: int | None = None
     count: int | None = None
+    injection: int | None = None
 
 
 class Condition(BaseModel):
@@ -67,12 +69,16 @@ class RogueTraffic:
     """Sender, sequence number and type."""
     counted: bool = False
     """There are more, of which only the number is on record."""
+    heard_of: set[int] = field(default_factory=set)
+    """Agents of which the scenario has datagrams that they sent elsewhere: what they did there is not on record."""
 
     def take_down(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
         """Add what the rogue node sent; returns itself."""
         for datagram in datagrams:
             self.messages.add((datagram.sender, datagram.sequence, datagram.message))
             self.counted |= datagram.count is not None
+            if datagram.injection == OF_NO_INJECTION and datagram.sender is not None:
+                self.heard_of.add(datagram.sender)
         return self
 
     def may_be(self, trigger: dict[str, Any]) -> bool:

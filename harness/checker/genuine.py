@@ -23,7 +23,7 @@ def check(evidence: Evidence) -> Judgement:
     findings: list[Finding] = []
     roster = evidence.roster
     completed = evidence.completed_blocks()
-    known = {*evidence.exports, *evidence.traces, *completed.values()}
+    known = {*evidence.exports, *evidence.traces, *completed.values()} - evidence.injected.heard_of
     unknown: set[int] = set()
     blocks = 0
     recomputed: dict[_Content, str] = {}
@@ -34,14 +34,14 @@ def check(evidence: Evidence) -> Judgement:
             name = evidence.name(block.block_hash)
             if roster is not None and block.agent_id not in roster:
                 detail = f"holds block {name} of agent {block.agent_id}, which is not on the roster"
+            elif completed.get(block.block_hash) == block.agent_id:
+                continue
             elif block.agent_id not in known:
                 unknown.add(block.agent_id)
                 continue
-            elif completed.get(block.block_hash) != block.agent_id:
+            else:
                 detail = f"holds block {name}, which agent {block.agent_id} never completed"
                 detail += _since(evidence.traces.get(agent_id), block.block_hash)
-            else:
-                continue
             findings.append(Finding(agent_id, detail, name, block.block_hash))
     for agent_id, export in evidence.before_final_reconcile.items():
         edited = _hashes_that_do_not_recompute(agent_id, export, evidence, recomputed)

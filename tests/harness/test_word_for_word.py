@@ -1,0 +1,109 @@
+"""What a scenario can say of a flight word for word: events, arrivals, late timers, datagrams, the chains expected."""
+
+import base64
+from typing import Any
+
+import pytest
+
+from harness.errors import ScenarioError
+from harness.run.simulate import Simulated, simulate
+from harness.scenario.expect import Expect
+from harness.scenario.load import parse
+from harness.scenario.numbered import in_text, numbered
+from tests.harness.virtual import scenario
+from ucp.block import Block, InceptionBlock, next_chain_hash
+from ucp.events import LoggableEvent
+from ucp.messages import CommitBlock, encode
+
+FULL = {"max_block_bytes": 267}
+"""Blocks are full with any event."""
+EVENT = {"at_s": 10, "agent": 1, "event_id": 7, "data": base64.b64encode(b"seen").decode(), "timestamp_us": 123}
+
+
+def played(**keys: Any) -> Simulated:
+    events = {"source": "scripted", "script": [EVENT]}
+    asked = {"agents": 2, "settings": FULL, "events": events, "duration_s": 60, **keys}
+    return simulate(scenario(**asked), 1, tracing=True)
+
+
+def times_of(simulated: Simulated, agent: int, handler: str) -> list[float]:
+    return [run.t for run in simulated.evidence.traces[agent].runs if run.handler == handler]
+
+
+def test_an_event_and_the_inception_block_are_those_of_the_flight() -> None:
+    simulated = played(initial_data=base64.b64encode(b"begin").decode())
+    block = Block(1, 123, LoggableEvent(123, 7, b"seen").encode())
+    top = next_chain_hash(InceptionBlock(b"begin").chain_hash, block.block_hash).hex()
+    assert {export.top_chain_hash for export in simulated.evidence.exports.values()} == {top}
+    expect = Expect.model_validate({"chains": {1: top, 2: "0" * 64, 3: top}})
+    tops = {agent: export.top_chain_hash for agent, export in simulated.evidence.exports.items()}
+    assert [*expect.other_chains(tops)] == [
+        f"agent 2 ends with the chain hash {top[:12]} on top, and should with 000000000000",
+        f"agent 3 has left no chain, and should end with {top[:12]} on top",
+    ]
+
+
+def test_what_arrives_and_when_is_as_the_fate_says_and_no_more() -> None:
+    fates = [
+        {"sender": 1, "receiver": 2, "arrivals": "0@11.5 0@12.25"},
+        {"sender": 2, "receiver": 1, "arrivals": "0@13"},
+    ]
+    simulated = played(fates=fates)
+    assert times_of(simulated, 2, "receive_request_add_block") == [11.5, 12.25]
+    assert times_of(simulated, 1, "receive_vote_add_block") == [13.0]
+    assert times_of(simulated, 2, "receive_commit_block") == []
+    assert simulated.played.unmatched_fates == []
+
+
+def test_a_datagram_that_never_left_is_told() -> None:
+    simulated = played(fates=[{"sender": 1, "receiver": 2, "arrivals": "0@11 70@12 90@13"}])
+    (sentence,) = simulated.played.unmatched_fates
+    assert sentence.endswith("2 of its datagrams, the first number 70, never left")
+
+
+def test_a_timer_ends_as_late_as_is_said() -> None:
+    assert times_of(played(), 1, "vote_timer_expiration") == [20.0]
+    assert times_of(played(lateness={1: "0+2.5"}), 1, "vote_timer_expiration") == [22.5]
+    assert times_of(played(lateness={1: "1+2.5"}), 1, "vote_timer_expiration") == [20.0]
+
+
+def test_a_datagram_that_nobody_sends_is_heard() -> None:
+    block = Block(2, 5, LoggableEvent(5, 1, b"x").encode())
+    top = next_chain_hash(InceptionBlock(b"").chain_hash, block.block_hash)
+    datagram = base64.b64encode(encode(2, 0, CommitBlock(block, top))).decode()
+    stray = {"source": 2, "datagram": datagram, "reaches": {1: 3.5}}
+    simulated = played(events={"source": "scripted"}, initial_data="", datagrams=[stray])
+    assert times_of(simulated, 1, "receive_commit_block") == [3.5]
+    assert len(simulated.evidence.exports[1].chain) == 1
+    assert simulated.result.characteristics["1"].verdict == "not applicable"
+    assert simulated.result.characteristics["4"].verdict == "not applicable"
+
+
+def test_the_operator_asks_for_a_reconcile_in_flight() -> None:
+    simulated = played(timeline=[{"at_s": 30, "reconcile": [2]}])
+    assert times_of(simulated, 2, "reconcile_begin") == [30.0]
+
+
+def test_seconds_by_number_are_written_as_they_are_read() -> None:
+    pairs = [(0, 12.5), (3, 0.000001), (1234567890, 86400.0)]
+    assert numbered(in_text(pairs, "@")) == pairs
+
+
+@pytest.mark.parametrize(
+    ("keys", "sentence"),
+    [
+        ({"fates": [{"sender": 1, "receiver": 2, "arrivals": "0@1 x"}]}, "fates.0.arrivals"),
+        ({"fates": [{"sender": 1, "arrivals": "0@1"}]}, "`arrivals` are from a `sender` to a `receiver`"),
+        ({"fates": [{"sender": 1, "receiver": 2, "count": 3, "arrivals": "0@1"}]}, "need no other key"),
+        ({"lateness": {9: "0+1"}}, "lateness names vehicle 9, which does not exist"),
+        ({"lateness": {1: "0@1"}}, "lateness"),
+        ({"datagrams": [{"source": 9, "datagram": "!", "reaches": {1: 1}}]}, "it should be base64"),
+        ({"datagrams": [{"source": 9, "datagram": "AA==", "reaches": {7: 1}}]}, "datagrams.0.reaches names vehicle 7"),
+        ({"initial_data": "?"}, "it should be base64"),
+        ({"expect": {"chains": {1: "abc"}}}, "expect.chains.1"),
+    ],
+)
+def test_what_means_nothing_is_told(keys: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ScenarioError) as error:
+        parse({"name": "test", "agents": 3, **keys})
+    assert sentence in str(error.value)
