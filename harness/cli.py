@@ -154,19 +154,20 @@ def main() -> NoReturn:
         finally:
             sys.stdout.flush()
     except HarnessError as error:
-        _end(str(error), error.exit_status)
+        _end(*error.details, str(error), exit_status=error.exit_status)
     except OSError as error:
         if error.filename is not None:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
-        _end(f"standard output cannot be written: {error.strerror}", MachineError.exit_status)
+        _end(f"standard output cannot be written: {error.strerror}", exit_status=MachineError.exit_status)
     sys.exit(0)
 
 
-def _end(sentence: str, exit_status: int) -> NoReturn:
+def _end(*sentences: str, exit_status: int) -> NoReturn:
     from harness.commands.terminal import complain
 
-    complain(sentence)
+    for sentence in sentences:
+        complain(sentence)
     sys.exit(exit_status)
 
 

@@ -1,5 +1,7 @@
 """Errors that a user meets: one clear sentence with the way out, and the exit status of the command line."""
 
+from collections.abc import Sequence
+
 VIOLATED, WRONG_REQUEST, CANNOT_HERE, INTERRUPTED = 1, 2, 3, 130
 """Exit statuses besides 0. 1: a characteristic is violated, or an agent failed; 2: scenario, arguments or exports are
 wrong; 3: this machine cannot do it; 130: interrupted."""
@@ -9,6 +11,8 @@ class HarnessError(Exception):
     """The base of all errors that the harness reports; never shown with a traceback."""
 
     exit_status = WRONG_REQUEST
+    details: Sequence[str] = ()
+    """Further sentences, of one thing each, that are said before it."""
 
 
 class ScenarioError(HarnessError):

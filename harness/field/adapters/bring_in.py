@@ -178,7 +178,7 @@ class _Stream:
             sorter.lives += lives
             if not lives:
                 self._drop(
-                    f"none of the {self._lines[agent_id]} lines of a trace of agent {agent_id} says anything", None
+                    f"what it has of agent {agent_id}'s trace, {self._lines[agent_id]} line(s), says nothing", None
                 )
         if not self._said and not self._dropped:
             self._drop("there is nothing in it that is of an agent", None)

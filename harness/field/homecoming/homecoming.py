@@ -77,8 +77,9 @@ class Homecoming:
         """The flight with the most in it. Raises FieldError if nothing can be used."""
         if not self.flights:
             why = f": {self.left_out[0].sentence}" if self.left_out else ""
-            more = f" (and {len(self.left_out) - 1} more)" if len(self.left_out) > 1 else ""
-            raise FieldError(f"nothing of this is a usable trace, chain export or capture{why}{more}")
+            error = FieldError(f"nothing of this is a usable trace, chain export or capture{why}")
+            error.details = [left_out.sentence for left_out in self.left_out[1:]]
+            raise error
         return self.flights[0]
 
     def sentences(self) -> Iterator[str]:

@@ -19,6 +19,7 @@ from harness.field.adapters.record import ImportRecord
 from harness.field.adapters.rosbag import RosBag
 from harness.field.homecoming import sort_out
 from harness.packets.files import capture_files, read_captures
+from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
 from tests.harness.field.recordings import of_run, write_bag1, write_bag2, write_csv
 
@@ -228,8 +229,16 @@ def test_without_the_package_it_is_said_what_is_missing(
 
 def test_lines_of_a_trace_of_which_none_says_anything_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("agent,kind,data\n" + "7,trace,hello\n" * 3)
-    with pytest.raises(FieldError, match="none of the 3 lines of a trace of agent 7 says anything"):
+    with pytest.raises(FieldError, match=r"what it has of agent 7's trace, 3 line\(s\), says nothing"):
         imported(tmp_path / "out", tmp_path / "a.csv")
+
+
+def test_if_nothing_is_usable_each_file_is_named(tmp_path: Path) -> None:
+    for name in ("a.csv", "b.txt", "c.bag"):
+        (tmp_path / name).write_text(f"hello {name}")
+    done = harness("import", tmp_path, "-o", tmp_path / "out")
+    assert done.returncode == 2
+    assert len(sentences(done.stderr)) == 3 and all(name in done.stderr for name in ("a.csv", "b.txt", "c.bag"))
 
 
 def test_nothing_usable_makes_nothing(tmp_path: Path) -> None:
