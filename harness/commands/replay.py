@@ -22,7 +22,9 @@ from harness.field.replay.summary import head, summary
 
 
 def replay_command(
-    record: Annotated[Path, typer.Argument(help="A trace; or a run directory, or one of field files, and --agent.")],
+    record: Annotated[
+        Path, typer.Argument(metavar="RECORD", help="A trace, a run directory, or a directory of field files.")
+    ],
     agent: Annotated[int | None, typer.Option(metavar="ID", help="Whose record; without it, all of them.")] = None,
     until: Annotated[float | None, typer.Option(metavar="S", help="Play up to this mission second.")] = None,
     step: Annotated[bool, typer.Option("--step", help="Stop at the start, and ask what to do.")] = False,

@@ -25,6 +25,10 @@ AGENTS = "agents"
 """Directory in a run's with what the agents left."""
 
 
+JUMPS, JUMPING = 3, 0.1
+"""More jumps in the numbers of messages than this, and in more than this share, are the agent's way to count."""
+
+
 @dataclass(frozen=True, slots=True)
 class Entry:
     """A line of the record; lines, and lives of the agent, count from 1.
@@ -88,22 +92,26 @@ class Record:
 
     @cached_property
     def unwritten(self) -> dict[int, str]:
-        """Entries before which lines are missing without a trace, by the numbers of what the agent sent; and why.
+        """Entries before which lines are missing without a sign, by the numbers of what the agent sent; and why.
 
-        Of the entries since it sent anything before that, nobody knows before which.
+        Of the entries since it sent anything before that, nobody knows before which. An agent whose numbers often jump
+        counts wrongly: then nothing is missing.
         """
         unwritten: dict[int, str] = {}
-        life, expected, sent_at = 1, 0, 0
+        life, expected, sent_at = 0, None, 0
+        sendings = jumps = 0
         for position, entry in enumerate(self.entries):
             if entry.life != life or entry.gap is not None:
-                life, expected, sent_at = entry.life, 0 if entry.gap is None else -1, position
+                life, expected = entry.life, None
             if isinstance(entry.what, HandlerRun) and entry.what.sent:
                 first = entry.what.sent[0].seq
-                if 0 <= expected < first:
+                sendings += 1
+                if expected is not None and expected < first:
+                    jumps += 1
                     why = f"lines are missing (no line has its message{_numbers(expected, first - 1)})"
                     unwritten.update(dict.fromkeys(range(sent_at, position + 1), why))
                 expected, sent_at = entry.what.sent[-1].seq + 1, position + 1
-        return unwritten
+        return unwritten if jumps <= max(JUMPS, sendings * JUMPING) else {}
 
     @property
     def ends_s(self) -> float:

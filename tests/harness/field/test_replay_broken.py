@@ -1,5 +1,6 @@
 """Records as they come home: what is left of them is played, and nobody is charged with what is missing."""
 
+import base64
 import gzip
 import json
 import shutil
@@ -170,3 +171,20 @@ def test_what_a_record_has_for_words_does_nothing_to_a_terminal(home: Path) -> N
     assert ended.returncode == 1
     assert "[bold]" in ended.stdout
     assert not any(character in ended.stdout + ended.stderr for character in "\x1b\x07")
+
+
+@pytest.mark.parametrize(("first", "by"), [(1, 1), (0, 2)], ids=["from one", "by two"])
+def test_an_agent_that_counts_its_messages_wrongly_has_lost_no_lines(first: int, by: int, home: Path) -> None:
+    path = home / "2.trace.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for line in lines:
+        for sent in line.get("sent", ()):
+            sequence = first + by * sent["seq"]
+            datagram = bytearray(base64.b64decode(sent["datagram"]))
+            datagram[8:12] = sequence.to_bytes(4, "big")
+            sent |= {"seq": sequence, "datagram": base64.b64encode(datagram).decode()}
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    found = Player(open_record(home, 2)).to_end()
+    assert found.deviations
+    assert found.unjudged == 0
+    assert "with sequence number" in found.deviations[0].difference(str)
