@@ -48,6 +48,8 @@ class Resumption:
             return False
         if chain is None or len(chain) != state.chain or building is None:
             return False
+        if len({block.block_hash for block in chain}) < len(chain):
+            return False  # no chain of the reference's holds a block twice
         newborn.begin_at(chain, building, self._sequence(position))
         return True
 

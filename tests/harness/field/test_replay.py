@@ -72,7 +72,7 @@ def test_whoever_was_switched_off_in_the_middle_of_a_vote_owes_no_more(tmp_path:
 
 
 @pytest.mark.parametrize(
-    "quirk", ["stale_chain_hash", "give_up_unfinished", "hide_commits", "leave_flag_set", "hasty_vote"]
+    "quirk", ["stale_chain_hash", "give_up_unfinished", "commit_others_twice", "leave_flag_set", "hasty_vote"]
 )
 def test_it_finds_what_the_judge_of_a_run_finds(quirk: str, tmp_path: Path) -> None:
     directory = flown(tmp_path / "run", quirks={quirk: True}, duration_s=900, network={"loss": 0.4})
