@@ -173,7 +173,7 @@ class TraceReader:
                 self._lose(number, piece[:lost_bytes], "it is damaged; what can be read at its end is used")
                 self._add(at_its_end, number)
             elif ended or piece is not pieces[-1]:
-                self._lose(number, piece, "it is damaged")
+                self._lose(number, piece, "it is damaged" if _said(piece) is None else "its time cannot be")
             else:
                 self._cut_off = number
         if not ended and self.lives and pieces and (self._cut_off or pieces[-1].startswith(b"\0")):
@@ -252,14 +252,18 @@ def _lines(file: Opened) -> Iterator[tuple[int, bytes, bool]]:
 
 def _entry(line: bytes) -> Header | Entry | None:
     """What a line says, if it is whole and can be."""
+    entry = _said(line)
+    return entry if entry is None or isinstance(entry, Header) or 0 <= entry.t <= LATEST_S else None
+
+
+def _said(line: bytes) -> Header | Entry | None:
+    """What a line says, if it is whole, at whatever time."""
     if not any(word in line for word in _TELLING):
         return None
     try:
         entry = parsed(line)
         if isinstance(entry, Header):
             base64.b64decode(entry.initial_data or "", validate=True)
-        elif not 0 <= entry.t <= LATEST_S:
-            return None
     except ValueError:
         return None
     return entry

@@ -24,6 +24,7 @@ MAX_DOCUMENTS = 1000
 ALIKE_TOLD = 3
 """Of files of one directory that are left out for the same reason."""
 _BAGS = (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd")
+_ARCHIVES = (b"PK\x03\x04", b"7z\xbc\xaf", b"\xfd7zXZ", b"BZh", b"Rar!")
 _BLANK = " \t\r\n\0\ufeff"
 
 
@@ -122,6 +123,10 @@ def _documents(text: str) -> Iterator[Any]:
 def _what_else(data: bytes) -> str:
     if not data.strip(b"\0\r\n\t "):
         return "it is empty" if not data else "there is nothing in it but NUL and blanks, as a loss of power leaves it"
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "it is text in UTF-16, as PowerShell writes it: `iconv -f UTF-16 -t UTF-8` makes it readable"
+    if data.startswith(_ARCHIVES):
+        return "it is an archive, or packed by other means than gzip: unpack it first"
     printable = sum(byte >= 32 or byte in b"\t\r\n" for byte in data[:4096])
     text = "text" if printable > 0.9 * len(data[:4096]) else "neither text nor a capture"
     return f"it is no trace, chain export or capture: {text} that says nothing of UCP here"

@@ -191,6 +191,23 @@ def test_a_clock_that_jumps_is_told(home: Path) -> None:
     assert "line 31: the clock of agent 1 jumps from" in why(homecoming) and not homecoming.left_out
 
 
+def test_a_time_that_cannot_be_is_no_damage(home: Path) -> None:
+    path = trace_of(home, 1)
+    lines = lines_of(path)
+    lines[4] = json.dumps(json.loads(lines[4]) | {"t": 1.79e9}).encode() + b"\n"
+    path.write_bytes(b"".join(lines))
+    homecoming = sort_out([home])
+    assert "line 5: its time cannot be" in why(homecoming) and len(homecoming.largest().traces[1].gaps) == 1
+
+
+def test_what_could_be_used_if_it_were_otherwise_is_told_the_way_out(home: Path) -> None:
+    (home / "utf16.jsonl").write_text(trace_of(home, 1).read_text(), encoding="utf-16")
+    (home / "home.zip").write_bytes(b"PK\x03\x04" + bytes(100))
+    (home / "flight.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    told = why(sort_out([home]))
+    assert "iconv" in told and "unpack it first" in told and "`ucp-harness import` reads it" in told
+
+
 def test_windows_line_ends_and_a_byte_order_mark_are_nothing(home: Path) -> None:
     for path in (home / "agents").iterdir():
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
