@@ -103,8 +103,15 @@ class CameHome:
 
     @property
     def claims(self) -> dict[str, str]:
-        """Of the blocks that are not what a file says: the true hash, and the claimed one."""
-        return {true: claimed for brought in self.brought for true, claimed in brought.claims.items()}
+        """Of the blocks that are nowhere what a file says: the true hash, and the claimed one.
+
+        A block that another export has under its own hash, or that its agent completed, is good.
+        """
+        claims = {true: claimed for brought in self.brought for true, claimed in brought.claims.items()}
+        for brought in self.brought if claims else ():
+            for good in {*brought.export.completed, *(brought.blocks() - brought.claims.keys())}:
+                claims.pop(good, None)
+        return claims
 
 
 @gc_paused()

@@ -18,6 +18,7 @@ from harness.depot.came_home import came_home
 from harness.depot.consolidation import Consolidation, consolidate
 from harness.depot.lines import Block, ConsolidatedLine, Event, Header, Lost, Reconciled
 from harness.depot.outputs import lines
+from harness.depot.reconcile import reconcile
 from harness.depot.words import in_words
 from harness.errors import ExportError, FieldError
 from tests.harness.command import harness, sentences, write_scenario
@@ -173,6 +174,9 @@ def test_a_wrong_hash_of_a_good_block_is_told_and_its_events_are_there_once(tmp_
     record = brought(tmp_path, document(1, "1.1 2.1"), edited)
     assert record.header.events == 4
     assert "does not hash to" in record.header.problems[0]
+    assert names(record) == ["1.1", "2.1"]
+    assert [block.line.claimed_hash for block in record.blocks] == [None, None]
+    assert len(reconcile(record).line.chain) == 2
 
 
 def test_of_two_exports_of_one_agent_the_later_counts_and_nothing_of_the_other_is_lost(tmp_path: Path) -> None:
