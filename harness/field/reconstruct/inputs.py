@@ -73,10 +73,19 @@ class Missing(Protocol):
     def events(self, agent_id: int) -> list[LoggableEvent]: ...
 
 
-def lives_of(trace: Trace, header: CheckedHeader, missing: Missing) -> list[list[Input]]:
-    """The inputs of each life of the agent. Raises UnusableInputError, naming the line."""
+def lives_of(trace: Trace, header: CheckedHeader, missing: Missing) -> tuple[list[list[Input]], str | None]:
+    """The inputs of each life of the agent; and, naming the line, why not all of them if the rest cannot be used."""
     reader = _Reader(header, missing)
-    return [list(reader.inputs(life)) for life in trace.lives()]
+    lives: list[list[Input]] = []
+    for life in trace.lives():
+        inputs: list[Input] = []
+        lives.append(inputs)
+        try:
+            for given in reader.inputs(life):
+                inputs.append(given)
+        except UnusableInputError as error:
+            return lives, str(error)
+    return lives, None
 
 
 class _Reader:

@@ -1,20 +1,17 @@
 """From what came home to a scenario that flies it again, and whether it does."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from harness.archive.exports import Export
-from harness.checker import Evidence, steps
 from harness.checker.judgement import agents
-from harness.checker.steps.header import CheckedHeader
 from harness.errors import FieldError
 from harness.field.homecoming import Flight
+from harness.field.reconstruct.alone import Alone
 from harness.field.reconstruct.comparing import FirstDifference, first_difference
 from harness.field.reconstruct.elsewhere import Elsewhere
-from harness.field.reconstruct.inferring import infer
-from harness.field.reconstruct.inputs import Input, UnusableInputError, lives_of
-from harness.field.reconstruct.rehearsal import Allowed, Parting, Rehearsal, rehearse
+from harness.field.reconstruct.rehearsal import Rehearsal
 from harness.field.reconstruct.script import scenario_of
 from harness.field.reconstruct.timetable import Timetable, timetable
 from harness.field.reconstruct.told import NOTHING, told
@@ -22,13 +19,11 @@ from harness.run.simulate import InMemory, Simulated, simulate_in_memory
 from harness.scenario.load import parse
 from harness.scenario.write import Document
 from ucp.clock import MICROSECONDS
-from ucp.quirks import QUIRKS
 
 SEED = 1
 """Of the reconstruction, in which nothing is left to chance."""
 
 Tell = Callable[[str], None]
-Lives = Sequence[Sequence[Input]]
 
 
 @dataclass(frozen=True)
@@ -117,23 +112,18 @@ def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -
     elsewhere = Elsewhere(flight)
     remarks += elsewhere.problems
     mission, headers = told(flight, elsewhere, name, remarks)
-    rehearsals: dict[int, Rehearsal] = {}
-    why: dict[int, str] = {}
-    by_captures: list[int] = []
+    alone = Alone(flight, elsewhere)
+    rehearsals, why = alone.rehearsals, alone.why
     for agent_id, header in headers.items():
         tell(f"agent {agent_id} alone")
-        if header.settings != mission.settings:
+        if header.settings == mission.settings:
+            alone.rehearse(header)
+        else:
             why[agent_id] = "was set otherwise than the others, and a scenario has one set of settings"
-            continue
-        rehearsal = _rehearsed(flight, elsewhere, header, remarks, why, by_captures)
-        if rehearsal is not None and (rehearsal.played or rehearsal.parting is None):
-            rehearsals[agent_id] = rehearsal
-    if not rehearsals:
+    remarks += alone.remarks
+    if not any(rehearsal.played for rehearsal in rehearsals.values()):
         first = next((f"agent {agent_id} {words}; " for agent_id, words in why.items()), "")
         raise FieldError(first + NOTHING)
-    if by_captures:
-        which = agents(by_captures)
-        remarks.append(f"what reached {which} is from captures and blocks, and when timers ended there is inferred")
     tell("putting everything in order")
     table = timetable(rehearsals)
     lost = {agent_id for agent_id in rehearsals if flight.exports and agent_id not in flight.exports}
@@ -155,107 +145,6 @@ def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -
     outcomes = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in came_home]
     document["expect"] = _expected(simulated, rehearsals)
     return Reconstruction(document, outcomes, remarks, difference, simulated, table)
-
-
-def _rehearsed(
-    flight: Flight,
-    elsewhere: Elsewhere,
-    header: CheckedHeader,
-    remarks: list[str],
-    why: dict[int, str],
-    by_captures: list[int],
-) -> Rehearsal | None:
-    """The agent alone, by its trace; or, if that does not lead to its export, by its capture if that does."""
-    agent_id = header.agent_id
-    by_trace: Rehearsal | None = None
-    if agent_id in flight.traces:
-        try:
-            by_trace = _by_trace(flight, elsewhere, header, remarks)
-        except UnusableInputError as error:
-            why[agent_id] = f"cannot be played by its trace: {error}"
-    if by_trace is not None and by_trace.parting:
-        why[agent_id] = _parted(flight, agent_id, by_trace)
-        return by_trace
-    home = flight.exports.get(agent_id)
-    captured = elsewhere.captured.get(agent_id)
-    if captured is None or home is None or (by_trace and by_trace.chain == list(home.chain_of_block_hashes)):
-        return by_trace
-    inferred = infer(header, captured, elsewhere.events(agent_id))
-    by_capture = rehearse(header, inferred.lives)
-    if by_trace is not None and len(by_trace.played) > len(by_capture.played):
-        return by_trace
-    why.pop(agent_id, None)
-    if inferred.problem:
-        why[agent_id] = inferred.problem
-        by_capture.broken_off = True
-    by_captures.append(agent_id)
-    return by_capture
-
-
-def _by_trace(flight: Flight, elsewhere: Elsewhere, header: CheckedHeader, remarks: list[str]) -> Rehearsal:
-    """Raises UnusableInputError."""
-    lives = lives_of(flight.traces[header.agent_id], header, elsewhere)
-    rehearsal = rehearse(header, lives)
-    if rehearsal.parting is None:
-        if not rehearsal.to_the_word and (words := _judged(flight, header.agent_id)):
-            remarks.append(f"agent {header.agent_id} is wrong to no effect: {words}")
-        return rehearsal
-    explained = _with_a_quirk(header, lives, rehearsal.parting, remarks) or _with_what_is_not_right(
-        header, lives, remarks
-    )
-    return explained or rehearsal
-
-
-def _with_a_quirk(header: CheckedHeader, lives: Lives, at: Parting, remarks: list[str]) -> Rehearsal | None:
-    """The rehearsal with a known mistake that explains the whole record, if possible to the word.
-
-    Those of the handlers are tried first that ran where the agent parts from the protocol.
-    """
-    explaining: dict[str, Rehearsal] = {}
-    certain = (quirk for quirk in QUIRKS.values() if not quirk.chance)
-    for quirk in sorted(certain, key=lambda quirk: at.algorithms.isdisjoint(quirk.algorithms)):
-        rehearsal = rehearse(header, lives, {quirk.name: True})
-        if rehearsal.parting is None:
-            explaining[quirk.name] = rehearsal
-            if rehearsal.to_the_word:
-                break
-    if not explaining:
-        return None
-    name = max(explaining, key=lambda name: explaining[name].to_the_word)
-    remarks.append(f"agent {header.agent_id} behaves as with {name}: {QUIRKS[name].sentence}")
-    return explaining[name]
-
-
-def _with_what_is_not_right(header: CheckedHeader, lives: Lives, remarks: list[str]) -> Rehearsal | None:
-    """The rehearsal of an agent whose mistakes a scenario can do without: its chain comes out all the same."""
-    ignoring = rehearse(header, lives, allowed=Allowed(ignoring=True))
-    if ignoring.parting is None:
-        first = ignoring.ignored[0]
-        many = f"{len(ignoring.ignored)} messages" if len(ignoring.ignored) > 1 else "a message"
-        remarks.append(
-            f"agent {header.agent_id} did nothing with {many} with which it should have done something, "
-            f"the first on trace line {first.line} ({first.runs[0].handler}): lost on their way here"
-        )
-        return ignoring
-    early = rehearse(header, lives, allowed=Allowed(early_timers=True))
-    if early.parting is None:
-        remarks.append(f"agent {header.agent_id} had timers end too early by its clock, as if that had been set back")
-        return early
-    return None
-
-
-def _parted(flight: Flight, agent_id: int, rehearsal: Rehearsal) -> str:
-    """Why the agent cannot be played any further."""
-    assert rehearsal.parting is not None, "it has parted"
-    parting = rehearsal.parting
-    words = _judged(flight, agent_id) or f"trace line {parting.line}, t={parting.at_s:g} s: it {parting.what}"
-    return f"does not do what the protocol says, and is played up to trace line {parting.line}: {words}"
-
-
-def _judged(flight: Flight, agent_id: int) -> str | None:
-    """The first step of the agent that the step judge finds wrong, in its words; None if it finds none."""
-    judgement = steps.check(Evidence(flight.exports, {agent_id: flight.traces[agent_id]}))
-    return next((finding.detail for finding in judgement.evidence if finding.agent_id == agent_id), None)
 
 
 def _compare_chains(

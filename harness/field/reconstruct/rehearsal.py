@@ -38,10 +38,8 @@ class Started:
 
 @dataclass(frozen=True)
 class Parting:
-    """Where an agent's record is not what the protocol does: at the input with this `index` of this life."""
+    """Where an agent's record is not what the protocol does."""
 
-    life: int
-    index: int
     line: int
     at_s: float
     what: str
@@ -70,7 +68,7 @@ class Played:
 class Rehearsal:
     """`played` are the inputs of all lives, up to where the record parts from the protocol; None is nowhere.
 
-    `chain` has the block hashes of the chain that the agent then held, `top_chain_hash` says the same in short.
+    `chain` has the block hashes of the chain that the agent then held.
     `pending` are the timers that ran at the end of each life.
     """
 
@@ -79,7 +77,6 @@ class Rehearsal:
     played: list[Played] = field(default_factory=list)
     parting: Parting | None = None
     chain: list[str] = field(default_factory=list)
-    top_chain_hash: str = ""
     pending: list[list[Started]] = field(default_factory=list)
     broken_off: bool = False
     """Whether the record ends in the middle of what its last input led to; the input is played to its end."""
@@ -118,7 +115,6 @@ def rehearse(
         agent = one_life.agent
         rehearsal.pending.append(one_life.pending())
         rehearsal.chain = [block.block_hash.hex() for block in agent.state.chain]
-        rehearsal.top_chain_hash = agent.state.chain.top_chain_hash.hex()
         if rehearsal.parting:
             break
         stored = StoredState.of(agent.state)
@@ -165,7 +161,7 @@ class _Life:
         problem = problem or _differs(given.runs, entries)
         if problem is not None:
             algorithms = frozenset(run.algorithm for run in given.runs)
-            return Parting(self._life, index, given.line, given.runs[0].t, problem, algorithms)
+            return Parting(given.line, given.runs[0].t, problem, algorithms)
         self._rehearsal.to_the_word &= _to_the_word(given.runs, entries)
         sent = self._sent(given)
         played = Played(self._life, given, sent, matters)
