@@ -78,7 +78,7 @@ def bisect(
     found.first = [history.commit(commit) for commit in step.first]
     outcome, run = runs.get(step.first[0] if len(step.first) == 1 else bad_commit, (bad_outcome, bad_run))
     found.changes = differences(good_outcome, outcome)
-    found.parting = _parting(good_run, run) if workshop.subject.scenario is not None else None
+    found.parting = _parting(good_run, run) if workshop.plays_the_same else None
     return found
 
 

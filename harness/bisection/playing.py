@@ -50,6 +50,11 @@ class Workshop:
         self._speedup = speedup
         self._count = 0
 
+    @property
+    def plays_the_same(self) -> bool:
+        """Whether the same code gives the same run, so that it means something where two runs part."""
+        return self.subject.scenario is not None and self._command is None
+
     def play(self, code: Path) -> tuple[Outcome, Path]:
         """What comes of it with this state of the code, and the run directory. Raises CannotBeTriedError."""
         self._count += 1
