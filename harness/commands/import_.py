@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from harness.commands.terminal import complain, print_lines
 from harness.errors import FieldError
@@ -42,11 +43,10 @@ def import_command(
     """
     if adapter is not None and format_ is not None:
         raise FieldError("--adapter and --format are two ways to say the same: give one of them")
-    if format_ is not None:
-        record = bring_in(sources, [ADAPTERS[format_]()], out, by_content=False)
-    else:
-        own = [load_adapter(adapter)] if adapter else []
-        record = bring_in(sources, [*own, *(kind() for kind in ADAPTERS.values())], out)
+    own = [load_adapter(adapter)] if adapter else []
+    adapters = [ADAPTERS[format_]()] if format_ else [*own, *(kind() for kind in ADAPTERS.values())]
+    with Console(stderr=True).status("looking for files") as status:
+        record = bring_in(sources, adapters, out, status.update, by_content=format_ is None)
     for remark in (*record.left_out, *record.remarks):
         complain(remark.sentence)
     print_lines(_told(flight, out) for flight in record.flights)

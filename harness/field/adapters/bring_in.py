@@ -4,10 +4,12 @@ What an agent did not record is not made up: who left handler runs has a trace, 
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from rich.markup import escape
 
 from harness.archive.opened import Opened
 from harness.errors import MachineError
@@ -43,13 +45,18 @@ _PLACES_TOLD = 10
 
 @gc_paused()
 def bring_in(
-    sources: Sequence[Path], adapters: Iterable[Adapter], out: Path, *, by_content: bool = True
+    sources: Sequence[Path],
+    adapters: Iterable[Adapter],
+    out: Path,
+    tell: Callable[[str], object] = str,
+    *,
+    by_content: bool = True,
 ) -> ImportRecord:
     """Read `sources` and write what is in them to `out`, which must be empty or not be.
 
-    Whatever no adapter recognises is taken for one of the house's own formats; not `by_content`, all sources are for
-    the first adapter. Raises FieldError if nothing of it can
-    be used, or a source does not exist, and RunDirectoryError if `out` cannot be written.
+    `tell` is told what is going on. Whatever no adapter recognises is taken for one of the house's own formats; not
+    `by_content`, all sources are for the first adapter. Raises FieldError if nothing of it can be used, or a source
+    does not exist, and RunDirectoryError if `out` cannot be written.
     """
     left_out: list[LeftOut] = []
     adapters = [*adapters]
@@ -57,6 +64,7 @@ def bring_in(
     streams: dict[Path, _Stream] = {}
     with TemporaryDirectory(prefix="ucp-import-") as scratch:
         for path in files_of(sources, left_out):
+            tell(f"reading {escape(path.name)}")
             adapter = _adapter_for(path, adapters) if by_content else adapters[0]
             if adapter is None:
                 sorter.take(path)
@@ -69,8 +77,10 @@ def bring_in(
             streams[whole].take(path, sorter)
         for stream in streams.values():
             stream.end(sorter)
+        tell("putting together what is of one flight")
         homecoming = sorter.sorted_out()
         homecoming.largest()
+        tell("writing")
         return write_import(homecoming, sources, out)
 
 
