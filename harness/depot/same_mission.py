@@ -121,7 +121,8 @@ def compare(paths: Iterable[Path]) -> Comparison:
         try:
             comparison.carried.append(read(path))
         except UnreadableFileError as error:
-            if named or path.name.endswith(_EXPECTED) or path.name == FILE:
+            begun = path.name.endswith(TRACE_SUFFIX) and not path.stat().st_size  # and not a line of it is there yet
+            if named or (path.name.endswith(_EXPECTED) and not begun) or path.name == FILE:
                 comparison.differences.append(Difference(path, None, f"{path}: {error}"))
     comparison.differences += differences(comparison.carried)
     return comparison
@@ -178,7 +179,8 @@ def _beginning(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise UnreadableFileError(f"cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError):
-        raise UnreadableFileError("damaged: not JSON; write it to the vehicle again") from None
+        why = "damaged: not JSON" if text.strip() else "empty"
+        raise UnreadableFileError(f"{why}; what it should say, nobody can compare") from None
     if not isinstance(document, dict):
         raise UnreadableFileError("neither mission file, manifest, chain export nor trace")
     return document

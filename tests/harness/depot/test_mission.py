@@ -253,6 +253,14 @@ def test_exports_and_traces_must_be_of_the_same_inception_block(directory: Path,
         )
 
 
+def test_a_trace_that_no_agent_has_begun_is_passed_over_among_others(directory: Path) -> None:
+    trace = directory / "28.trace.jsonl"
+    trace.touch()
+    assert compare([directory]).verdict == "same"
+    (difference,) = compare([directory, trace]).differences
+    assert "empty" in str(difference)
+
+
 def test_an_export_of_a_stranger_is_told(directory: Path, tmp_path: Path) -> None:
     path = tmp_path / "5.chain.json"
     path.write_text(json.dumps(export_chain(Agent(5, [5], DATA).state, 0)))
