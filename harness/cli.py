@@ -8,6 +8,7 @@ import os
 import sys
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -148,6 +149,8 @@ def _harness(
 
 def main() -> NoReturn:
     """The console script: a user's mistake ends in one sentence and the right exit status, never in a traceback."""
+    if sys.stdout is None:  # it was closed before we began: nobody wants to read
+        sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     try:
         try:
             app()

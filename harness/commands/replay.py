@@ -40,6 +40,8 @@ def replay_command(
     as_json: Annotated[bool, typer.Option("--json", help="What differs, as JSON on standard output.")] = False,
 ) -> None:
     """Feed what one agent saw into the reference core, step by step: exit status 1 if it did anything else."""
+    if until is not None and not until >= 0:
+        raise typer.BadParameter(f"--until {until:g} is no mission second: it is 0 or more")
     if as_json and (step or breaks):
         raise typer.BadParameter("--json is for programs, which play the whole record: leave out --step and --break")
     if debug and not breaks:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from harness.field.replay import player as player_module
 from harness.field.replay.names import Names
 from harness.field.replay.places import next_place, place
 from harness.field.replay.source import source_of
-from tests.harness.command import harness, sentences
+from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.field.flights import flown, trace_of
 from ucp.agent import HANDLERS
 from ucp.quirks import QUIRKS
@@ -85,6 +86,14 @@ def test_it_finds_what_the_judge_of_a_run_finds(quirk: str, tmp_path: Path) -> N
     assert judgement.reason.startswith(f"{len(deviations)} difference")
     assert first.handler is not None
     assert HANDLERS[first.handler].algorithm in QUIRKS[quirk].algorithms
+
+
+@pytest.mark.parametrize("options", ["", "--json", "--step"])
+def test_a_closed_standard_output_is_no_verdict(options: str, right: Path, wrong: Path) -> None:
+    for directory, status in ((right, 0), (wrong, 1)):
+        command = f"{' '.join(COMMAND)} replay {trace_of(directory, 2)} {options} </dev/null >&-"
+        ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=DEADLINE_S)
+        assert (ended.returncode, ended.stderr) == (status, "")
 
 
 def test_programs_are_told_the_same(wrong: Path) -> None:
