@@ -7,6 +7,8 @@ under test must do; this is the default.
 """
 
 import asyncio
+import base64
+import binascii
 import contextlib
 import dataclasses
 import logging
@@ -69,6 +71,7 @@ class Node:
             {
                 "status": self._status,
                 "start": self._start,
+                "log": self._log,
                 "stop_events": self._stop_events,
                 "export": self._export_command,
                 "quirk": self._quirk,
@@ -187,8 +190,8 @@ class Node:
         if self._store is not None and self._store.recovered is not None:
             self._drive(partial(self.agent.boot, self._store.recovered))
             log.info("went on from a store of %d blocks", len(self.agent.state.chain))
+        self.generating = True
         if self.mission.events.source != "none":
-            self.generating = True
             source = self._random_events if self.mission.events.source == "random" else self._vehicle_events
             self._source = asyncio.create_task(source())
             self._source.add_done_callback(self._source_ended)
@@ -254,6 +257,18 @@ class Node:
         if self.clock.running:
             raise CommandError("the mission has started already")
         self._begin(epoch_us)
+        return {}
+
+    def _log(self, request: dict[str, Any]) -> dict[str, Any]:
+        event_id, data = request.get("event_id"), request.get("data")
+        if not self.clock.running:
+            raise CommandError("the mission has not started")
+        if type(event_id) is not int or not 0 <= event_id <= 255 or not isinstance(data, str):
+            raise CommandError("log needs `event_id`, 0 to 255, and `data`, in base64")
+        try:
+            self._log_event(event_id, base64.b64decode(data, validate=True))
+        except binascii.Error:
+            raise CommandError("log needs `data` in base64") from None
         return {}
 
     def _stop_events(self, request: dict[str, Any]) -> dict[str, Any]:

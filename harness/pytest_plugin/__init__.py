@@ -1,4 +1,4 @@
-"""UCP in pytest: the fixtures `swarm` and `scenario`, and scenarios with an `expect:` section as tests by themselves.
+"""UCP in pytest: the fixtures `swarm` and `scenario`; scenarios with an `expect:` section, and stories, as tests.
 
 pytest loads this module wherever the harness is installed, so it imports hardly anything of it before a test asks.
 """
@@ -40,6 +40,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="DIR",
         help="Keep all run directories, in DIR; else those of failed tests, among pytest's temporary directories.",
     )
+    group.addoption("--ucp-rewrite", action="store_true", help="Write into *.story files what agents do now.")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -48,6 +49,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    if file_path.suffix == ".story":
+        from harness.pytest_plugin.stories import StoryFile
+
+        return StoryFile.from_parent(parent, path=file_path)
     if file_path.suffix not in (".yaml", ".yml"):
         return None
     from harness.pytest_plugin.yaml_files import is_asked_for, is_ours

@@ -57,9 +57,9 @@ def scenario_for(node: pytest.Item) -> Iterator[Findings]:
         discard(directory, options)
 
 
-def play(scenario: Scenario, seed: int, backend: BackendName, directory: Path) -> Run:
+def play(scenario: Scenario, seed: int, backend: BackendName, directory: Path, *, delivers_all: bool = False) -> Run:
     """Play and judge a scenario. Raises HarnessError, and KeyboardInterrupt if the run was interrupted."""
-    finished = run(scenario, seed, directory, Silent(), backend)
+    finished = run(scenario, seed, directory, Silent(), backend, delivers_all=delivers_all)
     if finished.played.outcome == "interrupted":
         raise KeyboardInterrupt(f"{finished.played.outcome_detail}; report: {finished.report}")
     return finished

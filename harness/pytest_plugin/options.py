@@ -20,6 +20,8 @@ class Options:
     speedup: float | None
     keep: Path | None
     """Where all run directories are kept, absolute."""
+    rewrite: bool
+    """Whether stories are written anew, not compared."""
 
     @classmethod
     def of(cls, config: pytest.Config) -> "Options":
@@ -29,7 +31,9 @@ class Options:
         )
         if seed is not None and seed < 0:
             raise ScenarioError(f"--ucp-seed is {seed}: it should be 0 or more")
-        return cls(backend, seed, speedup, keep and config.invocation_params.dir / keep)
+        return cls(
+            backend, seed, speedup, keep and config.invocation_params.dir / keep, config.getoption("--ucp-rewrite")
+        )
 
     def at_speedup(self, scenario: Scenario) -> Scenario:
         """Raises ScenarioError."""

@@ -49,16 +49,27 @@ class Run:
     timer_lag: TimerLag | None
 
 
-def run(scenario: Scenario, seed: int, out: Path, progress: Progress, backend: BackendName = "process") -> Run:
+def run(
+    scenario: Scenario,
+    seed: int,
+    out: Path,
+    progress: Progress,
+    backend: BackendName = "process",
+    *,
+    delivers_all: bool = False,
+) -> Run:
     """Play `scenario` and judge it, into the new or empty directory `out`. Raises HarnessError if it cannot even begin.
 
-    Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
+    With `delivers_all` traces have also what cannot matter to who heard it, as those of processes always
+    have. Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
     """
     chosen = BACKENDS[backend]
     chosen.refuse(scenario)
     recording = Recording(scenario, seed, out, backend)
     try:
-        played = asyncio.run(_until_interrupted(chosen, scenario, seed, recording.directory, progress))
+        played = asyncio.run(
+            _until_interrupted(chosen, scenario, seed, recording.directory, progress, delivers_all=delivers_all)
+        )
     except HarnessError as error:
         recording.fail(error)
         raise
@@ -141,7 +152,7 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
 
 
 async def _until_interrupted(
-    backend: Backend, scenario: Scenario, seed: int, directory: RunDirectory, progress: Progress
+    backend: Backend, scenario: Scenario, seed: int, directory: RunDirectory, progress: Progress, *, delivers_all: bool
 ) -> RunOutcome:
     interrupted = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -149,7 +160,8 @@ async def _until_interrupted(
     for number in before:
         loop.add_signal_handler(number, interrupted.set)
     try:
-        return await mission.play_on(backend.open(scenario, seed, directory, progress, interrupted), scenario)
+        opening = backend.open(scenario, seed, directory, progress, interrupted, delivers_all=delivers_all)
+        return await mission.play_on(opening, scenario)
     finally:
         for number, handler in before.items():
             loop.remove_signal_handler(number)

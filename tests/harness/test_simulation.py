@@ -297,7 +297,13 @@ def test_what_virtual_time_cannot_give_is_refused_by_its_keys(keys: dict[str, An
     ("keys", "named"),
     [
         ({"fates": [{"sender": 1, "drop": True}]}, "`fates` needs"),
-        ({"clocks": {1: {"drift": 0.1}}, "events": {"source": "scripted"}}, "`clocks`, `events.source: scripted` need"),
+        (
+            {
+                "clocks": {1: {"drift": 0.1}},
+                "events": {"source": "scripted", "script": [{"at_s": 1, "agent": 1, "timestamp_us": 7}]},
+            },
+            "`clocks`, `events.script.timestamp_us` need",
+        ),
     ],
 )
 def test_what_processes_cannot_be_given_yet_is_refused_by_its_keys(

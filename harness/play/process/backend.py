@@ -5,6 +5,7 @@ stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and s
 """
 
 import asyncio
+import base64
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -140,10 +141,20 @@ class ProcessRun:
             self._watchers.start(self._capture.watch())
         await self._start_clock()
         self._watchers.start(self._poll_agents())
+        self._watchers.start(self._log_script(), of="script")
         if self.vehicles:
             self._watchers.start(self._follow_flight())
         for vehicle in self.vehicles:
             self._fly(vehicle)
+
+    async def _log_script(self) -> None:
+        """Have the agents that run log what the scenario's script says."""
+        for event in sorted(self.scenario.events.script, key=lambda event: event.at_s):
+            await self.until(event.at_s)
+            agent = self.agents[self._number(event.agent)]
+            if agent.awake:
+                data = base64.b64encode(event.event_data).decode("ascii")
+                await agent.ask("log", event_id=event.event_id, data=data)
 
     def _fly(self, vehicle: VehicleProcess) -> None:
         flight = self.scenario.flight_of(vehicle.vehicle_id)
@@ -302,6 +313,7 @@ class ProcessRun:
             await asyncio.sleep(self.clock.wall_s(left_s))
 
     async def stop_events(self) -> None:
+        self._watchers.stop("script")
         await asyncio.gather(*self._starting.values())
         await asyncio.gather(*(agent.ask("stop_events") for agent in self._awake()))
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from harness.play.seeds import agent_seed
 from harness.scenario import Scenario
+from harness.scenario.events import Events
 from sitl.vehicle import AGENT_PORT
 from ucp.messages import PORT
 from ucp.mission import SCHEMA
@@ -36,7 +37,7 @@ def mission_file(
         "initial_data": base64.b64encode(initial_data).decode("ascii"),
         "network": {"address": address, "broadcast": broadcast, "port": PORT},
         "events": {
-            "source": events.source if with_vehicle else "random",
+            "source": _source(events, with_vehicle),
             "mean_s": events.mean_s,
             "position_interval_s": events.position_interval_s,
             "log": list(events.log),
@@ -50,3 +51,10 @@ def mission_file(
         "epoch_us": epoch_us,
         "store": store,
     }
+
+
+def _source(events: Events, with_vehicle: bool) -> str:
+    """Scripted events come by the command `log`, and those of no vehicle from the agent itself."""
+    if events.source == "scripted":
+        return "none"
+    return events.source if with_vehicle else "random"

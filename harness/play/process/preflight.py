@@ -29,7 +29,7 @@ def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
         *(["datagrams"] if scenario.datagrams else []),
         *(["lateness"] if scenario.lateness else []),
         *(["clocks"] if scenario.clocks else []),
-        *(["events.source: scripted"] if scenario.events.source == "scripted" else []),
+        *(["events.script.timestamp_us"] if any(event.timestamp_us for event in scenario.events.script) else []),
     ]
     if keys:
         named = ", ".join(f"`{key}`" for key in keys)

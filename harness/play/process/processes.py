@@ -52,6 +52,7 @@ class Processes(Backend):
         interrupted: asyncio.Event,
         *,
         keeps_disks: bool = False,
+        delivers_all: bool = False,
     ) -> AbstractAsyncContextManager[Swarm]:
         from harness.play.process.backend import ProcessRun
         from harness.play.process.vehicle_kinds import choose_vehicles

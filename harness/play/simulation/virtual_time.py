@@ -51,6 +51,7 @@ class VirtualTime(Backend):
         interrupted: asyncio.Event,
         *,
         keeps_disks: bool = False,
+        delivers_all: bool = False,
     ) -> AsyncIterator[Simulation]:
         async def breathe(simulation: Simulation) -> None:
             progress.show(_snapshot(simulation))
@@ -61,7 +62,7 @@ class VirtualTime(Backend):
         with closing(OnDisk(rundir)) as files:
             capture = _captures(rundir, scenario) if scenario.capture else None
             air = capture.air if capture else VirtualAir
-            simulation = Simulation(scenario, seed, files, breathe=breathe, air=air)
+            simulation = Simulation(scenario, seed, files, deliver_all=delivers_all, breathe=breathe, air=air)
             try:
                 yield simulation
             except InterruptedRunError as error:

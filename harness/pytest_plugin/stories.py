@@ -1,0 +1,95 @@
+"""A story as a test, on each backend that its `expect` section names: what agents do is compared with its text."""
+
+from collections.abc import Iterator
+from difflib import unified_diff
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.archive.archive import RunArchive
+from harness.backend_names import BackendName
+from harness.errors import HarnessError, ScenarioError
+from harness.play.backends import in_virtual_time
+from harness.pytest_plugin import TRIAL
+from harness.pytest_plugin.directories import discard, new_directory
+from harness.pytest_plugin.fixtures import play
+from harness.pytest_plugin.options import Options
+from harness.pytest_plugin.trial import Trial, one_sentence
+from harness.run.run import Run
+from harness.scenario.expect import Expect
+from harness.stories.telling import Telling
+from harness.stories.text import Story, read_story
+
+CONTEXT_LINES = 3
+
+
+class StoryFile(pytest.File):
+    def collect(self) -> Iterator[pytest.Item]:
+        try:
+            options = Options.of(self.config)
+            story = read_story(self.path)
+        except HarnessError as error:
+            raise self.CollectError(str(error)) from None
+        backends = (story.scenario.expect or Expect()).backends if options.backend is None else [options.backend]
+        for backend in backends:
+            yield StoryItem.from_parent(self, name=backend, story=story, backend=backend)
+
+
+class StoryItem(pytest.Item):
+    """One run; it is judged where that of every test is (`pytest_runtest_call`)."""
+
+    def __init__(self, *, story: Story, backend: BackendName, **node: Any) -> None:
+        super().__init__(**node)
+        self._story = story
+        self._backend = backend
+        self._directory: Path | None = None
+
+    def runtest(self) -> None:
+        options = Options.of(self.config)
+        with one_sentence():
+            if in_virtual_time(self._backend):
+                scenario = self._story.in_virtual_time
+            else:
+                self._skip_what_needs_virtual_time()
+                scenario = options.at_speedup(self._story.scenario)
+            self._directory = new_directory(self, options)
+            finished = play(scenario, options.seed or 1, self._backend, self._directory, delivers_all=True)
+        self.stash[TRIAL] = Trial(scenario, lambda _: finished)
+        text = self._told(finished)
+        if options.rewrite:
+            self.path.write_text(text, encoding="utf-8")
+        elif text != self._story.text:
+            pytest.fail("\n".join([*self._difference(text), f"report: {finished.report}"]), pytrace=False)
+
+    def _skip_what_needs_virtual_time(self) -> None:
+        from harness.play.process.preflight import refuse_what_needs_virtual_time
+
+        try:
+            refuse_what_needs_virtual_time(self._story.scenario)
+        except ScenarioError as error:
+            pytest.skip(str(error))
+
+    def _told(self, finished: Run) -> str:
+        """The story as it was played."""
+        telling = Telling(RunArchive(finished.directory).traces, self._story.scenario.roster)
+        answers = [telling.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
+        return self._story.with_answers(answers)
+
+    def _difference(self, text: str) -> Iterator[str]:
+        yield "agents do not do what the story tells; if they are right, --ucp-rewrite writes it anew"
+        yield from unified_diff(
+            self._story.text.splitlines(),
+            text.splitlines(),
+            f"{self.path.name}, as it is told",
+            "as it was played",
+            lineterm="",
+            n=CONTEXT_LINES,
+        )
+
+    def teardown(self) -> None:
+        if self._directory is not None and TRIAL in self.stash and self.stash[TRIAL].passed:
+            discard(self._directory, Options.of(self.config))
+
+    def reportinfo(self) -> tuple[Path, None, str]:
+        return self.path, None, f"{self.path.name}::{self.name}"

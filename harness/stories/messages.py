@@ -1,0 +1,60 @@
+"""The nine messages as a story tells them: "Block Add Request (1.1 on inception)"."""
+
+import base64
+import binascii
+from collections.abc import Callable
+from typing import Any
+
+from harness.stories.names import Names
+from ucp.messages import (
+    BlockAddRequest,
+    BlockAddResponse,
+    BlockResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    ChainHashSuccessorQuery,
+    CommitBlock,
+    MalformedDatagramError,
+    Message,
+    NextInSequenceResponse,
+    RequestForBlock,
+    decode,
+)
+from ucp.trace import Sent
+
+ANSWERS = frozenset(
+    message.NAME for message in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse, BlockResponse)
+)
+"""They are for whoever asked."""
+
+_SAYS: dict[type[Message], Callable[[Any, Names], str]] = {
+    BlockAddRequest: lambda message, names: (
+        f"{names.block(message.block_hash.hex())} on {names.chain(message.chain_hash)}"
+    ),
+    BlockAddResponse: lambda message, names: (
+        f"{names.block(message.block_hash.hex())}: {'approve' if message.approve else 'disapprove'}"
+    ),
+    CommitBlock: lambda message, names: (
+        f"{names.block(message.block.block_hash.hex())} on {names.chain_below(message.chain_hash)}"
+    ),
+    ChainContainQuery: lambda message, names: names.chain(message.chain_hash),
+    ChainContainResponse: lambda message, names: (
+        f"{names.chain(message.chain_hash)}: {'yes' if message.contained else 'no'}"
+    ),
+    ChainHashSuccessorQuery: lambda message, names: names.chain(message.chain_hash),
+    NextInSequenceResponse: lambda message, names: (
+        f"{names.chain(message.chain_hash)}: "
+        f"{names.block(message.block_hash.hex()) if message.block_hash else 'Is Top Of Chain'}"
+    ),
+    RequestForBlock: lambda message, names: names.block(message.block_hash.hex()),
+    BlockResponse: lambda message, names: names.block(message.block.block_hash.hex()),
+}
+
+
+def told(sent: Sent, names: Names) -> str:
+    """A message that an agent's trace has."""
+    try:
+        message = decode(base64.b64decode(sent.datagram.text if sent.datagram else "", validate=True)).message
+    except (MalformedDatagramError, binascii.Error):
+        return f"{sent.message} (not well-formed)"
+    return f"{message.NAME} ({_SAYS[type(message)](message, names)})"

@@ -1,0 +1,99 @@
+"""The sentences of a story: what happens to the agents, as entries of a scenario's script and timeline."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import yaml
+
+from harness.errors import ScenarioError
+from harness.scenario.faults import ASKED_FOR
+
+EVENT_BYTES = 256
+"""What a scripted event has by itself."""
+
+_IDS = r"(\d+(?: \d+)*)"
+_LOGS = re.compile(rf"{_IDS} logs?(?: (\d+) bytes)?")
+_CUT = re.compile(rf"{_IDS} do(?:es)? not reach {_IDS}")
+_JOINED = re.compile(rf"{_IDS} reach(?:es)? {_IDS} again")
+_PARTITION = re.compile(rf"partition {_IDS}((?: \| {_IDS})+)")
+_VERB = re.compile(rf"(\w+) {_IDS}")
+
+VERBS = [kind.what for kind in ASKED_FOR if not kind.further_keys()]
+SENTENCES = (
+    "`1 2 log` or `1 logs 100 bytes`, `1 does not reach 2 3`, `1 reaches 2 3 again`, `partition 1 2 | 3`, `heal`, "
+    f"{', '.join(f'`{verb} 1`' for verb in VERBS)}, an entry of a timeline such as `{{loss: 0.5}}`, `chains`, or `end`"
+)
+
+
+class Course:
+    """What a story has told by now: `script` of events, `timeline` of all else, and when it was at its end."""
+
+    def __init__(self) -> None:
+        self.script: list[dict[str, Any]] = []
+        self.timeline: list[dict[str, Any]] = []
+        self.ends_at_s: int | None = None
+
+    def tell(self, at_s: int, sentence: str) -> None:
+        """Raises ScenarioError for a sentence that is none."""
+        if sentence == "end":
+            self.ends_at_s = at_s
+        elif sentence == "heal":
+            self.timeline.append({"at_s": at_s, "heal": True})
+        elif sentence.startswith("{"):
+            self.timeline.append({"at_s": at_s, **_entry(sentence)})
+        elif sentence != "chains" and not any(
+            tell(at_s, told) for pattern, tell in self._patterns() if (told := pattern.fullmatch(sentence))
+        ):
+            raise ScenarioError(f"{sentence[:80]!r} is no sentence of a story: there are {SENTENCES}")
+
+    def _patterns(self) -> list[tuple[re.Pattern[str], Callable[[int, re.Match[str]], bool]]]:
+        return [
+            (_LOGS, self._logs),
+            (_CUT, self._cuts),
+            (_JOINED, self._joins),
+            (_PARTITION, self._parts),
+            (_VERB, self._strikes),
+        ]
+
+    def _logs(self, at_s: int, told: re.Match[str]) -> bool:
+        data_bytes = int(told[2] or EVENT_BYTES)
+        self.script += [{"at_s": at_s, "agent": agent, "bytes": data_bytes} for agent in _ids(told[1])]
+        return True
+
+    def _cuts(self, at_s: int, told: re.Match[str]) -> bool:
+        return self._links(at_s, told, 1.0)
+
+    def _joins(self, at_s: int, told: re.Match[str]) -> bool:
+        return self._links(at_s, told, 0.0)
+
+    def _links(self, at_s: int, told: re.Match[str], loss: float) -> bool:
+        link = {"from": _ids(told[1]), "to": _ids(told[2]), "loss": loss}
+        self.timeline.append({"at_s": at_s, "network": {"links": [link]}})
+        return True
+
+    def _parts(self, at_s: int, told: re.Match[str]) -> bool:
+        self.timeline.append(
+            {"at_s": at_s, "partition": [_ids(group) for group in told[0].removeprefix("partition").split("|")]}
+        )
+        return True
+
+    def _strikes(self, at_s: int, told: re.Match[str]) -> bool:
+        if told[1] not in VERBS:
+            return False
+        self.timeline.append({"at_s": at_s, told[1]: _ids(told[2])})
+        return True
+
+
+def _ids(text: str) -> list[int]:
+    return [int(word) for word in text.split()]
+
+
+def _entry(sentence: str) -> dict[str, Any]:
+    try:
+        entry = yaml.safe_load(sentence)
+    except yaml.YAMLError:
+        raise ScenarioError(f"{sentence[:80]!r} is not YAML, as an entry of a timeline is") from None
+    if not isinstance(entry, dict) or "at_s" in entry:
+        raise ScenarioError(f"{sentence[:80]!r} is no entry of a timeline, whose instant the story tells")
+    return entry

@@ -1,0 +1,165 @@
+"""A story's file: a scenario's keys, then sentences, each with the second at which it happens; below them, indented,
+what agents then do.
+
+    # Figure 3.8: what becomes of a vote.
+    agents: 3
+    1 s: 1 logs
+
+        at 1 s
+          1    1  Build Data Block: full; completes 1.1
+    ...
+    30 s: end
+
+What is indented is the answer, up to the next sentence that comes later: it is compared, and can be written anew.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from harness.errors import ScenarioError
+from harness.scenario import Scenario
+from harness.scenario.load import parse
+from harness.stories.sentences import Course
+
+MAX_BYTES = 1024 * 1024
+_SENTENCE = re.compile(r"(\d{1,7}) s: (.+?)\s*")
+INDENT = "    "
+DELAY_S = 0.02
+
+
+@dataclass(frozen=True)
+class Section:
+    """From `from_s` to `until_s` mission seconds, what is answered at the line numbered `line`, which counts from 0."""
+
+    line: int
+    from_s: int
+    until_s: int | None
+    shows_chains: bool
+
+
+@dataclass(frozen=True)
+class Story:
+    """`lines` are those of the file without the answers; each of `sections` comes after one of them."""
+
+    path: Path
+    text: str
+    lines: Sequence[str]
+    scenario: Scenario
+    sections: Sequence[Section]
+
+    @property
+    def in_virtual_time(self) -> Scenario:
+        """The scenario where messages take equally long, as in a real lab none overtakes another of the same sender."""
+        if self.scenario.network.delay:
+            return self.scenario
+        network = self.scenario.network.model_copy(update={"delay": DELAY_S})
+        return self.scenario.model_copy(update={"network": network})
+
+    def with_answers(self, answers: Sequence[Sequence[str]]) -> str:
+        """The file's text with these answers, one of each section."""
+        after = {section.line: answer for section, answer in zip(self.sections, answers, strict=True)}
+        lines: list[str] = []
+        for number, line in enumerate(self.lines):
+            if line or (lines and lines[-1]):  # one empty line is enough
+                lines.append(line)
+            if after.get(number):
+                lines += ["", *(f"{INDENT}{told}" for told in after[number]), ""]
+        while not lines[-1]:
+            lines.pop()
+        return "\n".join(lines) + "\n"
+
+
+def read_story(path: Path) -> Story:
+    """Raises ScenarioError: one sentence that names the file and the line."""
+    try:
+        if not path.is_file() or path.stat().st_size > MAX_BYTES:
+            raise ScenarioError(f"{path}: not a file, or larger than any story")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+    try:
+        return _parsed(path, text)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+
+
+def _parsed(path: Path, text: str) -> Story:
+    given = text.splitlines()
+    begins = next((number for number, line in enumerate(given) if _SENTENCE.fullmatch(line)), None)
+    if begins is None:
+        raise ScenarioError("there is no sentence in it, such as `1 s: 1 logs`")
+    while begins and given[begins - 1].startswith("#"):  # a remark on the first sentence
+        begins -= 1
+    lines, course = [*given[:begins], ""], Course()
+    told: list[tuple[int, int, bool]] = []  # line, second, whether chains are asked for
+    for number, line in enumerate(given[begins:], begins + 1):
+        if line.startswith((" ", "\t")) or not line.strip():
+            continue
+        if line.startswith("#"):
+            lines += [*_gap(lines), line]
+            continue
+        sentence = _SENTENCE.fullmatch(line)
+        if sentence is None:
+            raise ScenarioError(f"line {number}: {line[:80]!r} is no sentence: those begin with their second, `12 s: `")
+        at_s, words = int(sentence[1]), sentence[2]
+        if told and at_s < told[-1][1]:
+            raise ScenarioError(f"line {number}: {at_s} s is before {told[-1][1]} s, which was told already")
+        if course.ends_at_s is not None:
+            raise ScenarioError(f"line {number}: something is told after the end")
+        try:
+            course.tell(at_s, words)
+        except ScenarioError as error:
+            raise ScenarioError(f"line {number}: {error}") from None
+        lines.append(line)
+        told.append((len(lines) - 1, at_s, words in ("chains", "end")))
+    if course.ends_at_s is None:
+        raise ScenarioError("it has no end: the last sentence should be one such as `60 s: end`")
+    return Story(path, text, lines, _scenario(path, given[:begins], course), _sections(told))
+
+
+def _gap(lines: Sequence[str]) -> list[str]:
+    """Remarks stand apart from the sentence before them."""
+    return [""] if _SENTENCE.fullmatch(lines[-1]) else []
+
+
+def _sections(told: Sequence[tuple[int, int, bool]]) -> list[Section]:
+    """Of sentences of one second the last is answered."""
+    last = {at_s: (line, any(chains for _, other_s, chains in told if other_s == at_s)) for line, at_s, _ in told}
+    seconds = [*last]
+    return [
+        Section(line, at_s, until_s, chains)
+        for (at_s, (line, chains)), until_s in zip(last.items(), [*seconds[1:], None], strict=True)
+    ]
+
+
+def _problem(error: yaml.YAMLError) -> str:
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"{error.problem}, line {error.problem_mark.line + 1}"
+    return "it cannot be read"
+
+
+def _scenario(path: Path, header: Sequence[str], course: Course) -> Scenario:
+    try:
+        keys = yaml.safe_load("\n".join(header)) or {}
+    except yaml.YAMLError as error:
+        raise ScenarioError(
+            f"before its first sentence are a scenario's keys, and no YAML: {_problem(error)}"
+        ) from None
+    if not isinstance(keys, dict):
+        raise ScenarioError("before its first sentence are a scenario's keys, each with its value")
+    if taken := {"timeline", "duration_s", "events"} & keys.keys():
+        raise ScenarioError(f"`{min(taken)}` is what its sentences tell")
+    document: dict[str, Any] = {
+        "name": path.stem.replace("_", " "),
+        "vehicles": {"kind": "none"},
+        **keys,
+        "events": {"source": "scripted", "script": course.script},
+        "timeline": course.timeline,
+        "duration_s": course.ends_at_s,
+    }
+    return parse(document)

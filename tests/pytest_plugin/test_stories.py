@@ -1,0 +1,118 @@
+"""Stories: text that is played and compared, and written anew if asked."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.errors import ScenarioError
+from harness.stories.text import read_story
+from tests.pytest_plugin.inner import no_internals, run, run_directories
+
+pytest_plugins = "pytester"
+
+TOLD = """\
+# Somebody misses a commit.
+agents: 3
+settings: {max_block_bytes: 267}  # an event fills a block
+
+1 s: 1 logs
+8 s: 1 does not reach 3
+15 s: 1 reaches 3 again
+
+# It notices when it votes.
+20 s: 3 logs
+60 s: end
+"""
+
+
+def write(pytester: pytest.Pytester, text: str, file: str = "missed.story") -> Path:
+    path = pytester.path / file
+    path.write_text(text)
+    return path
+
+
+def written(pytester: pytest.Pytester, text: str = TOLD) -> Path:
+    """A story with what agents do."""
+    path = write(pytester, text)
+    run(pytester, path, "--ucp-rewrite").assert_outcomes(passed=1)
+    return path
+
+
+def test_what_agents_do_is_written_below_what_happens(pytester: pytest.Pytester) -> None:
+    text = written(pytester).read_text()
+    assert [line for line in text.splitlines() if line and not line.startswith(" ")] == [
+        line for line in TOLD.splitlines() if line
+    ]
+    assert (
+        "  1           5  Vote Timer Expiration: approved; deque -1.1, chain +1.1 -> Commit Block (1.1 on incep" in text
+    )
+    assert "(1.1 on inception), not to 3\n" in text
+    assert "      2           6  Receive Commit Block from 1: committed; chain +1.1\n" in text
+    assert (
+        "      1 2         3  Receive Request Add Block from 3: disapprove -> Block Add Response (3.1: disapprove)\n"
+        in text
+    )
+    assert text.endswith("    chains\n      inception 1.1 3.1  (1 2 3)\n")
+    run(pytester).assert_outcomes(passed=1)
+    assert not run_directories(pytester)
+
+
+def test_written_again_it_is_the_same(pytester: pytest.Pytester) -> None:
+    text = written(pytester).read_text()
+    assert written(pytester, text).read_text() == text
+
+
+def test_an_agent_that_does_otherwise_fails_with_the_lines_that_differ(pytester: pytest.Pytester) -> None:
+    path = written(pytester)
+    wrong = path.read_text().replace("agents: 3\n", "agents: 3\nquirks: {ignore_commit: {agents: [2], value: 1.0}}\n")
+    path.write_text(wrong)
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        [
+            "agents do not do what the story tells; if they are right, --ucp-rewrite writes it anew",
+            "--- missed.story, as it is told",
+            "+++ as it was played",
+            "-      2           6  Receive Commit Block from 1: committed; chain +1.1",
+            "+      2           6  Receive Commit Block from 1: ignored by quirk",
+            "report: *",
+        ]
+    )
+    no_internals(result)
+    assert path.read_text() == wrong
+
+
+def test_what_needs_virtual_time_is_skipped_elsewhere(pytester: pytest.Pytester) -> None:
+    fates = 'fates: [{message: Commit Block, block: "1.1", receiver: 3, drop: true}]\n'
+    path = written(pytester, TOLD.replace("agents: 3\n", "agents: 3\n" + fates))
+    result = run(pytester, path, "--ucp-backend", "process", "-rs")
+    result.assert_outcomes(skipped=1)
+    result.stdout.fnmatch_lines(["*`fates` needs virtual time: use --backend sim"])
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("agents: 3\n", "there is no sentence in it, such as `1 s: 1 logs`"),
+        ("1 s: 1 logs\n", "it has no end: the last sentence should be one such as `60 s: end`"),
+        ("1 s: 1 sings\n", "line 1: '1 sings' is no sentence of a story: there are `1 2 log`"),
+        ("1 s: 1 logs\n\nand then\n2 s: end\n", "line 3: 'and then' is no sentence: those begin with their second"),
+        ("9 s: 1 logs\n2 s: end\n", "line 2: 2 s is before 9 s, which was told already"),
+        ("9 s: end\n10 s: 1 logs\n", "line 2: something is told after the end"),
+        (
+            "agents: [\n1 s: end\n",
+            "before its first sentence are a scenario's keys, and no YAML: expected the node content",
+        ),
+        ("- 3\n1 s: end\n", "before its first sentence are a scenario's keys, each with its value"),
+        ("timeline: []\n1 s: end\n", "`timeline` is what its sentences tell"),
+        ("agents: 3\n1 s: kill 7\n2 s: end\n", "timeline.0.kill names vehicle 7, which does not exist"),
+        ("1 s: {kill: [1}\n2 s: end\n", "line 1: '{kill: [1}' is not YAML"),
+        ("1 s: {at_s: 3}\n2 s: end\n", "is no entry of a timeline, whose instant the story tells"),
+    ],
+)
+def test_a_mistake_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+    path = tmp_path / "wrong.story"
+    path.write_text(text)
+    with pytest.raises(ScenarioError) as told:
+        read_story(path)
+    assert sentence in str(told.value) and str(told.value).startswith(f"{path}: ")

@@ -1,0 +1,58 @@
+# Figure 3.11, Reconcile Phase 1: does anybody have this chain? It is asked again for each block that has been taken away.
+agents: 3
+settings: {max_block_bytes: 267}  # an event fills a block
+
+1 s: partition 3 | 1 2
+2 s: 3 logs
+
+    at 2 s
+      3           1  Build Data Block: full; completes 3.1, deque +3.1
+      3           2  Process Next Deque Block: proposed -> Block Add Request (3.1 on inception), not to 1 2
+    at 12 s
+      3           5  Vote Timer Expiration: approved; deque -3.1, chain +3.1 -> Commit Block (3.1 on inception), not to 1 2
+      3           2  Process Next Deque Block: deque empty
+
+14 s: 3 logs
+
+    at 14 s
+      3           1  Build Data Block: full; completes 3.2, deque +3.2
+      3           2  Process Next Deque Block: proposed -> Block Add Request (3.2 on 3.1), not to 1 2
+    at 24 s
+      3           5  Vote Timer Expiration: approved; deque -3.2, chain +3.2 -> Commit Block (3.2 on 3.1), not to 1 2
+      3           2  Process Next Deque Block: deque empty
+
+26 s: heal
+30 s: reconcile 3
+
+    at 30 s
+      3           7  Reconcile Begin: begun
+      3           8  Reconcile Phase 1: asked -> Chain Contain Query (3.1 3.2)
+      1 2         9  Receive Request Chain Contain from 3: no -> Chain Contain Response (3.1 3.2: no)
+      3          10  Receive Phase 1 Response from 1 2: no
+    at 35 s
+      3          11  Reconcile Phase 1 Timer Expiration: not contained; chain -3.2, stack +3.2
+      3           8  Reconcile Phase 1: asked -> Chain Contain Query (3.1)
+      1 2         9  Receive Request Chain Contain from 3: no -> Chain Contain Response (3.1: no)
+      3          10  Receive Phase 1 Response from 1 2: no
+    at 40 s
+      3          11  Reconcile Phase 1 Timer Expiration: not contained; chain -3.1, stack +3.1
+      3           8  Reconcile Phase 1: asked -> Chain Contain Query (inception)
+      1 2         9  Receive Request Chain Contain from 3: yes -> Chain Contain Response (inception: yes)
+      3          10  Receive Phase 1 Response from 1 2: yes
+    at 45 s
+      3          11  Reconcile Phase 1 Timer Expiration: contained
+      3          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (inception)
+      1 2        13  Receive Request Next in Sequence from 3: top of chain -> Next in Sequence Response (inception: Is Top Of Chain)
+      3          14  Receive Response Next in Sequence from 1 2: new candidate, counted
+    at 50 s
+      3          15  Reconcile Phase 2 Timer Expiration: top of chain
+      3          20  Reconcile Finalize: recommitted, more to come; stack -3.1, chain +3.1 -> Commit Block (3.1 on inception)
+      3          20  Reconcile Finalize: done; stack -3.2, chain +3.2 -> Commit Block (3.2 on 3.1)
+      3           2  Process Next Deque Block: deque empty
+      1 2         6  Receive Commit Block from 3: committed; chain +3.1
+      1 2         6  Receive Commit Block from 3: committed; chain +3.2
+
+70 s: end
+
+    chains
+      inception 3.1 3.2  (1 2 3)
