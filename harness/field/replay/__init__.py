@@ -1,6 +1,7 @@
 """An agent's record, fed into the reference core step by step, forward and back.
 
 record.py     what one agent's trace has to be played: its lines in order, and what lies beside it
+opening.py    finds records in what a user names
 player.py     plays them, and goes back exactly
 blocks.py     blocks by hash, wherever any record has them
 exchanges.py  the messages between the agent and another, as both records have them
@@ -17,7 +18,8 @@ others.py     what the other agents did at that moment
 prompt.py     the commands of whoever steps through it
 """
 
+from harness.field.replay.opening import open_record, open_records
 from harness.field.replay.player import Player
-from harness.field.replay.record import Record, open_record, open_records
+from harness.field.replay.record import Record
 
 __all__ = ["Player", "Record", "open_record", "open_records"]
