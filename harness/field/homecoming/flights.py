@@ -20,6 +20,7 @@ from harness.field.homecoming.copies import told_apart
 from harness.field.homecoming.glance import Glance
 from harness.field.homecoming.homecoming import Flight, LeftOut, Remark
 from harness.field.homecoming.lives import Life
+from ucp.block import InceptionBlock
 from ucp.events import LoggableEvent
 
 
@@ -261,15 +262,27 @@ def _inception(gathering: _Gathering) -> str:
     return next(iter(gathering.exports.values()))[1].inception.block_hash
 
 
-def _add_capture(gatherings: list[_Gathering], capture: Glance) -> None:
-    def shared(gathering: _Gathering) -> int:
-        return len(gathering.hashes & capture.hashes)
+def _inception_chain_hash(gathering: _Gathering) -> str | None:
+    """CH_0 (eq. 3.4), which every flight of the mission has."""
+    data = _decoded(gathering.mission.initial_data)
+    return None if data is None else InceptionBlock(data).chain_hash.hex()
 
-    able = [each for each in gatherings if shared(each) or not each.hashes or not capture.hashes]
+
+def _add_capture(gatherings: list[_Gathering], capture: Glance) -> None:
+    of_inceptions = {_inception_chain_hash(gathering) for gathering in gatherings}
+
+    def shared(gathering: _Gathering) -> int:
+        return len((gathering.hashes & capture.hashes) - of_inceptions)
+
+    def same_mission(gathering: _Gathering) -> bool:
+        return _inception_chain_hash(gathering) in capture.hashes
+
+    able = [each for each in gatherings if shared(each) or same_mission(each) or not each.hashes or not capture.hashes]
     likeliest = max(
         able,
         key=lambda each: (
             shared(each),
+            same_mission(each),
             capture.epoch_us is not None and capture.epoch_us == each.mission.epoch_us,
             capture.source.parent in each.directories,
             each.size,
