@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from harness.archive.exports import Export
 from harness.archive.record import RunRecord
+from harness.depot.lines import ConsolidatedLine
 from harness.depot.manifest import Manifest
 from harness.field.adapters.record import ImportRecord
 from harness.field.replay.document import ReplayDocument
@@ -23,6 +24,7 @@ DIRECTORY = Path(__file__).parent
 MODELS: dict[str, type[BaseModel]] = {
     "scenario": Scenario,
     "ucp-chain-export-1": Export,
+    "ucp-consolidated-1": ConsolidatedLine,
     "ucp-import-1": ImportRecord,
     "ucp-matrix-1": MatrixRecord,
     "ucp-mission-manifest-1": Manifest,
