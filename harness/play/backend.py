@@ -45,14 +45,13 @@ class Backend(ABC):
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        keeps_disks: bool = False,
+        told: bool = False,
         delivers_all: bool = False,
     ) -> AbstractAsyncContextManager[Swarm]:
         """A swarm, opened, for a scenario that has not been refused; it leaves its files in `rundir`.
 
         Whatever ends the mission early, `interrupted` too, raises inside the block, leaves it, and is on record in
-        `played` then, as is everything else. With `keeps_disks` any agent can be rebooted with its disk, not only those
-        that the scenario reboots so: of a mission that is told while it is played. With `delivers_all` agents hear, and
-        traces have, also what cannot matter to them, as on any real network. Raises HarnessError if there is no
-        swarm to be had.
+        `played` then, as is everything else. A mission that is `told` while it is played may yet do what the scenario
+        says nothing of: so any agent can be rebooted with its disk. With `delivers_all` agents hear, and traces have,
+        also what cannot matter to them, as on any real network. Raises HarnessError if there is no swarm to be had.
         """

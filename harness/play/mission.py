@@ -11,6 +11,8 @@ from typing import Any, Literal, Protocol
 from harness.errors import HarnessError
 from harness.scenario import Scenario
 from harness.scenario.changes import RANGE, Change, final_reconcile, timeline_of
+from harness.scenario.fates import Fate
+from ucp.trace import HandlerRun
 
 MAX_FINAL_ROUNDS = 20
 """Bound on the rounds of a final reconcile; each lets every agent reconcile once."""
@@ -54,6 +56,18 @@ class RunOutcome:
             self.faults.append(change)
 
 
+@dataclass(frozen=True)
+class Sought:
+    """A run of a handler that somebody waits for. None means any branch, or any agent."""
+
+    handler: str
+    branch: str | None = None
+    agent: int | None = None
+
+    def is_met_by(self, agent_id: int, run: HandlerRun) -> bool:
+        return run.handler == self.handler and self.branch in (None, run.branch) and self.agent in (None, agent_id)
+
+
 def _same_connections(now: dict[str, Any], before: dict[str, Any]) -> bool:
     return all(now[key] == before[key] for key in ("what", "detail", "fully_connected"))
 
@@ -73,8 +87,23 @@ class Swarm(Protocol):
 
     async def until(self, mission_s: float) -> None: ...
 
+    async def until_run(self, sought: Sought, mission_s: float) -> int | None:
+        """As `until`, but no further than until an agent runs what is sought; its ID, None if nobody has.
+
+        What came of the last change counts, too, and of real processes what has come since the last `until`.
+        """
+
     async def apply(self, change: Change) -> None:
         """Make the change, and take it down in `played`."""
+
+    async def hold(self, fate: Fate) -> int:
+        """Hold back what fits the fate, from its `from_s` on, until `release`; the hold's number.
+
+        Raises ScenarioError if messages cannot be held here.
+        """
+
+    async def release(self, number: int, fate: Fate) -> None:
+        """End a hold: by now it is known until when it lasts, which is `until_s` and `hold_until_s` of `fate`."""
 
     async def stop_events(self) -> None: ...
 

@@ -8,7 +8,7 @@ of the scenario's timeline: it is checked as an entry is, and what was told can 
 import asyncio
 import math
 import re
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from concurrent.futures import Future
 from typing import Any
 
@@ -16,16 +16,22 @@ from pydantic import ValidationError
 
 from harness.errors import ScenarioError
 from harness.play import mission
-from harness.play.mission import RunOutcome
+from harness.play.mission import RunOutcome, Sought
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of
+from harness.scenario.fates import Fate
 from harness.scenario.load import explain, parse
 from harness.scenario.timeline import TimelineEntry
+from ucp.agent import HANDLERS
 
 INSTANT_S = 0.001
 """Of two sentences in one instant the second comes a millisecond later."""
+HOLDABLE = ("message", "sender", "receiver", "block", "count")
+"""Keys of a fate that say which messages it is about."""
 LOOK_EVERY_S = 5.0
 """Mission seconds between two looks at who has voted."""
+
+HANDLER_BRANCHES = {name: handler.branches for name, handler in HANDLERS.items()}
 
 Sentence = Callable[[mission.Swarm], Awaitable[Any]]
 
@@ -40,6 +46,8 @@ class Told:
         self._sentences: asyncio.Queue[tuple[Sentence, Future[Any]] | None] = asyncio.Queue()
         self._played_s = 0.0
         """Until when the timeline has been played."""
+        self._holds: dict[int, dict[str, Any]] = {}
+        """What is held back, as it was told, by the number of its fate."""
         self._completed: dict[int, int] = {}
         """How many blocks each agent had completed when something was last told."""
 
@@ -56,6 +64,7 @@ class Told:
                 answer.set_exception(mistake)
             else:
                 answer.set_result(result)
+        await self.release(swarm)
 
     def hear(self, sentence: Sentence, answer: Future[Any]) -> None:
         """Take the next sentence. What it says, or a mistake in it, is set in `answer`, unless the run ends first."""
@@ -67,19 +76,97 @@ class Told:
 
     # Sentences
 
-    async def change(self, swarm: mission.Swarm, **entry: Any) -> None:
-        """Make this entry of a timeline happen now. Raises ScenarioError if it cannot."""
+    async def change(self, swarm: mission.Swarm, **entry: Any) -> float:
+        """Make this entry of a timeline happen now; its `at_s`. Raises ScenarioError if it cannot."""
         now = max(swarm.now(), self._played_s + INSTANT_S)
         at_s = math.ceil(now * 1000) / 1000
-        document = self.scenario.model_dump()
+        before, document = self.scenario, self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
+        document["duration_s"] = max(self.scenario.duration_s, _entry(at_s, entry).ends_at_s)
+        self._retell(document)
         try:
-            document["duration_s"] = max(self.scenario.duration_s, _entry(at_s, entry).ends_at_s)
+            await self.until(swarm, at_s)
+        except ScenarioError:  # the backend cannot
+            self.scenario = before
+            raise
+        self._completed = await swarm.completed()
+        return at_s
+
+    async def undo(self, swarm: mission.Swarm, at_s: float) -> None:
+        """Have the entry with this `at_s`, which changes the network, last no longer than until now."""
+        document = self.scenario.model_dump()
+        (entry,) = (entry for entry in document["timeline"] if entry["at_s"] == at_s)
+        over_s = _next_instant(max(swarm.now(), self._played_s))
+        for_s = round(over_s - at_s, 3)
+        if entry["for_s"] is not None and entry["for_s"] <= for_s:
+            return
+        entry["for_s"] = for_s
+        document["duration_s"] = max(self.scenario.duration_s, over_s)
+        self._retell(document)
+        await self.until(swarm, over_s)
+        self._completed = await swarm.completed()
+
+    async def hold(self, swarm: mission.Swarm, **which: Any) -> None:
+        """From now on hold back the messages that a fate with these keys is about. Raises ScenarioError."""
+        if unknown := next((key for key in which if key not in HOLDABLE), None):
+            raise ScenarioError(f"`{unknown}` is unknown: what is held is said by {', '.join(HOLDABLE)}")
+        if which in self._holds.values():
+            raise ScenarioError(f"{_in_words(which)} is held already")
+        now = swarm.now()
+        document = self.scenario.model_dump()
+        document["fates"].append({**which, "from_s": _next_instant(now), **_until(_next_instant(now + INSTANT_S))})
+        before = self.scenario
+        self._retell(document)
+        try:
+            self._holds[await swarm.hold(self.scenario.fates[-1])] = which
+        except ScenarioError:
+            self.scenario = before
+            raise
+
+    async def release(self, swarm: mission.Swarm, **which: Any) -> None:
+        """Let go of what was held by these words, or of everything. Raises ScenarioError if there is no such hold."""
+        if which and which not in self._holds.values():
+            held = ", ".join(map(_in_words, self._holds.values())) or "nothing"
+            raise ScenarioError(f"{_in_words(which)} is not held: {held} is")
+        for number in [number for number, held in self._holds.items() if which in ({}, held)]:
+            document = self.scenario.model_dump()
+            fate = document["fates"][number]
+            fate |= _until(_next_instant(max(swarm.now(), fate["from_s"])))
+            self._retell(document)
+            del self._holds[number]
+            await swarm.release(number, self.scenario.fates[number])
+
+    async def until_run(self, swarm: mission.Swarm, sought: Sought, limit_s: float) -> int | None:
+        """Go on until an agent runs what is sought; its ID, or None if that takes longer. Raises ScenarioError."""
+        self._check(sought)
+        end_s = swarm.now() + limit_s
+        while swarm.now() <= end_s:
+            coming = (change.at_s for change in timeline_of(self.scenario) if change.at_s > self._played_s)
+            next_s = min([end_s, *coming])
+            if (agent := await swarm.until_run(sought, next_s)) is not None:
+                return agent
+            await self.until(swarm, next_s)
+            if next_s == end_s:
+                break
+        return None
+
+    def _check(self, sought: Sought) -> None:
+        if sought.handler not in HANDLER_BRANCHES:
+            raise ScenarioError(f"there is no handler {sought.handler!r}: there are {', '.join(HANDLER_BRANCHES)}")
+        branches = HANDLER_BRANCHES[sought.handler]
+        by_the_book = self.scenario.agent_command is None and not self.scenario.has_wrong_agents
+        if by_the_book and sought.branch is not None and sought.branch not in branches:
+            named = ", ".join(map(repr, branches))
+            raise ScenarioError(f"{sought.handler} has no branch {sought.branch!r}: it has {named}")
+        if sought.agent is not None and sought.agent not in self.scenario.roster:
+            raise ScenarioError(f"there is no agent {sought.agent!r}: there are {_ids(self.scenario.roster)}")
+
+    def _retell(self, document: dict[str, Any]) -> None:
+        """Raises ScenarioError if there can be no such scenario."""
+        try:
             self.scenario = parse(document)
         except ScenarioError as error:
-            raise ScenarioError(re.sub(r"timeline\.\d+(\.|: )", "", str(error))) from None
-        await self.until(swarm, at_s)
-        self._completed = await swarm.completed()
+            raise ScenarioError(re.sub(r"(timeline|fates)\.\d+(\.|: )", "", str(error))) from None
 
     async def until(self, swarm: mission.Swarm, mission_s: float) -> None:
         """Go on until then, with what the timeline has in between."""
@@ -128,20 +215,15 @@ class Told:
                 silent.difference_update(fault.agents)
         return silent
 
-    async def reconcile(self, swarm: mission.Swarm, agent: int) -> None:
-        awake = await swarm.completed()
-        if agent not in awake:
-            raise ScenarioError(f"agent {agent!r} cannot reconcile: those that run are {', '.join(map(str, awake))}")
-        await swarm.reconcile(agent)
-
     async def end(self, swarm: mission.Swarm, *, reconcile_finally: bool) -> None:
         """The end of the mission, if it has not been. Raises ScenarioError if a second final reconcile is asked for."""
         if swarm.played.final_reconcile is not None:
             if reconcile_finally:
                 raise ScenarioError("the final reconcile has been: a mission has one, at its end")
             return
+        await self.release(swarm)
         if not self.scenario.schedule:  # which lasts as long as the mission was meant to
-            last_s = max(change.at_s for change in timeline_of(self.scenario))
+            last_s = max([0.0, *(entry.ends_at_s for entry in self.scenario.timeline)])
             await self.until(swarm, last_s)  # agents come back, and what is for a while passes
             self._set(duration_s=max(swarm.now(), INSTANT_S))
         self._set(final_reconcile=reconcile_finally or self.scenario.final_reconcile)
@@ -149,6 +231,23 @@ class Told:
 
     def _set(self, **keys: Any) -> None:
         self.scenario = self.scenario.model_copy(update=keys)
+
+
+def _next_instant(mission_s: float) -> float:
+    """A little later: what is sent by then has been sent."""
+    return round(mission_s + INSTANT_S, 3)
+
+
+def _until(mission_s: float) -> dict[str, float]:
+    return {"until_s": mission_s, "hold_until_s": mission_s}
+
+
+def _in_words(which: dict[str, Any]) -> str:
+    return Fate(**which, name="-").describe().removeprefix("name '-' ")
+
+
+def _ids(agents: Iterable[int]) -> str:
+    return ", ".join(map(str, agents))
 
 
 def _entry(at_s: float, keys: dict[str, Any]) -> TimelineEntry:

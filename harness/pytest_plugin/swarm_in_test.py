@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,16 @@ from harness.errors import HarnessError, ScenarioError
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS
-from harness.play.mission import RunOutcome
+from harness.play.mission import RunOutcome, Sought
 from harness.play.progress import Silent
 from harness.pytest_plugin.findings import Findings, JudgementInTest
 from harness.pytest_plugin.live_story import Sentence, Told
 from harness.run.run import Recording, Run
 from harness.scenario import Scenario
 from harness.scenario.faults import ASKED_FOR
+from harness.scenario.injection import INJECTIONS
 
-_VERBS = [kind.what for kind in ASKED_FOR]
+_VERBS = [*(kind.what for kind in ASKED_FOR), *INJECTIONS]
 
 
 class RunEndedError(Exception):
@@ -65,7 +67,7 @@ class SwarmInTest:
         scenario, directory = self._told.scenario, self._recording.directory
         with self._runner:
             try:
-                opening = backend.open(scenario, seed, directory, Silent(), self._interrupted, keeps_disks=True)
+                opening = backend.open(scenario, seed, directory, Silent(), self._interrupted, told=True)
                 return self._runner.run(mission.play_on(opening, scenario, self._told.story))
             except HarnessError as error:
                 self._recording.fail(error)
@@ -80,38 +82,80 @@ class SwarmInTest:
         """
         __tracebackhide__ = True
         self._change(partition=[list(group) for group in groups], for_s=for_s)
-        return self._healing()
+        return self._afterwards(self.heal)
 
     @contextmanager
-    def _healing(self) -> Iterator[None]:
+    def _afterwards(self, undo: Callable[[], object]) -> Iterator[None]:
         __tracebackhide__ = True
         yield
-        self.heal()
+        undo()
+
+    def _for_a_block(self, **entry: Any) -> AbstractContextManager[None]:
+        __tracebackhide__ = True
+        at_s = self._change(**entry)
+        return self._afterwards(lambda: self._act(lambda swarm: self._told.undo(swarm, at_s)))
 
     def heal(self) -> None:
         """Undo the partition."""
         __tracebackhide__ = True
         self._change(heal=True)
 
-    def loss(self, probability: float, for_s: float | None = None) -> None:
-        """From now on every receiver loses each message with this probability."""
-        __tracebackhide__ = True
-        self._change(loss=probability, for_s=for_s)
+    def loss(self, probability: float, for_s: float | None = None) -> AbstractContextManager[None]:
+        """From now on every receiver loses each message with this probability.
 
-    def network(self, for_s: float | None = None, **keys: Any) -> None:
-        """From now on these keys of a scenario's `network` count: `network(links=[{"from": 1, "to": 2, "loss": 0.9}])`.
-
-        Here as above: for so many mission seconds, or for good.
+        Here and below: for good, for so many mission seconds, or `with swarm.loss(0.5):` for a block.
         """
         __tracebackhide__ = True
-        self._change(network=keys, for_s=for_s)
+        return self._for_a_block(loss=probability, for_s=for_s)
+
+    def network(self, for_s: float | None = None, **keys: Any) -> AbstractContextManager[None]:
+        """From now on these keys of a scenario's `network` count: `network(delay=0.2, receivers={3: {"loss": 1}})`."""
+        __tracebackhide__ = True
+        return self._for_a_block(network=keys, for_s=for_s)
+
+    def link(
+        self,
+        sender: int | list[int],
+        receiver: int | list[int],
+        *,
+        both: bool = False,
+        for_s: float | None = None,
+        **keys: Any,
+    ) -> AbstractContextManager[None]:
+        """From now on what goes from one to the other meets this: `link(1, 2, loss=0.9)`; `both`: and back."""
+        __tracebackhide__ = True
+        if not keys:
+            raise ScenarioError("a link needs what is other on it than elsewhere, such as loss=0.9")
+        return self.network(for_s, links=[{"from": sender, "to": receiver, "both": both, **keys}])
+
+    def hold(self, message: str | None = None, **which: Any) -> AbstractContextManager[None]:
+        """From now on messages that match are on their way and do not arrive before `release`: virtual time alone.
+
+        They match as those of a scenario's fate do, by `message`, `sender`, `receiver`, `block` and `count`; what is
+        not said may be any. The end of `with swarm.hold("Commit Block", sender=2):` releases them, and so does that of
+        the test.
+        """
+        __tracebackhide__ = True
+        words = _of_message(message, which)
+        self._act(lambda swarm: self._told.hold(swarm, **words))
+        return self._afterwards(lambda: self.release(**words))
+
+    def release(self, message: str | None = None, **which: Any) -> None:
+        """Let go of what was held by these words, or of everything that is held."""
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.release(swarm, **_of_message(message, which)))
 
     # The agents
 
     def __getattr__(self, verb: str) -> Callable[..., None]:
-        """Each fault is a verb, with the further keys of its timeline entry: `kill(2, 4)`, `reboot(3, down_s=10)`."""
+        """Each fault is a verb, with the further keys of its timeline entry: `kill(2, 4)`, `reboot(3, down_s=10)`.
+
+        And so is each injection: `replay("Commit Block", sender=2, count=3)`, `flood(for_s=10, per_s=50)`.
+        """
         __tracebackhide__ = True
         fault = next((kind for kind in ASKED_FOR if kind.what == verb), None)
+        if verb in INJECTIONS:
+            return partial(self._inject, verb)
         if fault is None:
             raise AttributeError(f"a swarm has no {verb!r}; what can happen to it: {', '.join(_VERBS)}")
 
@@ -125,10 +169,10 @@ class SwarmInTest:
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *_VERBS]
 
-    def reconcile(self, agent: int) -> None:
-        """The agent begins a reconcile."""
+    def _inject(self, verb: str, message: str | None = None, **keys: Any) -> None:
+        """A rogue node sends this from now on."""
         __tracebackhide__ = True
-        self._act(lambda swarm: self._told.reconcile(swarm, agent))
+        self._change(**{verb: _of_message(message, keys)})
 
     # Time
 
@@ -149,6 +193,25 @@ class SwarmInTest:
         """Let the mission go on until then, which is not over yet."""
         __tracebackhide__ = True
         self._act(lambda swarm: self._told.from_now_until(swarm, mission_s))
+
+    def wait_for(
+        self, handler: str, branch: str | None = None, agent: int | None = None, limit_s: float = 1800.0
+    ) -> int:
+        """Let the mission go on until an agent runs this handler, with this branch; the agent's ID.
+
+        What was told last may have it run at once. Names are those of traces (ucp/HANDLERS.md). Raises AssertionError
+        if nobody runs it within `limit_s`.
+        """
+        __tracebackhide__ = True
+        if not 0 <= limit_s < math.inf:
+            raise ScenarioError(f"nobody waits for {limit_s:g} s")
+        sought = Sought(handler, branch, agent)
+        found = self._act(lambda swarm: self._told.until_run(swarm, sought, limit_s))
+        if found is None:
+            who = "no agent has" if agent is None else f"agent {agent} has not"
+            how = "" if branch is None else f" with the branch {branch!r}"
+            raise AssertionError(f"within {limit_s:g} mission seconds {who} run {handler}{how}")
+        return int(found)
 
     def wait_idle(self, limit_s: float = 1800.0) -> None:
         """Let the mission go on until what was told last has sunk in.
@@ -213,9 +276,9 @@ class SwarmInTest:
 
     # Between the test and the run
 
-    def _change(self, **entry: Any) -> None:
+    def _change(self, **entry: Any) -> float:
         __tracebackhide__ = True
-        self._act(lambda swarm: self._told.change(swarm, **entry))
+        return float(self._act(lambda swarm: self._told.change(swarm, **entry)))
 
     def _act(self, sentence: Sentence) -> Any:
         __tracebackhide__ = True
@@ -259,6 +322,10 @@ class SwarmInTest:
         self._judged = True
         self._recording.tell(self._told.scenario)
         return self._recording.end(played)
+
+
+def _of_message(message: str | None, keys: dict[str, Any]) -> dict[str, Any]:
+    return keys if message is None else {"message": message, **keys}
 
 
 async def _snapshot(swarm: mission.Swarm) -> RunOutcome:

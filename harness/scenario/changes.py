@@ -3,7 +3,7 @@
 A timeline is computed before the run from the scenario alone, so every backend plays the same.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any
@@ -79,11 +79,11 @@ def injections_of(scenario: Scenario) -> list[Injected]:
     return [Injected(at_s, what, injection, number) for number, (at_s, what, injection) in enumerate(entries, 1)]
 
 
-def injected_nothing(scenario: Scenario, sent: Mapping[int, int]) -> list[str]:
-    """A sentence for each injection that came to nothing; `sent` has the datagrams of each that has begun."""
+def injected_nothing(begun: Sequence[Injected], sent: Mapping[int, int]) -> list[str]:
+    """A sentence for each injection that has come to nothing; `sent` has the datagrams of each."""
     return [
         f"{injected.what} at {injected.at_s:g} s ({injected.detail}) sent nothing, for nothing like it was heard"
-        for injected in injections_of(scenario)
+        for injected in begun
         if sent.get(injected.number) == 0
     ]
 

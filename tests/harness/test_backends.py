@@ -89,7 +89,8 @@ class PerfectAir(Backend):
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        keeps_disks: bool = False,
+        told: bool = False,
+        delivers_all: bool = False,
     ) -> AsyncIterator[OnPerfectAir]:
         swarm = OnPerfectAir(list(scenario.roster), seed, rundir)
         yield swarm

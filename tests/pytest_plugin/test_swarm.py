@@ -96,7 +96,7 @@ FAULTS = """
         swarm.kill(3)
         with pytest.raises(Exception, match="kill: agent 3 is killed then"):
             swarm.kill(3)
-        with pytest.raises(Exception, match="agent 3 cannot reconcile: those that run are 7, 20, 40"):
+        with pytest.raises(Exception, match="reconcile: agent 3 is killed then, not running"):
             swarm.reconcile(3)
         swarm.pause(7)
         swarm.run_for(50)

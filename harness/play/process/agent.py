@@ -6,12 +6,13 @@ directory of its own, so that nothing of an earlier life is overwritten, or foun
 
 import asyncio
 import contextlib
+import json
 import os
 import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.archive.directory import RunDirectory
-from harness.archive.traces import SUFFIX, read_trace
+from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
 from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, Status
 from harness.play.process.lab import MissionLab, Program
 from harness.play.process.mission_file import mission_file
 from harness.scenario import Scenario
+from ucp.trace import HandlerRun
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
@@ -290,6 +292,17 @@ class AgentProcess:
         if self.awake:
             await self.export()
             self.outcome = "exported"
+
+    def runs_since(self, mission_s: float, handler: str) -> Iterator[HandlerRun]:
+        """What its trace has of this handler after then, of this life; damage is the checker's affair."""
+        trace = self._lives[-1].directory / f"{self.agent_id}{SUFFIX}"
+        name = json.dumps(handler).encode()
+        for line in trace.read_bytes().split(b"\n")[1:-1] if trace.exists() else ():
+            if name in line:
+                with contextlib.suppress(ValidationError):
+                    run = HANDLER_RUN.validate_json(line)
+                    if run.t > mission_s:
+                        yield run
 
     # The end
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 from typing import Any, Self
 
 from harness.archive.directory import RunDirectory
-from harness.errors import HarnessError, InterruptedRunError, MachineError
+from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
 from harness.play.control import Status
-from harness.play.mission import RunOutcome
+from harness.play.mission import RunOutcome, Sought
 from harness.play.process.agent import AgentProcess, reboots_with_disk
 from harness.play.process.lab import MissionLab, OpenLab
 from harness.play.process.preflight import on_the_air
@@ -26,6 +26,7 @@ from harness.play.progress import Progress, Snapshot
 from harness.play.radio_range import TRACK_S, RadioRange
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
+from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
@@ -83,6 +84,10 @@ class ProcessRun:
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()
         self._watchers = Watchers()
+        self._injected: list[Injected] = []
+        """What the rogue node was told."""
+        self._passed_s = 0.0
+        """When it had last gone on for as long as it was asked to."""
         self._starting: dict[int, asyncio.Task[None]] = {}
         """Agents that begin again and do not answer yet."""
 
@@ -209,7 +214,12 @@ class ProcessRun:
             await self._put_into_force(self._reach.ask(change), asked=change.conditions)
             return
         if isinstance(change, Injected):
-            assert self._rogue is not None, "a scenario that injects has one"
+            if self._rogue is None:
+                raise ScenarioError(
+                    f"`{change.what}` needs a rogue node, which real processes have if the timeline that the mission "
+                    "begins with injects something: use --backend sim"
+                )
+            self._injected.append(change)
             self.played.record(change.to_json(round(max(change.at_s, self.clock.now()), 3)))
             await self._rogue.inject(change)
             return
@@ -311,6 +321,26 @@ class ProcessRun:
     async def until(self, mission_s: float) -> None:
         while (left_s := mission_s - self.clock.now()) > 0:  # a clock that is about to start stands at 0
             await asyncio.sleep(self.clock.wall_s(left_s))
+            self._passed_s = self.clock.now()
+
+    async def until_run(self, sought: Sought, mission_s: float) -> int | None:
+        while True:
+            over = self.clock.now() >= mission_s
+            for agent in self.agents:
+                for run in agent.runs_since(self._passed_s, sought.handler):
+                    if sought.is_met_by(agent.agent_id, run):
+                        self._passed_s = run.t
+                        return agent.agent_id
+            if over:
+                self._passed_s = self.clock.now()
+                return None
+            await asyncio.sleep(QUIET_POLL_S)
+
+    async def hold(self, fate: Fate) -> int:
+        raise ScenarioError("`hold` needs virtual time: use --backend sim")
+
+    async def release(self, number: int, fate: Fate) -> None:
+        raise AssertionError("nothing was held")
 
     async def stop_events(self) -> None:
         self._watchers.stop("script")
@@ -417,7 +447,7 @@ class ProcessRun:
         except MachineError as error:
             if self.played.outcome == "completed":
                 self._ended_early(error)
-        self.played.unmatched_fates = injected_nothing(self.scenario, rogue.sent)
+        self.played.unmatched_fates = injected_nothing(self._injected, rogue.sent)
 
     def _show(self, stage: str) -> None:
         self.stage = stage

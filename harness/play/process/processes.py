@@ -51,7 +51,7 @@ class Processes(Backend):
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        keeps_disks: bool = False,
+        told: bool = False,
         delivers_all: bool = False,
     ) -> AbstractAsyncContextManager[Swarm]:
         from harness.play.process.backend import ProcessRun
@@ -70,5 +70,5 @@ class Processes(Backend):
             interrupted,
             agent_command=self.agent_command(scenario),
             open_lab=self.open_lab,
-            keeps_disks=keeps_disks,
+            keeps_disks=told,
         ).opened()

@@ -129,6 +129,12 @@ class VirtualAir:
         self._swept_at = 0
         self._waiting: dict[str, list[tuple[InFlight, int]]] = defaultdict(list)
         self._named: dict[str, float] = {}
+        self._held: dict[int, list[tuple[InFlight, int, float]]] = defaultdict(list)
+        """What holds keep back, by their numbers: to whom, and when it would have arrived."""
+
+    def deliver_everything(self) -> None:
+        """From now on deliver even what cannot matter."""
+        self._deliver_all = True
 
     def until(self, mission_s: float) -> Iterator[Happening]:
         """What comes up to and at `mission_s`, in order, with whatever comes of it meanwhile."""
@@ -174,7 +180,7 @@ class VirtualAir:
         if now + lots.latest > self.quiet_at:
             self.quiet_at = now + lots.latest
         answered = None if self._deliver_all else ANSWERED.get(kind)
-        if answered is None and kind in ASKED and not self._deliver_all:
+        if answered is None and kind in ASKED and (self._topics or not self._deliver_all):
             self._ask(number, ASKED[kind](message, self._settings))
         if self._script.listens and self._scripted(now, number, flight):
             return
@@ -323,11 +329,18 @@ class VirtualAir:
                 self._arrive(flight, receiver, max(now, self._named[name]) + RIGHT_AFTER_S)
             else:
                 self._waiting[name].append((flight, receiver))
+        for hold, receiver, at in decided.held:
+            self._held[hold].append((flight, receiver, at))
         for name, at in decided.named:
             self._named[name] = at
             for waiting, receiver in self._waiting.pop(name, ()):
                 self._arrive(waiting, receiver, at + RIGHT_AFTER_S)
         return True
+
+    def release(self, number: int, at: float) -> None:
+        """What the hold with this number has kept back arrives at `at`, or when it would have."""
+        for flight, receiver, would_arrive in self._held.pop(number, ()):
+            self._arrive(flight, receiver, max(at, would_arrive))
 
     def _arrive(self, flight: InFlight, receiver: int, at: float) -> None:
         self.quiet_at = max(self.quiet_at, at)

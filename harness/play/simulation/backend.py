@@ -7,7 +7,7 @@ one fault leaves the others as they are. Vehicles are tracks, without telemetry,
 
 import base64
 import dataclasses
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +15,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any, Protocol
 
 from harness.gc_pause import gc_paused
-from harness.play.mission import RunOutcome
+from harness.play.mission import RunOutcome, Sought
 from harness.play.radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.rogue.line import OF_NO_INJECTION, line_of
 from harness.play.seeds import agent_seed
@@ -33,7 +33,7 @@ from ucp.agent import Agent
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
-from ucp.messages import datagram_bytes
+from ucp.messages import Message, datagram_bytes
 from ucp.quirks import wrong_handlers
 from ucp.store import StoredState
 from ucp.trace import Entry, HandlerRun, Recorded
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 ENGINE = "virtual time"
 ANY_LIFE = 0
+REMEMBERED = 10_000
+"""Messages that a rogue node knows of that comes later: as many as it keeps itself."""
 BREATH_S = 20.0
 """Mission seconds between two looks at whoever watches."""
 
@@ -123,9 +125,9 @@ class Simulation:
     """A swarm in virtual time; see `harness.play.mission.Swarm`. Agents are numbered in the roster's order.
 
     `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. Where anybody
-    has quirks all hear everything: what cannot matter to the right agent may matter to a wrong one. `breathe` is
-    awaited every few mission seconds. `fate_script` makes what plays the scenario's fates, and `air` what carries
-    messages.
+    has quirks all hear everything: what cannot matter to the right agent may matter to a wrong one. `told`: the
+    timeline is told while it is played, and may yet inject. `breathe` is awaited every few mission seconds.
+    `fate_script` makes what plays the scenario's fates, and `air` what carries messages.
     """
 
     def __init__(
@@ -135,6 +137,7 @@ class Simulation:
         recorder: Recorder,
         *,
         deliver_all: bool = False,
+        told: bool = False,
         breathe: Callable[["Simulation"], Awaitable[None]] | None = None,
         fate_script: Callable[[Sequence[Fate], Sequence[int], NameOf], FateScript] = FateScript,
         air: Callable[..., VirtualAir] = VirtualAir,
@@ -169,6 +172,15 @@ class Simulation:
         self._script = fate_script(scenario.fates, self.roster, BlockNames(self.roster, self._lives).of)
         self._air = air(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
         self._rogue = self._rogue_node() if scenario.rogue else None
+        self._injected: list[Injected] = []
+        """What the rogue node was told."""
+        self._on_the_air: deque[tuple[int, int, Message, float]] | None = deque(maxlen=REMEMBERED) if told else None
+        """What a rogue node would have heard, if there is none and may be one."""
+        self._sought: Sought | None = None
+        self._found: int | None = None
+        """The agent that has run what was sought."""
+        self._at_once: list[tuple[int, HandlerRun]] | None = None
+        """What agents have run at the last change; None once time has passed."""
         self._recurrence: Recurrence | None = None
         """Is told of timers that end, once the swarm has had its time to finish."""
 
@@ -176,6 +188,14 @@ class Simulation:
         from harness.play.simulation.rogue import VirtualRogue  # scapy takes long to import
 
         return VirtualRogue(self.roster, self.seed, self._air, len(self.roster), self._recorder.injected)
+
+    def _late_rogue(self) -> "VirtualRogue":
+        """One that has been on the air all along, and begins to send now."""
+        assert self._on_the_air is not None, "a scenario that injects has a rogue node from the beginning"
+        rogue = self._rogue_node()
+        for sender, sequence, message, sent_at in self._on_the_air:
+            rogue.hears(sender, sequence, message, sent_at)
+        return rogue
 
     # The swarm, as harness.play.mission drives it
 
@@ -187,6 +207,7 @@ class Simulation:
 
     async def begin(self, first: Change) -> None:
         await self.apply(first)
+        self._at_once = None
         self._move()
         for number in range(len(self.roster)):
             self._start(number)
@@ -204,21 +225,45 @@ class Simulation:
         if self._breathe is None and not self._tracks:
             self._run(mission_s)
             return
-        while self._now < mission_s:
+        while self._now < mission_s and self._found is None:
             self._run(min(mission_s, self._now + BREATH_S, self._moves_at))
             if self._now == self._moves_at:
                 self._move()
             if self._breathe is not None:
                 await self._breathe(self)
 
+    async def until_run(self, sought: Sought, mission_s: float) -> int | None:
+        self._deliver_all = True  # also what does nothing is a handler run
+        self._air.deliver_everything()
+        at_once, self._at_once = self._at_once or [], None
+        for index, (agent_id, run) in enumerate(at_once):
+            if sought.is_met_by(agent_id, run):
+                self._at_once = at_once[index + 1 :]
+                return agent_id
+        self._sought, self._found = sought, None
+        await self.until(mission_s)
+        found, self._sought, self._found = self._found, None, None
+        return found
+
+    async def hold(self, fate: Fate) -> int:
+        return self._script.hold(fate)
+
+    async def release(self, number: int, fate: Fate) -> None:
+        assert fate.hold_until_s is not None, "by now it is known"
+        self._script.release(number, fate)
+        self._air.release(number, fate.hold_until_s)
+
     async def apply(self, change: Change) -> None:
+        self._at_once = []
         if isinstance(change, NetworkChange):
             self._put_into_force(self._reach.ask(change), asked=change.conditions.to_json())
             return
         record = change.to_json(round(self._now, 3))
         self.played.record(record)
         if isinstance(change, Injected):
-            assert self._rogue is not None, "a scenario that injects has one"
+            self._injected.append(change)
+            if self._rogue is None:
+                self._rogue = self._late_rogue()
             self._rogue.begin(change, self._now)
             return
         for agent_id in change.agents:
@@ -340,7 +385,7 @@ class Simulation:
         )
 
     def _injected_nothing(self) -> list[str]:
-        return injected_nothing(self.scenario, self._rogue.sent) if self._rogue is not None else []
+        return injected_nothing(self._injected, self._rogue.sent) if self._rogue is not None else []
 
     # What is there
 
@@ -389,9 +434,11 @@ class Simulation:
 
     def _run(self, until: float) -> None:
         """All that happens up to `until`."""
+        self._at_once = None
         with gc_paused():
             self._play(until)
-        self._now = until
+        if self._found is None:
+            self._now = until
 
     def _play(self, until: float) -> None:
         alive = self._alive
@@ -405,6 +452,8 @@ class Simulation:
                 self._happen(number, life, what)
             elif what is not None:
                 life.waiting.append(happening)
+            if self._found is not None:
+                return
 
     def _happen(self, number: int, life: Incarnation, what: InFlight | Logged | RogueDatagram | None) -> None:
         agent = life.agent
@@ -481,6 +530,8 @@ class Simulation:
             self._air.broadcast(self._now, number, sequence, message, data_bytes, datagram)
             if self._rogue is not None:
                 self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
+            elif self._on_the_air is not None:
+                self._on_the_air.append((life.agent.agent_id, sequence, message, self._now))
 
     def _wait(self, number: int, life: Incarnation) -> None:
         """Wait for the agent's next timer."""
@@ -519,10 +570,18 @@ class Simulation:
             entry.t = mission_s
             if isinstance(entry, HandlerRun):
                 life.handler_runs += 1
+                self._look(life.agent.agent_id, entry)
                 for sent in entry.sent:
                     datagrams.append(sent.datagram)
         self._recorder.write(life.agent.agent_id, entries)
         return datagrams
+
+    def _look(self, agent_id: int, run: HandlerRun) -> None:
+        """Whether it is what somebody waits for, or will wait for in a moment."""
+        if self._at_once is not None:
+            self._at_once.append((agent_id, run))
+        elif self._sought is not None and self._found is None and self._sought.is_met_by(agent_id, run):
+            self._found = agent_id
 
     # An agent's life
 

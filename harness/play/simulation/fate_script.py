@@ -20,6 +20,7 @@ class _Part:
     """One fate and what it has come to: messages that fit it, and deliveries that it decided.
 
     `arrivals` are the mission seconds at which the sender's datagrams arrive that have not been sent yet, by number.
+    While it `holds`, nobody knows yet until when.
     """
 
     index: int
@@ -27,6 +28,7 @@ class _Part:
     fitting: int = 0
     decided: int = 0
     arrivals: dict[int, list[float]] = field(default_factory=dict)
+    holds: bool = False
 
     def __post_init__(self) -> None:
         for number, at_s in numbered(self.fate.arrivals or ""):
@@ -40,6 +42,8 @@ class Decided:
     arrivals: list[tuple[int, float]] = field(default_factory=list)
     waiting: list[tuple[int, str]] = field(default_factory=list)
     """(receiver, name): to arrive after the message that the fate with this name is about."""
+    held: list[tuple[int, int, float]] = field(default_factory=list)
+    """(number, receiver, time): to arrive then, or when the hold with this number is over if that is later."""
     named: list[tuple[str, float]] = field(default_factory=list)
     """(name, time): when the message arrives that the fate with this name is about."""
 
@@ -58,6 +62,19 @@ class FateScript:
         self._about: dict[tuple[str | None, int | None], list[_Part]] = defaultdict(list)
         for part in self._parts:
             self._about[part.fate.message, part.fate.sender].append(part)
+
+    def hold(self, fate: Fate) -> int:
+        """From now on this fate is the last in the list, and holds back what fits it; its number."""
+        part = _Part(len(self._parts), fate.model_copy(update={"until_s": None}), holds=True)
+        self._parts.append(part)
+        self._about[fate.message, fate.sender].append(part)
+        self.listens = True
+        return part.index
+
+    def release(self, number: int, fate: Fate) -> None:
+        """The hold with this number lasts as long as `fate` says."""
+        part = self._parts[number]
+        part.fate, part.holds = fate, False
 
     def decide(
         self, now: float, sender: int, message: Message, lots: RandomDraws, hears: Callable[[int], bool]
@@ -80,8 +97,11 @@ class FateScript:
             if not hears(receiver):
                 continue
             fate = part.fate
-            if not fate.as_chance_says:
+            if part.holds or not fate.as_chance_says:
                 self.last_s = now
+            if part.holds:
+                decided.held += [(part.index, receiver, at) for at in arrivals]
+                continue
             if fate.after is not None:
                 decided.waiting.append((receiver, fate.after))
                 continue
@@ -100,7 +120,7 @@ class FateScript:
 
     def standing(self, now: float) -> tuple[int, ...] | None:
         """How far each fate has counted, as far as that still matters; None while the time of one is to come."""
-        if any(part.arrivals for part in self._parts):
+        if any(part.arrivals or part.holds for part in self._parts):
             return None
         times = (time for part in self._parts for time in (part.fate.from_s, part.fate.until_s, part.fate.hold_until_s))
         if any(time is not None and time > now for time in times):

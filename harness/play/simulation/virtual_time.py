@@ -50,7 +50,7 @@ class VirtualTime(Backend):
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        keeps_disks: bool = False,
+        told: bool = False,
         delivers_all: bool = False,
     ) -> AsyncIterator[Simulation]:
         async def breathe(simulation: Simulation) -> None:
@@ -62,7 +62,9 @@ class VirtualTime(Backend):
         with closing(OnDisk(rundir)) as files:
             capture = _captures(rundir, scenario) if scenario.capture else None
             air = capture.air if capture else VirtualAir
-            simulation = Simulation(scenario, seed, files, deliver_all=delivers_all, breathe=breathe, air=air)
+            simulation = Simulation(
+                scenario, seed, files, deliver_all=delivers_all, told=told, breathe=breathe, air=air
+            )
             try:
                 yield simulation
             except InterruptedRunError as error:
