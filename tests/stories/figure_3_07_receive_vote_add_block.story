@@ -49,7 +49,38 @@ fates:
       1           2  Process Next Deque Block: deque empty
       2 3 4       6  Receive Commit Block from 1: committed; chain +1.3
 
-60 s: end
+# Who has another chain disapproves.
+60 s: 1 does not reach 3
+61 s: 1 logs
+
+    at 61 s
+      1           1  Build Data Block: full; completes 1.4, deque +1.4
+      1           2  Process Next Deque Block: proposed -> Block Add Request (1.4 on 1.1 1.2 1.3), not to 3
+      2 4         3  Receive Request Add Block from 1: approve -> Block Add Response (1.4: approve)
+      1           4  Receive Vote Add Block from 2 4: yes
+    at 71 s
+      1           5  Vote Timer Expiration: approved; deque -1.4, chain +1.4 -> Commit Block (1.4 on 1.1 1.2 1.3), not to 3
+      1           2  Process Next Deque Block: deque empty
+      2 4         6  Receive Commit Block from 1: committed; chain +1.4
+
+75 s: 1 reaches 3 again
+80 s: 1 logs
+
+    at 80 s
+      1           1  Build Data Block: full; completes 1.5, deque +1.5
+      1           2  Process Next Deque Block: proposed -> Block Add Request (1.5 on 1.1 1.2 1.3 1.4)
+      2 4         3  Receive Request Add Block from 1: approve -> Block Add Response (1.5: approve)
+      3           3  Receive Request Add Block from 1: disapprove -> Block Add Response (1.5: disapprove)
+      1           4  Receive Vote Add Block from 2 4: yes
+      1           4  Receive Vote Add Block from 3: no
+    at 90 s
+      1           5  Vote Timer Expiration: approved; deque -1.5, chain +1.5 -> Commit Block (1.5 on 1.1 1.2 1.3 1.4)
+      1           2  Process Next Deque Block: deque empty
+      2 4         6  Receive Commit Block from 1: committed; chain +1.5
+      3           6  Receive Commit Block from 1: does not succeed
+
+110 s: end
 
     chains
-      inception 1.1 1.2 1.3  (1 2 3 4)
+      inception 1.1 1.2 1.3  (3)
+        1.4 1.5  (1 2 4)

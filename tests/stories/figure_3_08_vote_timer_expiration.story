@@ -82,7 +82,41 @@ settings: {max_block_bytes: 267}  # an event fills a block
       3           2  Process Next Deque Block: deque empty
       1 2         6  Receive Commit Block from 3: committed; chain +3.2
 
-110 s: end
+# A vote that ends during a reconcile decides nothing, and is held again after it.
+120 s: 1 logs
+
+    at 120 s
+      1           1  Build Data Block: full; completes 1.2, deque +1.2
+      1           2  Process Next Deque Block: proposed -> Block Add Request (1.2 on 1.1 2.1 3.1 3.2)
+      2 3         3  Receive Request Add Block from 1: approve -> Block Add Response (1.2: approve)
+      1           4  Receive Vote Add Block from 2 3: yes
+
+123 s: reconcile 1
+
+    at 123 s
+      1           7  Reconcile Begin: begun
+      1           8  Reconcile Phase 1: asked -> Chain Contain Query (1.1 2.1 3.1 3.2)
+      2 3         9  Receive Request Chain Contain from 1: yes -> Chain Contain Response (1.1 2.1 3.1 3.2: yes)
+      1          10  Receive Phase 1 Response from 2 3: yes
+    at 128 s
+      1          11  Reconcile Phase 1 Timer Expiration: contained
+      1          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (1.1 2.1 3.1 3.2)
+      2 3        13  Receive Request Next in Sequence from 1: top of chain -> Next in Sequence Response (1.1 2.1 3.1 3.2: Is Top Of Chain)
+      1          14  Receive Response Next in Sequence from 2 3: new candidate, counted
+    at 130 s
+      1           5  Vote Timer Expiration: reconcile in progress
+    at 133 s
+      1          15  Reconcile Phase 2 Timer Expiration: top of chain
+      1          20  Reconcile Finalize: done
+      1           2  Process Next Deque Block: proposed -> Block Add Request (1.2 on 1.1 2.1 3.1 3.2)
+      2 3         3  Receive Request Add Block from 1: approve -> Block Add Response (1.2: approve)
+      1           4  Receive Vote Add Block from 2 3: yes
+    at 143 s
+      1           5  Vote Timer Expiration: approved; deque -1.2, chain +1.2 -> Commit Block (1.2 on 1.1 2.1 3.1 3.2)
+      1           2  Process Next Deque Block: deque empty
+      2 3         6  Receive Commit Block from 1: committed; chain +1.2
+
+160 s: end
 
     chains
-      inception 1.1 2.1 3.1 3.2  (1 2 3)
+      inception 1.1 2.1 3.1 3.2 1.2  (1 2 3)

@@ -3,7 +3,7 @@
 agents: 4
 settings: {max_block_bytes: 267}  # an event fills a block
 
-# 4 reconciles when the first commit comes, and so does not have the block that the second one succeeds.
+# 4 reconciles when the first commit comes. It learns of the block all the same, from those whom it asks.
 
 1 s: 1 logs
 
@@ -55,7 +55,38 @@ settings: {max_block_bytes: 267}  # an event fills a block
       2           2  Process Next Deque Block: deque empty
       1 3 4       6  Receive Commit Block from 2: committed; chain +2.1
 
-40 s: end
+# It does not hear of the next block, and cannot follow the one on top of that.
+40 s: 3 does not reach 4
+41 s: 3 logs
+
+    at 41 s
+      3           1  Build Data Block: full; completes 3.1, deque +3.1
+      3           2  Process Next Deque Block: proposed -> Block Add Request (3.1 on 1.1 2.1), not to 4
+      1 2         3  Receive Request Add Block from 3: approve -> Block Add Response (3.1: approve)
+      3           4  Receive Vote Add Block from 1 2: yes
+    at 51 s
+      3           5  Vote Timer Expiration: approved; deque -3.1, chain +3.1 -> Commit Block (3.1 on 1.1 2.1), not to 4
+      3           2  Process Next Deque Block: deque empty
+      1 2         6  Receive Commit Block from 3: committed; chain +3.1
+
+55 s: 3 reaches 4 again
+60 s: 2 logs
+
+    at 60 s
+      2           1  Build Data Block: full; completes 2.2, deque +2.2
+      2           2  Process Next Deque Block: proposed -> Block Add Request (2.2 on 1.1 2.1 3.1)
+      1 3         3  Receive Request Add Block from 2: approve -> Block Add Response (2.2: approve)
+      4           3  Receive Request Add Block from 2: disapprove -> Block Add Response (2.2: disapprove)
+      2           4  Receive Vote Add Block from 1 3: yes
+      2           4  Receive Vote Add Block from 4: no
+    at 70 s
+      2           5  Vote Timer Expiration: approved; deque -2.2, chain +2.2 -> Commit Block (2.2 on 1.1 2.1 3.1)
+      2           2  Process Next Deque Block: deque empty
+      1 3         6  Receive Commit Block from 2: committed; chain +2.2
+      4           6  Receive Commit Block from 2: does not succeed
+
+80 s: end
 
     chains
-      inception 1.1 2.1  (1 2 3 4)
+      inception 1.1 2.1  (4)
+        3.1 2.2  (1 2 3)

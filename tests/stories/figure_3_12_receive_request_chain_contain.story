@@ -31,7 +31,7 @@ settings: {max_block_bytes: 267}  # an event fills a block
 
 35 s: 2 reaches 3 4 again
 
-# 4 asks about a chain that 1 and 2 have below their top, while 3 reconciles.
+# 3 asks about a chain that 1 and 2 have below their top. 2 asks about its whole chain, while 3 reconciles.
 40 s: reconcile 3
 
     at 40 s
@@ -40,74 +40,44 @@ settings: {max_block_bytes: 267}  # an event fills a block
       1 2 4       9  Receive Request Chain Contain from 3: yes -> Chain Contain Response (1.1: yes)
       3          10  Receive Phase 1 Response from 1 2 4: yes
 
-41 s: reconcile 4
+41 s: reconcile 2
 
     at 41 s
-      4           7  Reconcile Begin: begun
-      4           8  Reconcile Phase 1: asked -> Chain Contain Query (1.1)
-      1 2         9  Receive Request Chain Contain from 4: yes -> Chain Contain Response (1.1: yes)
-      3           9  Receive Request Chain Contain from 4: reconcile in progress
-      4          10  Receive Phase 1 Response from 1 2: yes
+      2           7  Reconcile Begin: begun
+      2           8  Reconcile Phase 1: asked -> Chain Contain Query (1.1 2.1)
+      1           9  Receive Request Chain Contain from 2: yes -> Chain Contain Response (1.1 2.1: yes)
+      3           9  Receive Request Chain Contain from 2: reconcile in progress
+      4           9  Receive Request Chain Contain from 2: no -> Chain Contain Response (1.1 2.1: no)
+      2          10  Receive Phase 1 Response from 1: yes
+      2          10  Receive Phase 1 Response from 4: no
+
+44 s: 2 does not reach 4
+
     at 45 s
       3          11  Reconcile Phase 1 Timer Expiration: contained
       3          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (1.1)
-      1 2        13  Receive Request Next in Sequence from 3: successor -> Next in Sequence Response (1.1: 2.1)
-      4          13  Receive Request Next in Sequence from 3: reconcile in progress
-      3          14  Receive Response Next in Sequence from 1 2: new candidate, counted
+      1          13  Receive Request Next in Sequence from 3: successor -> Next in Sequence Response (1.1: 2.1)
+      2          13  Receive Request Next in Sequence from 3: reconcile in progress
+      4          13  Receive Request Next in Sequence from 3: top of chain -> Next in Sequence Response (1.1: Is Top Of Chain)
+      3          14  Receive Response Next in Sequence from 1: new candidate
+      3          14  Receive Response Next in Sequence from 4: new candidate
     at 46 s
-      4          11  Reconcile Phase 1 Timer Expiration: contained
-      4          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (1.1)
-      1 2        13  Receive Request Next in Sequence from 4: successor -> Next in Sequence Response (1.1: 2.1)
-      3          13  Receive Request Next in Sequence from 4: reconcile in progress
-      4          14  Receive Response Next in Sequence from 1 2: new candidate, counted
+      2          11  Reconcile Phase 1 Timer Expiration: contained
+      2          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (1.1 2.1), not to 4
+      1          13  Receive Request Next in Sequence from 2: top of chain -> Next in Sequence Response (1.1 2.1: Is Top Of Chain)
+      3          13  Receive Request Next in Sequence from 2: reconcile in progress
+      2          14  Receive Response Next in Sequence from 1: new candidate
     at 50 s
-      3          15  Reconcile Phase 2 Timer Expiration: block
-      3          16  Reconcile Phase 3: asked -> Request for Block (2.1)
-      1 2        17  Receive Request Block for Hash from 3: sent -> Block Response (2.1)
-      4          17  Receive Request Block for Hash from 3: reconcile in progress
-      3          18  Receive Response Block for Hash from 1 2: committed, not in phase 3; chain +2.1
-      3          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (1.1 2.1)
-      1 2        13  Receive Request Next in Sequence from 3: top of chain -> Next in Sequence Response (1.1 2.1: Is Top Of Chain)
-      4          13  Receive Request Next in Sequence from 3: reconcile in progress
-      3          14  Receive Response Next in Sequence from 1 2: new candidate, counted
-    at 51 s
-      4          15  Reconcile Phase 2 Timer Expiration: block
-      4          16  Reconcile Phase 3: asked -> Request for Block (2.1)
-      1 2        17  Receive Request Block for Hash from 4: sent -> Block Response (2.1)
-      3          17  Receive Request Block for Hash from 4: reconcile in progress
-      4          18  Receive Response Block for Hash from 1 2: committed, not in phase 3; chain +2.1
-      4          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (1.1 2.1)
-      1 2        13  Receive Request Next in Sequence from 4: top of chain -> Next in Sequence Response (1.1 2.1: Is Top Of Chain)
-      3          13  Receive Request Next in Sequence from 4: reconcile in progress
-      4          14  Receive Response Next in Sequence from 1 2: new candidate, counted
-    at 55 s
-      3          15  Reconcile Phase 2 Timer Expiration: top of chain
+      3          15  Reconcile Phase 2 Timer Expiration: tie: top of chain
       3          20  Reconcile Finalize: done
       3           2  Process Next Deque Block: deque empty
-    at 56 s
-      4          15  Reconcile Phase 2 Timer Expiration: top of chain
-      4          20  Reconcile Finalize: done
-      4           2  Process Next Deque Block: deque empty
-
-# 2 asks about its whole chain, which 1 has by now, as all.
-80 s: reconcile 2
-
-    at 80 s
-      2           7  Reconcile Begin: begun
-      2           8  Reconcile Phase 1: asked -> Chain Contain Query (1.1 2.1)
-      1 3 4       9  Receive Request Chain Contain from 2: yes -> Chain Contain Response (1.1 2.1: yes)
-      2          10  Receive Phase 1 Response from 1 3 4: yes
-    at 85 s
-      2          11  Reconcile Phase 1 Timer Expiration: contained
-      2          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (1.1 2.1)
-      1 3 4      13  Receive Request Next in Sequence from 2: top of chain -> Next in Sequence Response (1.1 2.1: Is Top Of Chain)
-      2          14  Receive Response Next in Sequence from 1 3 4: new candidate, counted
-    at 90 s
+    at 51 s
       2          15  Reconcile Phase 2 Timer Expiration: top of chain
       2          20  Reconcile Finalize: done
       2           2  Process Next Deque Block: deque empty
 
-120 s: end
+80 s: end
 
     chains
-      inception 1.1 2.1  (1 2 3 4)
+      inception 1.1  (3 4)
+        2.1  (1 2)

@@ -1,9 +1,12 @@
-# Figure 3.17, Receive Response Next in Sequence: each answer is a candidate that is counted, with a timestamp.
+# Figure 3.17, Receive Response Next in Sequence: an answer counts if the timer runs and it is about the chain asked about.
+# Each different answer is a candidate, with a timestamp.
 agents: 5
 settings: {max_block_bytes: 267}  # an event fills a block
+fates:
+  - {message: Next in Sequence Response, sender: 4, receiver: 1, count: 1, delay_s: 7}  # when it has asked on
+  - {message: Next in Sequence Response, sender: 3, receiver: 1, count: 2, delay_s: 7}  # when it asks no more
 
 # 2, 3 and 4 commit a block; 5 has none of it, and neither has 1.
-
 1 s: partition 1 | 5 | 2 3 4
 2 s: 2 logs
 
@@ -19,7 +22,7 @@ settings: {max_block_bytes: 267}  # an event fills a block
 
 14 s: heal
 
-# Three name the block, and one says that there is nothing: two candidates.
+# Two name the block in time, and one says that there is nothing: two candidates.
 20 s: reconcile 1
 
     at 20 s
@@ -32,7 +35,7 @@ settings: {max_block_bytes: 267}  # an event fills a block
       1          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (inception)
       2 3 4      13  Receive Request Next in Sequence from 1: successor -> Next in Sequence Response (inception: 2.1)
       5          13  Receive Request Next in Sequence from 1: top of chain -> Next in Sequence Response (inception: Is Top Of Chain)
-      1          14  Receive Response Next in Sequence from 2 3 4: new candidate, counted
+      1          14  Receive Response Next in Sequence from 2 3: new candidate, counted
       1          14  Receive Response Next in Sequence from 5: new candidate
     at 30 s
       1          15  Reconcile Phase 2 Timer Expiration: block
@@ -45,10 +48,12 @@ settings: {max_block_bytes: 267}  # an event fills a block
       5          13  Receive Request Next in Sequence from 1: diverged
       5           7  Reconcile Begin: begun
       5           8  Reconcile Phase 1: asked -> Chain Contain Query (inception)
-      1          14  Receive Response Next in Sequence from 2 3 4: new candidate, counted
+      1          14  Receive Response Next in Sequence from 2 4: new candidate, counted
       1           9  Receive Request Chain Contain from 5: reconcile in progress
       2 3 4       9  Receive Request Chain Contain from 5: yes -> Chain Contain Response (inception: yes)
       5          10  Receive Phase 1 Response from 2 3 4: yes
+    at 32 s
+      1          14  Receive Response Next in Sequence from 4: another chain
     at 35 s
       1          15  Reconcile Phase 2 Timer Expiration: top of chain
       1          20  Reconcile Finalize: done
@@ -57,6 +62,8 @@ settings: {max_block_bytes: 267}  # an event fills a block
       5          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (inception)
       1 2 3 4    13  Receive Request Next in Sequence from 5: successor -> Next in Sequence Response (inception: 2.1)
       5          14  Receive Response Next in Sequence from 1 2 3 4: new candidate, counted
+    at 37 s
+      1          14  Receive Response Next in Sequence from 3: not in phase 2
     at 40 s
       5          15  Reconcile Phase 2 Timer Expiration: block
       5          16  Reconcile Phase 3: asked -> Request for Block (2.1)
