@@ -40,12 +40,32 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="DIR",
         help="Keep all run directories, in DIR; else those of failed tests, among pytest's temporary directories.",
     )
+    group.addoption(
+        "--ucp-kernel",
+        choices=("host", "uml"),
+        default="host",
+        help="This machine's kernel, or the session in User Mode Linux: it has netem, and needs no rights.",
+    )
+    group.addoption(
+        "--ucp-image-from-host",
+        action="store_true",
+        help="Containers of this machine's own files: no image is built, or pulled.",
+    )
     group.addoption("--ucp-rewrite", action="store_true", help="Write into *.story files what agents do now.")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     for marker in MARKERS:
         config.addinivalue_line("markers", marker)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> int | None:
+    if config.getoption("--ucp-kernel") == "host":
+        return None
+    from harness.pytest_plugin.kernel import session_inside
+
+    return session_inside(config)
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:

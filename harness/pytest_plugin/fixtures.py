@@ -30,7 +30,8 @@ def swarm_for(node: pytest.Item) -> Iterator[SwarmInTest]:
         for marker in reversed(list(node.iter_markers("swarm"))):  # the nearest has the last word
             keys |= marker.kwargs
         backend, seed = _backend_and_seed(keys.pop("backend"), keys.pop("seed"), options)
-        scenario = options.at_speedup(parse(keys))
+        options.refuse(backend)
+        scenario = options.laid_over(parse(keys))
         directory = new_directory(node, options)
         swarm = SwarmInTest(scenario, seed, backend, directory)
     trial = node.stash[TRIAL] = Trial(scenario, swarm.finish)
@@ -48,7 +49,8 @@ def scenario_for(node: pytest.Item) -> Iterator[Findings]:
         options = Options.of(node.config)
         path, keys = _marked(node)
         backend, seed = _backend_and_seed(keys["backend"], keys["seed"], options)
-        scenario = options.at_speedup(load_scenario(path))
+        options.refuse(backend)
+        scenario = options.laid_over(load_scenario(path))
         directory = new_directory(node, options)
         finished = play(scenario, seed, backend, directory)
     trial = node.stash[TRIAL] = Trial(scenario, lambda _: finished)

@@ -22,7 +22,7 @@ class ScenarioFile(pytest.File):
     def collect(self) -> Iterator[pytest.Item]:
         try:
             options = Options.of(self.config)
-            scenario = options.at_speedup(load_scenario(self.path))
+            scenario = options.laid_over(load_scenario(self.path))
         except HarnessError as error:
             raise self.CollectError(str(error)) from None
         expect = scenario.expect or Expect()
@@ -45,7 +45,9 @@ class ScenarioItem(pytest.Item):
 
     def runtest(self) -> None:
         with one_sentence():
-            self._directory = new_directory(self, Options.of(self.config))
+            options = Options.of(self.config)
+            options.refuse(self._backend)
+            self._directory = new_directory(self, options)
             finished = play(self._scenario, self._seed, self._backend, self._directory)
         self.stash[TRIAL] = Trial(self._scenario, lambda _: finished)
 

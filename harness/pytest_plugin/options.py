@@ -20,6 +20,10 @@ class Options:
     speedup: float | None
     keep: Path | None
     """Where all run directories are kept, absolute."""
+    in_uml: bool
+    """Whether processes are to be played in User Mode Linux."""
+    image_from_host: bool
+    """Whether containers are made of this machine's own files."""
     rewrite: bool
     """Whether stories are written anew, not compared."""
 
@@ -32,9 +36,27 @@ class Options:
         if seed is not None and seed < 0:
             raise ScenarioError(f"--ucp-seed is {seed}: it should be 0 or more")
         return cls(
-            backend, seed, speedup, keep and config.invocation_params.dir / keep, config.getoption("--ucp-rewrite")
+            backend,
+            seed,
+            speedup,
+            keep and config.invocation_params.dir / keep,
+            config.getoption("--ucp-kernel") == "uml",
+            config.getoption("--ucp-image-from-host"),
+            config.getoption("--ucp-rewrite"),
         )
 
-    def at_speedup(self, scenario: Scenario) -> Scenario:
-        """Raises ScenarioError."""
-        return scenario if self.speedup is None else parse({**scenario.model_dump(), "speedup": self.speedup})
+    def laid_over(self, scenario: Scenario) -> Scenario:
+        """The scenario as it is to be played. Raises ScenarioError."""
+        document = scenario.model_dump()
+        if self.speedup is not None:
+            document["speedup"] = self.speedup
+        if self.image_from_host:
+            document["docker"]["image_from_host"] = True
+        return parse(document) if document != scenario.model_dump() else scenario
+
+    def refuse(self, backend: BackendName) -> None:
+        """Raises MachineError, with the reason, for a backend that cannot play where the command line wants it to."""
+        if self.in_uml:
+            from harness.pytest_plugin.kernel import refuse_outside
+
+            refuse_outside(backend)

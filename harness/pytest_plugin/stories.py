@@ -48,11 +48,12 @@ class StoryItem(pytest.Item):
     def runtest(self) -> None:
         options = Options.of(self.config)
         with one_sentence():
+            options.refuse(self._backend)
             if in_virtual_time(self._backend):
                 scenario = self._story.in_virtual_time
             else:
                 self._skip_what_needs_virtual_time()
-                scenario = options.at_speedup(self._story.scenario)
+                scenario = options.laid_over(self._story.scenario)
             self._directory = new_directory(self, options)
             finished = play(scenario, options.seed or 1, self._backend, self._directory, delivers_all=True)
         self.stash[TRIAL] = Trial(scenario, lambda _: finished)

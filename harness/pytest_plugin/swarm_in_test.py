@@ -271,6 +271,7 @@ class SwarmInTest:
         return self._seen
 
     def _judge_by_now(self, played: RunOutcome) -> Findings:
+        self._recording.tell(self._told.scenario)
         self._recording.take_down(played)
         return Findings(self.directory, checker.check(checker.gather(RunArchive(self.directory))))
 

@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 
 import pytest
 
+from harness.scenario.scenario import MAX_DURATION_S
 from tests.harness.command import processes
 from tests.pytest_plugin.inner import run, run_directories, write_scenario
 
@@ -79,7 +80,7 @@ def test_eight_labs_at_once_do_not_meet(pytester: pytest.Pytester) -> None:
 def test_ctrl_c_ends_the_session_and_leaves_a_whole_run_and_no_process(
     pytester: pytest.Pytester, backend: str, what: str
 ) -> None:
-    write_scenario(pytester, "s.yaml", duration_s=1e7, settings={"vote_timeout_s": 1}, expect={})
+    write_scenario(pytester, "s.yaml", duration_s=MAX_DURATION_S, settings={"vote_timeout_s": 1}, expect={})
     pytester.makepyfile("""
     def test_swarm(swarm):
         swarm.run_for(1e7)

@@ -77,10 +77,12 @@ def test_the_same_story_is_told_to_processes(pytester: pytest.Pytester) -> None:
 
 def test_the_tests_in_the_documentation_pass(pytester: pytest.Pytester) -> None:
     for number, page in enumerate((REPOSITORY / "README.md", PAGE)):
-        (code,) = (it for it in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) if "def test_" in it)
-        pytester.makepyfile(**{f"test_{number}": "import pytest\n" + code})
+        code = [
+            block for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) if "def test_" in block
+        ]
+        pytester.makepyfile(**{f"test_{number}": "\n\n".join(["import pytest", *code])})
     (pytester.path / "scenarios").symlink_to(SCENARIOS)
-    run(pytester).assert_outcomes(passed=4)
+    run(pytester).assert_outcomes(passed=6)
     (expect,) = re.findall(r"```yaml\n(expect:.*?)```", PAGE.read_text(), re.DOTALL)
     scenario, _, _ = (SCENARIOS / "loss_15.yaml").read_text().partition("expect:")
     (pytester.path / "my.yaml").write_text(scenario + expect)

@@ -1,0 +1,56 @@
+"""`--ucp-kernel uml`: the whole session in User Mode Linux, where processes have netem, and need no rights."""
+
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from harness.backend_names import BackendName
+from harness.errors import MachineError
+from harness.play.backends import BACKENDS, in_virtual_time
+from netem import uml
+from netem.errors import UmlError
+
+
+def session_inside(config: pytest.Config) -> int | None:
+    """Run the session there, with the same command line; its exit status, or None if it has to be played here.
+
+    That is inside, and on a machine without User Mode Linux, where `refuse_outside` has single tests skipped. What
+    failed tests leave outlives the guest.
+    """
+    if uml.inside() or _missing() is not None:
+        return None
+    folder = Path(tempfile.mkdtemp(prefix="pytest-uml-"))
+    kept = [] if config.option.basetemp else [f"--basetemp={folder / 'tests'}"]
+    on_path = [] if str(Path.cwd()) in sys.path else ["-P"]  # `python -m pytest` has it there, `pytest` has not
+    command = [sys.executable, *on_path, "-m", "pytest", *config.invocation_params.args, *kept]
+    try:
+        status = uml.run(command, cwd=config.invocation_params.dir, env=os.environ)
+    except UmlError as error:
+        raise pytest.UsageError(f"--ucp-kernel: {error}") from None
+    if status == pytest.ExitCode.OK or not kept:
+        shutil.rmtree(folder, ignore_errors=True)
+    return status
+
+
+def refuse_outside(backend: BackendName) -> None:
+    """Raises MachineError if what this backend plays would not be played there; virtual time needs no kernel."""
+    if in_virtual_time(backend):
+        return
+    if why := BACKENDS[backend].not_in_uml:
+        raise MachineError(why)
+    if why := _missing():
+        raise MachineError(f"--ucp-kernel uml: {why}")
+
+
+def _missing() -> str | None:
+    if uml.inside():
+        return None
+    try:
+        uml.find()
+    except UmlError as error:
+        return str(error)
+    return None
