@@ -51,6 +51,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="Containers of this machine's own files: no image is built, or pulled.",
     )
+    group.addoption("--ucp-agent", metavar="COMMAND", help="Play with this agent, whatever scenarios say.")
     group.addoption("--ucp-rewrite", action="store_true", help="Write into *.story files what agents do now.")
 
 
@@ -70,6 +71,10 @@ def pytest_cmdline_main(config: pytest.Config) -> int | None:
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     if file_path.suffix == ".story":
+        from harness.stories.text import is_story
+
+        if not is_story(file_path):
+            return None
         from harness.pytest_plugin.stories import StoryFile
 
         return StoryFile.from_parent(parent, path=file_path)

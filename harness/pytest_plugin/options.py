@@ -1,5 +1,6 @@
 """What the command line of pytest says about runs; it has the last word over tests and scenarios."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,7 @@ class Options:
     """Whether processes are to be played in User Mode Linux."""
     image_from_host: bool
     """Whether containers are made of this machine's own files."""
+    agent_command: list[str] | None
     rewrite: bool
     """Whether stories are written anew, not compared."""
 
@@ -35,6 +37,7 @@ class Options:
         )
         if seed is not None and seed < 0:
             raise ScenarioError(f"--ucp-seed is {seed}: it should be 0 or more")
+        agent = config.getoption("--ucp-agent")
         return cls(
             backend,
             seed,
@@ -42,6 +45,7 @@ class Options:
             keep and config.invocation_params.dir / keep,
             config.getoption("--ucp-kernel") == "uml",
             config.getoption("--ucp-image-from-host"),
+            None if agent is None else _words(agent),
             config.getoption("--ucp-rewrite"),
         )
 
@@ -50,6 +54,8 @@ class Options:
         document = scenario.model_dump()
         if self.speedup is not None:
             document["speedup"] = self.speedup
+        if self.agent_command is not None:
+            document["agent_command"] = self.agent_command
         if self.image_from_host:
             document["docker"]["image_from_host"] = True
         return parse(document) if document != scenario.model_dump() else scenario
@@ -60,3 +66,14 @@ class Options:
             from harness.pytest_plugin.kernel import refuse_outside
 
             refuse_outside(backend)
+
+
+def _words(command: str) -> list[str]:
+    """Raises ScenarioError."""
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ScenarioError(f"--ucp-agent is {command!r}: {str(error).lower()}") from None
+    if not words:
+        raise ScenarioError("--ucp-agent names no program")
+    return words

@@ -16,7 +16,6 @@ from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.fixtures import play
 from harness.pytest_plugin.options import Options
 from harness.pytest_plugin.trial import Trial, one_sentence
-from harness.run.run import Run
 from harness.scenario.expect import Expect
 from harness.stories.telling import Telling
 from harness.stories.text import Story, read_story
@@ -49,19 +48,21 @@ class StoryItem(pytest.Item):
         options = Options.of(self.config)
         with one_sentence():
             options.refuse(self._backend)
-            if in_virtual_time(self._backend):
-                scenario = self._story.in_virtual_time
-            else:
+            virtual = in_virtual_time(self._backend)
+            if not virtual:
                 self._skip_what_needs_virtual_time()
-                scenario = options.laid_over(self._story.scenario)
+            scenario = options.laid_over(self._story.in_virtual_time if virtual else self._story.scenario)
             self._directory = new_directory(self, options)
             finished = play(scenario, options.seed or 1, self._backend, self._directory, delivers_all=True)
         self.stash[TRIAL] = Trial(scenario, lambda _: finished)
-        text = self._told(finished)
+        archive = RunArchive(finished.directory)
+        text = self._told(archive)
         if options.rewrite:
             self.path.write_text(text, encoding="utf-8")
         elif text != self._story.text:
-            pytest.fail("\n".join([*self._difference(text), f"report: {finished.report}"]), pytrace=False)
+            pytest.fail(
+                "\n".join([*self._difference(text), *archive.problems, f"report: {finished.report}"]), pytrace=False
+            )
 
     def _skip_what_needs_virtual_time(self) -> None:
         from harness.play.process.preflight import refuse_what_needs_virtual_time
@@ -71,9 +72,9 @@ class StoryItem(pytest.Item):
         except ScenarioError as error:
             pytest.skip(str(error))
 
-    def _told(self, finished: Run) -> str:
+    def _told(self, archive: RunArchive) -> str:
         """The story as it was played."""
-        telling = Telling(RunArchive(finished.directory).traces, self._story.scenario.roster)
+        telling = Telling(archive.traces, self._story.scenario.roster)
         answers = [telling.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)
 

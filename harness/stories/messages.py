@@ -53,8 +53,10 @@ _SAYS: dict[type[Message], Callable[[Any, Names], str]] = {
 
 def told(sent: Sent, names: Names) -> str:
     """A message that an agent's trace has."""
+    if sent.datagram is None:
+        return f"{sent.message} (not on record)"
     try:
-        message = decode(base64.b64decode(sent.datagram.text if sent.datagram else "", validate=True)).message
+        message = decode(base64.b64decode(sent.datagram.text, validate=True)).message
     except (MalformedDatagramError, binascii.Error):
         return f"{sent.message} (not well-formed)"
     return f"{message.NAME} ({_SAYS[type(message)](message, names)})"

@@ -1,6 +1,7 @@
 """What blocks and chains are called in a story, of the traces of all who take part."""
 
 import base64
+import binascii
 from collections.abc import Mapping, Sequence
 
 from harness.archive.traces import Trace
@@ -16,7 +17,10 @@ class LocalChain:
     """An agent's chain as its trace has it grow: hashes of its blocks, and the chain hash of each, the oldest first."""
 
     def __init__(self, trace: Trace) -> None:
-        data = base64.b64decode(trace.header.initial_data or "")
+        try:
+            data = base64.b64decode(trace.header.initial_data or "")
+        except binascii.Error:
+            data = b""
         self.chain_hashes = [InceptionBlock(data).chain_hash]
         self.blocks: list[str] = []
 
@@ -25,10 +29,18 @@ class LocalChain:
         for operation, block in run.changes:
             if operation == "chain+":
                 self.blocks.append(block)
-                self.chain_hashes.append(next_chain_hash(self.chain_hashes[-1], bytes.fromhex(block)))
+                self.chain_hashes.append(next_chain_hash(self.chain_hashes[-1], _digest(block)))
             elif operation == "chain-" and self.blocks:
                 self.blocks.pop()
                 self.chain_hashes.pop()
+
+
+def _digest(block_hash: str) -> bytes:
+    """Of what is no hash, none: nobody else has named a chain with it."""
+    try:
+        return bytes.fromhex(block_hash)
+    except ValueError:
+        return b""
 
 
 class Names:

@@ -9,7 +9,9 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
+from math import floor, inf, isfinite
 
+from harness.archive.history import in_time
 from harness.archive.traces import Trace
 from harness.stories.messages import ANSWERS, told
 from harness.stories.names import INCEPTION, LocalChain, Names
@@ -17,8 +19,9 @@ from harness.stories.text import Section
 from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun, Sent
 
-INSTANT_S = 1.0
-"""Mission seconds in which what a message causes is of the instant in which it was sent."""
+INSTANT_S = 1.5
+"""Mission seconds in which what a message causes is of the instant in which it was sent, and a timer is as good as
+punctual: a machine is late now and then, and more so the faster it plays a mission."""
 
 
 @dataclass
@@ -33,10 +36,14 @@ class Deed:
     """Whose message it was, if it was one."""
     reached: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
     """Who heard of each message that it sent, by sequence number."""
-    instant: int = 0
-    """The mission second in which it, or what caused it, began."""
+    at_s: float = 0.0
+    """When it, or what caused it, began, if everything had been punctual."""
     distance: int = 0
     """How many messages it is away from what began in this instant."""
+
+    @property
+    def instant(self) -> int:
+        return floor(self.at_s)
 
     @property
     def heard_from(self) -> int | None:
@@ -159,25 +166,43 @@ def _connected(traces: Mapping[int, Trace]) -> list[Deed]:
         for run in deed.runs:
             for message in run.sent:
                 sent[deed.agent_id, message.seq].append(deed)
-    for deed in sorted(deeds, key=lambda deed: deed.runs[0].t):
+    due: dict[tuple[int, object], float] = {}
+    """When which timer of which agent should end."""
+    for deed in sorted(deeds, key=lambda deed: (deed.runs[0].t, deed.agent_id, deed.position)):
         run = deed.runs[0]
-        deed.instant = round(run.t)
-        sender, sequence = deed.heard_from, run.trigger.get("seq")
-        if sender is None or not isinstance(sequence, int):
-            continue
-        earlier = [cause for cause in sent[sender, sequence] if cause.runs[0].t < run.t]
-        if earlier:
-            cause = deed.cause = max(earlier, key=lambda cause: cause.runs[0].t)
-            cause.reached[sequence].add(deed.agent_id)
-            if run.t - cause.runs[0].t < INSTANT_S:
-                deed.instant, deed.distance = cause.instant, cause.distance + 1
+        timer_ends_s = due.get((deed.agent_id, run.trigger.get("timer")), -inf)
+        deed.at_s = timer_ends_s if run.t - timer_ends_s < INSTANT_S else run.t
+        if deed.heard_from is not None:
+            _hear(deed, sent)
+        for run in deed.runs:
+            due |= {
+                (deed.agent_id, timer): deed.at_s + lasts_s
+                for timer, lasts_s in (run.started or {}).items()
+                if isfinite(lasts_s)
+            }
     return deeds
+
+
+def _hear(deed: Deed, sent: Mapping[tuple[int, int], Sequence[Deed]]) -> None:
+    """Find whose message it was that caused this."""
+    sender, run = deed.heard_from, deed.runs[0]
+    sequence = run.trigger.get("seq")
+    if sender is None or not isinstance(sequence, int):
+        return
+    earlier = [cause for cause in sent.get((sender, sequence), ()) if cause.runs[0].t < run.t]
+    if earlier:
+        cause = deed.cause = max(earlier, key=lambda cause: cause.runs[0].t)
+        cause.reached[sequence].add(deed.agent_id)
+        if run.t - cause.runs[0].t < INSTANT_S:
+            deed.at_s, deed.distance = cause.at_s, cause.distance + 1
 
 
 def _deeds(agent_id: int, trace: Trace) -> Iterator[Deed]:
     """Local events run right after what triggered them."""
     deed: Deed | None = None
     for position, run in enumerate(trace.runs):
+        if not in_time(run):
+            continue
         if "local" in run.trigger and deed is not None:
             deed.runs.append(run)
             continue

@@ -16,6 +16,7 @@ What is indented is the answer, up to the next sentence that comes later: it is 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,12 @@ from harness.scenario.load import parse
 from harness.stories.sentences import Course
 
 MAX_BYTES = 1024 * 1024
+MAX_LINES = 20_000
 _SENTENCE = re.compile(r"(\d{1,7}) s: (.+?)\s*")
 INDENT = "    "
 DELAY_S = 0.02
+SPEEDUP = 10.0
+"""Of processes: a machine takes some milliseconds to change a network, and sentences may be a second apart."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,15 @@ class Story:
         while not lines[-1]:
             lines.pop()
         return "\n".join(lines) + "\n"
+
+
+def is_story(path: Path) -> bool:
+    """Whether any line of the file is a sentence: other tools have files of that suffix, too."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            return any(_SENTENCE.fullmatch(line.rstrip("\n")) for line in islice(file, MAX_LINES))
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def read_story(path: Path) -> Story:
@@ -157,6 +170,7 @@ def _scenario(path: Path, header: Sequence[str], course: Course) -> Scenario:
     document: dict[str, Any] = {
         "name": path.stem.replace("_", " "),
         "vehicles": {"kind": "none"},
+        "speedup": SPEEDUP,
         **keys,
         "events": {"source": "scripted", "script": course.script},
         "timeline": course.timeline,

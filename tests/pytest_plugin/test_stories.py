@@ -1,5 +1,6 @@
 """Stories: text that is played and compared, and written anew if asked."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -88,6 +89,26 @@ def test_what_needs_virtual_time_is_skipped_elsewhere(pytester: pytest.Pytester)
     result = run(pytester, path, "--ucp-backend", "process", "-rs")
     result.assert_outcomes(skipped=1)
     result.stdout.fnmatch_lines(["*`fates` needs virtual time: use --backend sim"])
+
+
+@pytest.mark.lab
+def test_processes_do_as_the_story_tells(pytester: pytest.Pytester) -> None:
+    path = written(pytester)
+    agent = f"{sys.executable} -P -m ucp.node"
+    run(pytester, path, "--ucp-backend", "process", "--ucp-agent", agent).assert_outcomes(passed=1)
+
+
+def test_files_of_others_are_left_alone(pytester: pytest.Pytester) -> None:
+    write(pytester, "Scenario: trader is alerted\nGiven a stock\n", "trader.story")
+    (pytester.path / "binary.story").write_bytes(b"\xff\xfe1 s: x\n")
+    run(pytester).assert_outcomes()
+
+
+def test_virtual_time_has_no_other_agent(pytester: pytest.Pytester) -> None:
+    result = run(pytester, written(pytester), "--ucp-agent", "my_agent --quick")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["`agent_command` needs real processes*"])
+    no_internals(result)
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,9 @@ settings: {max_block_bytes: 267}  # an event fills a block
 quirks:
   crash_on_tie: {agents: [32]}
   early_phase3_expiry: {agents: [120]}
+settle: {limit_s: 60}
 expect:
-  characteristics: {1: violated}
+  characteristics: {1: violated, 5: violated, 6: violated}
   steps: deviates
   liveness: never finishes
 
@@ -95,6 +96,7 @@ expect:
       32          1  Build Data Block: full; completes 32.1, deque +32.1
       32          2  Process Next Deque Block: reconcile in progress
 
+150 s: heal
 160 s: end
 
     chains
