@@ -19,7 +19,6 @@ from harness.play import mission
 from harness.play.mission import RunOutcome, Sought
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of
-from harness.scenario.fates import Fate
 from harness.scenario.load import explain, parse
 from harness.scenario.timeline import TimelineEntry
 from ucp.agent import HANDLERS
@@ -102,12 +101,18 @@ class Told:
             return
         entry["for_s"] = for_s
         document["duration_s"] = max(self.scenario.duration_s, over_s)
-        self._retell(document)
+        try:
+            self._retell(document)
+        except ScenarioError:
+            raise ScenarioError(
+                "the block cannot be undone, for the same was changed in it for longer: give that change a block of "
+                "its own, or a `for_s` that ends before"
+            ) from None
         await self.until(swarm, over_s)
         self._completed = await swarm.completed()
 
-    async def hold(self, swarm: mission.Swarm, **which: Any) -> None:
-        """From now on hold back the messages that a fate with these keys is about. Raises ScenarioError."""
+    async def hold(self, swarm: mission.Swarm, **which: Any) -> int:
+        """From now on hold back the messages that a fate with these keys is about; its number. Raises ScenarioError."""
         if unknown := next((key for key in which if key not in HOLDABLE), None):
             raise ScenarioError(f"`{unknown}` is unknown: what is held is said by {', '.join(HOLDABLE)}")
         if which in self._holds.values():
@@ -118,10 +123,12 @@ class Told:
         before = self.scenario
         self._retell(document)
         try:
-            self._holds[await swarm.hold(self.scenario.fates[-1])] = which
-        except ScenarioError:
+            number = await swarm.hold(self.scenario.fates[-1])
+        except ScenarioError:  # the backend cannot
             self.scenario = before
             raise
+        self._holds[number] = which
+        return number
 
     async def release(self, swarm: mission.Swarm, **which: Any) -> None:
         """Let go of what was held by these words, or of everything. Raises ScenarioError if there is no such hold."""
@@ -129,12 +136,17 @@ class Told:
             held = ", ".join(map(_in_words, self._holds.values())) or "nothing"
             raise ScenarioError(f"{_in_words(which)} is not held: {held} is")
         for number in [number for number, held in self._holds.items() if which in ({}, held)]:
-            document = self.scenario.model_dump()
-            fate = document["fates"][number]
-            fate |= _until(_next_instant(max(swarm.now(), fate["from_s"])))
-            self._retell(document)
-            del self._holds[number]
-            await swarm.release(number, self.scenario.fates[number])
+            await self.let_go(swarm, number)
+
+    async def let_go(self, swarm: mission.Swarm, number: int) -> None:
+        """End this hold, if nobody has."""
+        if self._holds.pop(number, None) is None:
+            return
+        document = self.scenario.model_dump()
+        fate = document["fates"][number]
+        fate |= _until(_next_instant(max(swarm.now(), fate["from_s"])))
+        self._retell(document)
+        await swarm.release(number, self.scenario.fates[number])
 
     async def until_run(self, swarm: mission.Swarm, sought: Sought, limit_s: float) -> int | None:
         """Go on until an agent runs what is sought; its ID, or None if that takes longer. Raises ScenarioError."""
@@ -151,7 +163,7 @@ class Told:
         return None
 
     def _check(self, sought: Sought) -> None:
-        if sought.handler not in HANDLER_BRANCHES:
+        if sought.handler not in list(HANDLER_BRANCHES):
             raise ScenarioError(f"there is no handler {sought.handler!r}: there are {', '.join(HANDLER_BRANCHES)}")
         branches = HANDLER_BRANCHES[sought.handler]
         by_the_book = self.scenario.agent_command is None and not self.scenario.has_wrong_agents
@@ -243,7 +255,8 @@ def _until(mission_s: float) -> dict[str, float]:
 
 
 def _in_words(which: dict[str, Any]) -> str:
-    return Fate(**which, name="-").describe().removeprefix("name '-' ")
+    """As a test says it."""
+    return ", ".join(f"{key}={value!r}" for key, value in which.items()) or "every message"
 
 
 def _ids(agents: Iterable[int]) -> str:

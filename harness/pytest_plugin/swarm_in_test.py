@@ -2,9 +2,9 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,18 @@ _VERBS = [*(kind.what for kind in ASKED_FOR), *INJECTIONS]
 
 class RunEndedError(Exception):
     """The run has ended before the test: an agent or a vehicle failed, or the machine."""
+
+
+class _Block(AbstractContextManager[None]):
+    """What a verb returns, for `with`: at the end of a block that ends well what was told is undone."""
+
+    def __init__(self, undo: Callable[[], object]) -> None:
+        self._undo = undo
+
+    def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
+        __tracebackhide__ = True
+        if kind is None:
+            self._undo()
 
 
 class SwarmInTest:
@@ -82,18 +94,12 @@ class SwarmInTest:
         """
         __tracebackhide__ = True
         self._change(partition=[list(group) for group in groups], for_s=for_s)
-        return self._afterwards(self.heal)
-
-    @contextmanager
-    def _afterwards(self, undo: Callable[[], object]) -> Iterator[None]:
-        __tracebackhide__ = True
-        yield
-        undo()
+        return _Block(self.heal)
 
     def _for_a_block(self, **entry: Any) -> AbstractContextManager[None]:
         __tracebackhide__ = True
         at_s = self._change(**entry)
-        return self._afterwards(lambda: self._act(lambda swarm: self._told.undo(swarm, at_s)))
+        return _Block(partial(self._act, lambda swarm: self._told.undo(swarm, at_s)))
 
     def heal(self) -> None:
         """Undo the partition."""
@@ -137,8 +143,8 @@ class SwarmInTest:
         """
         __tracebackhide__ = True
         words = _of_message(message, which)
-        self._act(lambda swarm: self._told.hold(swarm, **words))
-        return self._afterwards(lambda: self.release(**words))
+        number = self._act(lambda swarm: self._told.hold(swarm, **words))
+        return _Block(partial(self._act, lambda swarm: self._told.let_go(swarm, number)))
 
     def release(self, message: str | None = None, **which: Any) -> None:
         """Let go of what was held by these words, or of everything that is held."""

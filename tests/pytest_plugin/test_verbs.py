@@ -105,6 +105,9 @@ HELD = """
         released_s = swarm.now_s
         assert swarm.wait_for("receive_commit_block", agent=3, limit_s=1) == 3
         assert swarm.now_s - released_s <= 0.002
+        with swarm.hold():
+            swarm.wait_for("process_next_deque_block", "proposed")
+            swarm.release()
         swarm.hold(sender=5, receiver=2)
         swarm.hold("Block Add Response", count=[1, 2])
         swarm.run_for(200)
@@ -118,9 +121,9 @@ HELD = """
 def test_messages_are_held_back_and_released(pytester: pytest.Pytester, tmp_path: Path) -> None:
     pytester.makepyfile(HELD)
     run(pytester, "--ucp-keep", "kept").assert_outcomes(passed=1)
-    first, second, third = given(record(pytester)["scenario"]["fates"])
+    first, every, second, third = given(record(pytester)["scenario"]["fates"])
     assert first["message"] == "Commit Block" and first["receiver"] == 3 and first["from_s"] == 0.001
-    for fate in (first, second, third):
+    for fate in (first, every, second, third):
         assert fate["from_s"] < fate["until_s"] == fate["hold_until_s"]
     assert third["until_s"] - second["until_s"] == pytest.approx(200, abs=0.01), "the end of the test releases it"
     is_played_again_alike(pytester, tmp_path / "again")
@@ -225,11 +228,20 @@ def test_what_needs_virtual_time_is_said_and_the_story_goes_on(pytester: pytest.
         ("swarm.hold('Commit')", "ScenarioError: `message` is 'Commit': it should be *"),
         ("swarm.hold(sender=9)", "ScenarioError: *sender names vehicle 9, which does not exist: *"),
         ("swarm.hold(drop=True)", "ScenarioError: `drop` is unknown: what is held is said by message, sender, *"),
-        ("swarm.hold(sender=2); swarm.hold(sender=2)", "ScenarioError: every message from 2 is held already"),
-        ("swarm.release(sender=2)", "ScenarioError: every message from 2 is not held: nothing is"),
+        ("swarm.hold(sender=2); swarm.hold(sender=2)", "ScenarioError: sender=2 is held already"),
+        ("swarm.release(sender=2)", "ScenarioError: sender=2 is not held: nothing is"),
+        (
+            "swarm.hold(sender=2); swarm.release('Commit')",
+            "ScenarioError: message='Commit' is not held: sender=2 is",
+        ),
+        ("swarm.wait_for(['vote'])", "ScenarioError: there is no handler [[]'vote'[]]: there are *"),
         ("swarm.link(1, 1, loss=1)", "ScenarioError: *a link from vehicle 1 to itself carries nothing"),
         ("swarm.link(1, 9, loss=1)", "ScenarioError: *names vehicle 9, which does not exist: *"),
         ("swarm.link(1, 2)", "ScenarioError: a link needs what is other on it than elsewhere, such as loss=0.9"),
+        (
+            "with swarm.loss(0.3): swarm.run_for(5); swarm.loss(0.5)",
+            "ScenarioError: the block cannot be undone, for the same was changed in it for longer: *",
+        ),
         ("swarm.replay(count=0)", "ScenarioError: `replay.count` is 0: *"),
         ("swarm.flood(for_s=5)", "ScenarioError: `flood.per_s` is missing*"),
     ],

@@ -12,7 +12,7 @@ import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -293,16 +293,19 @@ class AgentProcess:
             await self.export()
             self.outcome = "exported"
 
-    def runs_since(self, mission_s: float, handler: str) -> Iterator[HandlerRun]:
+    def runs_since(self, mission_s: float, handler: str) -> list[HandlerRun]:
         """What its trace has of this handler after then, of this life; damage is the checker's affair."""
+        runs: list[HandlerRun] = []
         trace = self._lives[-1].directory / f"{self.agent_id}{SUFFIX}"
         name = json.dumps(handler).encode()
-        for line in trace.read_bytes().split(b"\n")[1:-1] if trace.exists() else ():
+        for line in reversed(trace.read_bytes().split(b"\n")[1:-1] if trace.exists() else ()):
             if name in line:
                 with contextlib.suppress(ValidationError):
                     run = HANDLER_RUN.validate_json(line)
-                    if run.t > mission_s:
-                        yield run
+                    if run.t <= mission_s:
+                        break
+                    runs.append(run)
+        return runs[::-1]
 
     # The end
 
