@@ -53,15 +53,20 @@ class StoryItem(pytest.Item):
                 self._skip_what_needs_virtual_time()
             scenario = options.laid_over(self._story.in_virtual_time if virtual else self._story.scenario)
             self._directory = new_directory(self, options)
-            finished = play(scenario, options.seed or 1, self._backend, self._directory, delivers_all=True)
+            finished = play(
+                scenario, 1 if options.seed is None else options.seed, self._backend, self._directory, delivers_all=True
+            )
         self.stash[TRIAL] = Trial(scenario, lambda _: finished)
+        if finished.played.outcome != "completed":
+            return  # whoever judges the run says why
         archive = RunArchive(finished.directory)
         text = self._told(archive)
         if options.rewrite:
-            self.path.write_text(text, encoding="utf-8")
+            self._rewrite(text)
         elif text != self._story.text:
             pytest.fail(
-                "\n".join([*self._difference(text), *archive.problems, f"report: {finished.report}"]), pytrace=False
+                "\n".join([*self._difference(text), *archive.problems, *archive.gaps, f"report: {finished.report}"]),
+                pytrace=False,
             )
 
     def _skip_what_needs_virtual_time(self) -> None:
@@ -71,6 +76,12 @@ class StoryItem(pytest.Item):
             refuse_what_needs_virtual_time(self._story.scenario)
         except ScenarioError as error:
             pytest.skip(str(error))
+
+    def _rewrite(self, text: str) -> None:
+        try:
+            self.path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            pytest.fail(f"{self.path} cannot be written: {error.strerror}", pytrace=False)
 
     def _told(self, archive: RunArchive) -> str:
         """The story as it was played."""

@@ -155,6 +155,8 @@ class Telling:
                     chain = LocalChain(trace)
                 chain.replay(run)
             chains[agent_id] = self._names.of(chain.blocks)
+        if not chains:
+            return ["no chains: no agent has left a trace"]
         return ["chains", *_tree({agent_id: [INCEPTION, *chain] for agent_id, chain in chains.items()}, "  ")]
 
 

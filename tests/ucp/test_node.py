@@ -155,6 +155,27 @@ def test_quirks_are_set_and_reconciles_begun_on_command(agent: AgentUnderTest) -
     agent.wait_for(lambda: agent.ask("status")["idle"])
 
 
+def test_events_are_logged_on_command_until_they_are_stopped(directory: Path) -> None:
+    agent = AgentUnderTest(directory, mission(events={"source": "none"}))
+    try:
+        agent.start()
+        event = {"event_id": 1, "data": base64.b64encode(bytes(256)).decode()}
+        for _ in range(3):  # they fill a block
+            agent.ask("log", **event)
+        assert agent.ask("status")["completed"] == 1
+        agent.ask("stop_events")
+        for _ in range(3):
+            agent.ask("log", **event)
+        assert agent.ask("status")["completed"] == 1
+        with pytest.raises(AgentRefusedError, match="in base64"):
+            agent.ask("log", event_id=1, data="?")
+        with pytest.raises(AgentRefusedError, match="0 to 255"):
+            agent.ask("log", event_id="1", data="AQ==")
+    finally:
+        agent.process.kill()
+        agent.process.communicate()
+
+
 def test_an_agent_has_the_quirks_of_its_mission_until_it_is_told_others(directory: Path) -> None:
     agent = AgentUnderTest(directory, mission(quirks={"ignore_commit": 1}))
     try:
@@ -192,6 +213,7 @@ def test_a_quirk_makes_the_agent_wrong_until_it_is_taken_away(agent: AgentUnderT
         ("start", {"epoch_us": "now"}, "epoch_us"),
         ("start", {"epoch_us": True}, "epoch_us"),
         ("reconcile", {}, "has not started"),
+        ("log", {"event_id": 1, "data": "AQ=="}, "has not started"),
         ("quirk", {"name": "ignore_commit", "value": 7}, "probability"),
         ("quirk", {"name": "never_reconcile", "value": 1}, "never_reconcile is true or false"),
         ("quirk", {"name": "never_reconciles" * 1000, "value": True}, "the nearest are never_reconcile"),

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
-from harness.play.control import Status
+from harness.play.control import AgentRefusedError, Status
 from harness.play.mission import RunOutcome, Sought
 from harness.play.process.agent import AgentProcess, reboots_with_disk
 from harness.play.process.lab import MissionLab, OpenLab
@@ -159,7 +159,10 @@ class ProcessRun:
             agent = self.agents[self._number(event.agent)]
             if agent.awake:
                 data = base64.b64encode(event.event_data).decode("ascii")
-                await agent.ask("log", event_id=event.event_id, data=data)
+                try:
+                    await agent.ask("log", event_id=event.event_id, data=data)
+                except AgentRefusedError as error:
+                    raise AgentRefusedError(f"{error}; scripted events need that command (ucp/CONTRACT.md)") from None
 
     def _fly(self, vehicle: VehicleProcess) -> None:
         flight = self.scenario.flight_of(vehicle.vehicle_id)
