@@ -90,3 +90,13 @@ def test_a_wrong_agent_makes_a_story_another(tmp_path: Path, figure: str, quirk:
     path.write_text(wrong)
     played = told(read_story(path), tmp_path / "run")
     assert difference in played and difference not in wrong
+
+
+@pytest.mark.parametrize("path", sorted(STORIES.glob("*.story")), ids=lambda path: path.stem)
+def test_nothing_is_told_in_the_instant_in_which_a_timer_ends(path: Path) -> None:
+    """Which of the two is first would be chance among processes."""
+    text = path.read_text()
+    told_at = {*re.findall(r"^(\d+) s: ", text, re.MULTILINE)}
+    instants = re.split(r"^    at (\d+) s\n", text, flags=re.MULTILINE)[1:]
+    ended_at = {at for at, lines in zip(instants[::2], instants[1::2], strict=True) if "Timer Expiration:" in lines}
+    assert not told_at & ended_at

@@ -38,19 +38,19 @@ settings: {max_block_bytes: 267}  # an event fills a block
       4          12  Reconcile Phase 2: asked -> Chain Hash Successor Query (1.1)
       1 2 3      13  Receive Request Next in Sequence from 4: top of chain -> Next in Sequence Response (1.1: Is Top Of Chain)
       4          14  Receive Response Next in Sequence from 1 2 3: new candidate, counted
-
-25 s: 2 logs
-
     at 25 s
-      2           1  Build Data Block: full; completes 2.1, deque +2.1
-      2           2  Process Next Deque Block: proposed -> Block Add Request (2.1 on 1.1)
       4          15  Reconcile Phase 2 Timer Expiration: top of chain
       4          20  Reconcile Finalize: done
       4           2  Process Next Deque Block: deque empty
-      1 3         3  Receive Request Add Block from 2: approve -> Block Add Response (2.1: approve)
-      4           3  Receive Request Add Block from 2: reconcile in progress
-      2           4  Receive Vote Add Block from 1 3: yes
-    at 35 s
+
+27 s: 2 logs
+
+    at 27 s
+      2           1  Build Data Block: full; completes 2.1, deque +2.1
+      2           2  Process Next Deque Block: proposed -> Block Add Request (2.1 on 1.1)
+      1 3 4       3  Receive Request Add Block from 2: approve -> Block Add Response (2.1: approve)
+      2           4  Receive Vote Add Block from 1 3 4: yes
+    at 37 s
       2           5  Vote Timer Expiration: approved; deque -2.1, chain +2.1 -> Commit Block (2.1 on 1.1)
       2           2  Process Next Deque Block: deque empty
       1 3 4       6  Receive Commit Block from 2: committed; chain +2.1

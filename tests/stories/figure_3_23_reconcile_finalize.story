@@ -30,17 +30,18 @@ settings: {max_block_bytes: 267}  # an event fills a block
       1           8  Reconcile Phase 1: asked -> Chain Contain Query (1.1 1.2)
       2 3         9  Receive Request Chain Contain from 1: no -> Chain Contain Response (1.1 1.2: no)
       1          10  Receive Phase 1 Response from 2 3: no
-
-# A block that is completed meanwhile waits.
-35 s: 1 logs
-
     at 35 s
-      1           1  Build Data Block: full; completes 1.3, deque +1.3
-      1           2  Process Next Deque Block: reconcile in progress
       1          11  Reconcile Phase 1 Timer Expiration: not contained; chain -1.2, stack +1.2
       1           8  Reconcile Phase 1: asked -> Chain Contain Query (1.1)
       2 3         9  Receive Request Chain Contain from 1: no -> Chain Contain Response (1.1: no)
       1          10  Receive Phase 1 Response from 2 3: no
+
+# A block that is completed meanwhile waits.
+36 s: 1 logs
+
+    at 36 s
+      1           1  Build Data Block: full; completes 1.3, deque +1.3
+      1           2  Process Next Deque Block: reconcile in progress
     at 40 s
       1          11  Reconcile Phase 1 Timer Expiration: not contained; chain -1.1, stack +1.1
       1           8  Reconcile Phase 1: asked -> Chain Contain Query (inception)
