@@ -35,7 +35,7 @@ settings: {max_block_bytes: 267}  # an event fills a block
       2           2  Process Next Deque Block: deque empty
       1 3         6  Receive Commit Block from 2: committed; chain +2.1
 
-# Not approved: nobody has the block that 3 has committed by itself.
+# Not approved: 1 does not have the block that 3 has committed by itself, and the vote of 2 is lost. A tie is no majority.
 40 s: partition 3 | 1 2
 41 s: 3 logs
 
@@ -47,13 +47,18 @@ settings: {max_block_bytes: 267}  # an event fills a block
       3           2  Process Next Deque Block: deque empty
 
 55 s: heal
+57 s: 2 does not reach 3
 60 s: 3 logs
 
     at 60 s
       3           1  Build Data Block: full; completes 3.2, deque +3.2
       3           2  Process Next Deque Block: proposed -> Block Add Request (3.2 on 1.1 2.1 3.1)
-      1 2         3  Receive Request Add Block from 3: disapprove -> Block Add Response (3.2: disapprove)
-      3           4  Receive Vote Add Block from 1 2: no
+      1           3  Receive Request Add Block from 3: disapprove -> Block Add Response (3.2: disapprove)
+      2           3  Receive Request Add Block from 3: disapprove -> Block Add Response (3.2: disapprove), not to 3
+      3           4  Receive Vote Add Block from 1: no
+
+62 s: 2 reaches 3 again
+
     at 70 s
       3           5  Vote Timer Expiration: not approved
       3           7  Reconcile Begin: begun
