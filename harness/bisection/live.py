@@ -47,7 +47,8 @@ from ucp.messages import (
 from ucp.trace import Dropped, HandlerRun, Recorded, in_base64
 
 START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
-HEAD_START_S = 0.2
+HEAD_START_S = 2.0
+"""By when those who play the peers are there."""
 SLACK_S, SLACK_WALL_S = 1.0, 0.15
 """How far in time a message may be from the record's, in mission seconds, and more in wall seconds."""
 SHOWN = 12
@@ -262,7 +263,7 @@ class _Air:
                 await asyncio.sleep(0.02)
 
     async def _fly(self, lab: Lab, control: AgentControl, agent: LabProcess, log: Path) -> list[tuple[float, Message]]:
-        epoch_us = round((time.time() + 1.0) * MICROSECONDS)
+        epoch_us = round((time.time() + HEAD_START_S) * MICROSECONDS)
         script, heard = self._place / "script.jsonl", self._place / "heard.jsonl"
         lines = [given.to_json() for given in self._script.datagrams]
         lines += [{"t": at_s, "question": question} for at_s, question in self._script.questions]

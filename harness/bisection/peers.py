@@ -18,12 +18,13 @@ import math
 import signal
 import socket
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TextIO
 
 from netem import addresses
-from ucp.clock import MissionClock
+from ucp.clock import MICROSECONDS, MissionClock
 from ucp.messages import HEADER, PORT
 
 MAX_READ_BYTES = 65536
@@ -103,6 +104,7 @@ async def play(script: Path, heard: TextIO, clock: MissionClock) -> None:
     loop.add_reader(air, hear)
 
     async def speak() -> None:
+        await asyncio.sleep(max(0.0, (clock.epoch_us or 0) / MICROSECONDS - time.time()))  # it shows 0 until then
         for due in lines:
             if "question" in due:
                 continue

@@ -82,7 +82,8 @@ class CaptureFile:
             with Opened(self.path) as file:
                 magic = file.peek(4)[:4]
                 if not magic:
-                    raise CaptureError(f"{self.path}: empty: the capture ended before it began")
+                    why = file.trouble or "the capture ended before it began"
+                    raise CaptureError(f"{self.path}: empty: {why}")
                 if magic not in MAGICS:
                     raise CaptureError(
                         f"{self.path}: not a capture: it begins neither as pcapng nor as pcap; "

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[1]
-FOLDER = next(folder for folder in (_PACKAGE / "scenarios", _PACKAGE.parent / "scenarios") if folder.is_dir())
-"""In an installed package inside of it; in a checkout beside it."""
+_INSIDE = _PACKAGE / "scenarios"
+FOLDER = _INSIDE if _INSIDE.is_dir() else _PACKAGE.parent / "scenarios"
+"""In an installed package inside of it; in a checkout beside it. Who copied the package alone has none."""
 
 
 def names() -> list[str]:

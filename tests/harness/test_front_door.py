@@ -35,7 +35,7 @@ def test_the_list_says_what_a_commands_own_help_says(name: str) -> None:
     where, summary = COMMANDS[name]
     module, _, attribute = where.partition(":")
     command = getattr(import_module(module), attribute)
-    own = command.info.help if isinstance(command, typer.Typer) else getdoc(command)
+    own = command.info.help if isinstance(command, typer.Typer) else getattr(command, "help", None) or getdoc(command)
     assert own is not None
     assert own.split("\n\n")[0].replace("\n", " ") == summary
 

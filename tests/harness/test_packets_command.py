@@ -142,11 +142,15 @@ def test_a_capture_that_was_killed_is_read_as_far_as_it_goes(run_dir: Path) -> N
 
 def test_a_file_that_is_no_capture_is_told_and_the_others_are_read(run_dir: Path) -> None:
     bad = run_dir / "capture" / "4.pcapng"
-    bad.write_bytes(b"\x1f\x8b compressed")
-    done = harness("packets", run_dir)
-    assert done.returncode == 2
-    assert "4 datagrams" in done.stdout
-    assert sentences(done.stderr)[0].startswith(f"{bad}: not a capture: it begins neither as pcapng nor as pcap")
+    for content, why in (
+        (b"text", "not a capture: it begins neither as pcapng nor as pcap; "),
+        (b"\x1f\x8b compressed", "empty: "),
+    ):
+        bad.write_bytes(content)
+        done = harness("packets", run_dir)
+        assert done.returncode == 2
+        assert "4 datagrams" in done.stdout
+        assert sentences(done.stderr)[0].startswith(f"{bad}: {why}")
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,8 @@ def assert_no_difference(directory: Path) -> None:
     traces = sorted((directory / "agents").glob("*.trace.jsonl"))
     assert traces
     for trace in traces:
+        if trace.read_bytes().count(b"\n") == 1:
+            continue  # it was killed before it did anything
         with TemporaryDirectory() as alone:
             (Path(alone) / trace.name).write_bytes(trace.read_bytes())
             for path in (trace, Path(alone) / trace.name):
@@ -53,7 +55,7 @@ def assert_no_difference(directory: Path) -> None:
                 assert (sentences, found.unjudged, found.steps) == ([], 0, len(record.trace.runs)), path
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     agents=st.integers(2, 7),
     seed=st.integers(0, 2**32 - 1),
