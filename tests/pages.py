@@ -16,15 +16,15 @@ LEFT_OUT = "…"
 DEADLINE_S = 120
 
 
-def play(page: Path, directory: Path) -> int:
-    """Do what the page says in `directory`, and compare; how many commands it has."""
+def play(page: Path, directory: Path, columns: int = 120) -> int:
+    """Do what the page says in `directory`, on a terminal of so many columns, and compare; how many commands it has."""
     tried = 0
     for language, title, body in _blocks(page):
         if title:
             (directory / title).write_text(body)
         elif language == "console":
             for typed, shown in _commands(body):
-                _compare(typed, shown, directory)
+                _compare(typed, shown, directory, columns)
                 tried += 1
     return tried
 
@@ -42,9 +42,9 @@ def _commands(body: str) -> Iterator[tuple[str, list[str]]]:
         yield typed, shown
 
 
-def _compare(typed: str, shown: list[str], directory: Path) -> None:
+def _compare(typed: str, shown: list[str], directory: Path, columns: int) -> None:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": path, "COLUMNS": "120", "NO_COLOR": "1", "LC_ALL": "C.UTF-8"}
+    environment = {**os.environ, "PATH": path, "COLUMNS": str(columns), "NO_COLOR": "1", "LC_ALL": "C.UTF-8"}
     ended = subprocess.run(
         ["bash", "-c", typed],
         cwd=directory,

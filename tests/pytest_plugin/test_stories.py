@@ -1,5 +1,6 @@
 """Stories: text that is played and compared, and written anew if asked."""
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -94,7 +95,7 @@ def test_what_needs_virtual_time_is_skipped_elsewhere(pytester: pytest.Pytester)
 @pytest.mark.lab
 def test_processes_do_as_the_story_tells(pytester: pytest.Pytester) -> None:
     path = written(pytester)
-    agent = f"{sys.executable} -P -m ucp.node"
+    agent = f"{shlex.quote(sys.executable)} -P -m ucp.node"
     run(pytester, path, "--ucp-backend", "process", "--ucp-agent", agent).assert_outcomes(passed=1)
 
 

@@ -1,6 +1,7 @@
 """One agent's record, given to an agent as a process: a right one says what is in it, a wrong one is found."""
 
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -13,7 +14,8 @@ from harness.field.replay import open_record
 from tests.harness.command import harness
 from ucp.messages import ChainContainQuery, encode
 
-RIGHT = f"{sys.executable} -P -m ucp.node"
+PYTHON = shlex.quote(sys.executable)
+RIGHT = f"{PYTHON} -P -m ucp.node"
 WRONG = """import json, sys
 from pathlib import Path
 from ucp.node import main
@@ -44,12 +46,12 @@ def test_a_right_agent_says_what_is_in_the_record_and_a_wrong_one_does_not(recor
     assert right.returncode == 0, right.stdout + right.stderr
     assert "agent 2: as recorded" in right.stdout
     (tmp_path / "wrong.py").write_text(WRONG)
-    wrong = harness("again", records, *options, f"{sys.executable} -P {tmp_path / 'wrong.py'}")
+    wrong = harness("again", records, *options, f"{PYTHON} -P {shlex.quote(str(tmp_path / 'wrong.py'))}")
     assert wrong.returncode == 1, wrong.stdout + wrong.stderr
     assert "approve False); the record sent Block Add Response" in wrong.stdout
     none = harness("again", records, *options, "no-such-agent")
     assert none.returncode == 125
-    ending = harness("again", records, *options, f"{sys.executable} -c 'raise SystemExit(3)'")
+    ending = harness("again", records, *options, f"{PYTHON} -c 'raise SystemExit(3)'")
     assert ending.returncode == 125 and "the agent ended with status 3" in ending.stderr
 
 
