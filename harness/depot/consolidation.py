@@ -307,5 +307,5 @@ def _missing(agent_id: int, blocks: int) -> Lost:
     others = {0: "nobody has a block of it", 1: "others have 1 block of it"}.get(
         blocks, f"others have {blocks} of its blocks"
     )
-    why = f"vehicle {agent_id} did not come home: {others}; whatever else it had logged is lost with it"
+    why = f"no export of vehicle {agent_id} came home: {others}; whatever else it had logged is in none"
     return Lost(agent_id=agent_id, agents=[agent_id], why=why)

@@ -53,7 +53,7 @@ def test_the_page_says_what_the_record_says(flown: Consolidation) -> None:
     assert all(heading in page.text for heading in headings)
     assert "1 vehicle and 2 blocks lost" in page.text
     assert "vehicles home 3 of 4" in page.text
-    assert "vehicle 4 did not come home" in page.text
+    assert "no export of vehicle 4 came home" in page.text
     for lost in flown.lost_blocks:
         assert f"block {lost.block}" in page.text
     classes = [attributes.get("class") for tag, attributes in page.elements if tag in ("rect", "g")]
