@@ -2,7 +2,8 @@
 
 It says "ready" as soon as every port is tapped. What crosses the ports then waits in memory until SIGUSR1 says that
 FOLDER/<ID>.pcapng have been begun, and is appended to them. On SIGTERM no more is let in; what there is is written, and
-how much that was: last in each file, and for all in one JSON object on standard output. On a port directions are the
+how much that was: last in each file, and for all in one JSON object on standard output. Of a process that stood still
+SIGTERM may be seen first; that the mission began then is to be seen from the files. On a port directions are the
 switch's; in a file they are the vehicle's.
 """
 
@@ -15,7 +16,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from netem import addresses
@@ -38,8 +39,13 @@ class Tap:
         self.vehicle = vehicle
         self.ring = Ring(addresses.port(vehicle), blocks)
 
-    def open(self, folder: Path) -> None:
-        self._file = PcapngFile(folder / f"{self.vehicle}.pcapng")
+    def open(self, folder: Path) -> bool:
+        """Whether its file has been begun; raises OSError."""
+        path = folder / f"{self.vehicle}.pcapng"
+        begun = path.exists()
+        if begun:
+            self._file = PcapngFile(path)
+        return begun
 
     def write(self) -> None:
         """Raises OSError."""
@@ -63,12 +69,9 @@ def capture(folder: Path, vehicles: Sequence[int]) -> None:
     blocks = max(_FEWEST_BLOCKS, min(_RING_MEMORY, _MEMORY // len(vehicles)) // BLOCK_BYTES)
     taps = [Tap(vehicle, blocks) for vehicle in vehicles]
     _say("ready")
-    if asked.recv(1)[0] == signal.SIGTERM:
-        _say_what_was_counted({})  # the mission never began
-        return
-    for tap in taps:
-        tap.open(folder)
-    while not select.select([asked], [], [], RETIRE_MS / 1000)[0]:
+    stopping = asked.recv(1)[0] == signal.SIGTERM
+    taps = [tap for tap in taps if tap.open(folder)]  # if there are none, the mission never began
+    while not (stopping or select.select([asked], [], [], RETIRE_MS / 1000)[0]):
         for tap in taps:
             tap.write()
     for tap in taps:
@@ -80,12 +83,9 @@ def capture(folder: Path, vehicles: Sequence[int]) -> None:
         for tap in taps:
             tap.write()
         waiting = sum(tap.ring.count() for tap in taps)
-    _say_what_was_counted({tap.vehicle: tap.end() for tap in taps})
-
-
-def _say_what_was_counted(vehicles: Mapping[int, Mapping[str, int]]) -> None:
+    counted = {tap.vehicle: tap.end() for tap in taps}
     used = resource.getrusage(resource.RUSAGE_SELF)
-    _say({"vehicles": vehicles, "processor_s": used.ru_utime + used.ru_stime})
+    _say({"vehicles": counted, "processor_s": used.ru_utime + used.ru_stime})
 
 
 def _say(what: object) -> None:

@@ -11,7 +11,7 @@ import pytest
 from scapy.layers.inet import IP, UDP
 from scapy.layers.l2 import Ether
 
-from netem.capture import LiveCapture
+from netem.capture import LiveCapture, begin_file
 from netem.conditions import Delay, LinkConditions, NetworkConditions
 from netem.errors import CaptureError
 from netem.lab import Lab
@@ -166,6 +166,19 @@ def test_a_capture_that_ends_by_itself_is_an_error_and_leaves_what_it_had(tmp_pa
         assert captured() == [100, 100]
 
     capture([1, 2], tmp_path, story)
+
+
+def test_a_capture_that_sees_its_end_before_its_beginning_has_every_frame(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with await Lab.open([1, 2], log=tmp_path / "lab.log") as lab:
+            capture = await LiveCapture.start(lab, tmp_path)
+            await Air(lab, tmp_path).broadcast(1, 100)
+            for vehicle in (1, 2):
+                begin_file(tmp_path, vehicle, time.time_ns() // 1000, 20)
+            assert await capture.stop() == {vehicle: {"received": 100, "dropped": 0} for vehicle in (1, 2)}
+
+    play(story())
+    assert [len(frames(tmp_path / f"{vehicle}.pcapng")) for vehicle in (1, 2)] == [100, 100]
 
 
 def test_a_capture_of_a_mission_that_never_began_leaves_no_files(tmp_path: Path) -> None:
