@@ -25,6 +25,7 @@ from harness.play.process.lab import OpenLab
 from harness.play.process.processes import Processes
 from harness.scenario.load import parse
 from netem.errors import NetemError
+from ucp.clock import MissionClock
 
 _Row = dict[str, Any]
 _FORMS = {f"{key}_s": ".2f" for key in ("docker_up", "process_up", "docker_down", "process_down")} | {
@@ -38,8 +39,8 @@ async def once(agents: int, open_lab: OpenLab, directory: Path) -> tuple[float, 
         {"name": "up and down", "agents": agents, "vehicles": {"kind": "none"}, "docker": {"image_from_host": True}}
     )
     rundir = RunDirectory(directory)
-    command = agent_command(scenario)
-    started = [AgentProcess(agent, rundir, command) for agent in scenario.roster]
+    clock = MissionClock(scenario.speedup)
+    started = [AgentProcess(agent, rundir, agent_command(scenario, agent), clock.now) for agent in scenario.roster]
     begin = time.perf_counter()
     async with await open_lab(scenario, rundir, lambda _: None) as lab:
         await asyncio.gather(*(agent.start(lab, scenario, 1, b"benchmark", False, False) for agent in started))

@@ -166,7 +166,7 @@ class Told:
         if sought.handler not in list(HANDLER_BRANCHES):
             raise ScenarioError(f"there is no handler {sought.handler!r}: there are {', '.join(HANDLER_BRANCHES)}")
         branches = HANDLER_BRANCHES[sought.handler]
-        by_the_book = self.scenario.agent_command is None and not self.scenario.has_wrong_agents
+        by_the_book = not self.scenario.foreign and not self.scenario.has_wrong_agents
         if by_the_book and sought.branch is not None and sought.branch not in branches:
             named = ", ".join(map(repr, branches))
             raise ScenarioError(f"{sought.handler} has no branch {sought.branch!r}: it has {named}")

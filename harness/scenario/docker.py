@@ -14,7 +14,8 @@ class Docker(Model):
     """Limits are of each container by itself; none: the machine's. Other backends pass over all of this."""
 
     image: Annotated[str, Field(min_length=1, max_length=255)] | None = None
-    """In which agents run; the project's own, unless given. `agent_command` is a program in it."""
+    """In which agents run; the project's own, unless given. `agent_command` is a program in it; if that names agents,
+    the others do not run in it."""
     image_from_host: bool = False
     """This machine's own programs and packages, read-only, instead of the project's image."""
     memory_mib: Annotated[int, Field(ge=MIN_MEMORY_MIB, strict=True)] | None = None

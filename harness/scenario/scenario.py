@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
+from harness.scenario.agent_command import AgentCommand
 from harness.scenario.datagrams import ScriptedDatagram
 from harness.scenario.docker import Docker
 from harness.scenario.events import Events
@@ -63,8 +64,8 @@ class Scenario(Model):
     events: Events = Events()
     vehicles: Vehicles = Vehicles()
     flight: Annotated[list[Flight], Field(max_length=MAX_AGENTS)] = []
-    agent_command: Annotated[list[str], Field(min_length=1, max_length=100)] | None = None
-    """Any program that follows ucp/CONTRACT.md, with its arguments; the mission file's name is added."""
+    agent_command: AgentCommand = None
+    """Any program that follows ucp/CONTRACT.md, with its arguments: for all agents, or by agent for some."""
     docker: Docker = Docker()
     settings: Settings = Settings()
     quirks: AskedQuirks = {}
@@ -102,6 +103,16 @@ class Scenario(Model):
     def on_the_air(self) -> tuple[int, ...]:
         """The vehicles, and the rogue node if there is one."""
         return self.roster if self.rogue is None else (*self.roster, self.rogue)
+
+    def command_of(self, agent_id: int) -> list[str] | None:
+        """What starts this agent, but for the mission file; None of one that is the harness's own."""
+        asked = self.agent_command
+        return asked.get(agent_id) if isinstance(asked, dict) else asked
+
+    @property
+    def foreign(self) -> tuple[int, ...]:
+        """The agents that are not the harness's own, as the scenario says itself; ascending."""
+        return tuple(agent_id for agent_id in self.roster if self.command_of(agent_id) is not None)
 
     def quirks_of(self, agent_id: int) -> Quirks:
         """Mistakes that this agent is asked to make."""
@@ -182,6 +193,8 @@ class Scenario(Model):
         yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
         yield from (("clocks", vehicle) for vehicle in self.clocks)
         yield from (("lateness", vehicle) for vehicle in self.lateness)
+        if isinstance(self.agent_command, dict):
+            yield from (("agent_command", agent) for agent in self.agent_command)
         for index, datagram in enumerate(self.datagrams):
             yield from ((f"datagrams.{index}.reaches", vehicle) for vehicle in datagram.reaches)
         for name, asked in self.quirks.items():

@@ -243,6 +243,15 @@ def test_in_a_compose_file_an_image_of_ones_own_runs_ones_own_command(tmp_path: 
     assert services["start"]["depends_on"] == ["agent-7"]
 
 
+def test_in_a_compose_file_only_those_who_are_named_run_in_the_image_of_ones_own(tmp_path: Path) -> None:
+    own = {"docker": {"image": "mine:3"}, "agent_command": {"7": ["/app/agent"]}, "vehicles": {"kind": "none"}}
+    services = emitted(tmp_path, agents=[7, 8], **own)["services"]
+    assert (services["agent-7"]["image"], services["agent-7"]["entrypoint"]) == ("mine:3", ["/app/agent"])
+    assert services["agent-8"]["image"] == services["start"]["image"] != "mine:3"
+    assert services["agent-8"]["command"] == ["-P", "-m", "ucp.node", "8.mission.json"]
+    assert "build" in services["agent-8"]
+
+
 def test_the_start_of_a_compose_file_is_one_for_all(tmp_path: Path) -> None:
     from harness.play.containers import start
 

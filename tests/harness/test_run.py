@@ -254,10 +254,40 @@ def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: P
     assert (tmp_path / "started").read_text() == "--mine\n" * 3
 
 
-def test_an_agent_command_that_is_no_program_is_one_sentence_before_anything_starts(tmp_path: Path) -> None:
-    done = harness("run", write_scenario(tmp_path, agent_command=["./nowhere"]), "--out", tmp_path / "run")
+def test_some_agents_run_another_program_and_the_others_ours(tmp_path: Path) -> None:
+    agent = tmp_path / "my agent.py"
+    agent.write_text(f"import sys\nopen({str(tmp_path / 'started')!r}, 'a').write(sys.argv[1])\nimport ucp.node\n")
+    with agent.open("a") as file:
+        file.write("sys.exit(ucp.node.main(sys.argv[1:]))\n")
+    commands = {2: [sys.executable, os.path.relpath(agent)]}
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=commands)
+    done = harness("run", scenario, "--seed", 1, "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "started").read_text() == "2.mission.json"
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        (["./nowhere"], "`agent_command`: ./nowhere is no program: give a path, or a name on PATH"),
+        ({3: ["./nowhere"]}, "`agent_command` of agent 3: ./nowhere is no program: give a path, or a name on PATH"),
+        (
+            {3: ["{notes}"]},
+            "`agent_command` of agent 3: {notes} is a file that may not be executed: chmod +x, or name ",
+        ),
+        ({3: ["/usr"]}, "`agent_command` of agent 3: /usr is no program: give a path, or a name on PATH"),
+    ],
+)
+def test_an_agent_command_that_is_no_program_is_one_sentence_before_anything_starts(
+    tmp_path: Path, command: Any, sentence: str
+) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.touch()
+    asked = json.loads(json.dumps(command).replace("{notes}", str(notes)))
+    done = harness("run", write_scenario(tmp_path, agent_command=asked), "--out", tmp_path / "run")
     assert done.returncode == 2
-    assert sentences(done.stderr) == ["`agent_command`: ./nowhere is no program: give a path, or a name on PATH"]
+    assert sentences(done.stderr)[0].startswith(sentence.replace("{notes}", str(notes)))
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> None:

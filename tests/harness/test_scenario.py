@@ -110,6 +110,18 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
             "name: x\nquirks: {crash_on_tie: {agents: [1], valu: false}}",
             "`quirks.crash_on_tie.valu` is unknown: there are agents, value",
         ),
+        (
+            "name: x\nagent_command: ./mine",
+            "`agent_command` is './mine': it should be a program and its arguments, as a",
+        ),
+        ("name: x\nagent_command: []", "or a mapping of agent IDs to such lists"),
+        ("name: x\nagent_command: {2: ./mine}", "agent 2 needs a program and its arguments, as a list"),
+        ("name: x\nagent_command: {two: [./mine]}", "'two' is not an agent ID: it should be 1..65535"),
+        (
+            "name: x\nagent_command: {9: [./mine]}",
+            "agent_command names vehicle 9, which does not exist: there are 1, 2",
+        ),
+        ('name: x\nagent_command: ["./mine\\0"]', "a program and its arguments, as a list"),
         ("name: x\nvehicles: {kind: boat}", "it should be 'ardupilot', 'embedded' or 'none'"),
         ("name: x\nvehicles: {home: [100, 0, 0, 0]}", "latitude -90..90"),
         ("name: [x", "not YAML at line 1"),

@@ -25,12 +25,13 @@ class Containers(Processes):
 
         refuse_what_programs_cannot(scenario)
         refuse_what_docker_cannot(scenario)
-        self.agent_command(scenario)
+        self.agent_commands(scenario)
 
-    def agent_command(self, scenario: Scenario) -> list[str]:
-        if scenario.docker.image is not None and scenario.agent_command is not None:
-            return list(scenario.agent_command)  # a program in the image
-        return super().agent_command(scenario)
+    def agent_command(self, scenario: Scenario, agent_id: int) -> list[str]:
+        command = scenario.command_of(agent_id)
+        if scenario.docker.image is not None and command is not None:
+            return list(command)  # a program in the image
+        return super().agent_command(scenario, agent_id)
 
     async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "MissionLab":
         from harness.play.containers.lab import ContainerLab

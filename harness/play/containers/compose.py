@@ -73,7 +73,7 @@ def _services(
 ) -> dict[str, Any]:
     ours, build = _our_image(scenario, beside)
     asked = scenario.docker.image
-    agents = ours if asked is None else Image(asked, "python3", foreign=True)
+    in_named = set(images.agents_in_named(scenario))
     services: dict[str, Any] = {}
     for number, vehicle in enumerate(scenario.roster):
         mission = f"{vehicle}.mission.json"
@@ -101,9 +101,10 @@ def _services(
             services[name] = _service(scenario, ours, launch.argv, f"vehicles/{vehicle}", beside) | build | network
             services[name] |= {"environment": dict(launch.env)} if launch.env else {}
             network = {"network_mode": f"service:{name}", "depends_on": [name]}
-        argv = [*Containers().agent_command(scenario), mission]
-        services[f"agent-{vehicle}"] = _service(scenario, agents, argv, "agents", beside) | network
-        services[f"agent-{vehicle}"] |= build if asked is None else {}
+        argv = [*Containers().agent_command(scenario, vehicle), mission]
+        image = Image(str(asked), "python3", foreign=True) if vehicle in in_named else ours
+        services[f"agent-{vehicle}"] = _service(scenario, image, argv, "agents", beside) | network
+        services[f"agent-{vehicle}"] |= {} if vehicle in in_named else build
     waits = {"network_mode": "none", "depends_on": [f"agent-{vehicle}" for vehicle in scenario.roster]}
     (beside / "start.py").write_bytes(Path(__file__).with_name("start.py").read_bytes())
     argv = [sys.executable, f"{INSIDE}/start.py", f"{INSIDE}/agents"]

@@ -21,6 +21,7 @@ import docker.errors
 
 from harness.play.containers import ownership
 from harness.play.containers.engine import DockerError, Engine
+from harness.scenario import Scenario
 
 HOST_IMAGE = "ucp-harness-host:empty"
 PROJECT_IMAGE = "ucp-harness-agent"
@@ -79,6 +80,13 @@ def named(engine: Engine, name: str) -> Image:
     if not _exists(engine, name):
         raise DockerError(f"there is no image {name} on this machine: docker pull {name}, or build it")
     return Image(name, "python3", foreign=True)
+
+
+def agents_in_named(scenario: Scenario) -> Iterable[int]:
+    """The agents that run in the image that the scenario names: all, or those whose commands are programs in it."""
+    if scenario.docker.image is None:
+        return ()
+    return scenario.foreign if isinstance(scenario.agent_command, dict) else scenario.roster
 
 
 def project(engine: Engine, say: Callable[[str], object]) -> Image:

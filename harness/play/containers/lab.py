@@ -49,7 +49,9 @@ class ContainerLab:
         self._rundir = rundir
         self._docker = scenario.docker
         self._name = ownership.run_name(rundir)
-        self._images: dict[Role, Image] = {}
+        self._in_named = set(images.agents_in_named(scenario))
+        self._ours: Image | None = None
+        self._named: Image | None = None
         self._holders: dict[str, int] = {}
         """ID of a holder -> its vehicle."""
         self._containers: dict[str, Container] = {}
@@ -90,18 +92,15 @@ class ContainerLab:
                 raise DockerError("the build of the image was interrupted")
             loop.call_soon_threadsafe(say, word)
 
-        def choose() -> dict[Role, Image]:
-            chosen: dict[Role, Image] = {}
-            if asked.image is not None:
-                chosen["agent"] = images.named(self._engine, asked.image)
-            if asked.image is None or scenario.vehicles.kind != "none":
-                from_host = asked.image_from_host
-                ours = images.from_host(self._engine) if from_host else images.project(self._engine, tell)
-                chosen = {"vehicle": ours, "agent": ours, **chosen}
-            return chosen
+        def choose() -> tuple[Image | None, Image | None]:
+            named = None if asked.image is None else images.named(self._engine, asked.image)
+            if named is not None and scenario.vehicles.kind == "none" and self._in_named == set(scenario.roster):
+                return None, named
+            from_host = asked.image_from_host
+            return images.from_host(self._engine) if from_host else images.project(self._engine, tell), named
 
         try:
-            self._images = await self._engine.in_thread(choose)
+            self._ours, self._named = await self._engine.in_thread(choose)
         finally:
             over.set()
 
@@ -163,15 +162,17 @@ class ContainerLab:
     ) -> Container:
         """Start a program in a container of its own, in the vehicle's network."""
         holder = next(identity for identity, held in self._holders.items() if held == vehicle)
+        image = self._named if role == "agent" and vehicle in self._in_named else self._ours
+        assert image is not None, "it is there for whoever needs it"
         name, identity = await self._create(
             vehicle,
             role,
-            self._images[role],
+            image,
             argv,
             f"container:{holder}",
             self._docker,
             working_dir=str(cwd),
-            environment=self._images[role].environment(env),
+            environment=image.environment(env),
         )
         stream = await self._engine.ask(f"attach to {name}", self._attach, identity)
         container = Container(self._engine, identity, name, Output(stream, stdout, stderr), self._docker.memory_mib)

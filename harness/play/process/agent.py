@@ -36,15 +36,31 @@ ASK_AGAIN_S = 0.02
 MOMENT_S = 0.5
 
 
-def agent_command(scenario: Scenario) -> list[str]:
-    """What starts an agent, but for the mission file. Raises ScenarioError if there is no such program."""
-    if scenario.agent_command is None:
+def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
+    """What starts the agent here, but for the mission file: its files as absolute paths.
+
+    Raises ScenarioError if there is no such program.
+    """
+    command = scenario.command_of(agent_id)
+    if command is None:
         return [sys.executable, "-P", "-m", "ucp.node"]
-    program, *arguments = scenario.agent_command
+    program, *arguments = command
     path = shutil.which(program)
     if path is None:
-        raise ScenarioError(f"`agent_command`: {program} is no program: give a path, or a name on PATH")
-    return [str(Path(path).absolute()), *arguments]  # agents work in a directory of their own
+        raise ScenarioError(f"`agent_command`{_of_whom(scenario, agent_id)}: {_why_no_program(program)}")
+    # Agents work in a directory of their own.
+    files = (str(Path(word).absolute()) if Path(word).is_file() else word for word in arguments)
+    return [str(Path(path).absolute()), *files]
+
+
+def _of_whom(scenario: Scenario, agent_id: int) -> str:
+    return f" of agent {agent_id}" if isinstance(scenario.agent_command, dict) else ""
+
+
+def _why_no_program(program: str) -> str:
+    if Path(program).name != program and Path(program).is_file():
+        return f"{program} is a file that may not be executed: chmod +x, or name its interpreter before it"
+    return f"{program} is no program: give a path, or a name on PATH"
 
 
 class AgentFailedError(HarnessError):

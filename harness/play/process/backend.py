@@ -45,7 +45,7 @@ FOLLOW_S = 0.1
 class ProcessRun:
     """One run; open it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early.
 
-    `open_lab` says what vehicles and agents are made of, `agent_command` what starts an agent there.
+    `open_lab` says what vehicles and agents are made of, `agent_commands` what starts each agent there.
     With `keeps_disks` every agent has a disk that it can be rebooted with, else those that the scenario reboots so.
     """
 
@@ -59,7 +59,7 @@ class ProcessRun:
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        agent_command: Sequence[str],
+        agent_commands: Mapping[int, Sequence[str]],
         open_lab: OpenLab,
         keeps_disks: bool,
     ) -> None:
@@ -79,7 +79,9 @@ class ProcessRun:
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
-        self.agents = [AgentProcess(agent_id, rundir, agent_command, self.clock.now) for agent_id in scenario.roster]
+        self.agents = [
+            AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now) for agent_id in scenario.roster
+        ]
         self._capture: LiveCapture | None = None
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()

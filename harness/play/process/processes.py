@@ -28,13 +28,17 @@ class Processes(Backend):
         from harness.play.process.preflight import refuse_what_programs_cannot
 
         refuse_what_programs_cannot(scenario)
-        self.agent_command(scenario)
+        self.agent_commands(scenario)
 
-    def agent_command(self, scenario: Scenario) -> list[str]:
-        """What starts an agent, but for the mission file. Raises HarnessError if nothing would."""
+    def agent_command(self, scenario: Scenario, agent_id: int) -> list[str]:
+        """What starts the agent, but for the mission file. Raises HarnessError if nothing would."""
         from harness.play.process.agent import agent_command
 
-        return agent_command(scenario)
+        return agent_command(scenario, agent_id)
+
+    def agent_commands(self, scenario: Scenario) -> dict[int, list[str]]:
+        """What starts each agent. Raises as `agent_command`."""
+        return {agent_id: self.agent_command(scenario, agent_id) for agent_id in scenario.roster}
 
     async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "MissionLab":
         """What vehicles and agents live in; see `harness.play.process.lab.OpenLab`."""
@@ -68,7 +72,7 @@ class Processes(Backend):
             rundir,
             progress,
             interrupted,
-            agent_command=self.agent_command(scenario),
+            agent_commands=self.agent_commands(scenario),
             open_lab=self.open_lab,
             keeps_disks=told,
         ).opened()

@@ -29,7 +29,7 @@ class VirtualTime(Backend):
         asked = {
             "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
             "vehicles.binary": scenario.vehicles.binary is not None,
-            "agent_command": scenario.agent_command is not None,
+            "agent_command": bool(scenario.foreign),
         }
         keys = [f"`{key}`" for key, needed in asked.items() if needed]
         if keys:
