@@ -148,6 +148,10 @@ class AgentRecord(_Model):
 
     outcome: str
     detail: str | None = None
+    command: list[str] | None = None
+    """What started it, but for its mission file; null of one that ran inside the harness."""
+    version: str | None = None
+    """What it said of itself in its status."""
     restarts: int = 0
     """How often it began anew with nothing."""
     reboots: int = 0

@@ -9,8 +9,9 @@ from rich.console import Console
 from harness import checker
 from harness.archive.archive import RunArchive
 from harness.checker.survival import survival
-from harness.commands.terminal import complain, print_json, show_result, show_survival
+from harness.commands.terminal import complain, print_json, show_programs, show_result, show_survival
 from harness.errors import VIOLATED, WRONG_REQUEST
+from harness.report.programs import programs
 
 
 def check_command(
@@ -18,12 +19,15 @@ def check_command(
     as_json: Annotated[bool, typer.Option("--json", help="The verdict as JSON on standard output.")] = False,
 ) -> None:
     """Decide the six characteristics from exported chains, and from traces beside them."""
-    evidence = checker.gather(RunArchive(*paths))
+    archive = RunArchive(*paths)
+    evidence = checker.gather(archive)
     result, survived = checker.check(evidence), survival(evidence)
     if as_json:
-        print_json({**result.to_json(), "survival": survived.model_dump()})
+        ran = [program.to_json() for program in programs(archive.record)]
+        print_json({**result.to_json(), "survival": survived.model_dump(), "programs": ran})
     else:
         show_result(Console(), result)
+        show_programs(Console(), archive.record)
         show_survival(Console(), survived)
     for error in result.errors:
         complain(error)

@@ -12,9 +12,11 @@ from rich.text import Text
 
 from harness.commands.terminal import complain, print_json
 from harness.difference import AgentDifference, Difference, Parting, Step, compare
+from harness.report.programs import in_words
 
 DIFFERENT = 1
 VALUE_CHARACTERS = 60
+OURS = "all agents ran the harness's own"
 
 
 def diff_command(
@@ -40,6 +42,7 @@ def _lines(difference: Difference) -> Iterator[str]:
     """All that there is to say, A being the first run and B the second."""
     for differing in difference.keys:
         yield f"{differing.key}: {_value(differing.a)} in A, {_value(differing.b)} in B"
+    yield from _programs(difference)
     runs = f"{difference.handler_runs} handler runs of {len(difference.agents)} agents, and their chains"
     match difference.verdict:
         case "identical":
@@ -48,6 +51,15 @@ def _lines(difference: Difference) -> Iterator[str]:
             yield f"the same: {runs}; only times, and the hashes that cover them, differ"
         case _:
             yield from _differences(difference)
+
+
+def _programs(difference: Difference) -> Iterator[str]:
+    """Who ran what, unless all agents of both runs were the harness's own."""
+    a, b = difference.programs["a"], difference.programs["b"]
+    if a == b:
+        yield from [f"in both runs {in_words(a)}"] if a else []
+    else:
+        yield from (f"in {run} {in_words(ran) or OURS}" for run, ran in (("A", a), ("B", b)))
 
 
 def _differences(difference: Difference) -> Iterator[str]:

@@ -12,7 +12,7 @@ from rich.console import Console
 from harness.archive.directory import default_path
 from harness.archive.record import CapturedFrames
 from harness.backend_names import BackendName
-from harness.commands.terminal import complain, show_result, show_rogue, show_survival
+from harness.commands.terminal import complain, show_programs, show_result, show_rogue, show_survival
 from harness.errors import HarnessError, ScenarioError
 from harness.machine.kernel import Kernel, run_inside
 from harness.play import progress
@@ -81,6 +81,7 @@ def run_command(
     finally:
         shown.close()
     show_result(console, finished.result)
+    show_programs(console, finished.record)
     show_survival(console, finished.survival)
     show_rogue(console, finished.rogue)
     _show_end(console, finished)

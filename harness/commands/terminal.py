@@ -14,8 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from harness import checker
-from harness.archive.record import RogueInjection, Survival
+from harness.archive.record import RogueInjection, RunRecord, Survival
 from harness.checker import injections, survival
+from harness.report import programs
 from harness.scenario.verdicts import CHARACTERISTICS, Kind
 
 if TYPE_CHECKING:
@@ -43,6 +44,11 @@ def show_result(console: Console, result: checker.Result) -> None:
     known = {name: value for name, value in result.figures.items() if value is not None}
     words = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in known.items())
     console.print(words, highlight=False, style="dim")
+
+
+def show_programs(console: Console, record: RunRecord) -> None:
+    if ran := programs.programs(record):
+        console.print(programs.in_words(ran), highlight=False, soft_wrap=True, style="dim")
 
 
 def show_survival(console: Console, survived: Survival) -> None:

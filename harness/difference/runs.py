@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE
@@ -12,6 +12,7 @@ from harness.difference.keys import KeyDifference, differing_keys
 from harness.difference.steps import Step, completed_blocks, name
 from harness.errors import RunDirectoryError
 from harness.report.chain_tree import ranges
+from harness.report.programs import Program, programs
 
 
 @dataclass(frozen=True)
@@ -53,11 +54,13 @@ class Difference:
     keys: of the scenario, and `seed`.
     agents: every agent of the roster; both None for one that does the same in both.
     handler_runs: how many were the same, of all agents, each counted up to where it parts.
+    programs: who ran what in either run, where not all agents were the harness's own.
     exact: the traces are the same to the last byte of each handler run.
     errors: a sentence for each export that could not be used, and for each run without an end.
     """
 
     keys: list[KeyDifference]
+    programs: dict[Literal["a", "b"], list[Program]]
     agents: dict[int, AgentDifference]
     handler_runs: int
     exact: bool
@@ -82,6 +85,7 @@ class Difference:
         return {
             "verdict": self.verdict,
             "keys": [asdict(key) for key in self.keys],
+            "programs": {run: [program.to_json() for program in ran] for run, ran in self.programs.items()},
             "first": self.first,
             "handler_runs": self.handler_runs,
             "agents": {str(agent_id): asdict(difference) for agent_id, difference in self.agents.items()},
@@ -100,7 +104,8 @@ def compare(a: Path, b: Path) -> Difference:
         handler_runs, exact = handler_runs + same, exact and to_the_byte
         agents[agent_id] = AgentDifference(parting, _compare_chains(run_a.chain(agent_id), run_b.chain(agent_id)))
     keys = [*differing_keys(run_a.asked(), run_b.asked())]
-    return Difference(keys, agents, handler_runs, exact, [*run_a.problems(), *run_b.problems()])
+    ran: dict[Literal["a", "b"], list[Program]] = {"a": programs(run_a.record), "b": programs(run_b.record)}
+    return Difference(keys, ran, agents, handler_runs, exact, [*run_a.problems(), *run_b.problems()])
 
 
 class _Run:

@@ -4,13 +4,21 @@ import asyncio
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 from harness.errors import VIOLATED, HarnessError
 
 ANSWER_LIMIT_BYTES = 1024 * 1024
+
+
+VERSION_CHARACTERS = 80
+
+
+def _first_words(version: Any) -> str | None:
+    """What an agent says of its version as a line for people; None if it is no text."""
+    return " ".join(version.split())[:VERSION_CHARACTERS] or None if isinstance(version, str) else None
 
 
 class Status(BaseModel):
@@ -33,6 +41,7 @@ class Status(BaseModel):
     dropped: dict[str, int] = {}
     send_failures: int | None = None
     trace_problem: str | None = None
+    version: Annotated[str | None, BeforeValidator(_first_words)] = None
 
 
 class AgentSilentError(Exception):

@@ -51,7 +51,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="Containers of this machine's own files: no image is built, or pulled.",
     )
-    group.addoption("--ucp-agent", metavar="COMMAND", help="Play with this agent, whatever scenarios say.")
+    group.addoption(
+        "--ucp-agent",
+        metavar="[ID=]COMMAND",
+        action="append",
+        help="Play with this agent, whatever scenarios say; with ID=, for that one: may be given again and again.",
+    )
     group.addoption("--ucp-rewrite", action="store_true", help="Write into *.story files what agents do now.")
 
 

@@ -1,5 +1,6 @@
 """What the command line of pytest says about runs; it has the last word over tests and scenarios."""
 
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,8 @@ from harness.backend_names import BackendName
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
 from harness.scenario.load import parse
+
+OF_ONE = re.compile(r"(?P<agent>[0-9]{1,5})=")
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,8 @@ class Options:
     """Whether processes are to be played in User Mode Linux."""
     image_from_host: bool
     """Whether containers are made of this machine's own files."""
-    agent_command: list[str] | None
+    agent_commands: dict[int | None, list[str]]
+    """By agent; under None, of all that are not named. Whoever is not here is as scenarios say."""
     rewrite: bool
     """Whether stories are written anew, not compared."""
 
@@ -37,7 +41,6 @@ class Options:
         )
         if seed is not None and seed < 0:
             raise ScenarioError(f"--ucp-seed is {seed}: it should be 0 or more")
-        agent = config.getoption("--ucp-agent")
         return cls(
             backend,
             seed,
@@ -45,7 +48,7 @@ class Options:
             keep and config.invocation_params.dir / keep,
             config.getoption("--ucp-kernel") == "uml",
             config.getoption("--ucp-image-from-host"),
-            None if agent is None else _words(agent),
+            _by_agent(config.getoption("--ucp-agent") or []),
             config.getoption("--ucp-rewrite"),
         )
 
@@ -54,11 +57,17 @@ class Options:
         document = scenario.model_dump()
         if self.speedup is not None:
             document["speedup"] = self.speedup
-        if self.agent_command is not None:
-            document["agent_command"] = self.agent_command
+        if self.agent_commands:
+            document["agent_command"] = self._laid_over_commands(scenario)
         if self.image_from_host:
             document["docker"]["image_from_host"] = True
         return parse(document) if document != scenario.model_dump() else scenario
+
+    def _laid_over_commands(self, scenario: Scenario) -> dict[int, list[str]]:
+        others = self.agent_commands.get(None)
+        asked = {agent_id: others or scenario.command_of(agent_id) for agent_id in scenario.roster}
+        named = {agent_id: words for agent_id, words in self.agent_commands.items() if agent_id is not None}
+        return {agent_id: words for agent_id, words in (asked | named).items() if words is not None}
 
     def refuse(self, backend: BackendName) -> None:
         """Raises MachineError, with the reason, for a backend that cannot play where the command line wants it to."""
@@ -66,6 +75,18 @@ class Options:
             from harness.pytest_plugin.kernel import refuse_outside
 
             refuse_outside(backend)
+
+
+def _by_agent(commands: list[str]) -> dict[int | None, list[str]]:
+    """Raises ScenarioError."""
+    by_agent: dict[int | None, list[str]] = {}
+    for command in commands:
+        of_one = OF_ONE.match(command)
+        agent_id = int(of_one["agent"]) if of_one else None
+        if agent_id in by_agent:
+            raise ScenarioError(f"--ucp-agent names two programs for {of_one['agent'] if of_one else 'all'}")
+        by_agent[agent_id] = _words(command[of_one.end() :] if of_one else command)
+    return by_agent
 
 
 def _words(command: str) -> list[str]:

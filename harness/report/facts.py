@@ -4,6 +4,7 @@ from harness.archive.exports import Exports
 from harness.archive.record import RunRecord
 from harness.play.backends import in_virtual_time
 from harness.present import words
+from harness.report.programs import programs
 from harness.scenario.quirks import in_words
 
 FIGURES = {
@@ -40,6 +41,7 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
             parts.append(f"speedup {words.value(scenario.speedup)}")
     played = {"seed": record.seed, "backend": record.backend, "engine": record.engine}
     parts += [f"{key} {words.value(value)}" for key, value in played.items() if value is not None]
+    parts += [program.in_words for program in programs(record)]
     if record.wall_s is not None:
         parts.append(f"{words.duration(record.wall_s)} wall time")
     if record.started_at:

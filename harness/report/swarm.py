@@ -1,5 +1,6 @@
 """Who flew, and what each agent and each block came to."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +12,7 @@ from harness.archive.record import AgentRecord, RunRecord
 from harness.present import words
 from harness.present.colours import Ink, inks
 from harness.report.chain_tree import holders, ranges
+from harness.report.programs import programs
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +51,14 @@ def _fate(agent: AgentRecord | None) -> str:
 def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
     """Column labels, and a row (agent ID, ink, cells by column) for each agent and its vehicle."""
     record, exports = archive.record, archive.exports.by_agent
+    mixed = bool(programs(record))
     rows = []
     columns: dict[str, None] = {}
     for agent_id in sorted({*archive.roster, *exports}):
         agent = record.agents.get(str(agent_id))
         cells = _agent_cells(agent) if agent else {}
+        if mixed and agent:
+            cells |= {"program": shlex.join(agent.command or []) or None, "version": agent.version}
         if export := exports.get(agent_id):
             cells |= {
                 "idle": export.idle,
@@ -71,7 +76,7 @@ def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
 
 
 def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
-    kept = agent.model_dump(mode="json", exclude={"detail", "dropped"})
+    kept = agent.model_dump(mode="json", exclude={"detail", "dropped", "command", "version"})
     cells: dict[str, Any] = {words.label(key): value for key, value in kept.items()}
     cells["completed before"] = len(agent.completed_before) or None
     cells |= {"restarts": agent.restarts or None, "reboots": agent.reboots or None}

@@ -40,6 +40,7 @@ class Run:
 
     directory: Path
     played: RunOutcome
+    record: RunRecord
     result: checker.Result
     survival: Survival
     rogue: list[RogueInjection]
@@ -140,7 +141,7 @@ class Recording:
             raise MachineError(f"{error}; run.json has the verdict") from None
         status = played.exit_status or (VIOLATED if result.bad else WRONG_REQUEST if played.unmatched_fates else 0)
         late = None if in_virtual_time(self._record.backend) else timer_lag(evidence.traces.values())
-        return Run(self.directory.path, played, result, survived, rogue, status, wall_s, page, late)
+        return Run(self.directory.path, played, self._record, result, survived, rogue, status, wall_s, page, late)
 
     def _update(self, **keys: Any) -> None:
         self._record = _updated(self._record, **keys)

@@ -256,14 +256,34 @@ def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: P
 
 def test_some_agents_run_another_program_and_the_others_ours(tmp_path: Path) -> None:
     agent = tmp_path / "my agent.py"
-    agent.write_text(f"import sys\nopen({str(tmp_path / 'started')!r}, 'a').write(sys.argv[1])\nimport ucp.node\n")
-    with agent.open("a") as file:
-        file.write("sys.exit(ucp.node.main(sys.argv[1:]))\n")
+    agent.write_text(
+        f"""
+import sys
+import ucp.node
+open({str(tmp_path / "started")!r}, "a").write(sys.argv[1])
+class Mine(ucp.node.Node):
+    def _status(self, request):
+        return {{**super()._status(request), "version": "mine\\n1.4"}}
+ucp.node.Node = Mine
+sys.exit(ucp.node.main(sys.argv[1:]))
+"""
+    )
     commands = {2: [sys.executable, os.path.relpath(agent)]}
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=commands)
     done = harness("run", scenario, "--seed", 1, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "started").read_text() == "2.mission.json"
+    left = json.loads((tmp_path / "run" / "run.json").read_text())["agents"]
+    assert (left["1"]["version"], left["2"]["version"]) == (None, "mine 1.4")
+    interpreter, file = left["2"]["command"]
+    assert (interpreter, Path(file).resolve()) == (sys.executable, agent.resolve())
+    who = f"agents 1, 3 ran the harness's own; agent 2 ran {shlex.join(commands[2])} (mine 1.4)"
+    assert who in done.stdout
+    assert who in harness("check", tmp_path / "run").stdout
+    assert f"in both runs {who}\n" in harness("diff", tmp_path / "run", tmp_path / "run").stdout
+    assert "(mine 1.4)" in (tmp_path / "run" / "report.html").read_text()
+    ran = json.loads(harness("check", tmp_path / "run", "--json").stdout)["programs"]
+    assert [(program["agents"], program["version"]) for program in ran] == [([1, 3], None), ([2], "mine 1.4")]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Stories: text that is played and compared, and written anew if asked."""
 
+import json
 import shlex
 import sys
 from pathlib import Path
@@ -97,12 +98,35 @@ def test_processes_do_as_the_story_tells(pytester: pytest.Pytester) -> None:
     path = written(pytester)
     agent = f"{shlex.quote(sys.executable)} -P -m ucp.node"
     run(pytester, path, "--ucp-backend", "process", "--ucp-agent", agent).assert_outcomes(passed=1)
+    kept = pytester.path / "kept"
+    mixed = ("--ucp-agent", f"2={agent}", "--ucp-keep", kept)
+    run(pytester, path, "--ucp-backend", "process", *mixed).assert_outcomes(passed=1)
+    (record,) = kept.glob("*/run.json")
+    commands = {agent: left["command"] for agent, left in json.loads(record.read_text())["agents"].items()}
+    assert commands["2"] == [sys.executable, "-P", "-m", "ucp.node"]
 
 
 def test_files_of_others_are_left_alone(pytester: pytest.Pytester) -> None:
     write(pytester, "Scenario: trader is alerted\nGiven a stock\n", "trader.story")
     (pytester.path / "binary.story").write_bytes(b"\xff\xfe1 s: x\n")
     run(pytester).assert_outcomes()
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        (["9=my_agent"], "agent_command names vehicle 9, which does not exist: there are 1, 2, 3"),
+        (["2=my_agent", "2=yours"], "--ucp-agent names two programs for 2"),
+        (["2="], "--ucp-agent names no program"),
+    ],
+)
+def test_an_agent_of_the_command_line_that_cannot_be_is_one_sentence(
+    pytester: pytest.Pytester, asked: list[str], sentence: str
+) -> None:
+    options = [word for agent in asked for word in ("--ucp-agent", agent)]
+    result = run(pytester, write(pytester, TOLD), *options)
+    assert sentence in result.stdout.str() + result.stderr.str()
+    no_internals(result)
 
 
 def test_virtual_time_has_no_other_agent(pytester: pytest.Pytester) -> None:

@@ -355,6 +355,8 @@ class AgentProcess:
         record = {
             "outcome": self.outcome,
             "detail": self.detail,
+            "command": list(self._command),
+            "version": next((life.status.version for life in reversed(lives) if life.status is not None), None),
             "restarts": sum(not life.reboot for life in lives[1:]),
             "reboots": sum(life.reboot for life in lives),
             "completed_before": list(dict.fromkeys(self._completed_before)),

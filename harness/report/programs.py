@@ -1,0 +1,47 @@
+"""Who ran what, where not all agents were the harness's own."""
+
+import shlex
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from harness.archive.record import RunRecord
+from harness.report.chain_tree import ranges
+
+
+@dataclass(frozen=True)
+class Program:
+    """What these agents ran: `command` as the scenario has it, None for the harness's own.
+
+    `version` is what the agents said of themselves, None if they said nothing.
+    """
+
+    agents: tuple[int, ...]
+    command: tuple[str, ...] | None
+    version: str | None
+
+    @property
+    def in_words(self) -> str:
+        """ "agent 2 ran ./my_agent --fast (1.4)", "agents 1, 3 ran the harness's own"."""
+        program = "the harness's own" if self.command is None else shlex.join(self.command)
+        of_version = "" if self.version is None else f" ({self.version})"
+        return f"agent{'s' * (len(self.agents) > 1)} {', '.join(ranges([*self.agents]))} ran {program}{of_version}"
+
+    def to_json(self) -> dict[str, Any]:
+        return {"agents": self.agents, "command": self.command, "version": self.version}
+
+
+def programs(record: RunRecord) -> list[Program]:
+    """In the order of their first agents; none where all agents are the harness's own, or nothing is known of them."""
+    if record.scenario is None or not record.scenario.foreign:
+        return []
+    alike: dict[tuple[tuple[str, ...] | None, str | None], list[int]] = {}
+    for agent_id in record.scenario.roster:
+        command, agent = record.scenario.command_of(agent_id), record.agents.get(str(agent_id))
+        ran = tuple(command) if command else None, agent.version if agent else None
+        alike.setdefault(ran, []).append(agent_id)
+    return [Program(tuple(agents), command, version) for (command, version), agents in alike.items()]
+
+
+def in_words(ran: Iterable[Program]) -> str:
+    return "; ".join(program.in_words for program in ran)
