@@ -1,0 +1,39 @@
+"""JSON Schemas (draft 2020-12) of all that the agent contract has in JSON; `python -m ucp.schemas` writes the files.
+
+They say what a right agent reads and writes. Keys that they do not name are allowed wherever CONTRACT.md says that a
+reader ignores them.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ucp.schemas import chain_export, control, mission, trace, virtual
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+DOCUMENTS: dict[str, Callable[[], dict[str, Any]]] = {
+    "mission": mission.schema,
+    "trace": trace.schema,
+    "chain-export": chain_export.schema,
+    "control": control.schema,
+    "virtual": virtual.schema,
+}
+"""What there is a schema of, by name."""
+
+
+def generate(name: str) -> dict[str, Any]:
+    """The schema of this name."""
+    return {"$schema": DIALECT, "title": name, **DOCUMENTS[name]()}
+
+
+def path(name: str) -> Path:
+    """Where its file is."""
+    return Path(__file__).with_name(f"{name}.schema.json")
+
+
+def write_all() -> None:
+    """Write all files anew."""
+    for name in DOCUMENTS:
+        path(name).write_text(json.dumps(generate(name), indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,43 @@
+"""Test vectors of the agent contract; `python -m ucp.vectors` writes the files.
+
+hashes.py    events, blocks, inception blocks and chains: bytes and hashes
+messages.py  every message as a datagram
+drops.py     datagrams that are dropped, and why
+blocks.py    after which event a block is full, and its timestamp
+missions.py  whole missions in virtual time, input by input
+"""
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ucp.vectors import blocks, drops, hashes, messages
+
+DIRECTORY = Path(__file__).parent
+
+DOCUMENTS: dict[str, Callable[[], Any]] = {
+    "hashes": hashes.vectors,
+    "messages": messages.vectors,
+    "drops": drops.vectors,
+    "blocks": blocks.vectors,
+}
+"""Name of a file -> what it has."""
+
+
+def texts() -> dict[Path, str]:
+    """Every file and what stands in it."""
+    return {DIRECTORY / f"{name}.json": _json(vectors()) for name, vectors in DOCUMENTS.items()}
+
+
+def write_all() -> None:
+    """Write all files anew."""
+    for path, text in texts().items():
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="ascii")
+
+
+def _json(document: Any) -> str:
+    """Bytes are in base64, as everywhere in the contract."""
+    return json.dumps(document, indent=1, default=lambda data: base64.b64encode(data).decode("ascii")) + "\n"
