@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 MAX_LINE_BYTES = 64 * 1024
+MAX_NAME = 40
+"""More of a wrong command is not shown."""
 
 Command = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -62,10 +64,13 @@ class ControlServer:
             request = json.loads(line)
         except (ValueError, RecursionError):
             return {"ok": False, "error": "not JSON"}
-        name = request.get("command") if isinstance(request, dict) else None
+        if not isinstance(request, dict):
+            return {"ok": False, "error": "not a JSON object"}
+        name = request.get("command")
         command = self._commands.get(name) if isinstance(name, str) else None
         if command is None:
-            return {"ok": False, "error": f"unknown command {name!r}: there are {', '.join(self._commands)}"}
+            error = f"unknown command {str(name)[:MAX_NAME]!r}: there are {', '.join(self._commands)}"
+            return {"ok": False, "unsupported": True, "error": error}
         try:
             return {"ok": True, **command(request)}
         except CommandError as error:

@@ -12,16 +12,23 @@ from typing import Any, Literal
 
 from ucp.block import MAX_AGENT_ID
 from ucp.events import MEAN_TIME_BETWEEN_EVENTS_S
+from ucp.features import FEATURES
 from ucp.quirks import Quirks, check_quirk
 from ucp.settings import Settings
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
 SCHEMA = "ucp-mission/1"
 MAX_MISSION_BYTES = 4 * 1024 * 1024
+MAX_NAME = 40
+"""More of a wrong name is not shown."""
 
 
 class MissionError(Exception):
     """A mission file that cannot be used: one sentence with the file, the key and what is allowed."""
+
+
+class UnsupportedMissionError(MissionError):
+    """A mission that needs a feature that this agent does not have."""
 
 
 @dataclass(frozen=True)
@@ -82,15 +89,16 @@ def load_mission(path: Path) -> Mission:
     try:
         return parse_mission(document)
     except MissionError as error:
-        raise MissionError(f"{path}: {error}") from None
+        raise type(error)(f"{path}: {error}") from None
 
 
 def parse_mission(document: Any) -> Mission:
-    """Raises MissionError."""
+    """Raises MissionError; UnsupportedMissionError if it lists a feature that there is not."""
     if not isinstance(document, dict):
         raise MissionError("not a mission: a JSON object is needed")
     if document.get("schema") != SCHEMA:
         raise MissionError(f"`schema` is {document.get('schema')!r}, and this agent reads {SCHEMA!r}")
+    _check_features(document.get("features", []))
     agent_id = _integer(document, "agent_id", 1, MAX_AGENT_ID)
     roster = _get(document, "roster", list)
     if not roster or not all(type(member) is int and 1 <= member <= MAX_AGENT_ID for member in roster):
@@ -116,6 +124,15 @@ def parse_mission(document: Any) -> Mission:
         epoch_us=epoch_us,
         store=store,
     )
+
+
+def _check_features(features: Any) -> None:
+    if not isinstance(features, list) or not all(isinstance(feature, str) for feature in features):
+        raise MissionError("`features` must list names of features")
+    for feature in features:
+        if feature not in FEATURES:
+            name = feature[:MAX_NAME]
+            raise UnsupportedMissionError(f"needs the feature {name!r}, and this agent has {', '.join(FEATURES)}")
 
 
 def _get(document: dict[str, Any], key: str, kind: type) -> Any:

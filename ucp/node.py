@@ -8,7 +8,6 @@ under test must do; this is the default.
 
 import asyncio
 import base64
-import binascii
 import contextlib
 import dataclasses
 import logging
@@ -24,10 +23,11 @@ from typing import Any
 from ucp.agent import Agent
 from ucp.clock import MissionClock
 from ucp.control import CommandError, ControlServer
-from ucp.events import LoggableEvent, RandomEvents
+from ucp.events import EVENT_HEADER_BYTES, LoggableEvent, RandomEvents
 from ucp.export import export_chain
+from ucp.features import UNSUPPORTED
 from ucp.files import TraceFile, write_json_atomically
-from ucp.mission import Mission, MissionError, load_mission
+from ucp.mission import Mission, MissionError, UnsupportedMissionError, load_mission
 from ucp.quirks import check_quirk, wrong_handlers
 from ucp.store import Store, StoreError
 from ucp.telemetry import TelemetryEvents, follow
@@ -263,12 +263,16 @@ class Node:
         event_id, data = request.get("event_id"), request.get("data")
         if not self.clock.running:
             raise CommandError("the mission has not started")
-        if type(event_id) is not int or not 0 <= event_id <= 255 or not isinstance(data, str):
-            raise CommandError("log needs `event_id`, 0 to 255, and `data`, in base64")
+        if type(event_id) is not int or not 1 <= event_id <= 254 or not isinstance(data, str):
+            raise CommandError("log needs `event_id`, 1 to 254, and `data`, in base64")
         try:
-            self._log_event(event_id, base64.b64decode(data, validate=True))
-        except binascii.Error:
+            event_data = base64.b64decode(data, validate=True)
+        except ValueError:
             raise CommandError("log needs `data` in base64") from None
+        largest = self.mission.settings.max_event_bytes - EVENT_HEADER_BYTES
+        if len(event_data) > largest:
+            raise CommandError(f"an event of this mission has at most {largest} bytes of data, not {len(event_data)}")
+        self._log_event(event_id, event_data)
         return {}
 
     def _stop_events(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -322,7 +326,7 @@ def _broadcast_socket(mission: Mission) -> socket.socket:
 
 
 def main(arguments: list[str]) -> int:
-    """Exit status 0; 1 if the export failed; 2 if the mission file is wrong or its port is in use."""
+    """Exit status 0; 1: no export; 2: the mission file is wrong, or its port in use; 127: it lacks a feature."""
     if len(arguments) != 1:
         sys.stderr.write("usage: python -m ucp.node MISSION_FILE\n")
         return WRONG_MISSION
@@ -331,7 +335,7 @@ def main(arguments: list[str]) -> int:
         mission = load_mission(path)
     except MissionError as error:
         sys.stderr.write(f"{error}\n")
-        return WRONG_MISSION
+        return UNSUPPORTED if isinstance(error, UnsupportedMissionError) else WRONG_MISSION
 
     async def run() -> int:
         return await Node(mission, path.parent).run()

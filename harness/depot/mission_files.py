@@ -17,6 +17,7 @@ from harness.play.process.mission_file import NO_QUIRKS, mission_file
 from harness.scenario import Scenario
 from netem.addresses import BROADCAST, address
 from ucp.block import hash_digest
+from ucp.features import needed
 from ucp.files import write_json_atomically
 from ucp.messages import PORT
 from ucp.mission import Mission, MissionError, parse_mission
@@ -80,6 +81,7 @@ class Plan:
         document["network"]["port"] = self.port
         document["settings"].update(self.settings)
         document["events"].update(self.events)
+        document["features"] = needed(document)
         try:
             parse_mission(document)
         except MissionError as error:

@@ -169,7 +169,7 @@ def test_events_are_logged_on_command_until_they_are_stopped(directory: Path) ->
         assert agent.ask("status")["completed"] == 1
         with pytest.raises(AgentRefusedError, match="in base64"):
             agent.ask("log", event_id=1, data="?")
-        with pytest.raises(AgentRefusedError, match="0 to 255"):
+        with pytest.raises(AgentRefusedError, match="1 to 254"):
             agent.ask("log", event_id="1", data="AQ==")
     finally:
         agent.process.kill()
@@ -227,13 +227,34 @@ def test_a_command_that_cannot_be_carried_out_is_answered_with_a_sentence(
     assert agent.ask("status")["ok"]
 
 
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"event_id": 0, "data": "AQ=="}, "1 to 254"),
+        ({"event_id": 255, "data": "AQ=="}, "1 to 254"),
+        ({"event_id": 1, "data": "é"}, "base64"),
+        ({"event_id": 1, "data": base64.b64encode(bytes(257)).decode()}, "at most 256 bytes of data, not 257"),
+    ],
+)
+def test_what_is_no_event_is_not_logged_and_answered_with_a_sentence(
+    agent: AgentUnderTest, arguments: dict[str, Any], sentence: str
+) -> None:
+    agent.start()
+    with pytest.raises(AgentRefusedError, match=sentence):
+        agent.ask("log", **arguments)
+    assert agent.ask("status")["handled"] == 0
+
+
 def test_garbage_on_the_control_socket_ends_its_connection_and_nothing_else(agent: AgentUnderTest) -> None:
     with socket.socket(socket.AF_UNIX) as sock:
         descriptor = os.open(agent.directory, os.O_PATH)
         sock.connect(f"/proc/self/fd/{descriptor}/7.control")
         os.close(descriptor)
-        sock.sendall(b"\xff\xfe not json\n[1]\n")
-        assert sock.recv(4096).count(b'"ok": false') >= 1
+        with sock.makefile("rb") as answers:
+            for line, unsupported in ((b"\xff\xfe not json", False), (b"[1]", False), (b'{"command": "fly"}', True)):
+                sock.sendall(line + b"\n")
+                answer = json.loads(answers.readline())
+                assert (answer["ok"], answer.get("unsupported", False)) == (False, unsupported)
         with pytest.raises(ConnectionError):
             for _ in range(1000):
                 sock.sendall(b"x" * 65536)
@@ -272,6 +293,7 @@ def test_a_port_in_use_is_one_sentence_and_status_2(agent: AgentUnderTest, tmp_p
         ({"initial_data": "!"}, "not base64"),
         ({"initial_data": "é"}, "not base64"),
         ({"store": 7}, "`store` must be the path of a file"),
+        ({"features": "store"}, "`features` must list names"),
     ],
 )
 def test_a_wrong_mission_file_is_one_sentence_and_status_2(
@@ -283,6 +305,19 @@ def test_a_wrong_mission_file_is_one_sentence_and_status_2(
     said = agent.process.stderr.read()
     assert sentence in said
     assert said.count("\n") == 1
+
+
+def test_a_mission_that_needs_what_the_agent_lacks_is_one_sentence_and_status_127(tmp_path: Path) -> None:
+    agent = AgentUnderTest(tmp_path, mission(contract=3, features=["store", "signatures"], keys={"never": "heard of"}))
+    assert agent.process.wait(DEADLINE_S) == 127
+    assert agent.process.stderr is not None
+    said = agent.process.stderr.read()
+    assert "7.mission.json: needs the feature 'signatures'" in said
+    assert said.count("\n") == 1
+
+
+def test_a_mission_of_a_later_contract_that_needs_nothing_new_is_flown() -> None:
+    assert parse_mission(mission(contract=3, features=["store"], keys={"never": "heard of"})).agent_id == 7
 
 
 def test_a_killed_agent_leaves_no_half_export(directory: Path) -> None:

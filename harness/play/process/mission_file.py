@@ -8,6 +8,7 @@ from harness.play.seeds import agent_seed
 from harness.scenario import Scenario
 from harness.scenario.events import Events
 from sitl.vehicle import AGENT_PORT
+from ucp.features import CONTRACT, needed
 from ucp.messages import PORT
 from ucp.mission import SCHEMA
 
@@ -30,8 +31,10 @@ def mission_file(
 ) -> dict[str, Any]:
     """`seed` is the run's; an agent has one of its own in each `life`. With `epoch_us` it joins a mission under way."""
     events = scenario.events
-    return {
+    document = {
         "schema": SCHEMA,
+        "contract": CONTRACT,
+        "features": [],
         "agent_id": agent_id,
         "roster": list(scenario.roster),
         "initial_data": base64.b64encode(initial_data).decode("ascii"),
@@ -51,6 +54,7 @@ def mission_file(
         "epoch_us": epoch_us,
         "store": store,
     }
+    return document | {"features": needed(document)}
 
 
 def _source(events: Events, with_vehicle: bool) -> str:

@@ -1,0 +1,30 @@
+"""Features: what a mission needs of an agent beyond the base of CONTRACT.md, by name.
+
+A mission file lists those that it needs, so that an agent that lacks one can end with status 127 instead of doing
+something else than it was asked for.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+CONTRACT = 2
+"""The version of CONTRACT.md by which mission files are written."""
+
+UNSUPPORTED = 127
+"""Exit status of an agent that lacks a feature of its mission."""
+
+FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
+    "store": lambda mission: mission.get("store") is not None,
+    "telemetry": lambda mission: mission["events"]["source"] == "mavlink",
+    "quirks": lambda mission: any(mission["quirks"].values()),
+    "vote_names_chain": lambda mission: mission["settings"]["vote_names_chain"],
+    "changed_before_tally": lambda mission: mission["settings"]["changed_before_tally"],
+    "phase1_tie=pop": lambda mission: mission["settings"]["phase1_tie"] == "pop",
+    "phase2_tie=block": lambda mission: mission["settings"]["phase2_tie"] == "block",
+}
+"""Feature -> whether a mission file that has all keys needs it."""
+
+
+def needed(mission: Mapping[str, Any]) -> list[str]:
+    """The features that a mission file needs; it has all keys."""
+    return [name for name, is_needed in FEATURES.items() if is_needed(mission)]
