@@ -25,6 +25,10 @@ DOCUMENTS: dict[str, Callable[[], Any]] = {
 }
 """Name of a file -> what it has."""
 
+MISSIONS = DIRECTORY / "missions"
+INDEX = MISSIONS / "index.json"
+"""Name of each transcript, what happens in it, and which features it needs."""
+
 
 def texts() -> dict[Path, str]:
     """Every file and what stands in it."""
