@@ -1,6 +1,8 @@
 """Errors that a user meets: one clear sentence with the way out, and the exit status of the command line."""
 
+import shlex
 from collections.abc import Sequence
+from typing import Self
 
 VIOLATED, WRONG_REQUEST, CANNOT_HERE, INTERRUPTED = 1, 2, 3, 130
 """Exit statuses besides 0. 1: a characteristic is violated, or an agent failed; 2: scenario, arguments or exports are
@@ -39,6 +41,15 @@ class MachineError(HarnessError):
     """This machine cannot do what was asked."""
 
     exit_status = CANNOT_HERE
+
+
+class UnsupportedError(MachineError):
+    """An agent under test says that it lacks what the run needs: it is neither right nor wrong."""
+
+    @classmethod
+    def of(cls, agent_id: int, command: Sequence[str], words: str) -> Self:
+        """`words` are the agent's own, and may be none."""
+        return cls(f"not supported by agent {agent_id} ({shlex.join(command)}): {words or 'it does not say why'}")
 
 
 class InterruptedRunError(HarnessError):

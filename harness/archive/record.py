@@ -141,7 +141,8 @@ class HandlerRuns(_Model):
 
 
 class AgentRecord(_Model):
-    """`outcome` is exported, not exported, killed, rebooting, crashed, hung, paused, running or not started.
+    """`outcome` is exported, not exported, killed, rebooting, crashed, hung, broken, not supported, paused, running or
+    not started.
 
     Counters are those of all its lives, if it had more than one, and null if unknown.
     """
@@ -285,7 +286,9 @@ class JudgedRecord(_Model):
 
     schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
     roster: list[int]
-    outcome: Literal["running", "completed", "interrupted", "failed"] = "running"
+    outcome: Literal["running", "completed", "interrupted", "failed", "not supported"] = "running"
+    """Not supported: an agent said that it lacks what the run needs, and nothing is judged."""
+    outcome_detail: str | None = None
     network: list[NetworkState] = []
     faults: list[FaultRecord] = []
     final_reconcile: FinalReconcile | None = None
@@ -319,7 +322,6 @@ class RunRecord(JudgedRecord):
     versions: dict[str, str] = {}
     started_at: str | None = None
     wall_s: float | None = None
-    outcome_detail: str | None = None
     settled: bool = False
     vehicles: dict[AgentKey, dict[str, Any]] = {}
     unmatched_fates: list[str] = []

@@ -111,9 +111,11 @@ class Workshop:
         said = played.last_words.replace(f"{run_dir.parent}/", "")
         if played.status == INTERRUPTED:
             raise InterruptedRunError("interrupted")
+        archive = RunArchive(run_dir) if (run_dir / "run.json").is_file() else None
+        if archive is not None and archive.record.outcome == "not supported":
+            raise CannotBeTriedError(archive.record.outcome_detail or said)
         if played.status == CANNOT_HERE:
             raise MachineCannotError(said)
-        archive = RunArchive(run_dir) if (run_dir / "run.json").is_file() else None
         if played.status not in (0, VIOLATED, WRONG_REQUEST) or archive is None or not archive.exports.by_agent:
             raise CannotBeTriedError(said)
         return of_run(

@@ -19,6 +19,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.figures import figures
 from harness.checker.judgement import Judgement
 from harness.checker.records.doubt import in_doubt
+from harness.scenario.verdicts import JUDGED
 
 CHECKS = {
     "1": distributed.check,
@@ -73,10 +74,16 @@ class Result:
 
 def check(evidence: Evidence) -> Result:
     """Decide all six characteristics from the evidence, and what is judged beside them."""
+    chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}
+    if evidence.record is not None and evidence.record.outcome == "not supported":
+        reason = evidence.record.outcome_detail or "not supported by an agent"
+        unjudged = {key: Judgement(name, "not applicable", reason) for key, name in JUDGED.items()}
+        beside = {key: unjudged.pop(key) for key in BESIDE}
+        return Result(unjudged, figures(evidence), beside, evidence.errors, chains)
     return Result(
         {number: in_doubt(number, judge(evidence), evidence.examination) for number, judge in CHECKS.items()},
         figures(evidence),
         {key: judge(evidence) for key, judge in BESIDE.items()},
         evidence.errors,
-        {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()},
+        chains,
     )

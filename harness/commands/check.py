@@ -10,7 +10,7 @@ from harness import checker
 from harness.archive.archive import RunArchive
 from harness.checker.survival import survival
 from harness.commands.terminal import complain, print_json, show_programs, show_result, show_survival
-from harness.errors import VIOLATED, WRONG_REQUEST
+from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST
 from harness.report.programs import programs
 
 
@@ -33,5 +33,7 @@ def check_command(
         complain(error)
     if result.bad:
         raise typer.Exit(VIOLATED)
+    if archive.record.outcome == "not supported":
+        raise typer.Exit(CANNOT_HERE)
     if result.errors or not evidence.exports:
         raise typer.Exit(WRONG_REQUEST)

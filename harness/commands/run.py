@@ -80,10 +80,11 @@ def run_command(
         finished = run(request, chosen_seed, directory, shown, backend)
     finally:
         shown.close()
-    show_result(console, finished.result)
+    if finished.played.outcome != "not supported":
+        show_result(console, finished.result)
+        show_survival(console, finished.survival)
+        show_rogue(console, finished.rogue)
     show_programs(console, finished.record)
-    show_survival(console, finished.survival)
-    show_rogue(console, finished.rogue)
     _show_end(console, finished)
     raise typer.Exit(finished.exit_status)
 
@@ -118,7 +119,9 @@ def _with_options(
 
 
 def _show_end(console: Console, finished: Run) -> None:
-    if finished.played.outcome != "completed":
+    if finished.played.outcome == "not supported":
+        complain(f"{finished.played.outcome_detail}; nothing is judged")
+    elif finished.played.outcome != "completed":
         complain(f"{finished.played.outcome_detail}; what there was has been exported and checked")
     for error in finished.result.errors:
         complain(error)

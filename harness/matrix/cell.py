@@ -27,12 +27,20 @@ class Placed(BaseModel):
 
 
 class Run(Placed):
-    """What one run leaves here: figures, and the verdicts by number or key; or why it has none (`failed`)."""
+    """What one run leaves here: figures, and the verdicts by number or key.
+
+    Or why it has none: it `failed`, or an agent said that what it needs is `unsupported`.
+    """
 
     seed: int
     figures: dict[str, float | int | None] = {}
     verdicts: dict[str, Verdict] = {}
     failed: str | None = None
+    unsupported: str | None = None
+
+    @property
+    def judged(self) -> bool:
+        return self.failed is None and self.unsupported is None
 
     @property
     def task(self) -> Task:
@@ -40,7 +48,8 @@ class Run(Placed):
 
 
 class Cell(Placed):
-    """`runs` at one point, of which `failed` have no figures; an estimate per metric; how often each verdict fell.
+    """`runs` at one point, of which `failed` and `unsupported` have no figures; an estimate per metric; how often each
+    verdict fell.
 
     `violated` has the seeds of the runs that violated a characteristic, or what is judged beside them.
     """
@@ -50,6 +59,7 @@ class Cell(Placed):
     estimates: dict[str, Estimate]
     verdicts: dict[str, dict[Verdict, int]]
     violated: dict[str, list[int]]
+    unsupported: int = 0
 
     @property
     def finished(self) -> Estimate:
@@ -60,7 +70,9 @@ class Cell(Placed):
 
 
 def sum_up(point: Point, runs: Sequence[Run]) -> Cell:
-    judged = [run for run in runs if run.failed is None]
+    failed = sum(run.failed is not None for run in runs)
+    unsupported = sum(run.unsupported is not None for run in runs)
+    judged = [run for run in runs if run.judged]
     estimates = {metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS}
     before = {metric.name: metric.estimate(run.figures for run in judged) for metric in BEFORE_FINAL_RECONCILE}
     verdicts = {key: {run.seed: run.verdicts[key] for run in judged if key in run.verdicts} for key in JUDGED}
@@ -68,7 +80,8 @@ def sum_up(point: Point, runs: Sequence[Run]) -> Cell:
     return Cell(
         **point._asdict(),
         runs=len(runs),
-        failed=len(runs) - len(judged),
+        failed=failed,
+        unsupported=unsupported,
         estimates=estimates | {name: estimate for name, estimate in before.items() if estimate.n},
         verdicts={key: dict(Counter(by_seed.values())) for key, by_seed in verdicts.items() if by_seed},
         violated={key: seeds for key, seeds in bad.items() if seeds},

@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 
 from harness.matrix.record import MatrixRecord
-from harness.matrix.table import name_of, troubles
+from harness.matrix.table import name_of, troubles, unsupported
 from harness.present.junit import Case, to_xml
 
 
 def to_junit(record: MatrixRecord) -> str:
     """A cell fails if a run of it violated a characteristic or failed, or if it is worse than the baseline; a cell
-    without all its runs is skipped."""
+    without all its runs is skipped, and one that an agent does not support."""
     return to_xml(record.matrix.name, "matrix", record.started_at, record.wall_s, _cases(record))
 
 
@@ -19,6 +19,8 @@ def _cases(record: MatrixRecord) -> Iterator[Case]:
         name, cell = name_of(record.matrix, point), cells.get(point)
         if wrong := list(troubles(record, cell)) if cell else []:
             yield Case(name, wrong)
+        elif lacking := list(unsupported(record, cell)) if cell else []:
+            yield Case(name, skipped="; ".join(lacking))
         elif cell is None or cell.runs < len(record.matrix.seed_list):
             ended = cell.runs if cell else 0
             yield Case(name, skipped=f"interrupted: {ended} of {len(record.matrix.seed_list)} runs had ended")

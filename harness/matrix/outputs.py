@@ -49,7 +49,12 @@ def write(finished: Finished, directory: Path, nights: Nights | None = None) -> 
 
 
 def _cell_row(cell: Cell) -> dict[str, Any]:
-    row: dict[str, Any] = {**cell.point._asdict(), "runs": cell.runs, "failed": cell.failed}
+    row: dict[str, Any] = {
+        **cell.point._asdict(),
+        "runs": cell.runs,
+        "failed": cell.failed,
+        "unsupported": cell.unsupported,
+    }
     for metric in METRICS:
         estimate = cell.estimates[metric.name]
         row |= {metric.name: estimate.mean, f"{metric.name}_low": estimate.low, f"{metric.name}_high": estimate.high}
@@ -66,6 +71,7 @@ def _run_rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
             **{f"characteristic_{number}": run.verdicts.get(number) for number in CHARACTERISTICS},
             **{key: run.verdicts.get(key) for key in BESIDE},
             "failed": run.failed,
+            "unsupported": run.unsupported,
         }
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from harness.checker import Result
-from harness.errors import VIOLATED, HarnessError, InterruptedRunError
+from harness.errors import VIOLATED, HarnessError, InterruptedRunError, UnsupportedError
 from harness.gc_pause import gc_paused
 from harness.matrix.cell import Run
 from harness.matrix.model import Matrix, Point, Task
@@ -44,7 +44,10 @@ class Player:
     def __call__(self, task: Task) -> Run:
         scenario = self.matrix.scenario_at(task.point)
         in_memory = BACKENDS[task.point.backend].plays_in_memory
-        result = self.judge(scenario, task.seed) if in_memory else self._for_real(scenario, task)
+        try:
+            result = self.judge(scenario, task.seed) if in_memory else self._for_real(scenario, task)
+        except UnsupportedError as error:
+            return Run(**task.point._asdict(), seed=task.seed, unsupported=str(error))
         verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}
         return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts)
 
@@ -54,7 +57,7 @@ class Player:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
     def _for_real(self, scenario: Scenario, task: Task) -> Result:
-        """Raises RunFailedError, which names the run directory."""
+        """Raises UnsupportedError, or RunFailedError, which names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # of a run that was broken off
         try:
@@ -63,6 +66,8 @@ class Player:
             raise RunFailedError(f"{error}; see {directory}") from None
         if finished.played.outcome == "interrupted":
             raise InterruptedRunError(f"the run in {directory} was interrupted")
+        if finished.played.outcome == "not supported":
+            raise UnsupportedError(finished.played.outcome_detail)
         if finished.played.outcome == "failed":
             raise RunFailedError(f"{finished.played.outcome_detail}; see {directory}")
         if not finished.result.bad and self.matrix.keep == "violated":

@@ -5,7 +5,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
-from harness.errors import INTERRUPTED, VIOLATED
+from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED
 from harness.matrix.cell import Cell, Placed
 from harness.matrix.comparison import Comparison
 from harness.matrix.model import Matrix
@@ -13,7 +13,7 @@ from harness.matrix.model import Matrix
 SCHEMA = "ucp-matrix/1"
 
 
-class FailedRun(Placed):
+class RunWithoutResult(Placed):
     """A run without a result, and why."""
 
     seed: int
@@ -37,7 +37,9 @@ class MatrixRecord(BaseModel):
     wall_s: float
     outcome: Literal["completed", "interrupted"]
     cells: list[Cell]
-    failed: list[FailedRun] = []
+    failed: list[RunWithoutResult] = []
+    unsupported: list[RunWithoutResult] = []
+    """Those in which an agent said that it lacks what they need."""
     against: Comparison | None = None
 
     @property
@@ -50,11 +52,16 @@ class MatrixRecord(BaseModel):
 
     @property
     def exit_status(self) -> int:
-        """As documented for the command line; a run that failed counts like an agent that did."""
+        """As documented for the command line; a run that failed counts like an agent that did.
+
+        What is not supported is neither good nor bad, and this machine's agents cannot do it.
+        """
         if self.outcome == "interrupted":
             return INTERRUPTED
         regressed = self.against is not None and self.against.regressions
-        return VIOLATED if self.failed or regressed or any(cell.violated for cell in self.cells) else 0
+        if self.failed or regressed or any(cell.violated for cell in self.cells):
+            return VIOLATED
+        return CANNOT_HERE if self.unsupported else 0
 
     def to_json(self) -> dict[str, Any]:
         return self.model_dump(mode="json", by_alias=True)

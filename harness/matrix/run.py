@@ -13,7 +13,7 @@ from harness.matrix.cluster import cluster
 from harness.matrix.comparison import Comparison, compare
 from harness.matrix.model import Matrix, Point, Task
 from harness.matrix.play import Judge, Player, simulated
-from harness.matrix.record import FailedRun, MatrixRecord
+from harness.matrix.record import MatrixRecord, RunWithoutResult
 from harness.matrix.results import Results
 from harness.run.run import versions
 from harness.run.sweep import Failed, cores, sweep
@@ -76,7 +76,8 @@ def run_matrix(matrix: Matrix, results: Results, spread: Spread, judge: Judge = 
         wall_s=round(time.monotonic() - started, 1),
         outcome="interrupted" if interrupted else "completed",
         cells=[sum_up(point, its_runs) for point, its_runs in by_point.items()],
-        failed=[FailedRun(**run.point._asdict(), seed=run.seed, reason=run.failed) for run in runs if run.failed],
+        failed=[_without_result(run, run.failed) for run in runs if run.failed is not None],
+        unsupported=[_without_result(run, run.unsupported) for run in runs if run.unsupported is not None],
     )
     return Finished(record, runs)
 
@@ -86,6 +87,10 @@ def compared(finished: Finished, baseline: MatrixRecord, path: str) -> Finished:
     changes = list(compare(baseline.cells, finished.record.cells))
     comparison = Comparison(baseline=path, started_at=baseline.started_at, changes=changes)
     return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
+
+
+def _without_result(run: Run, reason: str) -> RunWithoutResult:
+    return RunWithoutResult(**run.point._asdict(), seed=run.seed, reason=reason)
 
 
 def _failed(task: Task, reason: str) -> Run:

@@ -14,6 +14,7 @@ from harness.matrix.table import (
     say_mean,
     troubles_of_all,
     unjudged,
+    unsupported_of_all,
     violated,
 )
 from harness.present import words
@@ -23,7 +24,7 @@ from harness.present.markdown import escaped, row
 def to_markdown(record: MatrixRecord) -> str:
     lines = [f"## {escaped(record.matrix.name)}", "", f"**{verdict(record)}**", "", *_table(record), ""]
     lines += [explanation(record) + unjudged(record), ""]
-    if findings := [*troubles_of_all(record), *improvements(record)]:
+    if findings := [*troubles_of_all(record), *unsupported_of_all(record), *improvements(record)]:
         lines += [*(f"- {escaped(sentence)}" for sentence in findings), ""]
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     lines += [f"<sub>Begun {words.started(record.started_at)}; {versions}</sub>"]
@@ -40,6 +41,8 @@ def verdict(record: MatrixRecord) -> str:
     parts.append(f"{bad} violated a characteristic" if bad else "none violated a characteristic")
     if record.failed:
         parts.append(f"{len(record.failed)} failed")
+    if record.unsupported:
+        parts.append(f"{len(record.unsupported)} not supported")
     if record.against:
         worse = len(record.against.regressions)
         which = f"{worse or 'no'} figure{'s' if worse > 1 else ''} worse"

@@ -26,8 +26,9 @@ def render(record: MatrixRecord) -> RenderableType:
             parts.append(Text(name, style="bold"))
         parts.append(_table(record, cells))
     notes = (Text(note, style="red") for note in troubles_of_all(record))
+    lacking = (Text(note, style="yellow") for note in unsupported_of_all(record))
     better = (Text(note, style="green") for note in improvements(record))
-    return Group(*parts, Text(explanation(record) + unjudged(record), style="dim"), *notes, *better)
+    return Group(*parts, Text(explanation(record) + unjudged(record), style="dim"), *notes, *lacking, *better)
 
 
 def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
@@ -139,6 +140,17 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
             yield _say_change(change)
 
 
+def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:
+    """What an agent lacks for runs of this cell: each sentence once."""
+    return dict.fromkeys(run.reason for run in record.unsupported if run.point == cell.point)
+
+
+def unsupported_of_all(record: MatrixRecord) -> Iterable[str]:
+    for cell in record.cells:
+        for sentence in unsupported(record, cell):
+            yield f"{name_of(record.matrix, cell.point)}: {sentence}"
+
+
 def troubles_of_all(record: MatrixRecord) -> Iterable[str]:
     for cell in record.cells:
         for sentence in troubles(record, cell):
@@ -169,6 +181,8 @@ def _finished(cell: Cell) -> Text:
 
 def _violated(cell: Cell) -> Text:
     runs = violated(cell)
+    if cell.unsupported == cell.runs:
+        return Text("\u2013")
     if cell.failed:
         return Text(f"{runs} + {cell.failed}", style="bold red")
     return Text(str(runs), style="bold red" if runs else "green")

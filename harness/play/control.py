@@ -54,6 +54,10 @@ class AgentRefusedError(HarnessError):
     exit_status = VIOLATED
 
 
+class AgentUnsupportedError(AgentRefusedError):
+    """The agent answered that it does not have this command, or what it asks for."""
+
+
 class AgentControl:
     """One connection, made anew when it breaks; one command at a time."""
 
@@ -63,7 +67,10 @@ class AgentControl:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, command: str, *, timeout_s: float, **arguments: Any) -> dict[str, Any]:
-        """The agent's answer. Raises AgentSilentError or AgentRefusedError. `timeout_s` is wall time."""
+        """The agent's answer, within `timeout_s` of wall time.
+
+        Raises AgentSilentError, AgentRefusedError, AgentUnsupportedError.
+        """
         async with self._lock:
             try:
                 async with asyncio.timeout(timeout_s):
@@ -76,7 +83,8 @@ class AgentControl:
                 self.close()  # an answer is still to come on this connection, and would be taken for the next one's
                 raise
         if not answer.get("ok"):
-            raise AgentRefusedError(str(answer.get("error", "no reason given")))
+            refused = AgentUnsupportedError if answer.get("unsupported") is True else AgentRefusedError
+            raise refused(str(answer.get("error", "no reason given")))
         return answer
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from harness.errors import HarnessError
+from harness.errors import HarnessError, UnsupportedError
 from harness.scenario import Scenario
 from harness.scenario.changes import RANGE, Change, final_reconcile, timeline_of
 from harness.scenario.fates import Fate
@@ -17,7 +17,7 @@ from ucp.trace import HandlerRun
 MAX_FINAL_ROUNDS = 20
 """Bound on the rounds of a final reconcile; each lets every agent reconcile once."""
 
-Outcome = Literal["completed", "interrupted", "failed"]
+Outcome = Literal["completed", "interrupted", "failed", "not supported"]
 
 
 @dataclass
@@ -42,7 +42,7 @@ class RunOutcome:
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:
         """The mission did not come to its end, because of `error`."""
-        self.outcome = outcome
+        self.outcome = "not supported" if isinstance(error, UnsupportedError) else outcome
         self.outcome_detail = str(error)
         self.exit_status = error.exit_status
 

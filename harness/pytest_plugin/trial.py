@@ -29,6 +29,8 @@ class Trial:
             finished = self._finish(True)
         except HarnessError as error:
             raise pytest.fail.Exception(str(error), pytrace=False) from None
+        if finished.played.outcome == "not supported":
+            pytest.skip(finished.played.outcome_detail or "not supported")
         if lines := self._unexpected(finished):
             pytest.fail("\n".join([*lines, f"report: {finished.report}"]), pytrace=False)
         self.passed = True

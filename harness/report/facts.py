@@ -56,6 +56,8 @@ def outcome(record: RunRecord) -> tuple[str, str] | None:
     detail = record.outcome_detail
     if record.outcome == "running":
         return "This run has not recorded its end", detail or "It is still going on, or it was killed."
+    if record.outcome == "not supported":
+        return "This run is not judged", detail or "An agent said that it lacks what the run needs."
     return f"This run did not complete: {record.outcome}", detail or ""
 
 

@@ -19,6 +19,9 @@ def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> str:
 
 def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[Case]:
     judged, expect = verdicts(record), (record.scenario and record.scenario.expect) or Expect()
+    if record.outcome == "not supported":
+        yield Case("run", skipped=record.outcome_detail or record.outcome)
+        return
     if wrong := [*_wrong_with_run(record), *([] if judged else ["There is no verdict."])]:
         yield Case("run", wrong)
     for verdict in judged:

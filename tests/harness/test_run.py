@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from tests.harness.command import COMMAND, DEADLINE_S, Running, harness, processes, sentences, write_scenario
+from tests.harness.unsupported import lacking, refusing_to_start
 
 pytestmark = pytest.mark.lab
 
@@ -317,6 +318,45 @@ def test_an_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> 
     assert done.returncode == 1
     assert re.match(r"agent \d ended by itself with status 4; its log is agents/\d\.log", sentences(done.stderr)[0])
     assert (tmp_path / "run" / "agents" / "1.log").read_text() == "no licence\n"
+
+
+@pytest.mark.parametrize("words", ["mine has no telemetry", ""])
+def test_an_agent_that_ends_with_127_at_its_start_is_not_judged(tmp_path: Path, words: str) -> None:
+    agent = refusing_to_start(tmp_path / "my-agent", words)
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command={2: [str(agent), "--x"]})
+    done = harness("run", scenario, "--out", tmp_path / "run")
+    assert done.returncode == 3
+    why = f"not supported by agent 2 ({shlex.quote(str(agent))} --x): {words or 'it does not say why'}"
+    assert sentences(done.stderr) == [f"{why}; nothing is judged"]
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (record["outcome"], record["outcome_detail"]) == ("not supported", why)
+    assert set(verdicts(record).values()) == {"not applicable"}
+    assert record["agents"]["2"]["outcome"] == "not supported"
+    assert "This run is not judged" in (tmp_path / "run" / "report.html").read_text()
+    assert 'failures="0"' in (tmp_path / "run" / "junit.xml").read_text()
+    assert harness("check", tmp_path / "run").returncode == 3
+
+
+def test_what_is_not_supported_half_way_leaves_no_verdict_either(tmp_path: Path) -> None:
+    command = lacking(tmp_path / "my_agent.py", "stop_events")
+    keys = {"vehicles": {"kind": "none"}, "timeline": [{"at_s": 60, "stop_events": [2]}]}
+    done = harness("run", write_scenario(tmp_path, agent_command={2: command}, **keys), "--out", tmp_path / "run")
+    assert done.returncode == 3
+    asked = f"not supported by agent 2 ({shlex.join(command)}): asked to stop_events, it says: mine has no stop_events"
+    assert sentences(done.stderr) == [f"{asked}; nothing is judged"]
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert set(verdicts(record).values()) == {"not applicable"}
+    assert 60 <= record["mission_s"] < 200
+    assert record["agents"]["1"]["outcome"] == "exported"
+
+
+def test_a_shell_that_does_not_find_the_agent_is_a_failure_and_no_agent_that_lacks_something(tmp_path: Path) -> None:
+    agent = executable(tmp_path / "my-agent", '#!/bin/sh\nno_such_program "$1"\n')
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command={2: [str(agent)]})
+    done = harness("run", scenario, "--out", tmp_path / "run")
+    assert done.returncode == 1
+    assert "agent 2 ended by itself with status 127 (" in sentences(done.stderr)[0]
+    assert "no_such_program: not found); its log is agents/2.log" in sentences(done.stderr)[0]
 
 
 def test_a_lab_that_dies_is_blamed_and_not_the_agents_that_die_with_it(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from harness.errors import ScenarioError
 from harness.stories.text import read_story
+from tests.harness.unsupported import refusing_to_start
 from tests.pytest_plugin.inner import no_internals, run, run_directories
 
 pytest_plugins = "pytester"
@@ -110,6 +111,16 @@ def test_files_of_others_are_left_alone(pytester: pytest.Pytester) -> None:
     write(pytester, "Scenario: trader is alerted\nGiven a stock\n", "trader.story")
     (pytester.path / "binary.story").write_bytes(b"\xff\xfe1 s: x\n")
     run(pytester).assert_outcomes()
+
+
+@pytest.mark.lab
+def test_what_an_agent_does_not_support_is_skipped(pytester: pytest.Pytester) -> None:
+    agent = refusing_to_start(pytester.path / "agent")
+    pytester.makepyfile("def test_waits(swarm):\n    swarm.run_for(60)\n")
+    command = f"2={shlex.quote(str(agent))}"
+    result = run(pytester, written(pytester), ".", "--ucp-backend", "process", "--ucp-agent", command, "-rs")
+    result.assert_outcomes(skipped=2)
+    result.stdout.fnmatch_lines(["SKIPPED * not supported by agent 2 (*/agent): mine has no telemetry"] * 2)
 
 
 @pytest.mark.parametrize(

@@ -22,13 +22,14 @@ MAX_ROWS = 12_000
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """`href` is the report of the run if it was kept; `failed` why it has no verdicts and figures."""
+    """`href` is the report of the run if it was kept; `failed` and `unsupported` why it has no verdicts and figures."""
 
     seed: int
     href: str | None
     verdicts: list[str]
     figures: list[str]
     failed: str | None
+    unsupported: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
     room = MAX_ROWS // max(1, len(by_point))
     cells = []
     for point, runs in by_point:
-        runs.sort(key=lambda run: (run.failed is None, not _bad(run)))
+        runs.sort(key=lambda run: (run.failed is None, not _bad(run), run.judged))
         figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
         played = ["ucp-harness", "run", scenario_file(point), "--backend", point.backend, "--seed", str(runs[0].seed)]
         cells.append(
@@ -73,6 +74,8 @@ def _count(runs: Sequence[Run]) -> str:
         counts.append(f"{number} judged bad")
     if number := sum(run.failed is not None for run in runs):
         counts.append(f"{number} failed")
+    if number := sum(run.unsupported is not None for run in runs):
+        counts.append(f"{number} not supported")
     return ", ".join(counts)
 
 
@@ -85,7 +88,8 @@ def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:
     return Row(
         run.seed,
         kept if (directory / kept).exists() else None,
-        [] if run.failed is not None else [ICONS[kind_of(run.verdicts.get(key, ""))] for key in JUDGED],
-        [] if run.failed is not None else [words.value(run.figures.get(name)) for name in figures],
+        [] if not run.judged else [ICONS[kind_of(run.verdicts.get(key, ""))] for key in JUDGED],
+        [] if not run.judged else [words.value(run.figures.get(name)) for name in figures],
         run.failed,
+        run.unsupported,
     )

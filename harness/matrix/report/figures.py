@@ -35,7 +35,7 @@ class Figure:
 
     def of(self, cell: Cell) -> Estimate:
         if self.metric is _VIOLATED:
-            return estimate_share(violated(cell), cell.runs - cell.failed)
+            return estimate_share(violated(cell), cell.runs - cell.failed - cell.unsupported)
         if self.metric is _FINISHED:
             return cell.finished
         return cell.estimates.get(self.metric.name, Estimate(n=0))

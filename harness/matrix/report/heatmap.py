@@ -128,6 +128,8 @@ def _marks(record: MatrixRecord, figure: Figure, cell: Cell) -> list[Mark]:
         marks.append(Mark("\u2717", f"{number} violated", "bad"))
     if cell.failed:
         marks.append(Mark("!", f"{cell.failed} failed", "bad"))
+    if cell.unsupported:
+        marks.append(Mark("\u2013", f"{cell.unsupported} not supported", "good"))
     for change in record.against.changes if record.against else ():
         if change.point == cell.point and change.metric == figure.metric.name:
             up = change.now.mean is not None and change.before.mean is not None and change.now.mean > change.before.mean

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from harness.errors import CANNOT_HERE
 from harness.matrix.nights import Nights
 from harness.matrix.picture import draw, series_of
 from harness.matrix.record import MatrixRecord
@@ -63,7 +64,7 @@ def _kind(record: MatrixRecord) -> str:
     """For the style sheet: half a matrix is no success."""
     if record.outcome == "interrupted":
         return "violated" if record.failed or any(cell.violated for cell in record.cells) else "unknown"
-    return "violated" if record.exit_status else "holds"
+    return {0: "holds", CANNOT_HERE: "unknown"}.get(record.exit_status, "violated")
 
 
 def _summary(record: MatrixRecord) -> list[str]:

@@ -21,8 +21,9 @@ from pydantic import ValidationError
 
 from harness.archive.directory import RunDirectory
 from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
-from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError
-from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, Status
+from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError, UnsupportedError
+from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, AgentUnsupportedError, Status
+from harness.play.last_words import UNSUPPORTED, last_words, last_words_in, of_a_shell
 from harness.play.process.lab import MissionLab, Program
 from harness.play.process.mission_file import mission_file
 from harness.scenario import Scenario
@@ -150,7 +151,7 @@ class AgentProcess:
         """Start the program and wait until it answers; with `epoch_us` it joins the mission that began then.
 
         With `keeps_disk` it stores what it holds, to be rebooted with it.
-        Raises AgentFailedError, AgentRefusedError.
+        Raises AgentFailedError, AgentRefusedError, UnsupportedError.
         """
         life = self._begin_life()
         mission = mission_file(
@@ -202,7 +203,7 @@ class AgentProcess:
                 await asyncio.sleep(ASK_AGAIN_S)
 
     async def watch(self) -> None:
-        """Raises AgentFailedError when the process ends."""
+        """Raises AgentFailedError when the process ends, or UnsupportedError."""
         assert self._process is not None
         await self._process.wait()
         raise self._crashed(self._process)
@@ -253,9 +254,11 @@ class AgentProcess:
     # What it is asked
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Raises AgentFailedError if the agent does not answer, AgentRefusedError if it cannot."""
+        """Raises AgentFailedError if the agent does not answer, AgentRefusedError if it cannot, UnsupportedError."""
         try:
             return await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
+        except AgentUnsupportedError as error:
+            raise self._unsupported(f"asked to {command}, it says: {last_words(str(error))}") from None
         except AgentRefusedError as error:
             raise AgentRefusedError(f"agent {self.agent_id} refused to {command}: {error}") from None
         except AgentSilentError as error:
@@ -384,8 +387,20 @@ class AgentProcess:
     def _log(self) -> Path:
         return self._lives[-1].directory / f"{self.agent_id}.log"
 
-    def _crashed(self, process: Program) -> AgentFailedError:
-        return self._failed("crashed", f"ended by itself with {process.end}")
+    def _crashed(self, process: Program) -> HarnessError:
+        """What it means that it has ended: at its start it may say that it lacks what the mission needs."""
+        status = self._lives[-1].status
+        words = last_words_in(self._log)
+        if process.returncode != UNSUPPORTED or (status is not None and status.started):
+            return self._failed("crashed", f"ended by itself with {process.end}")
+        if of_a_shell(words):
+            return self._failed("crashed", f"ended by itself with {process.end} ({words})")
+        return self._unsupported(words)
+
+    def _unsupported(self, words: str) -> UnsupportedError:
+        error = UnsupportedError.of(self.agent_id, self._command, words)
+        self.outcome, self.detail = "not supported", str(error)
+        return error
 
     def _failed(self, outcome: str, detail: str) -> AgentFailedError:
         self.outcome, self.detail = outcome, detail

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 import signal
 import subprocess
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from harness.matrix import MatrixRecord
 from tests.harness.command import COMMAND, DEADLINE_S, harness, processes, sentences
+from tests.harness.unsupported import refusing_to_start
 
 
 def written(directory: Path, **keys: Any) -> Path:
@@ -130,6 +132,22 @@ def test_a_run_whose_agent_crashes_is_a_result_and_is_kept(tmp_path: Path) -> No
         kept = tmp_path / "out" / "runs" / f"loss-{run.loss}-agents-2-process-seed-1"
         assert run.reason.endswith(f"; see {kept}")
         assert (kept / "run.json").exists()
+
+
+@pytest.mark.lab
+def test_what_an_agent_does_not_support_is_neither_failed_nor_violated(tmp_path: Path) -> None:
+    agent = refusing_to_start(tmp_path / "agent")
+    scenario = {"agents": 2, "duration_s": 60, "vehicles": {"kind": "none"}, "agent_command": {1: [str(agent)]}}
+    asked = written(tmp_path, scenario=scenario, loss=[0.0], seeds=1, backend="process")
+    done = harness("matrix", asked, "--out", tmp_path / "out")
+    assert done.returncode == 3, done.stderr
+    record = MatrixRecord.model_validate_json((tmp_path / "out" / "matrix.json").read_text())
+    (run,) = record.unsupported
+    assert run.reason == f"not supported by agent 1 ({shlex.quote(str(agent))}): mine has no telemetry"
+    assert "mine has no telemetry" in " ".join(done.stdout.split())
+    assert (record.failed, record.cells[0].violated, record.cells[0].unsupported) == ([], {}, 1)
+    assert "<skipped message=" in (tmp_path / "out" / "junit.xml").read_text()
+    assert "1 not supported" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_what_a_backend_cannot_play_is_refused_before_anything_is_played(tmp_path: Path) -> None:
