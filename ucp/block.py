@@ -13,6 +13,9 @@ from ucp.wire import Kind, struct_of
 HASH_BYTES = 32
 MAX_EVENT_DATA_BYTES = 1024
 MAX_AGENT_ID = 0xFFFF
+LATEST_US = 2**64 - 1
+"""No timestamp is later."""
+
 CHAIN_HASHES_KEPT = 4096
 """Agents of one process, and who judges them, come upon the same ones again and again."""
 

@@ -4,7 +4,7 @@ A full block waits in the deque, is proposed to the local UVS, and is committed 
 Anything else means that chains have parted, and starts a reconcile.
 """
 
-from ucp.block import Block, next_chain_hash
+from ucp.block import LATEST_US, Block, next_chain_hash
 from ucp.core import Core
 from ucp.events import LoggableEvent
 from ucp.handler import event_handler
@@ -18,8 +18,8 @@ def build_data_block(core: Core, event: LoggableEvent) -> str:
     if len(core.current_block) + core.settings.max_event_bytes < core.settings.max_block_bytes:
         return "building"
     # The newest event's timestamp (Section 4.2). A clock that stands still must not make two equal blocks
-    # (Section 3.4.2), so a block is at least a microsecond younger than the agent's last.
-    timestamp_us = max(event.timestamp_us, core.newest_block_timestamp_us + 1)
+    # (Section 3.4.2), so a block is at least a microsecond younger than the agent's last, as long as there is time.
+    timestamp_us = min(max(event.timestamp_us, core.newest_block_timestamp_us + 1), LATEST_US)
     core.complete(Block(core.agent_id, timestamp_us, bytes(core.current_block)))
     core.current_block.clear()
     core.trigger("Process Next Deque Block")

@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import Any, BinaryIO
 
+CHUNK_BYTES = 64 * 1024
+
 
 def write_json_atomically(path: Path, document: dict[str, Any]) -> None:
     """Write JSON as `write_atomically` does."""
@@ -33,12 +35,16 @@ def write_atomically(path: Path, text: str) -> None:
 class TraceFile:
     """Appends whole lines; once the disk refuses one, stops for good and keeps what was written.
 
-    `problem` then says why, so that a trace that ends early is not mistaken for an agent that fell silent.
+    Half a line, over which an earlier life of the agent was killed, is cut away. `problem` says why
+    it stopped, so that a trace that ends early is not mistaken for an agent that fell silent.
     """
 
     def __init__(self, path: Path) -> None:
         self.problem: str | None = None
-        self._file: BinaryIO = path.open("ab", buffering=0)
+        self._file: BinaryIO = path.open("a+b", buffering=0)
+        end = _end_of_last_line(self._file)
+        self._file.truncate(end)
+        self._file.seek(end)
 
     def write(self, lines: str) -> None:
         if self.problem is not None or not lines:
@@ -56,3 +62,16 @@ class TraceFile:
 
     def close(self) -> None:
         self._file.close()
+
+
+def _end_of_last_line(file: BinaryIO) -> int:
+    """Where the last whole line of the file ends; 0 if it has none."""
+    end = file.seek(0, os.SEEK_END)
+    while end:
+        begin = max(0, end - CHUNK_BYTES)
+        file.seek(begin)
+        newline = file.read(end - begin).rfind(b"\n")
+        if newline >= 0:
+            return begin + newline + 1
+        end = begin
+    return 0

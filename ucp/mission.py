@@ -19,6 +19,7 @@ from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
 SCHEMA = "ucp-mission/1"
 MAX_MISSION_BYTES = 4 * 1024 * 1024
+LATEST_EPOCH_US = 2**63 - 1
 MAX_NAME = 40
 """More of a wrong name is not shown."""
 
@@ -106,7 +107,7 @@ def parse_mission(document: Any) -> Mission:
     if agent_id not in roster:
         raise MissionError(f"`agent_id` {agent_id} is not on the `roster`")
     epoch_us = document.get("epoch_us")
-    if epoch_us is not None and (type(epoch_us) is not int or epoch_us < 0):
+    if epoch_us is not None and (type(epoch_us) is not int or not 0 <= epoch_us <= LATEST_EPOCH_US):
         raise MissionError("`epoch_us` must be microseconds since the Unix epoch, or null to wait for `start`")
     store = document.get("store")
     if store is not None and (not isinstance(store, str) or not store):

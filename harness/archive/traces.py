@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 
 SUFFIX = ".trace.jsonl"
-MAX_LINE_BYTES = 1024 * 1024
+MAX_LINE_BYTES = 16 * 1024 * 1024
 LARGEST = 2**64
 """No whole number in a header is as large; larger ones are none that a float can hold."""
 PLACES = ("chain", "deque", "stack")

@@ -38,6 +38,13 @@ def test_blocks_completed_in_the_same_microsecond_still_differ() -> None:
     assert air.fill_block(1) != air.fill_block(1)
 
 
+def test_no_block_is_later_than_the_last_timestamp() -> None:
+    agent = Air([1]).agents[1]
+    for number in range(6):
+        agent.add_event(LoggableEvent(2**64 - 1, 1 + number, bytes(256)), 0.0)
+    assert [block.timestamp_us for block in agent.state.blocks_to_be_committed] == [2**64 - 1] * 2
+
+
 def test_an_event_larger_than_the_mission_s_largest_is_refused() -> None:
     agent = Air([1]).agents[1]
     with pytest.raises(ValueError, match="max_event_bytes 267"):

@@ -21,6 +21,7 @@ from harness.archive.exports import read_export
 from harness.archive.traces import read_trace
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError
 from ucp.block import Block, InceptionBlock, next_chain_hash
+from ucp.files import TraceFile
 from ucp.messages import BlockAddRequest, CommitBlock, RequestForBlock, decode, encode
 from ucp.mission import parse_mission
 from ucp.node import Node
@@ -439,6 +440,16 @@ def test_what_an_agent_sends_is_traced_and_stored_before(tmp_path: Path) -> None
     node = Node(parse_mission(mission(store="7.store")), tmp_path)
     asyncio.run(fly())
     assert len(sent) == 1
+
+
+@pytest.mark.parametrize("left", ["", "{}\n", '{}\n{"t":1,"ha', '{"t":1,"ha' * 20000, "{}\n" + "x" * 100_000])
+def test_half_a_line_that_a_killed_agent_left_is_cut_away_before_its_trace_goes_on(tmp_path: Path, left: str) -> None:
+    path = tmp_path / "7.trace.jsonl"
+    path.write_text(left)
+    trace = TraceFile(path)
+    trace.write('{"schema"}\n')
+    trace.close()
+    assert path.read_text() == ("{}\n" if left.startswith("{}") else "") + '{"schema"}\n'
 
 
 def test_an_agent_that_joins_late_logs_no_events_of_before(directory: Path) -> None:

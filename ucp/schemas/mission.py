@@ -4,7 +4,7 @@ import dataclasses
 from typing import get_args
 
 from ucp.block import MAX_EVENT_DATA_BYTES
-from ucp.mission import SCHEMA
+from ucp.mission import LATEST_EPOCH_US, SCHEMA
 from ucp.schemas.parts import AGENT_ID, BASE64, FLAG, ROSTER, Schema, listed, record
 from ucp.settings import Phase1Tie, Phase2Tie, Settings
 from ucp.telemetry import EVENT_KINDS
@@ -64,7 +64,7 @@ def schema() -> Schema:
             "quirks": {"type": "object", "additionalProperties": {"type": ["boolean", "number"]}},
             "seed": {"type": "integer", "minimum": 0, "maximum": 2**64 - 1},
             "speedup": ABOVE_0,
-            "epoch_us": {"type": ["integer", "null"], "minimum": 0},
+            "epoch_us": {"type": ["integer", "null"], "minimum": 0, "maximum": LATEST_EPOCH_US},
             "store": {"type": ["string", "null"], "minLength": 1},
         },
         optional=("contract", "features", "settings", "quirks", "epoch_us", "store"),

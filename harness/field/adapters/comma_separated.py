@@ -39,7 +39,7 @@ KINDS = ("trace", "sent", "received", "event", "export")
 MAX_BYTES = 1024 * 1024 * 1024
 MAX_LINES_OF_A_ROW = 20_000
 """An export that a spreadsheet or a person has laid out over lines."""
-MAX_ROW_BYTES = 64 * MAX_LINE_BYTES
+MAX_ROW_BYTES = 4 * MAX_LINE_BYTES
 LAST_NS = 2**63 - 1
 MAX_EVENT_ID = 254
 _SEPARATORS = (",", ";", "\t")
