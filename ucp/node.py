@@ -1,4 +1,4 @@
-"""One agent as a process: `python -m ucp.node MISSION_FILE`.
+"""One agent as a process: `python -m ucp.node MISSION_FILE`. With `--virtual` it is `ucp.virtual`.
 
 It drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source, and leaves its files beside
 the mission file: `<id>.chain.json`, `<id>.trace.jsonl`, `<id>.log`, and the control socket `<id>.control` while it
@@ -29,6 +29,7 @@ from ucp.features import UNSUPPORTED
 from ucp.files import TraceFile, write_json_atomically
 from ucp.mission import Mission, MissionError, UnsupportedMissionError, load_mission
 from ucp.quirks import check_quirk, wrong_handlers
+from ucp.status import status_of
 from ucp.store import Store, StoreError
 from ucp.telemetry import TelemetryEvents, follow
 from ucp.trace import Commanded, Entry, HandlerRun, header_line
@@ -227,24 +228,12 @@ class Node:
     # Commands of the control socket
 
     def _status(self, request: dict[str, Any]) -> dict[str, Any]:
-        agent, state = self.agent, self.agent.state
         return {
-            "agent_id": agent.agent_id,
+            **status_of(self.agent),
             "started": self.clock.running,
             "mission_s": round(self.clock.now(), 3),
             "generating": self.generating,
-            "idle": state.idle,
-            "reconcile_in_progress": state.reconcile_in_progress,
-            "chain": len(state.chain),
-            "deque": len(state.blocks_to_be_committed),
-            "stack": len(state.reconcile_stack),
-            "top_chain_hash": state.chain.top_chain_hash.hex(),
-            "completed": len(state.completed),
-            "reconciles": state.reconciles,
             "handled": self.handled,
-            "sent": dict(state.sent),
-            "received": dict(agent.received),
-            "dropped": dict(agent.dropped),
             "bytes_sent": self.bytes_sent,
             "send_failures": self.send_failures,
             "trace_problem": self._trace.problem,
@@ -327,8 +316,12 @@ def _broadcast_socket(mission: Mission) -> socket.socket:
 
 def main(arguments: list[str]) -> int:
     """Exit status 0; 1: no export; 2: the mission file is wrong, or its port in use; 127: it lacks a feature."""
+    if arguments == ["--virtual"]:
+        from ucp.virtual import main as serve
+
+        return serve()
     if len(arguments) != 1:
-        sys.stderr.write("usage: python -m ucp.node MISSION_FILE\n")
+        sys.stderr.write("usage: python -m ucp.node MISSION_FILE, or --virtual\n")
         return WRONG_MISSION
     path = Path(arguments[0])
     try:

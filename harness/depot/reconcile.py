@@ -57,10 +57,11 @@ def reconcile(record: Consolidation, say: Callable[[str], None] = lambda words: 
     at_us = max(export.exported_at_us for export in home.exports.values()) + round(swarm.now() * MICROSECONDS)
     maker = ExportMaker()
     exports = {
-        life.agent.agent_id: maker.export(life.agent.state, at_us).model_copy(
+        life.agent.agent_id: maker.export(life.state, at_us).model_copy(
             update={"current_block": home.exports[life.agent.agent_id].current_block}
         )
         for life in swarm.living()
+        if life.state is not None
     }
     return Reconciliation(exports, _line(record, exports, rounds))
 

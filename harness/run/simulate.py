@@ -4,19 +4,23 @@ The checker is that of any other run; the evidence comes straight from the agent
 """
 
 from collections.abc import Coroutine, Mapping
+from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from harness import checker
-from harness.archive.exports import Export, ExportMaker
+from harness.archive.exports import SUFFIX, Export, ExportMaker, export_of
 from harness.archive.record import JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
 from harness.checker.evidence import InjectedDatagram, RogueTraffic
+from harness.errors import ExportError
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
-from harness.play.simulation.backend import Incarnation, Simulation
+from harness.play.simulation.backend import Simulation
+from harness.play.simulation.lives import Incarnation
 from harness.play.simulation.on_disk import header
 from harness.play.simulation.virtual_time import VirtualTime
 from harness.scenario import Scenario
@@ -49,9 +53,10 @@ def simulate_in_memory(memory: "InMemory", scenario: Scenario, seed: int, **opti
     """As `simulate`; `memory` keeps the run, and `options` are the simulation's."""
     VirtualTime().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
-    without_waiting(mission.play(simulation, scenario))
-    simulation.end()
-    evidence = memory.evidence(simulation)
+    with closing(simulation):
+        without_waiting(mission.play(simulation, scenario))
+        simulation.end()
+        evidence = memory.evidence(simulation)
     return Simulated(simulation.played, evidence, checker.check(evidence))
 
 
@@ -123,10 +128,21 @@ class InMemory:
                 "agents": simulation.played.agents,
             }
         )
-        return Evidence(self._exports(simulation), self._traces, record, [], self._kept, self._injected)
+        errors: list[str] = []
+        exports = self._exports(simulation, errors)
+        return Evidence(exports, self._traces, record, errors, self._kept, self._injected)
 
-    def _exports(self, simulation: Simulation) -> dict[int, Export]:
-        return {
-            life.agent.agent_id: self._maker.export(life.agent.state, simulation.timestamp_us(life))
-            for life in simulation.exporting()
-        }
+    def _exports(self, simulation: Simulation, errors: list[str] | None = None) -> dict[int, Export]:
+        """Those that can be used; of each of the others `errors` gets a sentence."""
+        exports = {}
+        for life in simulation.exporting():
+            agent_id = life.agent.agent_id
+            if life.state is not None:
+                exports[agent_id] = self._maker.export(life.state, simulation.timestamp_us(life))
+                continue
+            try:
+                exports[agent_id] = export_of(Path(f"{agent_id}{SUFFIX}"), simulation.export_of(life))
+            except ExportError as error:
+                if errors is not None:
+                    errors.append(str(error))
+        return exports

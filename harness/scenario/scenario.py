@@ -49,6 +49,14 @@ class Clock(Model):
     offset_s: Annotated[float, Field(ge=-1e10, le=1e10)] = 0.0
     drift: Annotated[float, Field(gt=-0.5, le=1.0)] = 0.0
 
+    def shows(self, mission_s: float) -> float:
+        """What it shows then."""
+        return self.offset_s + (1 + self.drift) * mission_s
+
+    def mission_s(self, shown_s: float) -> float:
+        """When it shows that."""
+        return (shown_s - self.offset_s) / (1 + self.drift)
+
 
 class Scenario(Model):
     """One experiment. Times are mission seconds."""

@@ -85,14 +85,14 @@ microseconds, None for that of the agent's clock."""
 
 
 @dataclass(frozen=True, slots=True)
-class RogueDatagram:
-    """A datagram that no agent has sent, under the address of vehicle `source`."""
+class StrayDatagram:
+    """A datagram that is no message of the agent at whose address, that of vehicle `source`, it is sent."""
 
     source: int
     datagram: bytes
 
 
-Happening = tuple[float, int, int, InFlight | Logged | RogueDatagram | None]
+Happening = tuple[float, int, int, InFlight | Logged | StrayDatagram | None]
 """(mission seconds, rank, number of the agent, what): a message, an event, or None for the end of a timer.
 
 The number after the last agent's is the rogue node's.
@@ -156,12 +156,18 @@ class VirtualAir:
         coming = sorted(happening[:3] for happening in self._coming if happening[3] is None)
         return list(dict.fromkeys(number for at, _, number in coming if ends.get(number) == at))
 
-    def inject(self, at: float, stray: RogueDatagram, numbers: Iterable[int]) -> None:
+    def inject(self, at: float, stray: StrayDatagram, numbers: Iterable[int]) -> None:
         """`stray` reaches the agents with these numbers at `at`."""
         self._rank += 1
         self.quiet_at = max(self.quiet_at, at)
         for number in numbers:
             heappush(self._coming, (at, self._rank, number, stray))
+
+    def broadcast_stray(self, now: float, number: int, datagram: bytes) -> None:
+        """The agent with this number sends what is no message of its own. No fate is about it."""
+        stray = StrayDatagram(self._roster[number], datagram)
+        for receiver, delay in self._medium.draw(number, now, len(datagram)).to_all():
+            self.inject(now + delay, stray, [receiver])
 
     def broadcast(
         self,

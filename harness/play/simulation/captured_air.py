@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from harness.play.simulation.air import Happening, InFlight, RogueDatagram, VirtualAir
+from harness.play.simulation.air import Happening, InFlight, StrayDatagram, VirtualAir
 from netem.capture import begin_file
 from netem.frames import udp_broadcast
 from netem.pcapng import PcapngFile
@@ -65,10 +65,14 @@ class CapturedAir(VirtualAir):
             if isinstance(what, InFlight):
                 frame = _frame(what.sender, what.sequence, what.message)
                 self._capture.take_down(at, number, frame, outbound=False)
-            elif isinstance(what, RogueDatagram):
+            elif isinstance(what, StrayDatagram):
                 frame = udp_broadcast(what.source, PORT, what.datagram)
                 self._capture.take_down(at, number, frame, outbound=False)
             yield happening
+
+    def broadcast_stray(self, now: float, number: int, datagram: bytes) -> None:
+        self._capture.take_down(now, number, udp_broadcast(self._roster[number], PORT, datagram), outbound=True)
+        super().broadcast_stray(now, number, datagram)
 
     def broadcast(
         self,

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from harness.archive.directory import RunDirectory
-from harness.play.simulation.backend import Incarnation, Simulation
+from harness.play.simulation.backend import Simulation
+from harness.play.simulation.lives import Incarnation
 from netem.radio import Place
-from ucp.export import export_chain
 from ucp.files import TraceFile, write_json_atomically
 from ucp.trace import Entry, header_line
 
@@ -50,7 +50,7 @@ class OnDisk:
         """Raises OSError."""
         for life in simulation.exporting():
             path = self._rundir.agents / f"{life.agent.agent_id}.chain.json"
-            write_json_atomically(path, export_chain(life.agent.state, simulation.timestamp_us(life)))
+            write_json_atomically(path, simulation.export_of(life))
 
     def problems(self) -> dict[int, str]:
         """Why the trace of which agent ends early."""
@@ -68,7 +68,7 @@ def header(life: Incarnation) -> dict[str, Any]:
     return {
         "agent_id": agent.agent_id,
         "roster": sorted(agent.roster),
-        "initial_data": agent.state.chain.inception.block_data,
-        "settings": dataclasses.asdict(agent.state.settings),
+        "initial_data": agent.initial_data,
+        "settings": dataclasses.asdict(agent.settings),
         "clock": clock,
     }

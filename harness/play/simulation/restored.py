@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from harness.play.simulation.backend import Recorder, Simulation
+from harness.play.simulation.agents import Stored
+from harness.play.simulation.backend import Simulation
+from harness.play.simulation.recorder import Recorder
 from harness.scenario import Scenario
 from ucp.store import StoredState
 
@@ -27,14 +29,15 @@ class Restored(Simulation):
     async def give_deque(self, agent_id: int) -> None:
         """The agent boots again with what it holds now, and with the deque that it came with."""
         life = self._alive[self._number[agent_id]]
-        assert life is not None, "it booted at the beginning"
-        now = StoredState.of(life.agent.state)
-        deque = [block for block in self._stored[agent_id].deque if not life.agent.state.holds(block.block_hash)]
+        assert life is not None and life.state is not None, "it booted at the beginning"
+        state = life.state
+        now = StoredState.of(state)
+        deque = [block for block in self._stored[agent_id].deque if not state.holds(block.block_hash)]
         await self.end_life(agent_id)
         self._disks[self._number[agent_id]] = replace(now, deque=[*now.deque, *deque])
         await self.begin_life(agent_id)
 
-    def _start(self, number: int, stored: StoredState | None = None) -> None:
+    def _start(self, number: int, stored: Stored | None = None) -> None:
         first = self._stored.get(self.roster[number])
         if stored is not None:
             super()._start(number, stored)

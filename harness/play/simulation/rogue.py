@@ -8,7 +8,7 @@ from typing import Any
 
 from harness.play.rogue.journal import Journal
 from harness.play.rogue.rogue import Rogue
-from harness.play.simulation.air import RogueDatagram, VirtualAir
+from harness.play.simulation.air import StrayDatagram, VirtualAir
 from harness.scenario.changes import Injected
 from netem.medium import LATENCY
 from ucp.messages import Message, encode
@@ -54,7 +54,7 @@ class VirtualRogue:
     def _send(self, now: float) -> None:
         for injected in self._rogue.to_send():
             hearing = [number for number, agent in enumerate(self._roster) if agent != injected.source]
-            self._air.inject(now + MOMENT_S, RogueDatagram(injected.source, injected.datagram), hearing)
+            self._air.inject(now + MOMENT_S, StrayDatagram(injected.source, injected.datagram), hearing)
             self._journal.add(injected, now)
         soonest = self._rogue.next_timer()
         if soonest is not None and (self._wakes_at is None or soonest < self._wakes_at):

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 from harness.archive.directory import RunDirectory
 from harness.errors import InterruptedRunError, MachineError, ScenarioError
 from harness.play.backend import Backend
-from harness.play.control import Status
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
-from harness.play.simulation.backend import Incarnation, Simulation
+from harness.play.simulation.backend import Simulation
 from harness.play.simulation.on_disk import OnDisk
 from harness.scenario import Scenario
 
@@ -29,12 +28,13 @@ class VirtualTime(Backend):
         asked = {
             "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
             "vehicles.binary": scenario.vehicles.binary is not None,
-            "agent_command": bool(scenario.foreign),
         }
         keys = [f"`{key}`" for key, needed in asked.items() if needed]
         if keys:
             verb = "need" if len(keys) > 1 else "needs"
             raise ScenarioError(f"{', '.join(keys)} {verb} real processes: use --backend process, or leave it out")
+        if scenario.foreign:
+            _refuse_what_foreign_agents_cannot(scenario)
 
     def remark(self, scenario: Scenario) -> str | None:
         if scenario.events.source != "mavlink":
@@ -59,16 +59,18 @@ class VirtualTime(Backend):
             if interrupted.is_set():
                 raise InterruptedRunError(f"the run was interrupted at mission second {simulation.now():.0f}")
 
-        with closing(OnDisk(rundir)) as files:
+        with closing(OnDisk(rundir)) as files, _programs(scenario, rundir) as programs:
             capture = _captures(rundir, scenario) if scenario.capture else None
             air = capture.air if capture else VirtualAir
             simulation = Simulation(
-                scenario, seed, files, deliver_all=delivers_all, told=told, breathe=breathe, air=air
+                scenario, seed, files, deliver_all=delivers_all, told=told, breathe=breathe, air=air, programs=programs
             )
             try:
                 yield simulation
             except InterruptedRunError as error:
                 simulation.played.end_early("interrupted", error)
+            except AgentFailedError as error:
+                simulation.fail(error)
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
             simulation.end()
@@ -96,17 +98,5 @@ def _captures(rundir: RunDirectory, scenario: Scenario) -> "VirtualCapture":
 
 
 def _snapshot(simulation: Simulation) -> Snapshot:
-    statuses = {life.agent.agent_id: _status(life) for life in simulation.living()}
+    statuses = {life.agent.agent_id: life.agent.status() for life in simulation.living()}
     return Snapshot(simulation.stage, simulation.now(), simulation.scenario.duration_s, simulation.network, statuses)
-
-
-def _status(life: Incarnation) -> Status:
-    state = life.agent.state
-    return Status.model_construct(
-        idle=state.idle,
-        reconcile_in_progress=state.reconcile_in_progress,
-        chain=len(state.chain),
-        deque=len(state.blocks_to_be_committed),
-        completed=len(state.completed),
-        reconciles=state.reconciles,
-    )

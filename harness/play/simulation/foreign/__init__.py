@@ -1,0 +1,7 @@
+"""Agents that are not ours in virtual time: programs that are given lines and answer with lines.
+
+program.py   one of them as a process: what it is told, what it says, and for how long one waits
+programs.py  those that wait for their next mission
+answer.py    what a line of theirs says
+agent.py     one life of such an agent, as the simulation drives it
+"""

@@ -1,0 +1,297 @@
+"""One life of an agent that is not ours, in virtual time: the same face as `OwnAgent`, and a program behind it.
+
+Every input is a line to the program, and its answer tells all that one may know: what it sends, when its next timer
+ends, what its trace says. What it holds it is asked for, by the commands of the control socket; these are the harness's
+own questions, and no part of the mission: what the agent's trace says of them is left out.
+"""
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import ValidationError
+
+from harness.play.control import Status
+from harness.play.simulation.agents import Outgoing, Stored
+from harness.play.simulation.foreign.answer import (
+    Answer,
+    AnswerError,
+    RefusedError,
+    UnsupportedError,
+    read_answer,
+)
+from harness.play.simulation.foreign.program import (
+    AgentFailedError,
+    NoAnswerError,
+    NotSupportedError,
+    Outcome,
+    Program,
+)
+from ucp.events import LoggableEvent
+from ucp.messages import Datagram, Message
+from ucp.settings import Settings
+from ucp.trace import Entry, HandlerRun, Recorded, in_base64
+
+MAX_AT_ONCE = 1000
+"""An agent whose timers end more often in one instant hangs."""
+MAX_SENT_PER_S = 5000
+"""Datagrams in a mission second: more are a storm, which feeds itself where others answer."""
+MAX_RECORD_BYTES = 64 * 1024 * 1024
+NO_VIRTUAL_TIME = (2, 126, 127)
+"""Exit statuses of programs that do not know `--virtual`, or cannot do what a mission needs."""
+
+
+@dataclass
+class LifeRecord:
+    """What an agent was given in one life, and what it answered, in lines; the first of it, if that is very much."""
+
+    agent_id: int
+    exchanges: list[tuple[bytes, bytes]] = field(default_factory=list)
+    length: int = 0
+
+    def add(self, line: bytes, answer: bytes) -> None:
+        if self.length < MAX_RECORD_BYTES:
+            self.length += len(line) + len(answer)
+            self.exchanges.append((line, answer))
+
+
+class ForeignAgent:
+    """The agent of a `mission` (`ucp-mission/1`), played by `program`. Raises AgentFailedError, NotSupportedError.
+
+    With a `store` it boots from that: (what an earlier life answered,).
+    """
+
+    def __init__(
+        self,
+        mission: dict[str, Any],
+        initial_data: bytes,
+        settings: Settings,
+        program: Program,
+        now: float,
+        *,
+        tracing: bool,
+        store: Stored | None = None,
+    ) -> None:
+        self.agent_id: int = mission["agent_id"]
+        self.roster: frozenset[int] = frozenset(mission["roster"])
+        self.initial_data = initial_data
+        self.settings = settings
+        self.messages_sent = 0
+        self.chain_changed_at: float | None = 0.0 if tracing else None
+        self.record = LifeRecord(self.agent_id)
+        self.failed: AgentFailedError | None = None
+        self._program = program
+        self._tracing = tracing
+        self._now = now
+        self._traced_at = -math.inf
+        self._timer: float | None = None
+        self._at_once = 0
+        self._sent_in = (0, 0)
+        """A mission second, and how many datagrams it sent in that."""
+        self._sent: list[tuple[bytes, Recorded]] = []
+        self._trace: list[Entry] = []
+        self._completed: list[bytes] | None = [] if tracing else None
+        """None if it has to be asked for."""
+        self._status: Status | None = None
+        """None if it may be another by now."""
+        self._last_status: Status | None = None
+        self._export: dict[str, Any] | None = None
+        """What it left."""
+        first = {
+            "t": float(now),
+            "mission": mission,
+            "trace": tracing,
+            **({"store": store[0]} if isinstance(store, tuple) else {}),
+        }
+        self._give(json.dumps(first, separators=(",", ":")), "its mission", now)
+
+    # Inputs
+
+    def receive_message(
+        self, sender: int, sequence: int, message: Message, now: float, datagram: Recorded | None = None
+    ) -> None:
+        self._receive((datagram or Recorded(None, Datagram(sender, sequence, message))).text, now)
+
+    def receive_datagram(self, data: bytes, now: float) -> None:
+        self._receive(in_base64(data), now)
+
+    def _receive(self, text: str, now: float) -> None:
+        self._give(f'{{"t":{self._at(now)},"datagram":"{text}"}}', "a datagram", now)
+
+    def add_event(self, event: LoggableEvent, now: float) -> None:
+        event_of = f'"event_id":{event.event_id},"data":"{in_base64(event.data)}","timestamp_us":{event.timestamp_us}'
+        self._give(f'{{"t":{self._at(now)},{event_of}}}', "an event", now)
+
+    def handle_timer(self, now: float) -> None:
+        self._at_once = self._at_once + 1 if now <= self._now else 0
+        if self._at_once > MAX_AT_ONCE:
+            raise self._failure("hung", f"has a timer that ends again and again at {now:g} s, and never stops it")
+        self._give(f'{{"t":{self._at(now)},"timer":true}}', "the end of its timer", now)
+
+    def begin_reconcile(self, now: float) -> None:
+        told = self._give(f'{{"t":{self._at(now)},"command":"reconcile"}}', "the command reconcile", now).told
+        self._accepted("reconcile", told)
+
+    # What comes of them
+
+    def next_timer(self) -> float | None:
+        return self._timer
+
+    def answers_nobody_until(self) -> float | None:
+        """Nobody knows."""
+        return None
+
+    def outgoing(self, entries: list[Entry]) -> Iterable[Outgoing]:
+        sent, self._sent = self._sent, []
+        outgoing: list[Outgoing] = []
+        for _, datagram in sent:
+            said = datagram.content
+            if isinstance(said, Datagram) and said.sender == self.agent_id:
+                outgoing.append((said.sequence, said.message, datagram))
+            else:
+                outgoing.append((0, None, datagram))
+        return outgoing
+
+    def trace(self) -> list[Entry]:
+        trace, self._trace = self._trace, []
+        return trace
+
+    # What it says of itself
+
+    def status(self) -> Status:
+        if self._status is None:
+            told = self._ask("status", self._now)
+            try:
+                self._status = self._last_status = Status.model_validate(told)
+            except ValidationError as error:
+                where = ".".join(str(part) for part in error.errors()[0]["loc"])
+                raise self._failure("crashed", f"answered to the command status without a proper `{where}`") from None
+        return self._status
+
+    def known_status(self) -> Status | None:
+        return self._last_status if self.failed else self.status()
+
+    def completed(self) -> list[bytes]:
+        if self._completed is not None:
+            return self._completed
+        if self.failed is not None:
+            return []
+        export = self._export if self._export is not None else self._ask("export", self._now)
+        try:
+            return [bytes.fromhex(block_hash) for block_hash in export["completed"]]
+        except (KeyError, TypeError, ValueError):
+            raise self._failure("crashed", "answered to the command export without a proper `completed`") from None
+
+    def export(self, now: float, exported_at_us: int) -> dict[str, Any]:
+        return self._export if self._export is not None else self._ask("export", now)
+
+    def stored(self, now: float) -> Stored:
+        told = self._ask("store", now)
+        if "store" not in told:
+            raise self._failure("crashed", "answered to the command store without `store`")
+        return (told["store"],)
+
+    def leave(self, now: float) -> None:
+        if self._export is None and self.failed is None:
+            self.status()
+            self._export = self._ask("export", now)
+
+    # Lines
+
+    def _at(self, now: float) -> str:
+        """The time of an input: rounding may make the next one a hair earlier than the last."""
+        return repr(float(max(now, self._now)))
+
+    def _ask(self, command: str, now: float) -> dict[str, Any]:
+        """Something about itself, which changes nothing. Raises HarnessError."""
+        timer = self._timer
+        answer = self._exchange(f'{{"t":{self._at(now)},"command":"{command}"}}', f"the command {command}", now)
+        if answer.sent or answer.timer != timer or any(isinstance(entry, HandlerRun) for entry in answer.trace):
+            raise self._failure("crashed", f"did more than answer when it was given the command {command}")
+        return self._accepted(command, answer.told)
+
+    def _accepted(self, command: str, told: Any) -> dict[str, Any]:
+        if not isinstance(told, dict):
+            raise self._failure("crashed", f"gave no `answer` to the command {command}")
+        if told.get("ok") is False:
+            error = str(told.get("error", "no reason given"))[:500]
+            if told.get("unsupported") is True:
+                raise NotSupportedError(f"agent {self.agent_id} does not support the command {command}: {error}")
+            raise self._failure("crashed", f"refused to {command}: {error}")
+        return told
+
+    def _give(self, line: str, what: str, now: float) -> Answer:
+        """An input, of which may come whatever it likes."""
+        answer = self._exchange(line, what, now)
+        self._status = None
+        self._timer = answer.timer
+        self._sent += answer.sent
+        self.messages_sent += len(answer.sent)
+        self._count_sent(len(answer.sent), now)
+        if self._tracing:
+            self._look_at(answer.trace)
+        return answer
+
+    def _exchange(self, line: str, what: str, now: float) -> Answer:
+        if self.failed is not None:
+            raise self.failed
+        given = f"{line}\n".encode("ascii")
+        program = self._program
+        try:
+            program.tell(given)
+            said = program.answer()
+            answer = read_answer(said, tracing=self._tracing)
+        except NoAnswerError as error:
+            if error.status in NO_VIRTUAL_TIME and not self.record.exchanges:
+                raise self._cannot(f"ended with status {error.status}") from None
+            raise self._failure(error.outcome, f"{error} when it was given {what} at {now:g} s") from None
+        except AnswerError as error:
+            raise self._failure("crashed", f"answered {what}, at {now:g} s, {error}") from None
+        except UnsupportedError as error:
+            raise NotSupportedError(f"agent {self.agent_id} does not support this mission: {error}") from None
+        except RefusedError as error:
+            raise self._failure("crashed", f"refused {what} at {now:g} s: {error}") from None
+        self.record.add(given, said)
+        self._now = max(now, self._now)
+        return answer
+
+    def _look_at(self, entries: list[Entry]) -> None:
+        """See from the trace what else would have to be asked for."""
+        assert self._completed is not None, "a traced agent says what it completes"
+        for entry in entries:
+            if entry.t < self._traced_at:
+                raise self._failure("crashed", f"wrote t={entry.t!r} into its trace after t={self._traced_at!r}")
+            self._traced_at = entry.t
+            for operation, block in entry.changes if isinstance(entry, HandlerRun) else ():
+                if operation == "complete":
+                    self._completed.append(self._hash(block))
+                elif operation.startswith("chain"):
+                    self.chain_changed_at = self._now
+        self._trace += entries
+
+    def _hash(self, text: str) -> bytes:
+        try:
+            return bytes.fromhex(text)
+        except ValueError:
+            raise self._failure("crashed", f"completed a block whose hash is {text[:40]!r} in its trace") from None
+
+    def _count_sent(self, count: int, now: float) -> None:
+        second, before = self._sent_in
+        count += before if second == int(now) else 0
+        self._sent_in = int(now), count
+        if count > MAX_SENT_PER_S:
+            raise self._failure("crashed", f"sent more than {MAX_SENT_PER_S} datagrams within mission second {now:.0f}")
+
+    def _failure(self, outcome: Outcome, detail: str) -> AgentFailedError:
+        self.failed = AgentFailedError(self.agent_id, outcome, f"{detail}{self._program.last_words()}")
+        self._program.owes_an_answer = True  # nobody knows what it will say next
+        return self.failed
+
+    def _cannot(self, how: str) -> NotSupportedError:
+        self._program.owes_an_answer = True
+        return NotSupportedError(
+            f"agent {self.agent_id} {how} when it was started with --virtual: it cannot be played in virtual time, or "
+            f"not this mission{self._program.last_words()}; use --backend process, or see docs/virtual-time.md"
+        )

@@ -1,0 +1,110 @@
+"""What a line of an agent in virtual time says, once it is known to say it properly."""
+
+import base64
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import from_json
+
+from harness.archive.traces import ASIDE, HANDLER_RUN
+from ucp.messages import Datagram, MalformedDatagramError, decode
+from ucp.trace import Entry, Recorded
+
+MAX_SENT = 1000
+"""No input makes an agent broadcast more."""
+MAX_UDP_BYTES = 65507
+LATEST_S = 1e12
+SHOWN = 60
+
+
+class AnswerError(Exception):
+    """A line that is no answer: why, in words that follow "agent 3 answered"."""
+
+
+class UnsupportedError(Exception):
+    """The agent says that it lacks what it was asked for: its sentence."""
+
+
+class RefusedError(Exception):
+    """The agent says that it cannot take the line: its sentence."""
+
+
+@dataclass(slots=True)
+class Answer:
+    """`sent` are datagrams as they are, and with what they say if they are messages."""
+
+    sent: list[tuple[bytes, Recorded]]
+    timer: float | None
+    trace: list[Entry] = field(default_factory=list)
+    told: Any = None
+
+
+def read_answer(line: bytes, *, tracing: bool) -> Answer:
+    """Raises AnswerError, UnsupportedError or RefusedError."""
+    try:
+        said = from_json(line, allow_inf_nan=False)
+    except ValueError as error:
+        raise AnswerError(f"with what is not JSON ({error}): {_shown(line)}") from None
+    if not isinstance(said, dict):
+        raise AnswerError(f"with what is not a JSON object: {_shown(line)}")
+    if "error" in said:
+        kind = UnsupportedError if said.get("unsupported") is True else RefusedError
+        raise kind(str(said["error"])[:500])
+    sent = said.get("sent")
+    if not isinstance(sent, list):
+        raise AnswerError(f"without a list `sent`: {_shown(line)}")
+    if len(sent) > MAX_SENT:
+        raise AnswerError(f"with {len(sent)} datagrams at once, and more than {MAX_SENT} are none that an input makes")
+    timer = said.get("timer", math.nan)
+    if timer is not None and (type(timer) not in (int, float) or not -LATEST_S <= timer <= LATEST_S):
+        what = f"with the timer {_shown(timer)}, not" if "timer" in said else "without"
+        raise AnswerError(f"{what} a number of mission seconds, or null, as `timer`")
+    answer = Answer([_datagram(text) for text in sent], timer, told=said.get("answer"))
+    if tracing:
+        trace = said.get("trace")
+        if not isinstance(trace, list):
+            raise AnswerError("without a list `trace`, which its mission asked for")
+        answer.trace = list(_entries(trace))
+    return answer
+
+
+def _datagram(text: Any) -> tuple[bytes, Recorded]:
+    try:
+        data = base64.b64decode(text, validate=True)
+    except (TypeError, ValueError):
+        raise AnswerError(f"with a datagram that is not base64: {_shown(text)}") from None
+    if len(data) > MAX_UDP_BYTES:
+        raise AnswerError(f"with a datagram of {len(data)} bytes, more than UDP carries")
+    content: Datagram | None
+    try:
+        content = decode(data)
+    except MalformedDatagramError:
+        content = None
+    return data, Recorded(text, content)
+
+
+def _entries(trace: list[Any]) -> Iterable[Entry]:
+    """The lines of a trace but for its header, which is known."""
+    for number, line in enumerate(trace):
+        if isinstance(line, dict) and "schema" in line:
+            continue
+        kind = HANDLER_RUN if isinstance(line, dict) and "handler" in line else ASIDE
+        try:
+            entry: Entry = kind.validate_python(line)
+        except ValidationError as error:
+            problem = error.errors()[0]
+            where = ".".join(str(part) for part in problem["loc"])
+            wrong = f": {where}: {problem['msg'].lower()}" if kind is HANDLER_RUN else ""
+            raise AnswerError(f"with `trace.{number}`, which is no line of a trace{wrong}: {_shown(line)}") from None
+        durations = getattr(entry, "started", None) or {}
+        if not all(math.isfinite(number) for number in (entry.t, *durations.values())):
+            raise AnswerError(f"with `trace.{number}`, in which a number is not finite: {_shown(line)}")
+        yield entry
+
+
+def _shown(value: Any) -> str:
+    text = value.decode(errors="replace").strip() if isinstance(value, bytes) else str(value)
+    return repr(text[:SHOWN] + ("..." if len(text) > SHOWN else ""))

@@ -1,0 +1,86 @@
+"""The agents of a swarm that are not ours: whose program plays whom, in which life."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from harness.errors import ScenarioError
+from harness.play.process.agent import agent_command
+from harness.play.process.mission_file import mission_file
+from harness.play.simulation.agents import Stored, VirtualAgent
+from harness.play.simulation.foreign.agent import ForeignAgent, LifeRecord
+from harness.play.simulation.foreign.program import Program
+from harness.play.simulation.foreign.programs import SHARED, Programs
+from harness.scenario import Scenario
+from netem import addresses
+
+
+def commands_of(scenario: Scenario) -> dict[int, list[str]]:
+    """What starts which foreign agent. Raises ScenarioError if there is no such program."""
+    return {agent_id: agent_command(scenario, agent_id) for agent_id in scenario.foreign}
+
+
+class Foreigners:
+    """Those of `scenario`. `programs` play them, by default those that all missions in this process share."""
+
+    def __init__(
+        self, scenario: Scenario, seed: int, initial_data: bytes, programs: Programs | None, *, tracing: bool
+    ) -> None:
+        self.records: list[LifeRecord] = []
+        self._scenario = scenario
+        self._seed = seed
+        self._initial_data = initial_data
+        self._programs = programs or SHARED
+        self._tracing = tracing
+        self._commands: Mapping[int, list[str]] = commands_of(scenario)
+        self._playing: dict[int, Program] = {}
+
+    def __contains__(self, agent_id: int) -> bool:
+        return agent_id in self._commands
+
+    def begin(self, agent_id: int, life: int, now: float, stored: Stored | None) -> ForeignAgent:
+        """A life of the agent, which goes on from what is `stored` of an earlier one. Raises HarnessError."""
+        try:
+            program = self._programs.take(self._commands[agent_id], agent_id)
+        except OSError as error:
+            raise ScenarioError(
+                f"`agent_command`: {self._commands[agent_id][0]} cannot be started: {error.strerror}"
+            ) from None
+        self._playing[agent_id] = program
+        agent = ForeignAgent(
+            self._mission(agent_id, life),
+            self._initial_data,
+            self._scenario.settings,
+            program,
+            now,
+            tracing=self._tracing,
+            store=stored,
+        )
+        self.records.append(agent.record)
+        return agent
+
+    def ended(self, agent: VirtualAgent) -> None:
+        """The agent's life is over: its program may play another."""
+        if (program := self._playing.pop(agent.agent_id, None)) is not None:
+            self._programs.give_back(program)
+
+    def close(self) -> None:
+        """All lives are over."""
+        for program in self._playing.values():
+            self._programs.give_back(program)
+        self._playing.clear()
+
+    def _mission(self, agent_id: int, life: int) -> dict[str, Any]:
+        """What it would be told as a process, but for what virtual time has otherwise."""
+        mission = mission_file(
+            agent_id,
+            self._scenario,
+            self._seed,
+            self._initial_data,
+            address=addresses.address(agent_id),
+            broadcast=addresses.BROADCAST,
+            with_vehicle=False,
+            life=life,
+            epoch_us=0,
+        )
+        mission["events"]["source"] = "none"
+        return {**mission, "speedup": 1}

@@ -1,0 +1,24 @@
+"""What an agent says of itself when it is asked for its status, whoever drives it (see CONTRACT.md)."""
+
+from typing import Any
+
+from ucp.agent import Agent
+
+
+def status_of(agent: Agent) -> dict[str, Any]:
+    """What the agent itself knows; whoever drives it knows more."""
+    state = agent.state
+    return {
+        "agent_id": agent.agent_id,
+        "idle": state.idle,
+        "reconcile_in_progress": state.reconcile_in_progress,
+        "chain": len(state.chain),
+        "deque": len(state.blocks_to_be_committed),
+        "stack": len(state.reconcile_stack),
+        "top_chain_hash": state.chain.top_chain_hash.hex(),
+        "completed": len(state.completed),
+        "reconciles": state.reconciles,
+        "sent": dict(state.sent),
+        "received": dict(agent.received),
+        "dropped": dict(agent.dropped),
+    }

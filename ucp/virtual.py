@@ -1,0 +1,256 @@
+"""One agent in virtual time: `python -m ucp.node --virtual`.
+
+It reads lines of JSON from standard input, each one input with the time at which it comes, and answers each with a line
+on standard output: what it broadcasts, when its next timer ends, and what its trace says of it. It has no socket, no
+file and no clock, and when the next mission line comes it has forgotten the last. CONTRACT.md says what any agent does
+that can be driven so.
+"""
+
+import base64
+import binascii
+import json
+import math
+import sys
+from collections.abc import Callable
+from random import Random
+from typing import Any, BinaryIO
+
+from ucp.agent import Agent
+from ucp.block import Block
+from ucp.clock import MICROSECONDS
+from ucp.events import LoggableEvent
+from ucp.export import export_chain
+from ucp.mission import MAX_MISSION_BYTES, MissionError, UnsupportedMissionError, parse_mission
+from ucp.quirks import check_quirk, wrong_handlers
+from ucp.status import status_of
+from ucp.store import StoredState
+from ucp.trace import Commanded, HandlerRun, in_base64
+
+MAX_LINE_BYTES = 16 * MAX_MISSION_BYTES
+"""The longest is a mission with a store."""
+
+
+class InputError(Exception):
+    """A line that is no input, or one that the agent cannot take: one sentence."""
+
+    def __init__(self, sentence: str, *, unsupported: bool = False) -> None:
+        super().__init__(sentence)
+        self.unsupported = unsupported
+
+
+def serve(lines: BinaryIO, answers: BinaryIO) -> None:
+    """Answer every line, until there are no more."""
+    agent: VirtualAgent | None = None
+    while line := lines.readline(MAX_LINE_BYTES):
+        try:
+            given = _read(line)
+            if "mission" in given:
+                agent = None
+                agent = VirtualAgent(given)
+            elif agent is None:
+                raise InputError("the first line has to have a mission")
+            else:
+                agent.give(given)
+            answer = agent.answer()
+        except InputError as error:
+            answer = json.dumps({"error": str(error), **({"unsupported": True} if error.unsupported else {})})
+        answers.write(answer.encode("ascii") + b"\n")
+        answers.flush()
+
+
+class VirtualAgent:
+    """One life of an agent, beginning with the line `{"t", "mission", "trace", "store"}`. Raises InputError."""
+
+    def __init__(self, given: dict[str, Any]) -> None:
+        try:
+            self._mission = mission = parse_mission(given["mission"])
+        except MissionError as error:
+            raise InputError(str(error), unsupported=isinstance(error, UnsupportedMissionError)) from None
+        if mission.epoch_us is None:
+            raise InputError("`epoch_us` of the mission must be a whole number: in virtual time nobody says `start`")
+        self._epoch_us = mission.epoch_us
+        self._tracing = given.get("trace", True) is True
+        self._lots = Random(mission.seed)
+        """Of what is random about its quirks."""
+        self._agent = Agent(
+            mission.agent_id,
+            mission.roster,
+            mission.initial_data,
+            mission.settings,
+            handlers=wrong_handlers(mission.quirks, self._lots),
+            tracing=self._tracing,
+        )
+        self._now = -math.inf
+        self._generating = True
+        self._handled = self._bytes_sent = 0
+        self._told: dict[str, Any] | None = None
+        """What it answers to the command that it was given last."""
+        self._noted: list[Commanded] = []
+        now = self._advance(given)
+        if given.get("store") is not None:
+            self._agent.boot(_stored(given["store"]), now)
+
+    def give(self, given: dict[str, Any]) -> None:
+        """One input. Raises InputError."""
+        now = self._advance(given)
+        self._told = None
+        if "datagram" in given:
+            self._agent.receive_datagram(_decoded(given, "datagram"), now)
+        elif "timer" in given:
+            self._agent.handle_timer(now)
+        elif "event_id" in given:
+            self._log(given, now)
+        elif "command" in given:
+            self._told = self._do(given, now)
+        else:
+            raise InputError("neither a mission, a datagram, an event, a timer nor a command")
+
+    def answer(self) -> str:
+        """What came of the last input, as a line."""
+        entries = [*self._agent.trace(), *self._noted]
+        self._noted = []
+        self._handled += sum(isinstance(entry, HandlerRun) for entry in entries)
+        datagrams = self._agent.datagrams_to_send()
+        self._bytes_sent += sum(map(len, datagrams))
+        parts = [
+            f'"sent":{json.dumps([in_base64(datagram) for datagram in datagrams])}',
+            f'"timer":{json.dumps(self._agent.next_timer())}',
+        ]
+        if self._tracing:
+            parts.append(f'"trace":[{",".join(entry.to_line().rstrip() for entry in entries)}]')
+        if self._told is not None:
+            parts.append(f'"answer":{json.dumps(self._told)}')
+        return "{" + ",".join(parts) + "}"
+
+    def _advance(self, given: dict[str, Any]) -> float:
+        now = given.get("t")
+        if isinstance(now, bool) or not isinstance(now, int | float) or not math.isfinite(now):
+            raise InputError("`t` must be a number of mission seconds")
+        if now < self._now:
+            raise InputError(f"`t` goes back, from {self._now!r} to {now!r}")
+        self._now = float(now)
+        return self._now
+
+    def _log(self, given: dict[str, Any], now: float) -> None:
+        event_id, timestamp_us = given["event_id"], given.get("timestamp_us")
+        if type(event_id) is not int or type(timestamp_us) is not int or not 0 <= timestamp_us < 2**64:
+            raise InputError("an event needs `event_id` and `timestamp_us`, whole numbers")
+        if not self._generating:
+            return
+        try:
+            self._agent.add_event(LoggableEvent(timestamp_us, event_id, _decoded(given, "data")), now)
+        except ValueError as error:
+            raise InputError(f"the event cannot be logged: {error}") from None
+
+    # Commands, as those of the control socket
+
+    def _do(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        name = given["command"]
+        command = _COMMANDS.get(name) if isinstance(name, str) else None
+        if command is None:
+            error = f"unknown command {str(name)[:40]!r}: there are {', '.join(_COMMANDS)}"
+            return {"ok": False, "unsupported": True, "error": error}
+        return command(self, given, now)
+
+    def _status(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        more = {"started": True, "mission_s": now, "handled": self._handled, "bytes_sent": self._bytes_sent}
+        return {"ok": True, **status_of(self._agent), **more, "generating": self._generating}
+
+    def _reconcile(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        self._agent.begin_reconcile(now)
+        return {"ok": True}
+
+    def _export(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        self._note(given, now)
+        exported_at_us = max(0, self._epoch_us + round(now * MICROSECONDS))
+        return export_chain(self._agent.state, exported_at_us)
+
+    def _store(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        return {"ok": True, "store": _to_store(StoredState.of(self._agent.state))}
+
+    def _stop_events(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        self._generating = False
+        self._note(given, now)
+        return {"ok": True}
+
+    def _quirk(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        name, value = str(given.get("name")), given.get("value")
+        try:
+            check_quirk(name, value)
+        except ValueError as error:
+            return {"ok": False, "error": str(error)}
+        quirks = self._mission.quirks
+        quirks[name] = value  # type: ignore[assignment]  # it was checked
+        self._agent.replace_handlers(wrong_handlers(quirks, self._lots))
+        self._note(given, now)
+        return {"ok": True, **quirks}
+
+    def _note(self, given: dict[str, Any], now: float) -> None:
+        """Commands that trigger no handler are in the trace, too."""
+        if self._tracing:
+            request = {key: value for key, value in given.items() if key != "t"}
+            self._noted.append(Commanded(now, str(given["command"]), request))
+
+
+_COMMANDS: dict[str, Callable[[VirtualAgent, dict[str, Any], float], dict[str, Any]]] = {
+    "status": VirtualAgent._status,
+    "reconcile": VirtualAgent._reconcile,
+    "export": VirtualAgent._export,
+    "store": VirtualAgent._store,
+    "stop_events": VirtualAgent._stop_events,
+    "quirk": VirtualAgent._quirk,
+}
+
+
+def _read(line: bytes) -> dict[str, Any]:
+    try:
+        given = json.loads(line)
+    except (ValueError, RecursionError):
+        raise InputError("not a line of JSON") from None
+    if not isinstance(given, dict):
+        raise InputError("not a JSON object")
+    return given
+
+
+def _decoded(given: dict[str, Any], key: str) -> bytes:
+    try:
+        return base64.b64decode(given[key], validate=True)
+    except (KeyError, TypeError, binascii.Error, ValueError):
+        raise InputError(f"`{key}` must be in base64") from None
+
+
+# What a brown-out leaves
+
+
+def _to_store(stored: StoredState) -> dict[str, Any]:
+    def listed(blocks: list[Block]) -> list[list[Any]]:
+        return [[block.agent_id, block.timestamp_us, in_base64(block.event_data)] for block in blocks]
+
+    return {
+        "completed": [block_hash.hex() for block_hash in stored.completed],
+        "chain": listed(stored.chain),
+        "deque": listed(stored.deque),
+        "stack": listed(stored.stack),
+    }
+
+
+def _stored(value: Any) -> StoredState:
+    """Raises InputError."""
+
+    def blocks(place: str) -> list[Block]:
+        return [
+            Block(agent_id, timestamp_us, base64.b64decode(event_data, validate=True))
+            for agent_id, timestamp_us, event_data in value[place]
+        ]
+
+    try:
+        completed = [bytes.fromhex(block_hash) for block_hash in value["completed"]]
+        return StoredState(completed, blocks("chain"), blocks("deque"), blocks("stack"))
+    except (KeyError, TypeError, ValueError):
+        raise InputError("`store` is not what this agent answered to the command `store`") from None
+
+
+def main() -> int:
+    """Exit status 0, at the end of standard input."""
+    serve(sys.stdin.buffer, sys.stdout.buffer)
+    return 0
