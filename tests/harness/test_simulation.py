@@ -285,7 +285,9 @@ def test_every_scenario_that_runs_as_processes_runs_in_virtual_time(path: Path) 
     ("keys", "sentence"),
     [
         ({"vehicles": {"kind": "ardupilot"}}, "`vehicles.kind: ardupilot` needs real processes"),
-        ({"vehicles": {"binary": "/bin/x"}, "agent_command": ["x"]}, "`vehicles.binary`, `agent_command` need real"),
+        ({"vehicles": {"binary": "/bin/x"}}, "`vehicles.binary` needs real processes"),
+        ({"agent_command": ["./nowhere"]}, "`agent_command`: ./nowhere is no program"),
+        ({"agent_command": {2: ["cat"]}, "lateness": {2: "3+0.25"}}, "nobody sees the single timers of an agent that"),
     ],
 )
 def test_what_virtual_time_cannot_give_is_refused_by_its_keys(keys: dict[str, Any], sentence: str) -> None:

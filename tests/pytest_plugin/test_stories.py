@@ -140,10 +140,12 @@ def test_an_agent_of_the_command_line_that_cannot_be_is_one_sentence(
     no_internals(result)
 
 
-def test_virtual_time_has_no_other_agent(pytester: pytest.Pytester) -> None:
-    result = run(pytester, written(pytester), "--ucp-agent", "my_agent --quick")
+def test_in_virtual_time_any_agent_does_as_the_story_tells(pytester: pytest.Pytester) -> None:
+    path = written(pytester)
+    run(pytester, path, "--ucp-agent", f"2={shlex.quote(sys.executable)} -P -m ucp.node").assert_outcomes(passed=1)
+    result = run(pytester, path, "--ucp-agent", "./my_agent --quick")
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["`agent_command` needs real processes*"])
+    result.stdout.fnmatch_lines(["`agent_command` of agent 1: ./my_agent is no program*"])
     no_internals(result)
 
 

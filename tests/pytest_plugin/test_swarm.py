@@ -312,7 +312,7 @@ def test_what_cannot_be_is_one_sentence_at_the_test_s_own_line(
         ("agent=7", "`agent` is unknown: there are name, *"),
         ("backend='kernel'", "`backend` is 'kernel': it should be 'process', 'docker' or 'sim'"),
         ("seed=-1", "`seed` is -1: it should be a number, 0 or more"),
-        ("agent_command=['x']", "`agent_command` needs real processes: *"),
+        ("agent_command=['./x']", "`agent_command`: ./x is no program: *"),
     ],
 )
 def test_a_swarm_that_cannot_be_is_one_sentence(pytester: pytest.Pytester, marker: str, sentence: str) -> None:

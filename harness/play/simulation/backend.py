@@ -29,7 +29,7 @@ from netem.radio import Place
 
 if TYPE_CHECKING:
     from harness.play.simulation.foreign.agent import LifeRecord
-    from harness.play.simulation.foreign.program import AgentFailedError
+    from harness.play.simulation.foreign.failure import AgentFailedError
     from harness.play.simulation.foreign.programs import Programs
 
 ENGINE = "virtual time"
@@ -262,7 +262,8 @@ class Simulation(Clockwork):
         self._alive[number] = None
         self._air.is_gone(number)
         self._failures[number] = error
-        self.played.end_early("failed", error)
+        if self.played.outcome == "completed":
+            self.played.end_early("failed", error)
 
     def close(self) -> None:
         """Nobody is asked anything any more."""
@@ -316,12 +317,14 @@ class Simulation(Clockwork):
         reboots = sum(life.rebooted for life in lives)
         known = [life.agent.known_status() for life in lives]
         dropped = sum((Counter(status.dropped) for status in known if status), Counter[str]())
-        ended = failure.outcome if failure else "rebooting" if number in self._disks else "killed"
+        gone = "rebooting" if number in self._disks else "killed" if lives else "not started"
+        ended = failure.outcome if failure else gone
         detail = failure.detail if failure else f"switched off at {off.ended_at:g} s" if off else None
         return {
             "outcome": "exported" if life else ended,
             **({"detail": detail} if detail else {}),
-            "restarts": len(lives) - 1 - reboots,
+            **self._whose(number, known),
+            "restarts": max(0, len(lives) - 1 - reboots),
             "reboots": reboots,
             "completed_before": list(completed),
             "idle": life.agent.status().idle if life else None,
@@ -336,6 +339,14 @@ class Simulation(Clockwork):
                 else {}
             ),
         }
+
+    def _whose(self, number: int, known: Sequence[Status | None]) -> dict[str, Any]:
+        """Whose make the agent is, if it is not ours."""
+        agent_id = self.roster[number]
+        if self._foreigners is None or agent_id not in self._foreigners:
+            return {}
+        version = next((status.version for status in reversed(known) if status), None)
+        return {"command": self._foreigners.command_of(agent_id), "version": version}
 
     def _handler_runs(self, life: Incarnation, status: Status | None) -> dict[str, int | float] | None:
         """How many it has counted; if nobody sees into it, as it says itself."""

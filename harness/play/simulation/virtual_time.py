@@ -1,8 +1,8 @@
 """The backend of virtual time: the very same agents on a simulated air, into a run directory as any other run."""
 
 import asyncio
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, closing
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, closing, contextmanager
 from typing import TYPE_CHECKING
 
 from harness.archive.directory import RunDirectory
@@ -11,11 +11,13 @@ from harness.play.backend import Backend
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.backend import Simulation
+from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.play.simulation.on_disk import OnDisk
 from harness.scenario import Scenario
 
 if TYPE_CHECKING:
     from harness.play.simulation.captured_air import VirtualCapture
+    from harness.play.simulation.foreign.programs import Programs
 
 
 class VirtualTime(Backend):
@@ -73,15 +75,49 @@ class VirtualTime(Backend):
                 simulation.fail(error)
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
-            simulation.end()
             try:
+                _export(simulation, files)
                 if capture:
                     simulation.played.capture = capture.end(simulation.now())
-                files.export(simulation)
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
             for agent_id, problem in files.problems().items():
                 simulation.played.agents[str(agent_id)]["trace_problem"] = problem
+
+
+def _export(simulation: Simulation, files: OnDisk) -> None:
+    """Take down what there is at the end, of whoever still answers. Raises OSError."""
+    while True:
+        try:
+            simulation.end()
+            files.export(simulation)
+            return
+        except AgentFailedError as error:
+            simulation.fail(error)
+
+
+@contextmanager
+def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["Programs | None"]:
+    """Those that play agents of another make, of whom each leaves its log in the run's directory."""
+    if not scenario.foreign:
+        yield None
+        return
+    from harness.play.simulation.foreign.programs import Programs
+
+    with closing(Programs(rundir.agents)) as programs:
+        yield programs
+
+
+def _refuse_what_foreign_agents_cannot(scenario: Scenario) -> None:
+    from harness.play.simulation.foreign.foreigners import commands_of
+
+    commands_of(scenario)
+    late = sorted(agent_id for agent_id in scenario.lateness if agent_id in scenario.foreign)
+    if late:
+        raise ScenarioError(
+            f"`lateness` names agent {late[0]}, and nobody sees the single timers of an agent that is not our own: "
+            "leave it out, or its `agent_command`"
+        )
 
 
 def _failure(error: OSError, rundir: RunDirectory) -> MachineError:

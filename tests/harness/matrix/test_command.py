@@ -54,7 +54,7 @@ def test_json_is_all_that_standard_output_gets(tmp_path: Path) -> None:
     ("keys", "sentence"),
     [
         ({"loss": [2]}, "`loss.0` is 2: it should be less than or equal to 1"),
-        ({"scenario": {"agent_command": ["./agent"]}}, "`agent_command` needs real processes"),
+        ({"scenario": {"agent_command": ["./agent"]}}, "`agent_command`: ./agent is no program"),
     ],
 )
 def test_a_wrong_request_is_one_sentence_and_status_2(tmp_path: Path, keys: dict[str, Any], sentence: str) -> None:

@@ -3,5 +3,7 @@
 program.py   one of them as a process: what it is told, what it says, and for how long one waits
 programs.py  those that wait for their next mission
 answer.py    what a line of theirs says
+failure.py   how one ends a mission
+foreigners.py  whose program plays whom
 agent.py     one life of such an agent, as the simulation drives it
 """

@@ -22,13 +22,8 @@ from harness.play.simulation.foreign.answer import (
     UnsupportedError,
     read_answer,
 )
-from harness.play.simulation.foreign.program import (
-    AgentFailedError,
-    NoAnswerError,
-    NotSupportedError,
-    Outcome,
-    Program,
-)
+from harness.play.simulation.foreign.failure import AgentFailedError, NotSupportedError, Outcome
+from harness.play.simulation.foreign.program import NoAnswerError, Program
 from ucp.events import LoggableEvent
 from ucp.messages import Datagram, Message
 from ucp.settings import Settings

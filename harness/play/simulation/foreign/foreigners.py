@@ -37,6 +37,10 @@ class Foreigners:
     def __contains__(self, agent_id: int) -> bool:
         return agent_id in self._commands
 
+    def command_of(self, agent_id: int) -> list[str]:
+        """What starts the agent, but for --virtual."""
+        return self._commands[agent_id]
+
     def begin(self, agent_id: int, life: int, now: float, stored: Stored | None) -> ForeignAgent:
         """A life of the agent, which goes on from what is `stored` of an earlier one. Raises HarnessError."""
         try:

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from ctypes import CDLL
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
-from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError
+from harness.play.simulation.foreign.failure import Outcome
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
@@ -29,26 +29,6 @@ MOMENT_S = 1.0
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = CDLL(None)
-
-Outcome = Literal["crashed", "hung"]
-
-
-class AgentFailedError(HarnessError):
-    """An agent crashed, hung, or answered what is no answer: the thing under test failed."""
-
-    exit_status = VIOLATED
-
-    def __init__(self, agent_id: int, outcome: Outcome, detail: str) -> None:
-        super().__init__(f"agent {agent_id} {detail}")
-        self.agent_id = agent_id
-        self.outcome = outcome
-        self.detail = detail
-
-
-class NotSupportedError(HarnessError):
-    """An agent says that it cannot do what this mission needs, or cannot be driven in virtual time."""
-
-    exit_status = WRONG_REQUEST
 
 
 class NoAnswerError(Exception):
@@ -215,7 +195,7 @@ class Program:
 
 
 def _passing_file() -> IO[bytes]:
-    return tempfile.TemporaryFile()  # noqa: SIM115  # whoever asks for it closes it
+    return tempfile.TemporaryFile()  # whoever asks for it closes it
 
 
 def _die_with_parent() -> None:

@@ -49,7 +49,7 @@ class Programs:
             program.forget_words()
             self._idle[program.command, program.log].append(program)
 
-    def end(self) -> None:
+    def close(self) -> None:
         """End all of them."""
         programs = [*self._taken, *(program for idle in self._idle.values() for program in idle)]
         self._taken.clear()
@@ -71,5 +71,5 @@ class Programs:
 SHARED = Programs()
 """Those of missions in memory, of which a sweep plays thousands."""
 
-atexit.register(SHARED.end)
+atexit.register(SHARED.close)
 os.register_at_fork(after_in_child=SHARED.forget)
