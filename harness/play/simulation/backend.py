@@ -29,7 +29,7 @@ from netem.radio import Place
 
 if TYPE_CHECKING:
     from harness.play.simulation.foreign.agent import LifeRecord
-    from harness.play.simulation.foreign.failure import AgentFailedError
+    from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
     from harness.play.simulation.foreign.programs import Programs
 
 ENGINE = "virtual time"
@@ -74,7 +74,7 @@ class Simulation(Clockwork):
         self._disks: dict[int, Stored] = {}
         """What is on the disk of the agents that reboot with it."""
         self._switched_off: dict[int, Incarnation] = {}
-        self._failures: dict[int, AgentFailedError] = {}
+        self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
@@ -254,8 +254,8 @@ class Simulation(Clockwork):
         self._recorder.export(self)
         return played
 
-    def fail(self, error: "AgentFailedError") -> None:
-        """The mission is over: an agent crashed or hung."""
+    def fail(self, error: "AgentFailedError | AgentLacksError") -> None:
+        """The mission is over: an agent crashed or hung, or cannot do it."""
         number = self._number[error.agent_id]
         if (life := self._alive[number]) is not None:
             life.ended_at = self._now

@@ -11,7 +11,7 @@ from harness.play.backend import Backend
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.backend import Simulation
-from harness.play.simulation.foreign.failure import AgentFailedError
+from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
 from harness.play.simulation.on_disk import OnDisk
 from harness.scenario import Scenario
 
@@ -71,7 +71,7 @@ class VirtualTime(Backend):
                 yield simulation
             except InterruptedRunError as error:
                 simulation.played.end_early("interrupted", error)
-            except AgentFailedError as error:
+            except (AgentFailedError, AgentLacksError) as error:
                 simulation.fail(error)
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
@@ -92,7 +92,7 @@ def _export(simulation: Simulation, files: OnDisk) -> None:
             simulation.end()
             files.export(simulation)
             return
-        except AgentFailedError as error:
+        except (AgentFailedError, AgentLacksError) as error:
             simulation.fail(error)
 
 

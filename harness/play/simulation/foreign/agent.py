@@ -14,15 +14,16 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.play.control import Status
+from harness.play.last_words import last_words, of_a_shell
 from harness.play.simulation.agents import Outgoing, Stored
 from harness.play.simulation.foreign.answer import (
     Answer,
     AnswerError,
+    LacksError,
     RefusedError,
-    UnsupportedError,
     read_answer,
 )
-from harness.play.simulation.foreign.failure import AgentFailedError, NotSupportedError, Outcome
+from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError, Outcome
 from harness.play.simulation.foreign.program import NoAnswerError, Program
 from ucp.events import LoggableEvent
 from ucp.messages import Datagram, Message
@@ -34,8 +35,8 @@ MAX_AT_ONCE = 1000
 MAX_SENT_PER_S = 5000
 """Datagrams in a mission second: more are a storm, which feeds itself where others answer."""
 MAX_RECORD_BYTES = 64 * 1024 * 1024
-NO_VIRTUAL_TIME = (2, 126, 127)
-"""Exit statuses of programs that do not know `--virtual`, or cannot do what a mission needs."""
+NO_VIRTUAL_TIME = (2, 127)
+"""Exit statuses of agents that take `--virtual` for a mission file that is wrong, or say that they lack it."""
 
 
 @dataclass
@@ -53,7 +54,7 @@ class LifeRecord:
 
 
 class ForeignAgent:
-    """The agent of a `mission` (`ucp-mission/1`), played by `program`. Raises AgentFailedError, NotSupportedError.
+    """The agent of a `mission` (`ucp-mission/1`), played by `program`. Raises AgentFailedError, AgentLacksError.
 
     With a `store` it boots from that: (what an earlier life answered,).
     """
@@ -76,7 +77,7 @@ class ForeignAgent:
         self.messages_sent = 0
         self.chain_changed_at: float | None = 0.0 if tracing else None
         self.record = LifeRecord(self.agent_id)
-        self.failed: AgentFailedError | None = None
+        self.failed: AgentFailedError | AgentLacksError | None = None
         self._program = program
         self._tracing = tracing
         self._now = now
@@ -211,10 +212,10 @@ class ForeignAgent:
         if not isinstance(told, dict):
             raise self._failure("crashed", f"gave no `answer` to the command {command}")
         if told.get("ok") is False:
-            error = str(told.get("error", "no reason given"))[:500]
+            error = str(told.get("error", "no reason given"))
             if told.get("unsupported") is True:
-                raise NotSupportedError(f"agent {self.agent_id} does not support the command {command}: {error}")
-            raise self._failure("crashed", f"refused to {command}: {error}")
+                raise self._lacks(f"asked to {command}, it says: {last_words(error)}")
+            raise self._failure("crashed", f"refused to {command}: {last_words(error)}")
         return told
 
     def _give(self, line: str, what: str, now: float) -> Answer:
@@ -240,14 +241,14 @@ class ForeignAgent:
             answer = read_answer(said, tracing=self._tracing)
         except NoAnswerError as error:
             if error.status in NO_VIRTUAL_TIME and not self.record.exchanges:
-                raise self._cannot(f"ended with status {error.status}") from None
+                raise self._has_no_virtual_time(error.status) from None
             raise self._failure(error.outcome, f"{error} when it was given {what} at {now:g} s") from None
         except AnswerError as error:
             raise self._failure("crashed", f"answered {what}, at {now:g} s, {error}") from None
-        except UnsupportedError as error:
-            raise NotSupportedError(f"agent {self.agent_id} does not support this mission: {error}") from None
+        except LacksError as error:
+            raise self._lacks(last_words(str(error))) from None
         except RefusedError as error:
-            raise self._failure("crashed", f"refused {what} at {now:g} s: {error}") from None
+            raise self._failure("crashed", f"refused {what} at {now:g} s: {last_words(str(error))}") from None
         self.record.add(given, said)
         self._now = max(now, self._now)
         return answer
@@ -280,13 +281,21 @@ class ForeignAgent:
             raise self._failure("crashed", f"sent more than {MAX_SENT_PER_S} datagrams within mission second {now:.0f}")
 
     def _failure(self, outcome: Outcome, detail: str) -> AgentFailedError:
-        self.failed = AgentFailedError(self.agent_id, outcome, f"{detail}{self._program.last_words()}")
+        self.failed = AgentFailedError(self.agent_id, outcome, f"{detail}{self._program.where_it_logs()}")
         self._program.owes_an_answer = True  # nobody knows what it will say next
         return self.failed
 
-    def _cannot(self, how: str) -> NotSupportedError:
+    def _lacks(self, words: str) -> AgentLacksError:
+        self.failed = AgentLacksError(self.agent_id, self._program.command, words)
         self._program.owes_an_answer = True
-        return NotSupportedError(
-            f"agent {self.agent_id} {how} when it was started with --virtual: it cannot be played in virtual time, or "
-            f"not this mission{self._program.last_words()}; use --backend process, or see docs/virtual-time.md"
+        return self.failed
+
+    def _has_no_virtual_time(self, status: int) -> AgentFailedError | AgentLacksError:
+        """It ended before it said anything."""
+        words = self._program.last_words()
+        if of_a_shell(words):
+            return self._failure("crashed", f"ended by itself with status {status} ({words})")
+        return self._lacks(
+            f"with --virtual it ends with status {status}{words and ', and says: '}{words}; use --backend process, or "
+            "see docs/virtual-time.md"
         )

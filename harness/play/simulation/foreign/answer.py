@@ -24,7 +24,7 @@ class AnswerError(Exception):
     """A line that is no answer: why, in words that follow "agent 3 answered"."""
 
 
-class UnsupportedError(Exception):
+class LacksError(Exception):
     """The agent says that it lacks what it was asked for: its sentence."""
 
 
@@ -43,7 +43,7 @@ class Answer:
 
 
 def read_answer(line: bytes, *, tracing: bool) -> Answer:
-    """Raises AnswerError, UnsupportedError or RefusedError."""
+    """Raises AnswerError, LacksError or RefusedError."""
     try:
         said = from_json(line, allow_inf_nan=False)
     except ValueError as error:
@@ -51,7 +51,7 @@ def read_answer(line: bytes, *, tracing: bool) -> Answer:
     if not isinstance(said, dict):
         raise AnswerError(f"with what is not a JSON object: {_shown(line)}")
     if "error" in said:
-        kind = UnsupportedError if said.get("unsupported") is True else RefusedError
+        kind = LacksError if said.get("unsupported") is True else RefusedError
         raise kind(str(said["error"])[:500])
     sent = said.get("sent")
     if not isinstance(sent, list):

@@ -1,10 +1,11 @@
 """How an agent that is not ours ends a mission in virtual time."""
 
+from collections.abc import Sequence
 from typing import Literal
 
-from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError
+from harness.errors import VIOLATED, HarnessError, UnsupportedError
 
-Outcome = Literal["crashed", "hung"]
+Outcome = Literal["crashed", "hung", "not supported"]
 
 
 class AgentFailedError(HarnessError):
@@ -19,7 +20,12 @@ class AgentFailedError(HarnessError):
         self.detail = detail
 
 
-class NotSupportedError(HarnessError):
-    """An agent says that it cannot do what this mission needs, or cannot be driven in virtual time."""
+class AgentLacksError(UnsupportedError):
+    """An agent says that it lacks what this mission needs, or cannot be driven in virtual time."""
 
-    exit_status = WRONG_REQUEST
+    outcome: Outcome = "not supported"
+
+    def __init__(self, agent_id: int, command: Sequence[str], words: str) -> None:
+        super().__init__(str(UnsupportedError.of(agent_id, command, words)))
+        self.agent_id = agent_id
+        self.detail = str(self)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from harness.errors import ScenarioError
-from harness.play.process.agent import agent_command
+from harness.play.process.agent import agent_command, reboots_with_disk
 from harness.play.process.mission_file import mission_file
 from harness.play.simulation.agents import Stored, VirtualAgent
 from harness.play.simulation.foreign.agent import ForeignAgent, LifeRecord
@@ -85,6 +85,7 @@ class Foreigners:
             with_vehicle=False,
             life=life,
             epoch_us=0,
+            store="store" if reboots_with_disk(agent_id, self._scenario) else None,
         )
         mission["events"]["source"] = "none"
-        return {**mission, "speedup": 1}
+        return {**mission, "speedup": 1, "store": None}  # that it may be asked for one `features` says

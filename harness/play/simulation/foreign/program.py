@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
+from harness.play.last_words import LOOKED_AT_BYTES, last_words, last_words_in
 from harness.play.simulation.foreign.failure import Outcome
 
 START_LIMIT_S = 30.0
@@ -24,7 +25,6 @@ ANSWER_LIMIT_S = 10.0
 """Wall time after which a program that does not answer counts as hung; the first answer comes after its start."""
 MAX_ANSWER_BYTES = MAX_EXPORT_BYTES
 CHUNK_BYTES = 64 * 1024
-WORDS_BYTES = 500
 MOMENT_S = 1.0
 
 _PR_SET_PDEATHSIG = 1
@@ -155,14 +155,20 @@ class Program:
             return NoAnswerError("crashed", f"was ended by {signal.Signals(-status).name}")
         return NoAnswerError("crashed", f"ended by itself with status {status}", status)
 
-    def last_words(self) -> str:
+    def where_it_logs(self) -> str:
         """Where its log is, or what it said last, as the end of a sentence."""
         if self.log is not None:
             return f"; its log is {self.log}"
+        words = self.last_words()
+        return f"; it said: {words}" if words else ""
+
+    def last_words(self) -> str:
+        """What it said last on standard error; empty if nothing."""
+        if self.log is not None:
+            return last_words_in(self.log)
         size = self._errors.seek(0, os.SEEK_END)
-        self._errors.seek(max(0, size - WORDS_BYTES))
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return f"; it said: {lines[-1].strip()}" if lines else ""
+        self._errors.seek(max(0, size - LOOKED_AT_BYTES))
+        return last_words(self._errors.read().decode("utf-8", "replace"))
 
     def forget_words(self) -> None:
         """What it said on standard error in a mission that is over, if nobody keeps it."""
