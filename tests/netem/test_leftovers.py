@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -52,10 +54,16 @@ def interfaces() -> set[str]:
     return {path.name for path in Path("/sys/class/net").iterdir()}
 
 
-def orchestrator_in(folder: Path) -> subprocess.Popen[bytes]:
-    """Start `bare.py`; it and all that it starts carry the folder's name as their mark."""
+@contextmanager
+def orchestrator_in(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """`bare.py`, killed if the test fails; it and all that it starts carry the folder's name as their mark."""
     env = {**os.environ, "UCP_TEST_MARK": str(folder)}
-    return subprocess.Popen([sys.executable, str(BARE), str(folder)], stdout=subprocess.PIPE, env=env)
+    with subprocess.Popen([sys.executable, str(BARE), str(folder)], stdout=subprocess.PIPE, env=env) as orchestrator:
+        try:
+            yield orchestrator
+        except BaseException:
+            orchestrator.kill()
+            raise
 
 
 @pytest.mark.parametrize("after_s", MOMENTS)
@@ -102,7 +110,8 @@ def test_a_full_lab_is_gone_after_its_orchestrator_even_if_it_is_stopped_itself(
         # The orchestrator, setpriv's unshare, its init, and two of each program at least.
         everybody = processes_of(tmp_path)
         for pid in everybody - {orchestrator.pid}:
-            os.kill(pid, signal.SIGSTOP)
+            with suppress(ProcessLookupError):  # a program that sets conditions ends by itself
+                os.kill(pid, signal.SIGSTOP)
         orchestrator.send_signal(number)
     assert len(everybody) >= 3 + 6 * 2
     play(until(lambda: not processes_of(tmp_path), "every process is gone"))
