@@ -8,8 +8,10 @@ BIN := $(VENV)/bin
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 SCENARIO ?= scenarios/loss_15.yaml
 TESTS ?= -n 2
+FUZZ_SECONDS ?= 10
+TARGETS ?=
 
-.PHONY: run test test-netem docs lint setup clean
+.PHONY: run test test-netem fuzz docs lint setup clean
 
 run: setup
 	$(BIN)/ucp-harness run $(SCENARIO)
@@ -20,6 +22,11 @@ test: setup
 # The tests of real tc netem, inside User Mode Linux: for machines whose kernel lacks sch_netem.
 test-netem: setup
 	$(BIN)/python -m tests.netem.uml
+
+# Hostile input for all that reads any, so many seconds for each target: `make fuzz FUZZ_SECONDS=600 TARGETS="agent store"`.
+fuzz: setup
+	$(BIN)/python -c 'import atheris' 2>/dev/null || $(BIN)/pip install -q -e '.[fuzz]'
+	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS) $(TARGETS)
 
 # The documentation as a site, in site/index.html.
 docs: setup
@@ -49,4 +56,4 @@ $(VENV)/installed: pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .fuzz .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -5,6 +5,7 @@ A Unix stream socket; one JSON object per line in, one per line out (see CONTRAC
 
 import asyncio
 import json
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,9 @@ from typing import Any
 MAX_LINE_BYTES = 64 * 1024
 MAX_NAME = 40
 """More of a wrong command is not shown."""
+
+MAX_PARTS = 100
+"""A request has no more objects and lists in it."""
 
 Command = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -61,7 +65,7 @@ class ControlServer:
 
     def _answer(self, line: bytes) -> dict[str, Any]:
         try:
-            request = json.loads(line)
+            request = _request(line)
         except (ValueError, RecursionError):
             return {"ok": False, "error": "not JSON"}
         if not isinstance(request, dict):
@@ -75,3 +79,19 @@ class ControlServer:
             return {"ok": True, **command(request)}
         except CommandError as error:
             return {"ok": False, "error": str(error)}
+
+
+def _request(line: bytes) -> Any:
+    """What a line says in JSON. Raises ValueError, also for what json reads and a trace cannot hold, RecursionError."""
+    if line.count(b"[") + line.count(b"{") > MAX_PARTS:
+        raise ValueError
+    request = json.loads(line, parse_float=_finite, parse_constant=_finite)
+    json.dumps(request, ensure_ascii=False).encode()  # half a character is none
+    return request
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError
+    return number

@@ -17,6 +17,8 @@ MAX_EVENT_BYTES = EVENT_HEADER_BYTES + 256
 """The largest event of the thesis: 256 bytes of data and its header."""
 
 MEAN_TIME_BETWEEN_EVENTS_S = 30.0
+MAX_MEAN_S = 31 * 86400.0
+"""No mission is longer; and to find out that nothing happens for years takes minutes."""
 TRIAL_PERIOD_S = 1.0
 EVENT_DATA_BYTES = (32, 64, 128, 256)
 

@@ -100,7 +100,7 @@ class CommitBlock:
     @classmethod
     def from_body(cls, body: bytes) -> "CommitBlock":
         (chain_hash,) = _hashes(body[:HASH_BYTES], 1)
-        return cls(_unpack_block(body[HASH_BYTES:]), chain_hash)
+        return cls(decode_block(body[HASH_BYTES:]), chain_hash)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +208,7 @@ class BlockResponse:
 
     @classmethod
     def from_body(cls, body: bytes) -> "BlockResponse":
-        return cls(_unpack_block(body))
+        return cls(decode_block(body))
 
 
 Message = (
@@ -310,7 +310,8 @@ def _flag(body: bytes) -> bool:
     return body[0] == 1
 
 
-def _unpack_block(body: bytes) -> Block:
+def decode_block(body: bytes) -> Block:
+    """The block with this block data. Raises MalformedDatagramError if no message can carry it."""
     if not BLOCK_HEADER.size < len(body) <= BLOCK_HEADER.size + MAX_EVENT_DATA_BYTES:
         raise MalformedDatagramError("wrong length")
     agent_id, timestamp_us = BLOCK_HEADER.unpack_from(body)

@@ -8,18 +8,23 @@ import stat
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 from ucp.block import MAX_AGENT_ID
-from ucp.events import MEAN_TIME_BETWEEN_EVENTS_S
+from ucp.events import MAX_MEAN_S, MEAN_TIME_BETWEEN_EVENTS_S
 from ucp.features import FEATURES
 from ucp.quirks import Quirks, check_quirk
 from ucp.settings import Settings
+from ucp.shown import shown
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
 SCHEMA = "ucp-mission/1"
 MAX_MISSION_BYTES = 4 * 1024 * 1024
+MAX_INITIAL_DATA_BYTES = 512 * 1024
+"""The first line of a trace has it whole, and is read up to a mebibyte."""
+MAX_SPEEDUP = 1000.0
 LATEST_EPOCH_US = 2**63 - 1
+"""With these no timestamp of the next centuries is more than a block has room for."""
 MAX_NAME = 40
 """More of a wrong name is not shown."""
 
@@ -98,7 +103,7 @@ def parse_mission(document: Any) -> Mission:
     if not isinstance(document, dict):
         raise MissionError("not a mission: a JSON object is needed")
     if document.get("schema") != SCHEMA:
-        raise MissionError(f"`schema` is {document.get('schema')!r}, and this agent reads {SCHEMA!r}")
+        raise MissionError(f"`schema` is {shown(document.get('schema'))}, and this agent reads {SCHEMA!r}")
     _check_features(document.get("features", []))
     agent_id = _integer(document, "agent_id", 1, MAX_AGENT_ID)
     roster = _get(document, "roster", list)
@@ -107,10 +112,10 @@ def parse_mission(document: Any) -> Mission:
     if agent_id not in roster:
         raise MissionError(f"`agent_id` {agent_id} is not on the `roster`")
     epoch_us = document.get("epoch_us")
-    if epoch_us is not None and (type(epoch_us) is not int or not 0 <= epoch_us <= LATEST_EPOCH_US):
+    if epoch_us is not None and not is_epoch(epoch_us):
         raise MissionError("`epoch_us` must be microseconds since the Unix epoch, or null to wait for `start`")
     store = document.get("store")
-    if store is not None and (not isinstance(store, str) or not store):
+    if store is not None and not (isinstance(store, str) and store.isprintable() and store):
         raise MissionError("`store` must be the path of a file, or null to keep nothing on disk")
     return Mission(
         agent_id=agent_id,
@@ -121,10 +126,15 @@ def parse_mission(document: Any) -> Mission:
         settings=_settings(document.get("settings", {})),
         quirks=_quirks(document.get("quirks", {})),
         seed=_integer(document, "seed", 0, 2**64 - 1),
-        speedup=_positive(document, "speedup"),
+        speedup=_positive(document, "speedup", MAX_SPEEDUP),
         epoch_us=epoch_us,
         store=store,
     )
+
+
+def is_epoch(value: object) -> TypeGuard[int]:
+    """Whether it can be a mission's second 0 in microseconds since the Unix epoch."""
+    return type(value) is int and 0 <= value <= LATEST_EPOCH_US
 
 
 def _check_features(features: Any) -> None:
@@ -146,22 +156,26 @@ def _get(document: dict[str, Any], key: str, kind: type) -> Any:
 def _integer(document: dict[str, Any], key: str, low: int, high: int) -> int:
     value = document.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise MissionError(f"`{key}` must be a whole number {low}..{high}, not {value!r}")
+        raise MissionError(f"`{key}` must be a whole number {low}..{high}, not {shown(value)}")
     return value
 
 
-def _positive(document: dict[str, Any], key: str) -> float:
+def _positive(document: dict[str, Any], key: str, most: float = sys.float_info.max) -> float:
     value = document.get(key)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value <= sys.float_info.max:
-        raise MissionError(f"`{key}` must be a number above 0, not {value!r}")
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value <= most:
+        at_most = f", at most {most:g}" if most < sys.float_info.max else ""
+        raise MissionError(f"`{key}` must be a number above 0{at_most}, not {shown(value)}")
     return float(value)
 
 
 def _initial_data(document: dict[str, Any]) -> bytes:
     try:
-        return base64.b64decode(_get(document, "initial_data", str), validate=True)
+        initial_data = base64.b64decode(_get(document, "initial_data", str), validate=True)
     except ValueError as error:
         raise MissionError(f"`initial_data` is not base64: {error}") from None
+    if len(initial_data) > MAX_INITIAL_DATA_BYTES:
+        raise MissionError(f"`initial_data` is {len(initial_data)} bytes, more than {MAX_INITIAL_DATA_BYTES}")
+    return initial_data
 
 
 def _network(document: dict[str, Any]) -> Network:
@@ -169,17 +183,17 @@ def _network(document: dict[str, Any]) -> Network:
         try:
             ipaddress.IPv4Address(str(document.get(key)))
         except ValueError:
-            raise MissionError(f"`network.{key}` must be an IPv4 address, not {document.get(key)!r}") from None
+            raise MissionError(f"`network.{key}` must be an IPv4 address, not {shown(document.get(key))}") from None
     return Network(document["address"], document["broadcast"], _integer(document, "port", 1, 65535))
 
 
 def _event_source(document: dict[str, Any]) -> EventSource:
     document = {**dataclasses.asdict(EventSource()), **_known(document, "events", EventSource)}
     if document["source"] not in ("random", "mavlink", "none"):
-        raise MissionError(f"`events.source` must be random, mavlink or none, not {document['source']!r}")
+        raise MissionError(f"`events.source` must be random, mavlink or none, not {shown(document['source'])}")
     return EventSource(
         document["source"],
-        max(1.0, _positive(document, "mean_s")),
+        max(1.0, _positive(document, "mean_s", MAX_MEAN_S)),
         _positive(document, "position_interval_s"),
         _log(document["log"]),
         _get(document, "vehicle_host", str),
@@ -189,7 +203,7 @@ def _event_source(document: dict[str, Any]) -> EventSource:
 
 def _log(kinds: Any) -> tuple[EventKind, ...]:
     if not isinstance(kinds, list | tuple) or not all(isinstance(kind, str) and kind in EVENT_KINDS for kind in kinds):
-        raise MissionError(f"`events.log` must list kinds of events ({', '.join(EVENT_KINDS)}), not {kinds!r}")
+        raise MissionError(f"`events.log` must list kinds of events ({', '.join(EVENT_KINDS)}), not {shown(kinds)}")
     return tuple(kinds)
 
 
@@ -217,5 +231,5 @@ def _known(document: Any, key: str, kind: type) -> dict[str, Any]:
     names = [field.name for field in dataclasses.fields(kind)]
     for name in document:
         if name not in names:
-            raise MissionError(f"`{key}.{name}` is unknown: there are {', '.join(names)}")
+            raise MissionError(f"`{key}.{shown(name)[1:-1]}` is unknown: there are {', '.join(names)}")
     return document

@@ -27,7 +27,7 @@ from ucp.events import EVENT_HEADER_BYTES, LoggableEvent, RandomEvents
 from ucp.export import export_chain
 from ucp.features import UNSUPPORTED
 from ucp.files import TraceFile, write_json_atomically
-from ucp.mission import Mission, MissionError, UnsupportedMissionError, load_mission
+from ucp.mission import Mission, MissionError, UnsupportedMissionError, is_epoch, load_mission
 from ucp.quirks import check_quirk, wrong_handlers
 from ucp.status import status_of
 from ucp.store import Store, StoreError
@@ -92,6 +92,8 @@ class Node:
             self._begin(self.mission.epoch_us)
         await self._ended.wait()
         self._stop_source()
+        if self._timer is not None:
+            self._timer.cancel()
         loop.remove_reader(self._socket)
         self._socket.close()
         status = 0
@@ -241,7 +243,7 @@ class Node:
 
     def _start(self, request: dict[str, Any]) -> dict[str, Any]:
         epoch_us = request.get("epoch_us")
-        if type(epoch_us) is not int or epoch_us < 0:
+        if not is_epoch(epoch_us):
             raise CommandError("start needs `epoch_us`, microseconds since the Unix epoch")
         if self.clock.running:
             raise CommandError("the mission has started already")

@@ -1,10 +1,15 @@
 """What an agent can be told: timers, sizes, and the readings of an ambiguous thesis."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MAX_EVENT_BYTES
+from ucp.shown import shown
+
+MAX_TIMER_S = 1e9
+"""Thirty years."""
 
 Phase1Tie = Literal["phase2", "pop"]
 Phase2Tie = Literal["oldest", "block"]
@@ -35,14 +40,18 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} must be more than 0 seconds, not {getattr(self, name)}")
-        if not 0 <= self.finalize_gap_s < float("inf"):
-            raise ValueError(f"finalize_gap_s must not be negative, not {self.finalize_gap_s}")
-        if not 0 < self.max_block_bytes <= MAX_EVENT_DATA_BYTES:
-            raise ValueError(f"max_block_bytes must be 1..{MAX_EVENT_DATA_BYTES}, not {self.max_block_bytes}")
-        if not 0 < self.max_event_bytes <= self.max_block_bytes:
-            raise ValueError(f"max_event_bytes must be 1..max_block_bytes, not {self.max_event_bytes}")
+            self._check(name, f"more than 0 seconds, at most {MAX_TIMER_S:g}", (int, float), math.ulp(0.0), MAX_TIMER_S)
+        self._check("finalize_gap_s", f"0..{MAX_TIMER_S:g} seconds", (int, float), 0, MAX_TIMER_S)
+        self._check("max_block_bytes", f"1..{MAX_EVENT_DATA_BYTES}", (int,), 1, MAX_EVENT_DATA_BYTES)
+        self._check("max_event_bytes", "1..max_block_bytes", (int,), 1, self.max_block_bytes)
+        for name in ("vote_names_chain", "changed_before_tally"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be true or false, not {shown(getattr(self, name))}")
         for name, allowed in (("phase1_tie", get_args(Phase1Tie)), ("phase2_tie", get_args(Phase2Tie))):
             if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {shown(getattr(self, name))}")
+
+    def _check(self, name: str, allowed: str, kinds: tuple[type, ...], low: float, high: float) -> None:
+        value = getattr(self, name)
+        if type(value) not in kinds or not low <= value <= high:
+            raise ValueError(f"{name} must be {allowed}, not {shown(value)}")

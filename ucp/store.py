@@ -14,13 +14,16 @@ import contextlib
 import errno
 import json
 import os
+import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ucp.block import Block
+from ucp.block import BLOCK_HEADER, Block
+from ucp.messages import decode_block
+from ucp.shown import shown
 from ucp.state import AgentState
 
 SCHEMA = "ucp-store/1"
@@ -81,7 +84,7 @@ class StoredState:
     def replay(self, entry: dict[str, Any], known: dict[str, Block]) -> None:
         """Make all changes of an entry; `known` are the blocks of the entries before, by hash, and get this one's."""
         for agent_id, timestamp_us, event_data in entry["blocks"]:
-            block = Block(agent_id, timestamp_us, base64.b64decode(event_data))
+            block = decode_block(BLOCK_HEADER.pack(agent_id, timestamp_us) + base64.b64decode(event_data))
             known[block.block_hash.hex()] = block
         for operation, block_hash in entry["changes"]:
             self._change(operation, known[block_hash])
@@ -108,9 +111,18 @@ class Store:
         self.recovered = self._read()
 
     def _read(self) -> StoredState | None:
-        entries = _entries(self._path)
+        try:
+            return self._replayed(_entries(self._path))
+        except (ValueError, TypeError, LookupError, RecursionError, struct.error):
+            raise StoreError(
+                f"{self._path} has an entry whose checksum is right and that no agent wrote: move it away or name "
+                "another file as `store`"
+            ) from None
+
+    def _replayed(self, entries: Iterator[Any]) -> StoredState | None:
+        """Raises some error for entries that have no meaning, or make a state that no agent is in."""
         header = next(entries, None)
-        if header is None:
+        if not isinstance(header, dict):
             if self._path.exists() and self._path.stat().st_size:
                 raise StoreError(
                     f"{self._path} does not begin as a store: move it away or name another file as `store`"
@@ -118,12 +130,15 @@ class Store:
             return None
         if header != self._header:
             raise StoreError(
-                f"{self._path} is the store of agent {header.get('agent_id')} in another mission, or of another "
-                "version: name another file as `store`"
+                f"{self._path} is the store of agent {shown(header.get('agent_id'))} in another mission, or of "
+                "another version: name another file as `store`"
             )
         stored, known = StoredState(), dict[str, Block]()
         for entry in entries:
             stored.replay(entry, known)
+        held = [block.block_hash for block in stored.blocks()]
+        if len({*held}) < len(held) or not {*stored.completed} <= {*held}:
+            raise ValueError("a block is in two places, or one that it completed in none")
         return stored
 
     def write(self, changes: list[Change]) -> None:
@@ -194,8 +209,11 @@ def _sync_directory(path: Path) -> None:
         os.close(descriptor)
 
 
-def _entries(path: Path) -> Iterator[dict[str, Any]]:
-    """The entries of a store up to the first that is not whole; none if there is no store. Raises OSError."""
+def _entries(path: Path) -> Iterator[Any]:
+    """The entries of a store up to the first that is not whole; none if there is no store.
+
+    Raises OSError; ValueError or RecursionError for an entry that is whole and no JSON.
+    """
     try:
         file = path.open("rb")
     except FileNotFoundError:

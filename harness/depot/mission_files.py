@@ -20,11 +20,9 @@ from ucp.block import hash_digest
 from ucp.features import needed
 from ucp.files import write_json_atomically
 from ucp.messages import PORT
-from ucp.mission import Mission, MissionError, parse_mission
+from ucp.mission import MAX_INITIAL_DATA_BYTES, Mission, MissionError, parse_mission
 
 SUFFIX = ".mission.json"
-MAX_INITIAL_DATA_BYTES = 512 * 1024
-"""The first line of a trace has it whole, and is read up to a mebibyte."""
 
 
 class MissionFileError(HarnessError):

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from harness.errors import ScenarioError
 from harness.matrix.model import Matrix
 from harness.matrix.record import SCHEMA, MatrixRecord
-from harness.scenario.model import BOUNDED
+from ucp.shown import shown
 
 _SAYS_NOTHING_OF_RUNS: Any = {"name": True, "about": True, "keep": True, "scenario": {"name", "about"}}
 
@@ -31,7 +31,7 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
         raise ScenarioError(f"{path} is not JSON: an earlier night is its matrix.json") from None
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema != SCHEMA:
-        claim = f"has schema {BOUNDED.repr(schema)}" if schema is not None else "names no schema"
+        claim = f"has schema {shown(schema)}" if schema is not None else "names no schema"
         raise ScenarioError(f"{path} {claim}: an earlier night is its matrix.json, whose schema is {SCHEMA}")
     try:
         record = MatrixRecord.model_validate(document)

@@ -10,7 +10,8 @@ from harness.backend_names import BackendName
 from harness.errors import ScenarioError
 from harness.play.backends import BACKENDS
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
-from harness.scenario.model import BOUNDED, MAX_AGENTS, Model, Probability
+from harness.scenario.model import MAX_AGENTS, Model, Probability
+from ucp.shown import shown
 
 MAX_SEEDS = 10_000
 MAX_SEED = 2**32 - 1
@@ -101,7 +102,7 @@ class Matrix(Model):
         if agents:
             first = agents[0] if isinstance(agents, list) else agents
             if scenario.get("agents", first) != first:
-                its_agents = BOUNDED.repr(scenario["agents"])
+                its_agents = shown(scenario["agents"])
                 raise ValueError(
                     f"`scenario` sets agents to {its_agents}, which the matrix's `agents` is for: remove it there"
                 )
@@ -147,7 +148,7 @@ class Matrix(Model):
             raise ValueError(f"it should be a number of seeds 1..{MAX_SEEDS}, or a list of them")
         for seed in seeds:
             if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
-                raise ValueError(f"{BOUNDED.repr(seed)} is not a seed: it should be 0..{MAX_SEED}")
+                raise ValueError(f"{shown(seed)} is not a seed: it should be 0..{MAX_SEED}")
         return _each_once(seeds)
 
 

@@ -9,8 +9,9 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from harness.scenario.model import BOUNDED, VehicleKey
+from harness.scenario.model import VehicleKey
 from ucp.block import MAX_AGENT_ID
+from ucp.shown import shown
 
 MAX_WORDS = 100
 
@@ -23,16 +24,16 @@ def _commands(asked: Any) -> Any:
     if isinstance(asked, Mapping):
         for agent, words in asked.items():
             if not _is_agent(agent):
-                raise ValueError(f"{BOUNDED.repr(agent)} is not an agent ID: it should be 1..{MAX_AGENT_ID}")
+                raise ValueError(f"{shown(agent)} is not an agent ID: it should be 1..{MAX_AGENT_ID}")
             if not _is_command(words):
-                raise ValueError(f"agent {BOUNDED.repr(agent)} needs a program and its arguments, as a list")
+                raise ValueError(f"agent {shown(agent)} needs a program and its arguments, as a list")
     elif asked is not None and not _is_command(asked):
         raise ValueError("should be a program and its arguments, as a list, or a mapping of agent IDs to such lists")
     return asked
 
 
 def _is_agent(key: object) -> bool:
-    digits = str(key)
+    digits = shown(key).strip("'")
     return digits.isdecimal() and len(digits) <= len(str(MAX_AGENT_ID)) and 1 <= int(digits) <= MAX_AGENT_ID
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from harness.scenario.model import Data, Instant, Model, Seconds, VehicleId
+from ucp.events import MAX_MEAN_S
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
 Bytes = bytes
@@ -45,7 +46,7 @@ class Events(Model):
     source: Literal["mavlink", "random", "scripted"] = "mavlink"
     log: Annotated[list[EventKind], Field(min_length=1, max_length=len(EVENT_KINDS))] = list(DEFAULT_LOG)
     position_interval_s: Seconds = 10.0
-    mean_s: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 30.0
+    mean_s: Annotated[float, Field(ge=1, le=MAX_MEAN_S, allow_inf_nan=False)] = 30.0
     script: Annotated[list[ScriptedEvent], Field(max_length=1_000_000)] = []
 
     @model_validator(mode="after")

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from harness.backend_names import BackendName
-from harness.scenario.model import BOUNDED, Model, VehicleId, VehicleKey
+from harness.scenario.model import Model, VehicleId, VehicleKey
 from harness.scenario.verdicts import (
     BESIDE,
     CHARACTERISTICS,
@@ -32,6 +32,7 @@ from harness.scenario.verdicts import (
     kind_of,
 )
 from ucp.agent import HANDLERS
+from ucp.shown import shown
 
 FigureName = Literal[
     "agents",
@@ -62,7 +63,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 def _known_number(key: Any) -> int:
     number = NUMBERS.get(str(key))
     if number is None or isinstance(key, float):
-        raise ValueError(f"there is no characteristic {BOUNDED.repr(key)}: they are 1 to 6")
+        raise ValueError(f"there is no characteristic {shown(key)}: they are 1 to 6")
     return number
 
 
@@ -142,9 +143,7 @@ class Expect(Model):
     def _known_figures(cls, figures: Any) -> Any:
         for name in figures if isinstance(figures, Mapping) else ():
             if name not in get_args(FigureName):
-                raise ValueError(
-                    f"there is no figure {BOUNDED.repr(name)}: there are {', '.join(get_args(FigureName))}"
-                )
+                raise ValueError(f"there is no figure {shown(name)}: there are {', '.join(get_args(FigureName))}")
         return figures
 
     @field_validator("deviations")
@@ -153,7 +152,7 @@ class Expect(Model):
         for handler in deviations.values():
             if handler not in HANDLERS:
                 near = ", ".join(get_close_matches(handler[:80], HANDLERS, cutoff=0.0))
-                raise ValueError(f"there is no handler {BOUNDED.repr(handler)}: the nearest are {near}")
+                raise ValueError(f"there is no handler {shown(handler)}: the nearest are {near}")
         return deviations
 
     @model_validator(mode="after")

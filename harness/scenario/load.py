@@ -10,9 +10,11 @@ from pydantic import BaseModel, ValidationError
 
 from harness.errors import ScenarioError
 from harness.scenario import library
-from harness.scenario.model import BOUNDED
 from harness.scenario.scenario import Scenario
+from ucp.shown import shown
 
+MAX_PROBLEM = 200
+"""More of what is wrong with a file is not shown."""
 MAX_SCENARIO_BYTES = 8 * 1024 * 1024
 """A flight of two hours with twenty vehicles, word for word, is half of that."""
 
@@ -41,11 +43,25 @@ class _Loader(yaml.SafeLoader):
         seen: set[str] = set()
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
             if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    problem=f"{key.value} is there twice", problem_mark=key.start_mark
-                )
+                problem = f"{shown(key.value)[1:-1]} is there twice"
+                raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def parse_yaml(text: str) -> Any:
+    """Whatever the text says. Raises ScenarioError: one sentence that begins with "not YAML"."""
+    try:
+        return yaml.load(text, _Loader)  # noqa: S506  (a safe loader)
+    except RecursionError:
+        where, problem = "", "it is nested too deeply"
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}" if mark else ""
+        problem = str(getattr(error, "problem", None) or getattr(error, "reason", None) or "it cannot be read")
+    except ValueError as error:  # a date that is none, a number of thousands of digits
+        where, problem = "", f"a value in it is none: {str(error).partition(':')[0].partition(';')[0]}"
+    raise ScenarioError(f"not YAML{where}: {problem[:MAX_PROBLEM]}")
 
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
@@ -57,17 +73,18 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
             raise ScenarioError(f"{path}: not a file that holds a {what}")
         if status.st_size > MAX_SCENARIO_BYTES:
             raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which no {what} is")
-        document = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506  (a safe loader)
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         names = "`ucp-harness scenarios` lists those that come along"
         raise ScenarioError(f"{path}: there is no such file or {what}; {names}") from None
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "it cannot be decoded"
-        raise ScenarioError(f"{path}: not YAML{where}: {problem}") from None
+    except UnicodeDecodeError:
+        raise ScenarioError(f"{path}: not YAML: it is not UTF-8 text") from None
+    try:
+        document = parse_yaml(text)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: {error}") from None
     if not isinstance(document, dict):
         raise ScenarioError(f"{path}: a {what} is a YAML mapping with at least `name`")
     return document
@@ -85,8 +102,8 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if not key:
         return str(message)
-    shown = BOUNDED.repr(problem["input"])
-    return f"`{key}` is {shown}: it {message}" if message.startswith("should") else f"`{key}` is {shown}: {message}"
+    value = shown(problem["input"])
+    return f"`{key}` is {value}: it {message}" if message.startswith("should") else f"`{key}` is {value}: {message}"
 
 
 def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:

@@ -2,7 +2,6 @@
 
 import base64
 import binascii
-import reprlib
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
@@ -10,9 +9,6 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from ucp.block import MAX_AGENT_ID
 
 MAX_AGENTS = 1000
-
-BOUNDED = reprlib.Repr()  # a few lines of YAML aliases can stand for gigabytes
-BOUNDED.maxlevel = 2
 
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]

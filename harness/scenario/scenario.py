@@ -16,7 +16,7 @@ from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.flight import Flight
-from harness.scenario.model import BOUNDED, MAX_AGENTS, Data, Model, Seconds, VehicleKey
+from harness.scenario.model import MAX_AGENTS, Data, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
 from harness.scenario.numbered import Lateness
 from harness.scenario.quirks import AskedQuirks, OfSome, of_agent
@@ -31,6 +31,7 @@ from sitl.plan import PlanError
 from ucp.block import MAX_AGENT_ID
 from ucp.quirks import Quirks, in_force
 from ucp.settings import Settings
+from ucp.shown import shown
 
 MAX_DURATION_S = 31 * 86400
 """No mission is longer: a run in virtual time would take hours and all memory."""
@@ -160,7 +161,7 @@ class Scenario(Model):
             raise ValueError(f"it should be a number of agents 1..{MAX_AGENTS}, or a list of their IDs")
         for agent in ids:
             if isinstance(agent, bool) or not isinstance(agent, int) or not 1 <= agent <= MAX_AGENT_ID:
-                raise ValueError(f"{BOUNDED.repr(agent)} is not an agent ID: it should be 1..{MAX_AGENT_ID}")
+                raise ValueError(f"{shown(agent)} is not an agent ID: it should be 1..{MAX_AGENT_ID}")
         if len(set(ids)) < len(ids):
             raise ValueError(f"names {Counter(ids).most_common(1)[0][0]} twice")
         return agents

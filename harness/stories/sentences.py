@@ -4,16 +4,15 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-import yaml
-
 from harness.errors import ScenarioError
 from harness.scenario.faults import ASKED_FOR
+from harness.scenario.load import parse_yaml
 
 EVENT_BYTES = 256
 """What a scripted event has by itself."""
 
-_IDS = r"(\d+(?: \d+)*)"
-_LOGS = re.compile(rf"{_IDS} logs?(?: (\d+) bytes)?")
+_IDS = r"(\d{1,7}(?: \d{1,7})*)"
+_LOGS = re.compile(rf"{_IDS} logs?(?: (\d{1, 7}) bytes)?")
 _CUT = re.compile(rf"{_IDS} do(?:es)? not reach {_IDS}")
 _JOINED = re.compile(rf"{_IDS} reach(?:es)? {_IDS} again")
 _PARTITION = re.compile(rf"partition {_IDS}((?: \| {_IDS})+)")
@@ -91,8 +90,8 @@ def _ids(text: str) -> list[int]:
 
 def _entry(sentence: str) -> dict[str, Any]:
     try:
-        entry = yaml.safe_load(sentence)
-    except yaml.YAMLError:
+        entry = parse_yaml(sentence)
+    except ScenarioError:
         raise ScenarioError(f"{sentence[:80]!r} is not YAML, as an entry of a timeline is") from None
     if not isinstance(entry, dict) or "at_s" in entry:
         raise ScenarioError(f"{sentence[:80]!r} is no entry of a timeline, whose instant the story tells")

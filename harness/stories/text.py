@@ -20,11 +20,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
-from harness.scenario.load import parse
+from harness.scenario.load import parse, parse_yaml
 from harness.stories.sentences import Course
 
 MAX_BYTES = 1024 * 1024
@@ -94,7 +92,8 @@ def read_story(path: Path) -> Story:
             raise ScenarioError(f"{path}: not a file, or larger than any story")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+        why = "it is not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror
+        raise ScenarioError(f"{path}: cannot be read: {why}") from None
     try:
         return _parsed(path, text)
     except ScenarioError as error:
@@ -150,19 +149,11 @@ def _sections(told: Sequence[tuple[int, int, bool]]) -> list[Section]:
     ]
 
 
-def _problem(error: yaml.YAMLError) -> str:
-    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
-        return f"{error.problem}, line {error.problem_mark.line + 1}"
-    return "it cannot be read"
-
-
 def _scenario(path: Path, header: Sequence[str], course: Course) -> Scenario:
     try:
-        keys = yaml.safe_load("\n".join(header)) or {}
-    except yaml.YAMLError as error:
-        raise ScenarioError(
-            f"before its first sentence are a scenario's keys, and no YAML: {_problem(error)}"
-        ) from None
+        keys = parse_yaml("\n".join(header)) or {}
+    except ScenarioError as error:
+        raise ScenarioError(f"before its first sentence are a scenario's keys: {error}") from None
     if not isinstance(keys, dict):
         raise ScenarioError("before its first sentence are a scenario's keys, each with its value")
     if taken := {"timeline", "duration_s", "events"} & keys.keys():

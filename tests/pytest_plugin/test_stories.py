@@ -160,7 +160,7 @@ def test_in_virtual_time_any_agent_does_as_the_story_tells(pytester: pytest.Pyte
         ("9 s: end\n10 s: 1 logs\n", "line 2: something is told after the end"),
         (
             "agents: [\n1 s: end\n",
-            "before its first sentence are a scenario's keys, and no YAML: expected the node content",
+            "before its first sentence are a scenario's keys: not YAML at line 1: expected the node content",
         ),
         ("- 3\n1 s: end\n", "before its first sentence are a scenario's keys, each with its value"),
         ("timeline: []\n1 s: end\n", "`timeline` is what its sentences tell"),

@@ -23,6 +23,7 @@ from typing import Any
 from ucp.core import Core
 from ucp.handler import EventHandler, LocalEvent
 from ucp.messages import Message
+from ucp.shown import shown
 
 Handler = Callable[..., str]
 """What runs otherwise: a handler, given the core and its input."""
@@ -57,9 +58,9 @@ class Quirk:
         """Raises ValueError, in a sentence, if the quirk cannot have this value."""
         if not self.chance:
             if not isinstance(value, bool):
-                raise ValueError(f"{self.name} is true or false, not {value!r}")
+                raise ValueError(f"{self.name} is true or false, not {shown(value)}")
         elif isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
-            raise ValueError(f"{self.name} is a probability 0..1, not {value!r}")
+            raise ValueError(f"{self.name} is a probability 0..1, not {shown(value)}")
 
     def in_place_of(self, good: EventHandler[Any], value: float, lots: Random) -> EventHandler[Any]:
         """The wrong handler; what is random about it is drawn from `lots`."""

@@ -1,10 +1,11 @@
 """Requests and answers of the control socket."""
 
+from ucp.mission import LATEST_EPOCH_US
 from ucp.schemas.parts import BASE64, COUNT, EVENT_ID, FLAG, HASH, SECONDS, Schema, record
 
 REQUESTS: dict[str, Schema] = {
     "status": {},
-    "start": {"epoch_us": COUNT},
+    "start": {"epoch_us": COUNT | {"maximum": LATEST_EPOCH_US}},
     "log": {"event_id": EVENT_ID, "data": BASE64},
     "stop_events": {},
     "reconcile": {},

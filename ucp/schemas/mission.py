@@ -4,9 +4,10 @@ import dataclasses
 from typing import get_args
 
 from ucp.block import MAX_EVENT_DATA_BYTES
-from ucp.mission import LATEST_EPOCH_US, SCHEMA
+from ucp.events import MAX_MEAN_S
+from ucp.mission import LATEST_EPOCH_US, MAX_SPEEDUP, SCHEMA
 from ucp.schemas.parts import AGENT_ID, BASE64, FLAG, ROSTER, Schema, listed, record
-from ucp.settings import Phase1Tie, Phase2Tie, Settings
+from ucp.settings import MAX_TIMER_S, Phase1Tie, Phase2Tie, Settings
 from ucp.telemetry import EVENT_KINDS
 
 ABOVE_0: Schema = {"type": "number", "exclusiveMinimum": 0}
@@ -15,11 +16,11 @@ PORT: Schema = {"type": "integer", "minimum": 1, "maximum": 65535}
 BYTES: Schema = {"type": "integer", "minimum": 1, "maximum": MAX_EVENT_DATA_BYTES}
 
 SETTINGS: dict[str, Schema] = {
-    "vote_timeout_s": ABOVE_0,
-    "phase1_timeout_s": ABOVE_0,
-    "phase2_timeout_s": ABOVE_0,
-    "phase3_timeout_s": ABOVE_0,
-    "finalize_gap_s": {"type": "number", "minimum": 0},
+    "vote_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
+    "phase1_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
+    "phase2_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
+    "phase3_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
+    "finalize_gap_s": {"type": "number", "minimum": 0, "maximum": MAX_TIMER_S},
     "max_block_bytes": BYTES,
     "max_event_bytes": BYTES,
     "vote_names_chain": FLAG,
@@ -39,7 +40,7 @@ def settings(*, optional: bool) -> Schema:
 def events() -> Schema:
     """Where an agent's events come from."""
     of_telemetry: Schema = {
-        "mean_s": ABOVE_0,
+        "mean_s": ABOVE_0 | {"maximum": MAX_MEAN_S},
         "position_interval_s": ABOVE_0,
         "log": listed({"enum": list(EVENT_KINDS)}),
         "vehicle_host": {"type": "string"},
@@ -63,7 +64,7 @@ def schema() -> Schema:
             "settings": settings(optional=True),
             "quirks": {"type": "object", "additionalProperties": {"type": ["boolean", "number"]}},
             "seed": {"type": "integer", "minimum": 0, "maximum": 2**64 - 1},
-            "speedup": ABOVE_0,
+            "speedup": ABOVE_0 | {"maximum": MAX_SPEEDUP},
             "epoch_us": {"type": ["integer", "null"], "minimum": 0, "maximum": LATEST_EPOCH_US},
             "store": {"type": ["string", "null"], "minLength": 1},
         },

@@ -1,0 +1,102 @@
+"""`python -m tests.fuzz [TARGET ...] [--seconds 60] [--random]`: hostile input for all that reads any.
+
+Each target for so many seconds, under coverage guidance if `atheris` is installed (`pip install -e '.[test,fuzz]'`).
+Without it, and with `--random`, the kept inputs are mutated at random. New inputs that cover more are kept in .fuzz
+from one time to the next, and inputs that fail in .fuzz/failures; the exit status is then 1.
+"""
+
+import argparse
+import hashlib
+import re
+import subprocess
+import sys
+import time
+import traceback
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from tests.fuzz.corpus import FOLDER, files_of
+from tests.fuzz.execute import executed, mutated
+from tests.fuzz.finding import MOST_S
+from tests.fuzz.targets import NAMES, named
+
+GROWN = Path(".fuzz")
+FAILURES = GROWN / "failures"
+MOST_BYTES = 65536
+MOST_MIB = 1024
+PATIENCE_S = 60
+"""So much longer than asked may the last input take, and the start."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"of {', '.join(NAMES)}; all if none is named")
+    parser.add_argument("--seconds", type=int, default=60, help="for each target")
+    parser.add_argument("--random", action="store_true", help="no coverage guidance")
+    asked = parser.parse_args()
+    if unknown := [name for name in asked.targets if name not in NAMES]:
+        parser.error(f"there is no target {unknown[0]}: there are {', '.join(NAMES)}")
+    FAILURES.mkdir(parents=True, exist_ok=True)
+    is_guided = not asked.random and find_spec("atheris") is not None
+    failed = [
+        name for name in asked.targets or NAMES if not (_guided if is_guided else _at_random)(name, asked.seconds)
+    ]
+    if failed:
+        sys.stdout.write(f"failed: {', '.join(failed)}; the inputs are in {FAILURES}\n")
+    return 1 if failed else 0
+
+
+def _guided(name: str, seconds: int) -> bool:
+    """Whether nothing fails. It is a process of its own: libFuzzer ends the one that it is in."""
+    grown = GROWN / name
+    grown.mkdir(exist_ok=True)
+    log = GROWN / f"{name}.log"
+    options = [f"-max_total_time={seconds}", f"-timeout={MOST_S:.0f}", f"-rss_limit_mb={MOST_MIB}"]
+    options += [f"-max_len={MOST_BYTES}", "-print_final_stats=1", f"-artifact_prefix={FAILURES}/{name}-"]
+    with TemporaryDirectory(prefix="ucp-fuzz-") as scratch, log.open("wb") as output:
+        command = [sys.executable, "-m", "tests.fuzz.guided", name, *options, str(grown), str(FOLDER / name)]
+        began = time.monotonic()
+        try:
+            ended = subprocess.run(
+                ["env", f"TMPDIR={scratch}", *command], stdout=output, stderr=output, timeout=seconds + PATIENCE_S
+            )
+            problem = "" if ended.returncode == 0 else f"ended with status {ended.returncode}"
+        except subprocess.TimeoutExpired:
+            problem = "hangs"
+        left = [path.name for path in Path(scratch).iterdir() if not path.name.startswith("fuzz-")]
+    if left and not problem:
+        problem = f"leaves {left[0]} behind"
+    told = log.read_text(errors="replace")
+    inputs = int((re.findall(r"stat::number_of_executed_units: (\d+)", told) or ["0"])[-1])
+    edges = (re.findall(r"cov: (\d+)", told) or ["0"])[-1]
+    _tell(name, inputs, time.monotonic() - began, f"{edges} edges", f"{problem}, see {log}" if problem else "")
+    return not problem
+
+
+def _at_random(name: str, seconds: int) -> bool:
+    """Whether nothing fails."""
+    target, kept = named(name), [path.read_bytes() for path in files_of(name)]
+    began, inputs, problem = time.monotonic(), 0, ""
+    for data in mutated(kept, seed=time.time_ns()):
+        if problem or time.monotonic() > began + seconds:
+            break
+        inputs += 1
+        try:
+            executed(target, data)
+        except Exception:
+            failed = FAILURES / f"{name}-crash-{hashlib.sha1(data, usedforsecurity=False).hexdigest()}"
+            failed.write_bytes(data)
+            problem = f"{failed}: {traceback.format_exc()}"
+    _tell(name, inputs, time.monotonic() - began, "at random", problem)
+    return not problem
+
+
+def _tell(name: str, inputs: int, seconds: float, reached: str, problem: str) -> None:
+    rate = inputs / seconds if seconds else 0.0
+    sys.stdout.write(f"{name:11} {inputs:8} inputs, {rate:6.0f}/s, {reached}, {problem or 'nothing fails'}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

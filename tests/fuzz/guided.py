@@ -1,0 +1,40 @@
+"""One target under coverage guidance: `python -m tests.fuzz.guided [--blind] TARGET [libFuzzer's options] FOLDER...`
+
+Half of the mutations are libFuzzer's, half those of `tests.fuzz.mutations`. `--blind` mutates the kept inputs at random
+and learns nothing from what that covers: to compare. An input that fails stays in the file that is named last.
+"""
+
+import random
+import sys
+
+import atheris
+
+PACKAGES = ["ucp", "harness", "netem", "sitl"]
+
+
+def main(arguments: list[str]) -> None:
+    blind = arguments[0] == "--blind"
+    name, *options = arguments[blind:]
+    with atheris.instrument_imports(include=PACKAGES):
+        from tests.fuzz.corpus import files_of
+        from tests.fuzz.mutations import damaged
+        from tests.fuzz.targets import named
+
+        target = named(name)
+    kept = [path.read_bytes() for path in files_of(name)]
+
+    def mutate(data: bytes, most_bytes: int, seed: int) -> bytes:
+        chance = random.Random(seed)
+        if blind:
+            return damaged(chance.choice(kept), chance)[:most_bytes]
+        if chance.random() < 0.5:
+            mutated: bytes = atheris.Mutate(data, most_bytes)
+            return mutated
+        return damaged(data, chance)[:most_bytes]
+
+    atheris.Setup([sys.argv[0], *options], target.run, custom_mutator=mutate)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,81 @@
+"""A capture, pcapng or pcap: read, joined with another, shown; its frames are written and read the same."""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from harness.errors import HarnessError
+from harness.packets import text
+from harness.packets.document import document
+from harness.packets.exchanges import Exchanges
+from harness.packets.files import read_captures
+from harness.packets.losses import count_losses
+from harness.packets.names import Names
+from harness.packets.pcap import OUTBOUND, CaptureFile, Frame
+from harness.packets.text import Wording
+from harness.packets.transmissions import join
+from netem.pcapng import PcapngFile, header
+from tests.fuzz.finding import require, sound
+from tests.fuzz.targets.home import came_home, sound_run
+
+NAME = "1.pcapng"
+_LAST_NS = 2**63 - 1
+_ETHERNET = 1
+
+
+def run(data: bytes) -> None:
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / NAME
+        path.write_bytes(data)
+        file = CaptureFile(path)
+        try:
+            _same_again([*file], Path(directory) / "again.pcapng")
+        except HarnessError as error:
+            sound(str(error))
+        sound(file.trouble)
+        _show([path])
+        _show([path, sound_run() / "capture" / "2.pcapng"])
+    came_home(NAME, data)
+
+
+def _same_again(frames: list[Frame], path: Path) -> None:
+    frames = [frame for frame in frames if 0 <= frame.time_ns <= _LAST_NS]
+    path.write_bytes(header("eth0", ""))
+    file = PcapngFile(path)
+    for frame in frames:
+        file.packet(frame.time_ns, frame.data, outbound=frame.direction == OUTBOUND)
+    file.close()
+    again = [(frame.time_ns, frame.data) for frame in CaptureFile(path)]
+    require(again == [(frame.time_ns, frame.data) for frame in frames], "frames are written otherwise")
+
+
+def _show(paths: list[Path]) -> None:
+    """As `ucp-harness packets` does."""
+    captures = read_captures(paths)
+    for sentence in (*captures.errors, *captures.problems):
+        sound(sentence)
+    transmissions = join(captures)
+    exchanges, names = Exchanges(transmissions), Names(transmissions, [])
+    list(text.lines(transmissions, exchanges, Wording(names, str), None))
+    text.head(captures)
+    list(text.tail(captures, transmissions))
+    list(document(captures, count_losses(transmissions), transmissions, exchanges, names))
+
+
+def seeds(flown: Path) -> Iterator[bytes]:
+    capture = flown / "capture" / NAME
+    yield capture.read_bytes()
+    frames = [*CaptureFile(capture)][:10]
+    for magic, order, fraction_ns in ((0xA1B2C3D4, "<", 1000), (0xA1B23C4D, ">", 1)):
+        yield struct.pack(order + "I2H4I", magic, 2, 4, 0, 0, 65535, _ETHERNET) + b"".join(
+            struct.pack(
+                order + "4I",
+                frame.time_ns // 10**9,
+                frame.time_ns % 10**9 // fraction_ns,
+                len(frame.data),
+                len(frame.data),
+            )
+            + frame.data
+            for frame in frames
+        )

@@ -1,0 +1,56 @@
+"""What arrives on the port: accepted is what its own writer makes, byte for byte, and scapy reads the same."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from scapy.config import conf
+from scapy.packet import Raw
+
+from harness.packets.datagram import NotUcpError, unwrap
+from harness.packets.pcap import CaptureFile
+from harness.packets.summary import summarize
+from tests.fuzz.finding import require
+from ucp.events import MalformedEventsError, decode_events
+from ucp.messages import MAX_DATAGRAM_BYTES, MalformedDatagramError, datagram_bytes, decode
+from ucp.scapy import LAYERS, UCP
+from ucp.telemetry import describe
+
+conf.debug_dissector = True  # else scapy hides what its layers raise
+
+
+def run(data: bytes) -> None:
+    packet = UCP(data) if data else None
+    require(packet is None or bytes(packet) == data, "scapy gives other bytes back")
+    try:
+        datagram = decode(data)
+    except MalformedDatagramError:
+        require(packet is None or type(packet.lastlayer()) in (Raw, UCP), "scapy accepts what the codec refuses")
+        return
+    require(datagram.encode() == data and len(data) <= MAX_DATAGRAM_BYTES, "accepted, and written otherwise")
+    require(datagram_bytes(datagram.message) == len(data), "its length is not what it is said to be")
+    assert packet is not None
+    require(type(packet.lastlayer()) is LAYERS[type(datagram.message)], "scapy reads another message")
+    summarize(datagram.message)
+    block = getattr(datagram.message, "block", None)
+    if block is None:
+        return
+    try:
+        events = decode_events(block.event_data)
+    except MalformedEventsError:
+        return
+    require(b"".join(event.encode() for event in events) == block.event_data, "events are written otherwise")
+    for event in events:
+        describe(event.event_id, event.data)
+
+
+def seeds(flown: Path) -> Iterator[bytes]:
+    """A datagram of each type."""
+    types: dict[int, bytes] = {}
+    for capture in sorted((flown / "capture").iterdir()):
+        for frame in CaptureFile(capture):
+            try:
+                datagram, _ = unwrap(frame)
+            except NotUcpError:
+                continue
+            types.setdefault(datagram[3], datagram)
+    yield from types.values()

@@ -1,0 +1,178 @@
+"""What came home from the field, through all that reads such files: no traceback, and what is not used is named.
+
+A file is sorted out, alone and beside sound ones, imported, replayed if it is a trace, and read from the archive of the
+run that it is of. What costs more is done with some inputs only, always the same.
+"""
+
+import zlib
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from harness import checker
+from harness.archive.archive import RunArchive
+from harness.archive.record import RogueInjection
+from harness.archive.trace_lines import read_lines
+from harness.errors import HarnessError
+from harness.field.adapters import bring_in
+from harness.field.adapters.comma_separated import CommaSeparated
+from harness.field.adapters.record import FILE, ImportRecord
+from harness.field.adapters.rosbag import RosBag
+from harness.field.homecoming import Homecoming, sort_out
+from harness.field.replay import Player, open_record
+from tests.fuzz.finding import require, sound
+from tests.harness.field.flights import flown
+
+TRACE_LINES = 24
+FRAMES = 30
+DURATION_S = 150.0
+_AGENTS = {1, 2, 3}
+
+
+def run_of_three(directory: Path) -> Path:
+    """A run whose files are small: traces and captures have only their beginnings."""
+    run = flown(directory, duration_s=DURATION_S, capture=True)
+    for trace in (run / "agents").glob("*.trace.jsonl"):
+        trace.write_bytes(b"".join(trace.read_bytes().splitlines(keepends=True)[:TRACE_LINES]))
+    for capture in (run / "capture").iterdir():
+        capture.write_bytes(_first_blocks(capture.read_bytes()))
+    return run
+
+
+def _first_blocks(capture: bytes) -> bytes:
+    position = 0
+    for _ in range(FRAMES):
+        if position + 8 > len(capture):
+            break
+        position += int.from_bytes(capture[position + 4 : position + 8], "little")
+    return capture[:position]
+
+
+@cache
+def _place() -> TemporaryDirectory[str]:
+    """It goes when the process does."""
+    return TemporaryDirectory(prefix="fuzz-")
+
+
+@cache
+def sound_run() -> Path:
+    """One in this process, whose files are exchanged and put back."""
+    return run_of_three(Path(_place().name) / "run")
+
+
+def came_home(name: str, data: bytes) -> None:
+    """A file of this name and content."""
+    lot = zlib.crc32(data)
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / name
+        path.write_bytes(data)
+        _named(path, sort_out([path]))
+        if lot % 4 == 0:
+            _among_others(path)
+        if _import(path, Path(directory) / "out") and lot % 8 == 0:
+            _check(Path(directory) / "out")
+        if name.endswith(".trace.jsonl"):
+            _replay(path)
+
+
+def in_its_run(place: str, data: bytes) -> None:
+    """A run of which the file at `place` has this content."""
+    run = sound_run()
+    path = run / place
+    whole = path.read_bytes() if path.exists() else None
+    try:
+        path.write_bytes(data)
+        _archive(run)
+    finally:
+        if whole is None:
+            path.unlink()
+        else:
+            path.write_bytes(whole)
+
+
+def _named(path: Path, homecoming: Homecoming) -> None:
+    """Whatever is not used is said."""
+    for sentence in homecoming.sentences():
+        sound(sentence)
+    dropped = bool(homecoming.left_out)
+    if not homecoming.flights:
+        require(dropped, "nothing is used, and nobody says why")
+        return
+    if not dropped and path.suffix == ".jsonl":
+        lines = [line for line in path.read_bytes().removeprefix(b"\xef\xbb\xbf").split(b"\n") if line.strip()]
+        used = sum(
+            len(trace.runs) + len(trace.asides) + len(trace.starts) + 1
+            for flight in homecoming.flights
+            for trace in flight.traces.values()
+        ) + sum(len(events) for flight in homecoming.flights for events in flight.logged.values())
+        require(used >= len(lines), f"{len(lines) - used} lines are not used, and nobody says so")
+
+
+def _among_others(path: Path) -> None:
+    """A damaged file takes nothing away from the sound ones beside it."""
+    homecoming = sort_out([sound_run(), path])
+    for sentence in homecoming.sentences():
+        sound(sentence)
+    flight = homecoming.largest()
+    require({*flight.traces} & {*flight.exports} & {*flight.captures} >= _AGENTS, "a sound file is not used")
+
+
+def _check(out: Path) -> None:
+    """What was imported is judged, or not: without a traceback."""
+    try:
+        result = checker.check(checker.gather(RunArchive(out)))
+    except HarnessError as error:  # captures alone are not judged
+        sound(str(error))
+        return
+    for sentence in result.errors:
+        sound(sentence)
+
+
+def _import(path: Path, out: Path) -> bool:
+    """Whether anything came of it."""
+    try:
+        record = bring_in([path], [CommaSeparated(), RosBag()], out)
+    except HarnessError as error:
+        sound(str(error))
+        require(not out.exists(), "nothing is used, and yet there is a directory")
+        return False
+    for remark in (*record.left_out, *record.remarks):
+        sound(remark.sentence)
+    ImportRecord.model_validate_json((out / FILE).read_bytes())
+    again = sort_out([out])
+    imported = {(len(trace.runs), len(trace.asides)) for flight in again.flights for trace in flight.traces.values()}
+    runs = sum(agent.handler_runs for flight in record.flights for agent in flight.agents.values())
+    require(sum(count for count, _ in imported) <= runs, "more is read of an import than was written")
+    return True
+
+
+def _replay(path: Path) -> None:
+    try:
+        record = open_record(path)
+        Player(record).to_end()
+    except HarnessError as error:
+        sound(str(error))
+        return
+    for sentence in record.problems:
+        sound(sentence)
+
+
+def _archive(run: Path) -> None:
+    """The archive's own readers, which all other commands stand on."""
+    archive = RunArchive(run)
+    sentences = [*archive.problems, *archive.gaps]
+    list(archive.injected(RogueInjection))
+    sentences += archive.network(_AGENTS).problems
+    sentences += archive.tracks(_AGENTS).problems
+    for agent in _AGENTS:
+        _lines(run / "agents" / f"{agent}.trace.jsonl")
+    for sentence in sentences:
+        sound(sentence)
+
+
+def _lines(path: Path) -> None:
+    try:
+        for line in read_lines(path):
+            line.parsed()
+    except HarnessError as error:
+        sound(str(error))

@@ -1,0 +1,83 @@
+"""Every input that is kept, through its target, and a few that are mutated: `make fuzz` gives them by the million."""
+
+from itertools import islice
+
+import pytest
+
+from tests.fuzz.corpus import FOLDER, MOST_BYTES, MOST_FILES, files_of
+from tests.fuzz.execute import executed, mutated
+from tests.fuzz.finding import FailedError
+from tests.fuzz.targets import NAMES, named
+
+MUTATED = 25
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_input_breaks_its_reader(name: str) -> None:
+    target, kept = named(name), {path: path.read_bytes() for path in files_of(name)}
+    assert kept
+    for path, data in kept.items():
+        try:
+            executed(target, data)
+        except Exception as error:
+            raise AssertionError(f"{path}: {error}") from error
+    for data in islice(mutated([*kept.values()], seed=17), MUTATED):
+        executed(target, data)
+
+
+def test_the_corpus_is_small_and_each_of_its_folders_is_that_of_a_target() -> None:
+    kept = [path for path in FOLDER.rglob("*") if path.is_file()]
+    assert len(kept) <= MOST_FILES
+    assert sum(path.stat().st_size for path in kept) <= MOST_BYTES
+    assert {path.relative_to(FOLDER).parts[0] for path in kept} == {*NAMES}
+
+
+def _some_mutation_fails(name: str, tries: int = 300) -> None:
+    target, kept = named(name), [path.read_bytes() for path in files_of(name)]
+    for data in (*kept, *islice(mutated(kept, seed=17), tries)):
+        executed(target, data)
+
+
+def test_a_decoder_that_takes_what_follows_a_message_for_a_part_of_it_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    decode = named("datagram").decode  # type: ignore[attr-defined]
+    monkeypatch.setattr("tests.fuzz.targets.datagram.decode", lambda data: decode(data.rstrip(b"\0")))
+    with pytest.raises((FailedError, AssertionError)):
+        _some_mutation_fails("datagram")
+
+
+def test_an_agent_whose_handler_does_something_else_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ucp.core.Core.pop_to_stack", lambda core: core.chain.pop())
+    with pytest.raises(FailedError):
+        _some_mutation_fails("agent")
+
+
+def test_a_reader_that_drops_lines_without_a_word_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.field.homecoming.lives.TraceReader._left_out", lambda reader: iter(()))
+    with pytest.raises(FailedError, match="nobody says"):
+        _some_mutation_fails("trace")
+
+
+def test_a_reader_that_raises_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.field.homecoming.lives._entry", lambda line: 1 // (b"NaN" not in line))
+    with pytest.raises((ZeroDivisionError, FailedError)):
+        _some_mutation_fails("trace")
+
+
+def test_a_command_that_is_answered_by_nothing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ucp.control.ControlServer._answer", lambda server, line: {}[line])
+    with pytest.raises(FailedError, match="no answer"):
+        _some_mutation_fails("control", 0)
+
+
+def test_an_input_that_takes_long_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.fuzz.finding.MOST_S", 0.05)
+
+    class Endless:
+        def run(self, data: bytes) -> None:
+            while True:
+                pass
+
+    with pytest.raises(FailedError, match="took more than"):
+        executed(Endless(), b"")  # type: ignore[arg-type]
