@@ -39,17 +39,23 @@ class Simulated:
     result: checker.Result
 
 
-def simulate(scenario: Scenario, seed: int, *, tracing: bool = False, deliver_all: bool = False) -> Simulated:
+def simulate(
+    scenario: Scenario, seed: int, *, tracing: bool = False, deliver_all: bool = False, again: bool = False
+) -> Simulated:
     """Play `scenario` in virtual time and judge it, all in memory.
 
     Without `tracing` characteristic 1 cannot be judged, and 2 and 3 only at the end. `deliver_all` delivers even what
-    changes nothing. Raises ScenarioError for a scenario that needs real processes.
+    changes nothing. Agents that are not ours are given their inputs again if the run is bad, or if asked for: the same
+    seed has to mean the same. Raises ScenarioError for a scenario that needs real processes, and HarnessError for such
+    an agent that fails, or cannot do it.
     """
-    return simulate_in_memory(InMemory(tracing), scenario, seed, deliver_all=deliver_all)
+    return simulate_in_memory(InMemory(tracing), scenario, seed, again=again, deliver_all=deliver_all)
 
 
 @gc_paused()
-def simulate_in_memory(memory: "InMemory", scenario: Scenario, seed: int, **options: Any) -> Simulated:
+def simulate_in_memory(
+    memory: "InMemory", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
+) -> Simulated:
     """As `simulate`; `memory` keeps the run, and `options` are the simulation's."""
     VirtualTime().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
@@ -57,7 +63,12 @@ def simulate_in_memory(memory: "InMemory", scenario: Scenario, seed: int, **opti
         without_waiting(mission.play(simulation, scenario))
         simulation.end()
         evidence = memory.evidence(simulation)
-    return Simulated(simulation.played, evidence, checker.check(evidence))
+    result = checker.check(evidence)
+    if (records := simulation.records()) and (again or result.bad):
+        from harness.play.simulation.foreign.again import compare_again
+
+        compare_again(records)
+    return Simulated(simulation.played, evidence, result)
 
 
 def without_waiting(story: Coroutine[Any, Any, Result]) -> Result:

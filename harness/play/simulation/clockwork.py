@@ -171,6 +171,7 @@ class Clockwork:
     def _timer_ends(self, number: int, life: Incarnation) -> None:
         if life.deadline is None or life.deadline > self._now or (soonest := life.agent.next_timer()) is None:
             return  # it was stopped, or started anew, since it was expected to end now
+        life.deadline = None
         self._hear(number, life)
         if self._recurrence is not None:
             self._recurrence.timers_end(self._now, max(soonest, self._local(life)), _own(life).state)

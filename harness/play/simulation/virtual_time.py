@@ -81,6 +81,8 @@ class VirtualTime(Backend):
                     simulation.played.capture = capture.end(simulation.now())
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
+            if simulation.records() and simulation.played.outcome == "completed":
+                _compare_again(simulation, progress)
             for agent_id, problem in files.problems().items():
                 simulation.played.agents[str(agent_id)]["trace_problem"] = problem
 
@@ -94,6 +96,18 @@ def _export(simulation: Simulation, files: OnDisk) -> None:
             return
         except (AgentFailedError, AgentLacksError) as error:
             simulation.fail(error)
+
+
+def _compare_again(simulation: Simulation, progress: Progress) -> None:
+    """Play the lives of agents that are not ours again, to see whether they are the same twice."""
+    from harness.play.simulation.foreign.again import NotTheSameError, compare_again
+
+    simulation.enter("the same again")
+    progress.show(_snapshot(simulation))
+    try:
+        compare_again(simulation.records())
+    except NotTheSameError as error:
+        simulation.played.end_early("failed", error)
 
 
 @contextmanager

@@ -6,4 +6,5 @@ answer.py    what a line of theirs says
 failure.py   how one ends a mission
 foreigners.py  whose program plays whom
 agent.py     one life of such an agent, as the simulation drives it
+again.py     whether it is the same twice
 """

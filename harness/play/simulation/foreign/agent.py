@@ -44,6 +44,9 @@ class LifeRecord:
     """What an agent was given in one life, and what it answered, in lines; the first of it, if that is very much."""
 
     agent_id: int
+    command: tuple[str, ...]
+    after_another: bool
+    """Its process had played another life before."""
     exchanges: list[tuple[bytes, bytes]] = field(default_factory=list)
     length: int = 0
 
@@ -76,7 +79,7 @@ class ForeignAgent:
         self.settings = settings
         self.messages_sent = 0
         self.chain_changed_at: float | None = 0.0 if tracing else None
-        self.record = LifeRecord(self.agent_id)
+        self.record = LifeRecord(self.agent_id, program.command, after_another=not program.is_new)
         self.failed: AgentFailedError | AgentLacksError | None = None
         self._program = program
         self._tracing = tracing
@@ -244,7 +247,7 @@ class ForeignAgent:
                 raise self._has_no_virtual_time(error.status) from None
             raise self._failure(error.outcome, f"{error} when it was given {what} at {now:g} s") from None
         except AnswerError as error:
-            raise self._failure("crashed", f"answered {what}, at {now:g} s, {error}") from None
+            raise self._failure("crashed", f"answered {what} at {now:g} s {error}") from None
         except LacksError as error:
             raise self._lacks(last_words(str(error))) from None
         except RefusedError as error:

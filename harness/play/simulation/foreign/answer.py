@@ -47,20 +47,20 @@ def read_answer(line: bytes, *, tracing: bool) -> Answer:
     try:
         said = from_json(line, allow_inf_nan=False)
     except ValueError as error:
-        raise AnswerError(f"with what is not JSON ({error}): {_shown(line)}") from None
+        raise AnswerError(f"with what is not JSON ({error}): {shown(line)}") from None
     if not isinstance(said, dict):
-        raise AnswerError(f"with what is not a JSON object: {_shown(line)}")
+        raise AnswerError(f"with what is not a JSON object: {shown(line)}")
     if "error" in said:
         kind = LacksError if said.get("unsupported") is True else RefusedError
         raise kind(str(said["error"])[:500])
     sent = said.get("sent")
     if not isinstance(sent, list):
-        raise AnswerError(f"without a list `sent`: {_shown(line)}")
+        raise AnswerError(f"without a list `sent`: {shown(line)}")
     if len(sent) > MAX_SENT:
         raise AnswerError(f"with {len(sent)} datagrams at once, and more than {MAX_SENT} are none that an input makes")
     timer = said.get("timer", math.nan)
     if timer is not None and (type(timer) not in (int, float) or not -LATEST_S <= timer <= LATEST_S):
-        what = f"with the timer {_shown(timer)}, not" if "timer" in said else "without"
+        what = f"with the timer {shown(timer)}, not" if "timer" in said else "without"
         raise AnswerError(f"{what} a number of mission seconds, or null, as `timer`")
     answer = Answer([_datagram(text) for text in sent], timer, told=said.get("answer"))
     if tracing:
@@ -75,7 +75,7 @@ def _datagram(text: Any) -> tuple[bytes, Recorded]:
     try:
         data = base64.b64decode(text, validate=True)
     except (TypeError, ValueError):
-        raise AnswerError(f"with a datagram that is not base64: {_shown(text)}") from None
+        raise AnswerError(f"with a datagram that is not base64: {shown(text)}") from None
     if len(data) > MAX_UDP_BYTES:
         raise AnswerError(f"with a datagram of {len(data)} bytes, more than UDP carries")
     content: Datagram | None
@@ -98,13 +98,14 @@ def _entries(trace: list[Any]) -> Iterable[Entry]:
             problem = error.errors()[0]
             where = ".".join(str(part) for part in problem["loc"])
             wrong = f": {where}: {problem['msg'].lower()}" if kind is HANDLER_RUN else ""
-            raise AnswerError(f"with `trace.{number}`, which is no line of a trace{wrong}: {_shown(line)}") from None
+            raise AnswerError(f"with `trace.{number}`, which is no line of a trace{wrong}: {shown(line)}") from None
         durations = getattr(entry, "started", None) or {}
         if not all(math.isfinite(number) for number in (entry.t, *durations.values())):
-            raise AnswerError(f"with `trace.{number}`, in which a number is not finite: {_shown(line)}")
+            raise AnswerError(f"with `trace.{number}`, in which a number is not finite: {shown(line)}")
         yield entry
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """As much of something that an agent said as a sentence can hold."""
     text = value.decode(errors="replace").strip() if isinstance(value, bytes) else str(value)
     return repr(text[:SHOWN] + ("..." if len(text) > SHOWN else ""))

@@ -75,6 +75,11 @@ class Program:
         self._readable.register(self._out, select.POLLIN)
 
     @property
+    def is_new(self) -> bool:
+        """Whether it has answered nothing yet."""
+        return not self._answered
+
+    @property
     def runs(self) -> bool:
         return self._process.poll() is None
 
@@ -191,6 +196,10 @@ class Program:
             self._process.kill()
             self._process.wait()
         self.let_go()
+
+    def close(self) -> None:
+        """Have it ended, now."""
+        self.end()
 
     def let_go(self) -> None:
         """Close what belongs to it here. It goes on."""
