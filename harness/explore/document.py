@@ -145,8 +145,10 @@ def with_agents(document: Document, kept: Collection[int]) -> Document:
     document = with_key(document, "quirks", {name: value for name, value in quirks.items() if value is not None})
     datagrams = [_datagram(datagram, kept) for datagram in document.get("datagrams", [])]
     document = with_key(document, "datagrams", [datagram for datagram in datagrams if datagram["reaches"]])
-    for key in ("clocks", "lateness", "vehicles.types"):
+    for key in ("clocks", "lateness", "vehicles.types", "agent_command"):
         named = at(document, key) or {}
+        if isinstance(named, list):  # of all agents
+            continue
         document = with_key(document, key, {name: value for name, value in named.items() if int(name) in kept})
     return with_key(document, "network", _network(document.get("network", {}), kept))
 

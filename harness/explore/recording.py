@@ -12,7 +12,9 @@ from functools import partial
 from typing import Any
 
 from harness.checker import Result
+from harness.explore.search import ended_by
 from harness.play.simulation.fate_script import Decided, FateScript, NameOf
+from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.run.simulate import InMemory, simulate_in_memory
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
@@ -57,9 +59,13 @@ class Recording:
 
 
 def record(scenario: Scenario, seed: int) -> Recording:
+    """Of a run that an agent ended, up to there."""
     tape = _Recorder()
-    simulated = simulate_in_memory(tape, scenario, seed, fate_script=partial(_Listening, tape=tape))
-    return Recording(simulated.result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
+    try:
+        result = simulate_in_memory(tape, scenario, seed, fate_script=partial(_Listening, tape=tape)).result
+    except AgentFailedError as error:
+        result = ended_by(error)
+    return Recording(result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
 
 
 class _Recorder(InMemory):
@@ -81,7 +87,7 @@ class _Recorder(InMemory):
         for run in entries:
             if not isinstance(run, HandlerRun):
                 continue
-            if run.handler == "build_data_block" and run.branch == "full":
+            if run.handler == "build_data_block" and run.branch == "full" and agent_id in self._last_of:
                 last = self.events[self._last_of[agent_id]]
                 self.events[self._last_of[agent_id]] = Logged(last.at_s, last.agent, last.bytes, completes=True)
             for sent in run.sent:
@@ -90,8 +96,8 @@ class _Recorder(InMemory):
                     count = self._counts[agent_id]
                     self.sent[agent_id, sent.seq] = Lost(run.t, sent.message, agent_id, 0, count, None)
             if run.branch == "ignored by quirk":
-                sent_by, sequence = run.trigger["from"], run.trigger["seq"]
-                lost = self.sent.get((int(sent_by), int(sequence)))
+                commit: Any = run.trigger.get("from"), run.trigger.get("seq")
+                lost = self.sent.get(commit)
                 if lost is not None:  # a rogue node's is no agent's
                     self.lost.append(
                         Lost(lost.at_s, lost.message, lost.sender, agent_id, lost.count, None, by_quirk=True)

@@ -12,6 +12,7 @@ from harness.explore.search import Judge, Searched, Violation, search, simulated
 from harness.explore.shrink import BudgetSpentError, Shrinker
 from harness.explore.smaller import replays, scenario_of, shrink, size
 from harness.explore.write import claim, evidence_lines, file_of, write
+from harness.run.simulate import same_twice
 from harness.scenario import Scenario
 
 MAX_RUNS = 5000
@@ -65,10 +66,12 @@ def explore(
 ) -> Explored:
     """Play `scenario`, which `source` names for people, with `seeds`, and shrink the first run that violates.
 
-    Raises HarnessError if the scenario cannot be played, or the file cannot be written.
+    Raises HarnessError if the scenario cannot be played, the file cannot be written, or an agent is not the same twice.
     """
     watcher = watcher or Watcher()
     path = claim(out, scenario.name)
+    if scenario.foreign:
+        same_twice(scenario, seeds[0])
     searched = search(scenario, seeds, jobs, judge, shown=watcher.shown)
     explored = Explored(searched, interrupted=searched.interrupted)
     if searched.violation is None:

@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from rich.console import Console
 
 from harness.explore.run import Explored, Watcher
-from harness.explore.search import Violation
+from harness.explore.search import ENDED, Violation
 from harness.explore.write import evidence_lines
 from harness.scenario.verdicts import BAD_IN_WORDS
+
+_WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}
 
 LINE_EVERY_S = 10.0
 REDRAW_EVERY_S = 0.1
@@ -23,7 +25,7 @@ def watching(console: Console) -> Iterator[Watcher]:
     last = 0.0
 
     def on_violation(violation: Violation) -> None:
-        words = " and ".join(BAD_IN_WORDS[key] for key in violation.keys)
+        words = " and ".join(_WORDS[key] for key in violation.keys)
         console.print(f"seed {violation.seed}: {words}; shrinking", highlight=False)
 
     def on_step(runs: int, words: str) -> None:

@@ -33,6 +33,12 @@ def simulated(scenario: Scenario, seed: int) -> Result:
     return simulate(scenario, seed, tracing=True).result
 
 
+def _same_twice(scenario: Scenario, seed: int) -> None:
+    from harness.run.simulate import same_twice
+
+    same_twice(scenario, seed)
+
+
 @dataclass(frozen=True)
 class Player:
     """Plays any run of `matrix`; processes leave their run directories in `directory`. `judge` is for virtual time."""
@@ -45,6 +51,8 @@ class Player:
         scenario = self.matrix.scenario_at(task.point)
         in_memory = BACKENDS[task.point.backend].plays_in_memory
         try:
+            if in_memory and scenario.foreign and task.seed == self.matrix.seed_list[0]:
+                _same_twice(scenario, task.seed)
             result = self.judge(scenario, task.seed) if in_memory else self._for_real(scenario, task)
         except UnsupportedError as error:
             return Run(**task.point._asdict(), seed=task.seed, unsupported=str(error))

@@ -4,7 +4,7 @@ The checker is that of any other run; the evidence comes straight from the agent
 """
 
 from collections.abc import Coroutine, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +20,7 @@ from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
 from harness.play.simulation.backend import Simulation
+from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.play.simulation.lives import Incarnation
 from harness.play.simulation.on_disk import header
 from harness.play.simulation.virtual_time import VirtualTime
@@ -69,6 +70,15 @@ def simulate_in_memory(
 
         compare_again(records)
     return Simulated(simulation.played, evidence, result)
+
+
+def same_twice(scenario: Scenario, seed: int) -> None:
+    """Play `scenario` to see whether agents that are not ours answer the same when they are given the same again.
+
+    Raises HarnessError if one does not, or cannot be played so; not of one that crashes or hangs, which its run tells.
+    """
+    with suppress(AgentFailedError):
+        simulate(scenario, seed, tracing=True, again=True)
 
 
 def without_waiting(story: Coroutine[Any, Any, Result]) -> Result:

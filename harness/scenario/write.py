@@ -9,6 +9,7 @@ import yaml
 ORDER = (
     "name",
     "agents",
+    "agent_command",
     "duration_s",
     "initial_data",
     "network",
@@ -25,6 +26,7 @@ ORDER = (
     "settle",
     "final_reconcile",
 )
+"""Keys in the order in which people read them; all others come at the end."""
 WIDTH = 112
 
 Document = dict[str, Any]
@@ -35,9 +37,8 @@ def to_yaml(
 ) -> str:
     """The file. `remark` is what is to be said beside an entry of a list."""
     lines = [f"# {line}".rstrip() for line in comment]
-    for key in ORDER:
-        if key in document:
-            lines += _lines(key, _plain(document[key]), remark)
+    for key in sorted(document, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER)):
+        lines += _lines(key, _plain(document[key]), remark)
     return "\n".join(lines) + "\n"
 
 
