@@ -62,6 +62,8 @@ def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
         )
     if short := sorted(evidence.examination.short):
         return f"the trace of {agents(short)} is not whole, and does not tell whether there was a chance to reconcile"
+    if unknown := evidence.unknown_word("handler", "branch", "operation"):
+        return f"nothing tells whether there was a chance to reconcile: {unknown}"
     if not had_a_chance(evidence, differing):
         without = sorted(differing)
         more = len(without) - REASONS_TOLD

@@ -1,11 +1,12 @@
 """Characteristic 1: distributed, event driven and asynchronous.
 
 Every handler run has a local trigger or a message that its sender really sent, and no vote waits for anybody: it ends
-when its own timer does. Only traces can tell.
+when its own timer does. Only traces can tell, and only in words that are known.
 """
 
 from typing import Any
 
+from harness.archive.vocabulary import MESSAGES, TIMERS, TRIGGERS
 from harness.checker.evidence import Evidence, Sendings
 from harness.checker.judgement import Finding, Judgement, agents, violated
 from harness.checker.waiting import waited_too_long
@@ -15,7 +16,6 @@ from ucp.trace import HandlerRun
 NAME = "distributed"
 
 _OF_MESSAGE = {message.NAME: handler.name for message, handler in ON_MESSAGE.items()}
-_ALGORITHM = {name: handler.algorithm for name, handler in HANDLERS.items()}
 _OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
 _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 
@@ -27,6 +27,7 @@ def check(evidence: Evidence) -> Judgement:
     sent = evidence.sendings
     findings: list[Finding] = []
     untraced: set[int] = set()
+    sends_unknown = {agent_id for agent_id, words in evidence.unknown.items() if "message" in words}
     runs = 0
     for agent_id, trace in evidence.traces.items():
         runs += len(trace.runs)
@@ -40,6 +41,8 @@ def check(evidence: Evidence) -> Judgement:
                 if isinstance(sender, int) and sender not in sent:
                     untraced.add(sender)
                     continue
+                if not _is_in_known_words(run) or sender in sends_unknown:
+                    continue
                 wrong = _wrong_trigger(run, ran, sent)
                 if wrong and sender in evidence.injected.heard_of:
                     untraced.add(sender)
@@ -49,6 +52,8 @@ def check(evidence: Evidence) -> Judgement:
     findings += waited_too_long(evidence)
     if findings:
         return violated(NAME, "a handler ran without a trigger of its own, or waited for another agent", findings)
+    if unknown := evidence.unknown_word("trigger", "handler", "timer", "message", "branch"):
+        return Judgement(NAME, "not applicable", unknown)
     silent = sorted(set(evidence.roster or evidence.exports) - set(evidence.traces))
     if untraced or silent:
         return Judgement(
@@ -65,8 +70,6 @@ def check(evidence: Evidence) -> Judgement:
 def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
     """Whether its own timer, a handler that ran, or a message that was sent by whom it names triggered the run."""
     trigger, handler = run.trigger, run.handler
-    if _ALGORITHM.get(handler) != run.algorithm:
-        return False
     if "seq" in trigger:
         name = trigger.get("message")
         if _OF_MESSAGE.get(name) != handler:  # type: ignore[arg-type]
@@ -79,10 +82,20 @@ def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings])
     return _OF_TIMER.get(trigger.get("timer")) == handler  # type: ignore[arg-type]
 
 
+def _is_in_known_words(run: HandlerRun) -> bool:
+    """Whether handler and trigger are named as CONTRACT.md names them, as far as they are named at all."""
+    trigger = run.trigger
+    if run.handler not in HANDLERS or (trigger and TRIGGERS.isdisjoint(trigger)):
+        return False
+    return (
+        trigger.get("message", "") in {"", *MESSAGES}
+        and trigger.get("timer", "") in {"", *TIMERS}
+        and trigger.get("local", "") in {"", *HANDLERS}
+    )
+
+
 def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
     """What is wrong with the run's trigger, completing "the handler ..."; None if nothing is."""
-    if _ALGORITHM.get(run.handler) != run.algorithm:
-        return "is not one of the 20 event handlers"
     trigger = run.trigger
     match trigger:
         case {"message": str(name), "from": int(sender), "seq": int(sequence)}:

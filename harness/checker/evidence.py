@@ -15,6 +15,7 @@ from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
 from harness.archive.record import AgentRecord, Counters, Cycle, JudgedRecord
 from harness.archive.traces import Trace
+from harness.archive.vocabulary import Kind, Unknown, first_of, unknown_words
 from harness.checker.cycles import cycle_of
 from harness.checker.replay import Life, replay
 from harness.errors import RunDirectoryError
@@ -111,6 +112,19 @@ class Evidence:
     def name(self, block_hash: str) -> str:
         """The block's name for people, such as 4.11, or the beginning of its hash."""
         return self.names.get(block_hash, block_hash[:12])
+
+    @cached_property
+    def unknown(self) -> dict[int, Unknown]:
+        """Words in traces that the harness does not know, of each agent whose trace has any."""
+        words = {agent_id: unknown_words(trace.runs) for agent_id, trace in self.traces.items()}
+        return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
+
+    def unknown_word(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
+        """The first unknown word of these kinds, in words, in this agent's trace or in any; None if there is none."""
+        for named, unknown in self.unknown.items():
+            if agent_id in (None, named) and (words := first_of(unknown, kinds)):
+                return f"{words} in the trace of agent {named}"
+        return None
 
     @cached_property
     def lives(self) -> dict[int, list[Life]]:
@@ -243,6 +257,11 @@ class Evidence:
     def network_at_end(self) -> str | None:
         """The conditions at the end of the run, in words; None if not on record."""
         return self.record.network[-1].detail if self.record and self.record.network else None
+
+    def not_told_completed(self) -> set[int]:
+        """Agents of which nothing tells all that they completed, for their traces have operations that nobody knows."""
+        unknown = {agent_id for agent_id, words in self.unknown.items() if "operation" in words}
+        return {agent for agent in unknown if agent not in self.exports or self.was_restarted(agent)}
 
     def completed_blocks(self) -> dict[str, int]:
         """Hash -> agent of every block known to have been completed."""

@@ -13,23 +13,26 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
     """
     chains = [export.chain_of_block_hashes for export in evidence.exports.values()]
     completed = evidence.completed_blocks()
+    all_known = not evidence.not_told_completed()
     copies = Counter(block_hash for chain in chains for block_hash in chain)
     per_block = [copies[block_hash] for block_hash in completed]
     distinct = len(set(chains))
     messages = _of_all_agents(evidence, "messages_sent")
     result: dict[str, float | int | None] = {
         "agents": len(chains),
-        "blocks": len(completed),
+        "blocks": len(completed) if all_known else None,
         "mutual_chain": common_prefix(chains),
         "longest_chain": max(map(len, chains), default=0),
         "distinct_chains": distinct,
-        "copies_min": min(per_block, default=None),
-        "copies_mean": round(sum(per_block) / len(per_block), 3) if per_block else None,
+        "copies_min": min(per_block, default=None) if all_known else None,
+        "copies_mean": round(sum(per_block) / len(per_block), 3) if per_block and all_known else None,
         "uniform_at_s": uniform_at_s(evidence),
         "reconciles": _of_all_agents(evidence, "reconciles"),
         "messages": messages,
         "bytes": _of_all_agents(evidence, "bytes_sent"),
-        "messages_per_block": round(messages / len(completed), 1) if completed and messages is not None else None,
+        "messages_per_block": round(messages / len(completed), 1)
+        if completed and messages is not None and all_known
+        else None,
     }
     if evidence.before_final_reconcile:
         before = [export.chain_of_block_hashes for export in evidence.before_final_reconcile.values()]
@@ -51,7 +54,7 @@ def _of_all_agents(evidence: Evidence, counter: str) -> int | None:
     match counter:
         case "messages_sent":
             return sum(len(run.sent) for run in runs)
-        case "reconciles":
+        case "reconciles" if evidence.unknown_word("handler", "branch") is None:
             return sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in runs)
     return None
 
@@ -69,6 +72,8 @@ def uniform_at_s(evidence: Evidence) -> float | None:
         agent, trace = recorded.get(str(agent_id)), evidence.traces.get(agent_id)
         if agent is not None and agent.chain_changed_at_s is not None:
             last_s = max(last_s, agent.chain_changed_at_s)
+        elif evidence.unknown_word("operation", agent_id=agent_id):
+            return None
         elif trace is not None and agent_id not in evidence.examination.short:
             last_s = max(last_s, round(trace.chain_changed_at(), 3))
         else:

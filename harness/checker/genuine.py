@@ -24,6 +24,7 @@ def check(evidence: Evidence) -> Judgement:
     roster = evidence.roster
     completed = evidence.completed_blocks()
     known = {*evidence.exports, *evidence.traces, *completed.values()} - evidence.injected.heard_of
+    known -= evidence.not_told_completed()
     unknown: set[int] = set()
     blocks = 0
     recomputed: dict[_Content, str] = {}

@@ -23,6 +23,8 @@ def check(evidence: Evidence) -> Judgement:
         )
     if evidence.missing:
         return Judgement(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
+    if unknown := evidence.unknown_word("operation"):
+        return Judgement(NAME, "not applicable", unknown)
     looked = "at the end and after every traced step" if evidence.traces else "at the end"
     blocks = sum(len(export.completed) for export in evidence.exports.values())
     return Judgement(NAME, "holds", f"all {blocks} completed blocks are in their agents' chains, {looked}")

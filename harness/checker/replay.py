@@ -9,6 +9,8 @@ from itertools import islice, pairwise
 
 from harness.archive.history import LATEST_S
 from harness.archive.traces import Trace
+from harness.archive.vocabulary import OPERATIONS
+from ucp.agent import HANDLERS
 from ucp.block import HASH_BYTES, next_chain_hash
 from ucp.trace import HandlerRun, StateSummary
 
@@ -48,6 +50,8 @@ class Life:
     stack: list[str] = field(default_factory=list)
     completed: list[str] = field(default_factory=list)
     sent: int = 0
+    unknown: bool = False
+    """Some changes are operations that nobody knows: what it holds is not known from the first of them on."""
     impossible: list[Sight] = field(default_factory=list)
     """Changes that nobody can make."""
     second_copies: list[Sight] = field(default_factory=list)
@@ -82,21 +86,22 @@ def _replayed(life: Life, inception: str | None) -> Life:
     reconciling, compared, now, sequence = False, True, 0.0, 0
     for line, run in life.numbered():
         state = run.state
-        if run.changes:
+        if run.changes and not life.unknown:
             holds.change(line, run)
             checked = None
+            compared = compared and not life.unknown
         if state is not checked:
             checked = state
             if compared:
                 compared = holds.compare(line, run)
             if state.reconciling != reconciling:
                 reconciling = state.reconciling
-                if run.handler not in BEGINS_OR_ENDS_A_RECONCILE:
+                if run.handler in HANDLERS and run.handler not in BEGINS_OR_ENDS_A_RECONCILE:
                     what = f"a reconcile {'begins' if reconciling else 'ends'}, as only Algorithms 7 and 20 can make it"
                     life.flags.append(Sight(line, run, what))
             if state.idle and reconciling:
                 life.flags.append(Sight(line, run, "idle and reconciling at once"))
-        if state.idle and holds.anything_aside:
+        if state.idle and holds.anything_aside and not life.unknown:
             life.idle_too_early.append(holds.idle_too_early(line, run))
         if not now <= run.t <= LATEST_S:
             life.back_in_time.append(Sight(line, run, f"the clock goes from {now:g} s to {run.t:g} s"))
@@ -126,16 +131,17 @@ class _Holds:
 
     def change(self, line: int, run: HandlerRun) -> None:
         life = self._life
+        if not OPERATIONS.issuperset(operation for operation, _ in run.changes):
+            life.unknown = True
+            return
         for operation, block in run.changes:
             if operation == "complete":
                 life.completed.append(block)
                 self._completed.add(block)
                 self._not_in_chain[block] = None
                 continue
-            place = self._places.get(operation[:-1])
-            if place is None or operation[-1] not in "+-":
-                life.impossible.append(Sight(line, run, f"unknown operation {operation!r}"))
-            elif operation[-1] == "-":
+            place = self._places[operation[:-1]]
+            if operation[-1] == "-":
                 if impossible := self._take(operation[:-1], place, block):
                     life.impossible.append(Sight(line, run, impossible, block))
             else:

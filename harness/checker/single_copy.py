@@ -29,5 +29,7 @@ def check(evidence: Evidence) -> Judgement:
         return Judgement(NAME, "not applicable", "there is no export to look at")
     if evidence.missing:
         return Judgement(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
+    if unknown := evidence.unknown_word("operation"):
+        return Judgement(NAME, "not applicable", unknown)
     looked = " and after every traced step" if evidence.traces else ""
     return Judgement(NAME, "holds", f"no block twice in {len(evidence.exports)} exports{looked}")

@@ -21,7 +21,7 @@ from ucp.block import Block
 from ucp.core import Core
 from ucp.handler import EventHandler
 from ucp.messages import TYPE_CODES
-from ucp.quirks import QUIRKS, Quirk
+from ucp.quirks import CRASHED, QUIRKS, Quirk
 from ucp.store import StoredState
 from ucp.trace import SCHEMA, Dropped, HandlerRun, Recorded, in_base64
 
@@ -148,13 +148,16 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
         (lambda runs: runs.remove(proposal(runs)), "it triggered nothing, and should have triggered Process Next"),
         (lambda runs: runs.remove(expiry(runs)), "it ran without having been triggered"),
         (lambda runs: without_expiry(runs), "it had not run by then, and the voting timer ended at t="),
-        (lambda runs: setattr(expiry(runs), "algorithm", 4), "it ran as Algorithm 4; what came is for Algorithm 5"),
+        (
+            lambda runs: setattr(expiry(runs), "handler", "receive_vote_add_block"),
+            "it ran as Algorithm 4; what came is for Algorithm 5",
+        ),
         (lambda runs: setattr(expiry(runs), "t", expiry(runs).t - 3), "s before the voting timer ended"),
-        (lambda runs: expiry(runs).trigger.update(timer="x"), "it ran as the x timer ended, which was not running"),
+        (lambda runs: expiry(runs).trigger.update(timer="finalize gap"), "the finalize gap timer ended, which was not"),
         (lambda runs: expiry(runs).trigger.clear(), "it ran without a trigger that there is"),
         (lambda runs: first_run(runs, "build_data_block").trigger.update(event=255), "said to have logged event 255"),
         (
-            lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", {"local": "x"}),
+            lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", {"local": "reconcile_begin"}),
             "it ran without having been triggered",
         ),
         (lambda runs: commit(runs).trigger.update(seq=77), "it said to have got Commit Block 77 from agent"),
@@ -179,15 +182,16 @@ def test_any_line_that_says_something_else_is_found(honest: Evidence, data: st.D
     agent = data.draw(st.sampled_from(sorted(honest.traces)))
     number = data.draw(st.integers(0, len(honest.traces[agent].runs) - 1))
     document = json.loads(honest.traces[agent].runs[number].to_line())
-    keys = {"branch": "no such branch", "algorithm": 21, "handler": "no_handler", "state": None, "changes": None}
-    key = data.draw(st.sampled_from(sorted(keys)))
+    key = data.draw(st.sampled_from(["branch", "handler", "state", "changes"]))
     if key == "state":
         part = data.draw(st.sampled_from(["chain", "deque", "stack", "top"]))
         document["state"][part] = "00" * 32 if part == "top" else document["state"][part] + 1
     elif key == "changes":
         document["changes"] = [*document["changes"], ["chain+", "00" * 32]]
     else:
-        document[key] = keys[key]
+        others = [name for name, handler in HANDLERS.items() if key == "handler" and name != document["handler"]]
+        others = others or [*{*HANDLERS[document["handler"]].branches, CRASHED} - {document["branch"]}]
+        document[key] = data.draw(st.sampled_from(sorted(others)))
     changed = edited(honest, agent, lambda runs: runs.__setitem__(number, HANDLER_RUN.validate_python(document)))
     judgement = steps.check(changed)
     assert judgement.verdict == "deviates"
@@ -347,15 +351,45 @@ def test_whatever_a_handler_leaves_out_or_does_twice_is_found_and_named(
     assert different
 
 
-def test_handlers_that_there_are_not_are_counted_together_however_many_names_they_have(honest: Evidence) -> None:
+def test_handlers_that_there_are_not_are_not_judged_however_many_names_they_have(honest: Evidence) -> None:
     def rename(runs: list[HandlerRun]) -> None:
         for number, run in enumerate(runs):
             run.handler = f"handler_{number}" * 20
 
     judgement = steps.check(edited(honest, 3, rename))
-    assert judgement.verdict == "deviates"
+    assert judgement.verdict == "not applicable"
+    assert judgement.reason.startswith("of agent 3 the trace is not understood: unknown handler name 'handler_0")
     assert len(judgement.reason) < 500
-    assert {finding.handler for finding in judgement.evidence} <= {None, *HANDLERS}
+
+
+def test_what_an_agent_did_wrong_before_it_said_what_nobody_knows_is_found(honest: Evidence) -> None:
+    def first_wrong_then_unknown(runs: list[HandlerRun]) -> None:
+        proposal(runs).sent.clear()
+        runs[-1].handler = "no_handler"
+
+    judgement = steps.check(edited(honest, 3, first_wrong_then_unknown))
+    assert judgement.verdict == "deviates"
+    assert "it sent nothing; it should have sent" in judgement.evidence[0].detail
+
+
+def test_of_a_step_with_an_unknown_branch_all_else_is_compared(honest: Evidence) -> None:
+    def otherwise(runs: list[HandlerRun]) -> None:
+        for run in runs:
+            run.branch = run.branch.upper()
+
+    judgement = steps.check(edited(honest, 3, otherwise))
+    assert (judgement.verdict, "unknown branch 'BUILDING' of build_data_block" in judgement.reason) == (
+        "not applicable",
+        True,
+    )
+    judgement = steps.check(edited(honest, 3, lambda runs: (otherwise(runs), proposal_in_capitals(runs).sent.clear())))
+    assert judgement.verdict == "deviates"
+    (finding, *_) = judgement.evidence
+    assert "branch" not in finding.detail
+
+
+def proposal_in_capitals(runs: list[HandlerRun]) -> HandlerRun:
+    return first_run(runs, "process_next_deque_block", "PROPOSED")
 
 
 @pytest.mark.parametrize("moment", [math.nan, math.inf, -1e300, 1e300])

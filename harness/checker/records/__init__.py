@@ -10,13 +10,24 @@ from dataclasses import dataclass
 
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
-from harness.checker.records import air, at_export, completed, conditions, counters, headers, messages, within
+from harness.checker.records import (
+    air,
+    algorithms,
+    at_export,
+    completed,
+    conditions,
+    counters,
+    headers,
+    messages,
+    within,
+)
 from harness.checker.records.contradiction import Contradiction
 
 NAME = "every record"
 
 COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     headers.compare,
+    algorithms.compare,
     within.compare,
     counters.compare,
     at_export.compare,
@@ -78,6 +89,8 @@ def check(evidence: Evidence) -> Judgement:
         return Judgement(NAME, "not applicable", not_whole(examination))
     if not evidence.exports:
         return Judgement(NAME, "not applicable", "there is no export to hold against the traces")
+    if unknown := evidence.unknown_word("trigger", "handler", "branch", "message", "operation"):
+        return Judgement(NAME, "not applicable", unknown)
     runs = sum(len(trace.runs) for trace in evidence.traces.values())
     record = " and run.json" if evidence.record else ""
     return Judgement(

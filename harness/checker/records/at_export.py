@@ -51,6 +51,8 @@ def _before_final_reconcile(evidence: Evidence, agent_id: int, export: Export) -
     states = _states_when(export, trace)
     if states and _state(export) not in states:
         yield _otherwise(agent_id, what, _state(export), states[-1])
+    elif any(life.unknown for life in evidence.lives[agent_id]):
+        return
     elif export.completed not in _completed_when(export, evidence.lives[agent_id]):
         yield of_agent(agent_id, f"{what} names other blocks that it had completed than its trace", "5")
 
@@ -114,7 +116,7 @@ def _value(value: object) -> str:
 
 def _contents(agent_id: int, export: Export, life: Life) -> Iterator[Contradiction]:
     """The blocks of an export that the whole trace has led to, as far as its lengths and its top tell."""
-    if life.otherwise or life.another_top or life.impossible:
+    if life.otherwise or life.another_top or life.impossible or life.unknown:
         return
     for place, exported, traced, touches in (
         ("chain", export.chain, life.chain, "6"),

@@ -12,7 +12,7 @@ from harness.checker.replay import Life
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     """What an agent completed is the same, in the same order, wherever it is told."""
     for agent_id, lives in evidence.lives.items():
-        if evidence.traces[agent_id].problem:
+        if evidence.traces[agent_id].problem or any(life.unknown for life in lives):
             continue
         yield from _over_brown_outs(evidence, agent_id, lives)
         traced = dict.fromkeys(block for life in lives for block in life.completed)

@@ -10,6 +10,7 @@ from collections import Counter
 from itertools import islice
 
 from harness.archive.traces import Trace
+from harness.archive.vocabulary import Kind, first_of, unknown_words
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.steps.deviation import Deviation
@@ -21,6 +22,9 @@ from ucp.messages import MalformedDatagramError
 from ucp.trace import Commanded, Dropped
 
 NAME = "every step"
+
+COMPARED_WITHOUT: frozenset[Kind] = frozenset(("branch", "tally"))
+"""Of a step with unknown words of these kinds all the rest is compared; with others it is not known what it was."""
 
 
 def check(evidence: Evidence) -> Judgement:
@@ -49,6 +53,8 @@ def check(evidence: Evidence) -> Judgement:
         return _deviates(evidence, deviations, steps, lost)
     for agent_id in sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):
         unjudged[agent_id] = "there is no trace"
+    for agent_id, words in evidence.unknown.items():
+        unjudged.setdefault(agent_id, f"the trace is not understood: {first_of(words)}")
     unjudged |= {agent_id: f"the trace is not whole: {why}" for agent_id, why in evidence.examination.short.items()}
     if unjudged or not evidence.traces:
         return Judgement(NAME, "not applicable", _why(unjudged))
@@ -75,9 +81,12 @@ def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: 
 
 
 def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> None:
-    """Take each life of the agent through all of its steps."""
+    """Take each life of the agent through all of its steps, up to the first that it tells in unknown words."""
+    understood = not evidence.unknown.get(agent_id, {}).keys() - COMPARED_WITHOUT
     for follower, life in zip(followers, trace.lives(), strict=True):
         for line, run in life:
+            if not understood and unknown_words([run]).keys() - COMPARED_WITHOUT:
+                return
             follower.follow(line, run)
     if agent_id in evidence.exports and not trace.cut_off and not trace.problem:
         followers[-1].end(evidence.end_of(agent_id))

@@ -6,6 +6,7 @@ from copy import deepcopy
 from typing import Any, NamedTuple
 
 from harness.archive.traces import Trace
+from harness.archive.vocabulary import branch_is_known, tally_is_known
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.header import CheckedHeader
 from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, stored_blocks
@@ -55,9 +56,8 @@ class AnotherHandlerError(NotHandledError):
     """The run is another handler's than `handler`, for which the input is."""
 
     def __init__(self, run: HandlerRun, handler: EventHandler[Any]) -> None:
-        super().__init__(
-            f"ran as Algorithm {run.algorithm}; what came is for Algorithm {handler.algorithm}, {handler.name}"
-        )
+        ran = HANDLERS[run.handler].algorithm if run.handler in HANDLERS else run.algorithm
+        super().__init__(f"ran as Algorithm {ran}; what came is for Algorithm {handler.algorithm}, {handler.name}")
 
 
 class Follower:
@@ -258,7 +258,7 @@ class Follower:
             handler, inputs = ON_LOCAL_EVENT["Reconcile Finalize"], ()
         else:
             raise NotHandledError("ran without a trigger that there is")
-        if handler.name != run.handler or handler.algorithm != run.algorithm:
+        if handler.name != run.handler:
             raise AnotherHandlerError(run, handler)
         return handler, inputs
 
@@ -286,7 +286,7 @@ class Follower:
                 f"and the datagram is {message.NAME} {sequence} from agent {sender}"
             )
         handler = ON_MESSAGE[type(message)]
-        if handler.name != run.handler or handler.algorithm != run.algorithm:
+        if handler.name != run.handler:
             raise AnotherHandlerError(run, handler)
         return handler, sender, message
 
@@ -341,13 +341,14 @@ class Follower:
 
     def _differs(self, run: HandlerRun, handler: EventHandler[Any], branch: str, may_touch_timers: bool) -> bool:
         core = self._core
-        if run.branch != branch or run.changes != core.changes:
+        if (run.branch != branch and branch_is_known(run)) or run.changes != core.changes:
             return True
         if (run.sent or core.outbox) and not core.has_sent(run.sent):
             return True
         if self._tells.timers and (run.started or {}) != core.started:
             return True
-        if branch in COUNTING and run.handler in self._tells.tallying and run.tally != tally_of(core, handler):
+        tells_tally = branch in COUNTING and run.handler in self._tells.tallying
+        if tells_tally and run.tally != tally_of(core, handler) and tally_is_known(run):
             return True
         state = run.state
         if state is self._state and not (may_touch_timers or run.changes or core.triggered):
@@ -379,8 +380,9 @@ class Follower:
             self._top_in_hex(),
         )
         changes, sent = list(core.changes), core.sent_in_full()
-        expected = HandlerRun(run.t, handler.name, handler.algorithm, run.trigger, branch, changes, sent, state)
-        tells_tally = branch in COUNTING and run.handler in self._tells.tallying
+        taken = branch if branch_is_known(run) else run.branch
+        expected = HandlerRun(run.t, handler.name, handler.algorithm, run.trigger, taken, changes, sent, state)
+        tells_tally = branch in COUNTING and run.handler in self._tells.tallying and tally_is_known(run)
         expected.started = dict(core.started) if self._tells.timers else run.started
         expected.tally = tally_of(core, handler) if tells_tally else run.tally
         return expected
