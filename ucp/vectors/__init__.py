@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ucp.vectors import blocks, drops, hashes, messages
+from ucp.vectors import blocks, drops, hashes, messages, missions
 
 DIRECTORY = Path(__file__).parent
 
@@ -32,7 +32,14 @@ INDEX = MISSIONS / "index.json"
 
 def texts() -> dict[Path, str]:
     """Every file and what stands in it."""
-    return {DIRECTORY / f"{name}.json": _json(vectors()) for name, vectors in DOCUMENTS.items()}
+    made = {DIRECTORY / f"{name}.json": _json(vectors()) for name, vectors in DOCUMENTS.items()}
+    index = {}
+    for name, mission in missions.MISSIONS.items():
+        exchanges = mission().exchanges
+        features = exchanges[0]["input"]["mission"]["features"]
+        index[name] = {"what": mission.__doc__, "features": features, "lines": len(exchanges)}
+        made[MISSIONS / f"{name}.jsonl"] = "".join(json.dumps(exchange) + "\n" for exchange in exchanges)
+    return made | {INDEX: _json(index)}
 
 
 def write_all() -> None:
