@@ -1,0 +1,91 @@
+"""Agents of another make in virtual time: `python -m benchmarks.foreign [-- COMMAND...]`, by default ours driven so.
+
+Missions of 20 minutes with five agents, 15 % loss, with traces and judged in everything, on `--jobs` cores, beside the
+same missions with our agent in the simulation itself. `--same` plays the whole library with some seeds instead, and
+says where our agent, driven by lines, does anything else than in the simulation: it has to be the same to the byte, but
+for swarms of which it is proven that they never finish: nobody proves that of agents into which nobody sees.
+"""
+
+import argparse
+import resource
+import sys
+import time
+from pathlib import Path
+
+from harness.run.simulate import Simulated, simulate
+from harness.run.sweep import Failed, sweep
+from harness.scenario import Scenario, library, load_scenario
+
+OURS = [sys.executable, "-P", "-m", "ucp.node"]
+
+
+def of_library(name: str, command: list[str] | None) -> Scenario:
+    return load_scenario(Path(name)).model_copy(update={"agent_command": command})
+
+
+def measure(scenario: Scenario, missions: int, jobs: int) -> tuple[float, int]:
+    """Wall seconds of so many missions, and handler runs in all of them."""
+
+    def work(seed: int) -> int:
+        result = simulate(scenario, seed, tracing=True, deliver_all=True)
+        assert not result.result.bad, f"seed {seed}: {result.result.bad}"
+        return sum(len(trace.runs) for trace in result.evidence.traces.values())
+
+    began, runs = time.monotonic(), 0
+    with sweep(range(missions), work, jobs) as outcomes:
+        for seed, outcome in outcomes:
+            if isinstance(outcome, Failed):
+                sys.exit(f"seed {seed}: {outcome.reason}")
+            runs += outcome
+    return time.monotonic() - began, runs
+
+
+def left_behind(simulated: Simulated) -> object:
+    exports = [export.model_dump() for export in simulated.evidence.exports.values()]
+    return exports, [[run.to_line() for run in trace.runs] for trace in simulated.evidence.traces.values()]
+
+
+def same(seeds: int, jobs: int) -> int:
+    """How many missions are not the same."""
+
+    def work(task: tuple[str, int]) -> bool:
+        name, seed = task
+        ours, driven = (
+            simulate(of_library(name, command), seed, tracing=True, deliver_all=True) for command in (None, OURS)
+        )
+        return ours.played.cycle is not None or left_behind(ours) == left_behind(driven)
+
+    differ = 0
+    names = [name for name in library.names() if not name.endswith("matrix")]
+    tasks = [(name, seed) for name in names for seed in range(seeds)]
+    with sweep(tasks, work, jobs, what="missions") as outcomes:
+        for (name, seed), outcome in outcomes:
+            if outcome is not True:
+                differ += 1
+                sys.stdout.write(
+                    f"{name}, seed {seed}: {outcome.reason if isinstance(outcome, Failed) else 'differs'}\n"
+                )
+    sys.stdout.write(f"{len(tasks) - differ} of {len(tasks)} missions are the same\n")
+    return differ
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--missions", type=int, default=200)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--same", type=int, default=0, metavar="SEEDS")
+    parser.add_argument("command", nargs="*", default=OURS)
+    asked = parser.parse_args()
+    if asked.same:
+        return 1 if same(asked.same, asked.jobs) else 0
+    for words, command in (("in the simulation", None), (" ".join(asked.command), asked.command)):
+        wall_s, runs = measure(of_library("loss_15", command), asked.missions, asked.jobs)
+        rate = f"{asked.missions / wall_s * 60:.0f} missions a minute, {runs / wall_s:.0f} handler runs a second"
+        sys.stdout.write(f"{words}: {asked.missions} missions in {wall_s:.1f} s, {rate}\n")
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    sys.stdout.write(f"processor time of both: {used.ru_utime:.1f} s, and {used.ru_stime:.1f} s of the kernel\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
