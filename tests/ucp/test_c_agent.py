@@ -1,0 +1,183 @@
+"""The agent in C, `ucp/examples/ucp_agent.c`: what any agent has to do, and what only a program in C can get wrong."""
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+import ucp
+from harness.play.progress import Silent
+from harness.run.run import run
+from tests.harness.command import harness, write_scenario
+from tests.harness.virtual import scenario
+from tests.machine import do_without
+from ucp.vectors import INDEX
+from ucp.vectors.replay import Player, play
+
+SOURCE = Path(ucp.__path__[0]) / "examples" / "ucp_agent.c"
+VECTORS = INDEX.parent.parent
+WARNINGS = ["-std=c11", "-Wall", "-Wextra", "-Werror"]
+HARD_RUN: dict[str, Any] = {
+    "network": {"loss": 0.15},
+    "timeline": [{"at_s": 50, "partition": [[1, 2], [3]]}, {"at_s": 100, "heal": True}],
+    "events": {"source": "random", "mean_s": 10},
+    "final_reconcile": True,
+}
+
+
+def compiled(program: Path, *options: str) -> Path:
+    if shutil.which("cc") is None:
+        do_without("cc", "no C compiler (Debian packages `gcc` and `libc6-dev`)")
+    subprocess.run(["cc", *WARNINGS, *options, "-o", program, SOURCE, "-lm"], check=True)
+    return program
+
+
+@pytest.fixture(scope="session")
+def agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return compiled(tmp_path_factory.mktemp("c agent") / "ucp_agent", "-O2")
+
+
+@pytest.fixture(scope="session")
+def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, but it ends as soon as it does what C does not define, or leaks."""
+    folder = tmp_path_factory.mktemp("checked")
+    probe = ["cc", "-fsanitize=address,undefined", "-x", "c", "-o", folder / "probe", "-"]
+    if shutil.which("cc") and subprocess.run(probe, input=b"int main(void){return 0;}", check=False).returncode != 0:
+        do_without("cc", "no sanitizers (Debian package `libgcc-12-dev`)")
+    options = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover")
+    return compiled(folder / "ucp_agent", *options)
+
+
+@pytest.fixture(scope="module")
+def player(agent: Path) -> Iterator[Player]:
+    with Player([str(agent)]) as playing:
+        yield playing
+
+
+def mission(**keys: Any) -> dict[str, Any]:
+    network = {"address": "127.0.0.1", "broadcast": "127.255.255.255", "port": 14600}
+    return {
+        "schema": "ucp-mission/1",
+        "agent_id": 7,
+        "roster": [1, 7, 28],
+        "initial_data": "dGVzdA==",
+        "network": network,
+        "events": {"source": "none"},
+        "seed": 1,
+        "speedup": 1,
+        "epoch_us": 0,
+        **keys,
+    }
+
+
+def vectors(name: str) -> Any:
+    return json.loads((VECTORS / f"{name}.json").read_text(encoding="ascii"))
+
+
+@pytest.mark.parametrize("name", json.loads(INDEX.read_text(encoding="ascii")))
+def test_a_transcript(name: str, player: Player) -> None:
+    assert play(player, INDEX.with_name(f"{name}.jsonl")) is None
+
+
+def test_what_is_dropped_and_why(player: Player) -> None:
+    drops = vectors("drops")
+    player.give({"t": 0, "mission": mission(agent_id=drops["agent_id"], roster=drops["roster"])})
+    for number, drop in enumerate(drops["datagrams"]):
+        (line,) = player.give({"t": number, "datagram": drop["datagram"]})["trace"][:1]
+        assert line.get("dropped") == drop["dropped"], drop["what"]
+
+
+def test_blocks_and_when_they_are_full(player: Player) -> None:
+    for case in vectors("blocks"):
+        settings = {key: case[key] for key in ("max_block_bytes", "max_event_bytes")}
+        player.give(
+            {"t": 0, "mission": mission(agent_id=case["agent_id"], roster=[case["agent_id"]], settings=settings)}
+        )
+        for event in case["events"]:
+            keys = ("event_id", "data", "timestamp_us")
+            line = player.give({"t": 0, **{key: event[key] for key in keys}})["trace"][0]
+            assert line["branch"] == event["branch"]
+            if "block" in event:
+                assert line["changes"][0] == ["complete", event["block"]["block_hash"]]
+
+
+def test_inception_blocks(player: Player) -> None:
+    for block in vectors("hashes")["inception"]:
+        player.give({"t": 0, "mission": mission(initial_data=block["initial_data"])})
+        assert player.give({"t": 0, "command": "status"})["answer"]["top_chain_hash"] == block["chain_hash"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "status", "word"),
+    [
+        ({"features": ["phase1_tie=coin"], "settings": {"phase1_tie": "coin"}}, 127, "phase1_tie=coin"),
+        ({"features": ["quirks"]}, 127, "quirks"),
+        ({"quirks": {"ignore_commit": 0.5}}, 127, "quirks"),
+        ({"events": {"source": "mavlink"}}, 127, "telemetry"),
+        ({"schema": "ucp-mission/2", "features": ["quirks"]}, 2, "ucp-mission/1"),
+        ({"settings": {"max_block_bytes": 100}}, 2, "max_event_bytes"),
+        ({"seed": 2**64}, 2, "seed"),
+        ({"roster": [1, 28]}, 2, "roster"),
+    ],
+)
+def test_a_mission_that_it_cannot_play_is_one_sentence(
+    agent: Path, tmp_path: Path, changed: dict[str, Any], status: int, word: str
+) -> None:
+    (tmp_path / "7.mission.json").write_text(json.dumps(mission(**changed)))
+    done = subprocess.run([agent, "7.mission.json"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (status, 1)
+    assert word in done.stderr
+
+
+def test_hostile_lines_do_no_harm(checked: Path) -> None:
+    """Lines of transcripts with bytes that are wrong or missing: each is answered, and nothing leaks."""
+    random = Random(1)
+    told = []
+    for transcript in sorted(INDEX.parent.glob("*.jsonl")):
+        for line in transcript.read_text(encoding="ascii").splitlines():
+            given = bytearray(json.dumps(json.loads(line)["input"]).encode())
+            told.append(bytes(given))
+            for _ in range(random.randrange(4)):
+                at = random.randrange(len(given))
+                given[at : at + random.randrange(3)] = random.choice([b"", b'"', b"9", b"\\u0", b"\xff", b"[[[", b"{"])
+            told.append(bytes(given))
+    told += [b"", b"[" * 100_000, b'{"t": 1e999, "timer": true}', b'{"t": 1e300, "timer": true}']
+    sent = b"".join(line + b"\n" for line in told)
+    done = subprocess.run([checked, "--virtual"], input=sent, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    answers = [json.loads(answer) for answer in done.stdout.splitlines()]
+    assert len(answers) == len(told)
+    assert 0 < sum("error" in answer for answer in answers) < len(told)
+
+
+def test_a_mission_in_virtual_time_with_ours_among_them(agent: Path, tmp_path: Path) -> None:
+    reboot = {"at_s": 130, "reboot": [3], "down_s": 5, "disk": "kept"}
+    keys = {**HARD_RUN, "timeline": [*HARD_RUN["timeline"], reboot], "duration_s": 200}
+    mixed = scenario(agents=3, agent_command={1: [str(agent)], 3: [str(agent)]}, **keys)
+    finished = run(mixed, 1, tmp_path / "run", Silent(), "sim")
+    assert finished.exit_status == 0
+    assert_nothing_to_find(tmp_path / "run")
+
+
+@pytest.mark.lab
+def test_a_mission_over_udp_with_ours_among_them(checked: Path, agent: Path, tmp_path: Path) -> None:
+    commands = {1: [str(agent)], 3: [str(checked)]}
+    path = write_scenario(tmp_path, vehicles={"kind": "none"}, duration_s=150, agent_command=commands, **HARD_RUN)
+    environment = {**os.environ, "ASAN_OPTIONS": "exitcode=99"}
+    done = harness("run", path, "--seed", 1, "--out", tmp_path / "run", env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert_nothing_to_find(tmp_path / "run")
+
+
+def assert_nothing_to_find(directory: Path) -> None:
+    record = json.loads((directory / "run.json").read_text(encoding="utf-8"))
+    assert {verdict["verdict"] for verdict in record["characteristics"].values()} == {"holds"}
+    assert record["steps"]["verdict"] == "as specified"
+    assert record["records"]["verdict"] == "agree"
+    assert record["figures"]["blocks"] > 0
