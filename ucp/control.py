@@ -5,18 +5,16 @@ A Unix stream socket; one JSON object per line in, one per line out (see CONTRAC
 
 import asyncio
 import json
-import math
 import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ucp.request import check_request
+
 MAX_LINE_BYTES = 64 * 1024
 MAX_NAME = 40
 """More of a wrong command is not shown."""
-
-MAX_PARTS = 100
-"""A request has no more objects and lists in it."""
 
 Command = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -65,11 +63,12 @@ class ControlServer:
 
     def _answer(self, line: bytes) -> dict[str, Any]:
         try:
-            request = _request(line)
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                return {"ok": False, "error": "not a JSON object"}
+            check_request(request)
         except (ValueError, RecursionError):
             return {"ok": False, "error": "not JSON"}
-        if not isinstance(request, dict):
-            return {"ok": False, "error": "not a JSON object"}
         name = request.get("command")
         command = self._commands.get(name) if isinstance(name, str) else None
         if command is None:
@@ -79,19 +78,3 @@ class ControlServer:
             return {"ok": True, **command(request)}
         except CommandError as error:
             return {"ok": False, "error": str(error)}
-
-
-def _request(line: bytes) -> Any:
-    """What a line says in JSON. Raises ValueError, also for what json reads and a trace cannot hold, RecursionError."""
-    if line.count(b"[") + line.count(b"{") > MAX_PARTS:
-        raise ValueError
-    request = json.loads(line, parse_float=_finite, parse_constant=_finite)
-    json.dumps(request, ensure_ascii=False).encode()  # half a character is none
-    return request
-
-
-def _finite(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError
-    return number

@@ -63,6 +63,12 @@ class StoredState:
         """The blocks' data, the chain's first, then the deque's and the stack's, a length (u16) before each."""
         return b"".join(len(data).to_bytes(2, "big") + data for data in (block.block_data() for block in self.blocks()))
 
+    def check(self) -> None:
+        """Raises ValueError for what no agent holds."""
+        held = [block.block_hash for block in self.blocks()]
+        if len({*held}) < len(held) or not {*self.completed} <= {*held}:
+            raise ValueError("a block is in two places, or one that it completed in none")
+
     def _change(self, operation: str, block: Block) -> None:
         """Make a change of a trace."""
         match operation:
@@ -84,7 +90,7 @@ class StoredState:
     def replay(self, entry: dict[str, Any], known: dict[str, Block]) -> None:
         """Make all changes of an entry; `known` are the blocks of the entries before, by hash, and get this one's."""
         for agent_id, timestamp_us, event_data in entry["blocks"]:
-            block = decode_block(BLOCK_HEADER.pack(agent_id, timestamp_us) + base64.b64decode(event_data))
+            block = block_on_disk(agent_id, timestamp_us, base64.b64decode(event_data))
             known[block.block_hash.hex()] = block
         for operation, block_hash in entry["changes"]:
             self._change(operation, known[block_hash])
@@ -113,7 +119,7 @@ class Store:
     def _read(self) -> StoredState | None:
         try:
             return self._replayed(_entries(self._path))
-        except (ValueError, TypeError, LookupError, RecursionError, struct.error):
+        except (ValueError, TypeError, LookupError, RecursionError):
             raise StoreError(
                 f"{self._path} has an entry whose checksum is right and that no agent wrote: move it away or name "
                 "another file as `store`"
@@ -136,9 +142,7 @@ class Store:
         stored, known = StoredState(), dict[str, Block]()
         for entry in entries:
             stored.replay(entry, known)
-        held = [block.block_hash for block in stored.blocks()]
-        if len({*held}) < len(held) or not {*stored.completed} <= {*held}:
-            raise ValueError("a block is in two places, or one that it completed in none")
+        stored.check()
         return stored
 
     def write(self, changes: list[Change]) -> None:
@@ -186,6 +190,14 @@ class Store:
     def close(self) -> None:
         if self._file is not None:
             self._file.close()
+
+
+def block_on_disk(agent_id: int, timestamp_us: int, event_data: bytes) -> Block:
+    """A block as it is kept. Raises ValueError if it can be none, or no message carries it."""
+    try:
+        return decode_block(BLOCK_HEADER.pack(agent_id, timestamp_us) + event_data)
+    except struct.error as error:
+        raise ValueError(str(error)) from None
 
 
 def _line(document: dict[str, Any]) -> bytes:

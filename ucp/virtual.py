@@ -22,10 +22,13 @@ from ucp.events import LoggableEvent
 from ucp.export import export_chain
 from ucp.mission import MAX_MISSION_BYTES, MissionError, UnsupportedMissionError, parse_mission
 from ucp.quirks import check_quirk, wrong_handlers
+from ucp.request import check_request
 from ucp.status import status_of
-from ucp.store import StoredState
+from ucp.store import StoredState, block_on_disk
 from ucp.trace import Commanded, HandlerRun, in_base64
 
+LATEST_S = 1e12
+"""Mission seconds; the timestamp of no event would have room for more."""
 MAX_LINE_BYTES = 16 * MAX_MISSION_BYTES
 """The longest is a mission with a store."""
 
@@ -124,7 +127,7 @@ class VirtualAgent:
 
     def _advance(self, given: dict[str, Any]) -> float:
         now = given.get("t")
-        if isinstance(now, bool) or not isinstance(now, int | float) or not math.isfinite(now):
+        if isinstance(now, bool) or not isinstance(now, int | float) or not abs(now) <= LATEST_S:
             raise InputError("`t` must be a number of mission seconds")
         if now < self._now:
             raise InputError(f"`t` goes back, from {self._now!r} to {now!r}")
@@ -146,6 +149,10 @@ class VirtualAgent:
 
     def _do(self, given: dict[str, Any], now: float) -> dict[str, Any]:
         name = given["command"]
+        try:
+            check_request(given)
+        except ValueError:
+            raise InputError("not a line of JSON") from None
         command = _COMMANDS.get(name) if isinstance(name, str) else None
         if command is None:
             error = f"unknown command {str(name)[:40]!r}: there are {', '.join(_COMMANDS)}"
@@ -239,13 +246,15 @@ def _stored(value: Any) -> StoredState:
 
     def blocks(place: str) -> list[Block]:
         return [
-            Block(agent_id, timestamp_us, base64.b64decode(event_data, validate=True))
+            block_on_disk(agent_id, timestamp_us, base64.b64decode(event_data, validate=True))
             for agent_id, timestamp_us, event_data in value[place]
         ]
 
     try:
         completed = [bytes.fromhex(block_hash) for block_hash in value["completed"]]
-        return StoredState(completed, blocks("chain"), blocks("deque"), blocks("stack"))
+        stored = StoredState(completed, blocks("chain"), blocks("deque"), blocks("stack"))
+        stored.check()
+        return stored
     except (KeyError, TypeError, ValueError):
         raise InputError("`store` is not what this agent answered to the command `store`") from None
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Protocol
 
 NAMES = (
-    *("datagram", "agent", "store", "mission", "control", "telemetry", "scenario", "story"),
+    *("datagram", "agent", "store", "mission", "control", "virtual", "foreign", "telemetry", "scenario", "story"),
     *("trace", "events", "export", "run_record", "network", "tracks", "capture", "csv", "bag", "packed"),
 )
 

@@ -24,7 +24,7 @@ SHORT = """\
 name: Short
 agents: 3
 duration_s: 60
-network: {loss: 0.1, delay: 0.05, jitter: 0.01}
+network: {loss: 0.1, delay: {mean_s: 0.05, jitter_s: 0.01}}
 settings: {max_block_bytes: 300, vote_timeout_s: 4}
 quirks: {ignore_commit: {agents: [2], value: 0.5}}
 clocks: {2: {offset_s: 1.5, drift: 0.001}}
@@ -74,12 +74,12 @@ def run(data: bytes) -> None:
             sound(str(error))
             return
         require(played.played.outcome == "completed", f"it is not completed: {played.played.outcome_detail}")
-        for judgement in played.result.judgements:
+        for judgement in played.result.judgements.values():
             sound(judgement.reason)
 
 
 def _short(scenario: Scenario) -> bool:
-    """Whether it is played in a moment."""
+    """Whether it is played in a moment, and starts no program that an input names."""
     entries = len(scenario.events.script) + len(scenario.timeline) + len(scenario.datagrams) + len(scenario.fates)
     injects = any(entry.injection for entry in scenario.timeline)
     return (
@@ -90,6 +90,7 @@ def _short(scenario: Scenario) -> bool:
         and not scenario.schedule
         and not injects
         and not scenario.flight
+        and scenario.agent_command is None
     )
 
 

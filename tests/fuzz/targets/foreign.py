@@ -1,0 +1,119 @@
+"""A swarm in virtual time of which one agent is a program of somebody's: its answers may be any, the run ends.
+
+The program is ours, in this process, but for some answers. An input is lines `{"n":5,"answer":{...}}`: its answer
+number 5, counted from 0 through all its lives, is this, whatever it is.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from unittest.mock import patch
+
+from harness import checker
+from harness.errors import HarnessError
+from harness.play.simulation.foreign import foreigners, programs
+from harness.play.simulation.foreign.program import Program
+from harness.run.simulate import simulate
+from harness.scenario import Scenario
+from tests.fuzz.finding import require, sound
+from tests.harness.virtual import scenario
+from ucp.virtual import VirtualAgent
+
+_REPLACED = re.compile(rb'\{"n":(\d{1,3}),"answer":(.*)\}')
+SCENARIO: Scenario = scenario(
+    agents=3,
+    duration_s=30,
+    network={"loss": 0.1},
+    settings={"max_block_bytes": 64, "max_event_bytes": 64},
+    events={"source": "scripted", "script": [{"at_s": at_s, "agent": at_s % 3 + 1, "bytes": 40} for at_s in range(9)]},
+    timeline=[{"at_s": 20, "reboot": [2], "down_s": 3, "disk": "kept"}, {"at_s": 26, "reconcile": [2]}],
+    agent_command={2: ["true"]},
+    settle={"limit_s": 30},
+)
+
+
+class _Ours(Program):
+    """Our agent, which says something else now and then; it needs no process."""
+
+    _agent: VirtualAgent
+    answers: list[bytes]
+    replaced: dict[int, bytes]
+
+    def __init__(self, command: tuple[str, ...], log: Path | None = None) -> None:
+        self.command, self.log, self.owes_an_answer = tuple(command), None, False
+        self._said = b""
+
+    @property
+    def is_new(self) -> bool:
+        return not self.answers
+
+    @property
+    def runs(self) -> bool:
+        return True
+
+    def tell(self, line: bytes) -> None:
+        given = json.loads(line)
+        if "mission" in given:
+            self._agent = VirtualAgent(given)
+        else:
+            self._agent.give(given)
+
+    def answer(self) -> bytes:
+        good = self._agent.answer().encode() + b"\n"
+        answer = self.replaced.get(len(self.answers), good)
+        self.answers.append(good)
+        return answer
+
+    def where_it_logs(self) -> str:
+        return ""
+
+    def last_words(self) -> str:
+        return ""
+
+    def forget_words(self) -> None:
+        """It has none."""
+
+    def end(self, within_s: float = 0.0) -> None:
+        """It is no process."""
+
+
+def run(data: bytes) -> None:
+    replaced = {int(told[1]): told[2] + b"\n" for line in data.split(b"\n") if (told := _REPLACED.fullmatch(line))}
+    _play(replaced)
+
+
+def _play(replaced: dict[int, bytes]) -> list[bytes]:
+    """The good answers."""
+    ours = type("Replaced", (_Ours,), {"answers": [], "replaced": replaced})
+    with patch.object(programs, "Program", ours), patch.object(foreigners, "SHARED", programs.Programs()):
+        try:
+            played = simulate(SCENARIO, 1, tracing=True)
+        except HarnessError as error:
+            sound(str(error))
+        else:
+            require(played.played.outcome in ("completed", "failed"), f"it is {played.played.outcome}")
+            sound(played.played.outcome_detail or "")
+            _judge(played.result)
+    return ours.answers  # type: ignore[attr-defined,no-any-return]
+
+
+def _judge(result: checker.Result) -> None:
+    for judgement in result.judgements.values():
+        sound(judgement.reason)
+        for finding in judgement.evidence:
+            sound(finding.detail)
+    for sentence in result.errors:
+        sound(sentence)
+
+
+def seeds(flown: Path) -> Iterator[bytes]:
+    """Answers as they are, of each kind."""
+    kept, kinds = [], set[frozenset[bytes]]()
+    for number, answer in enumerate(_play({})[:999]):
+        kind = frozenset(re.findall(rb'"(?:handler|message|answer|store|schema)":"?\w*', answer))
+        if kind not in kinds and len(answer) < 3000:
+            kinds.add(kind)
+            kept.append(b'{"n":%d,"answer":%s}' % (number, answer.strip()))
+    for start in range(0, len(kept), 4):
+        yield b"\n".join(kept[start : start + 4])
