@@ -239,11 +239,14 @@ class LeastHeld(_Model):
 
 
 class Survival(_Model):
-    """What became of the `completed` blocks where vehicles were lost; `gone` are on no vehicle at the end."""
+    """What became of the `completed` blocks where vehicles were lost; `gone` are on no vehicle at the end.
+
+    None where nothing tells what some agents completed.
+    """
 
     losses: list[Loss] = []
-    completed: int
-    gone: int
+    completed: int | None
+    gone: int | None
     at_end: LeastHeld | None = None
     before_final_reconcile: LeastHeld | None = None
 
@@ -252,14 +255,14 @@ class InjectedMessages(_Model):
     """Of one injection the messages of one type: how many it sent, and what the agents that heard them did.
 
     `handled`: branch of the handler -> how often it was taken. `changed`: how many of these handler runs changed what
-    an agent holds. `unhandled`: how many of the messages no agent handled.
+    an agent holds. `unhandled`: how many of the messages no agent handled; None if traces name messages otherwise.
     """
 
     message: str
     sent: int
     handled: dict[str, int] = {}
     changed: int = 0
-    unhandled: int = 0
+    unhandled: int | None = 0
 
 
 class RogueInjection(_Model):

@@ -43,6 +43,9 @@ TALLIES = {
 }
 """Handler -> the keys of its tally; None if they are block hashes."""
 
+COMPARED_WITHOUT: frozenset[Kind] = frozenset(("branch", "tally"))
+"""Of a step with unknown words of these kinds all the rest can be judged; with others it is not known what it was."""
+
 SHOWN = 40
 """More of an unknown word is not shown."""
 

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from harness.archive.archive import RunArchive
 from harness.archive.record import InjectedMessages, RogueInjection
 from harness.archive.traces import Trace
+from harness.archive.vocabulary import unknown_words
 from harness.play.rogue.sequences import injection_of
 from harness.scenario import Scenario
 from harness.scenario.changes import injections_of
@@ -65,6 +66,9 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
     if not injections:
         return []
     tallies = {injection.number: _Tally() for injection in injections}
+    named_otherwise = any(
+        {"message", "trigger"} & unknown_words(trace.runs).keys() for trace in archive.traces.values()
+    )
     copies: dict[_Key, list[tuple[float, int]]] = defaultdict(list)
     for line in archive.injected(_Line):
         if line.injection in tallies:
@@ -78,7 +82,8 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
                     tally.changed[message] += bool(run.changes)
                     tally.reached[message].add((key, copy))
     return [
-        _told(injection.at_s, injection.what, injection.detail, tallies[injection.number]) for injection in injections
+        _told(injection.at_s, injection.what, injection.detail, tallies[injection.number], named_otherwise)
+        for injection in injections
     ]
 
 
@@ -140,14 +145,15 @@ def _paired(
             yield number, copy, left.pop()
 
 
-def _told(at_s: float, what: str, detail: str, tally: _Tally) -> RogueInjection:
+def _told(at_s: float, what: str, detail: str, tally: _Tally, named_otherwise: bool) -> RogueInjection:
+    """With `named_otherwise` there are agents that handled messages of which nobody knows which they were."""
     messages = [
         InjectedMessages(
             message=message,
             sent=sent,
             handled=dict(tally.handled[message].most_common()),
             changed=tally.changed[message],
-            unhandled=max(0, sent - len(tally.reached[message]) - tally.untraced),
+            unhandled=None if named_otherwise else max(0, sent - len(tally.reached[message]) - tally.untraced),
         )
         for message, sent in tally.sent.most_common()
     ]

@@ -21,11 +21,12 @@ LOSSES_TOLD = 5
 def survival(evidence: Evidence) -> Survival:
     """What became of the completed blocks with each loss of vehicles, and what the next loss could take."""
     at_end = _holders(evidence.exports)
+    completed = None if evidence.not_told_completed() else evidence.completed_blocks()
     lost = [fault for fault in (evidence.record.faults if evidence.record else ()) if fault.loses_data]
     return Survival(
         losses=_losses(evidence, lost, at_end),
-        completed=len(evidence.completed_blocks()),
-        gone=len(evidence.completed_blocks().keys() - at_end.keys()),
+        completed=None if completed is None else len(completed),
+        gone=None if completed is None else len(completed.keys() - at_end.keys()),
         at_end=_least_held(evidence, evidence.exports),
         before_final_reconcile=_least_held(evidence, evidence.before_final_reconcile),
     )
@@ -61,7 +62,7 @@ def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld 
 
 def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, list[int]]) -> list[Loss]:
     untold = [trace for trace in evidence.traces.values() if trace.problem]
-    if untold or set(evidence.roster or ()) - set(evidence.traces):
+    if untold or evidence.unknown_word("operation") or set(evidence.roster or ()) - set(evidence.traces):
         return [Loss(at_s=fault.at_s, what=fault.what, vehicles=fault.agents or []) for fault in lost]
     instants = [fault.at_s for fault in lost]
     held = {
@@ -134,8 +135,10 @@ def in_words(survived: Survival) -> list[str]:
     sentences = [_loss_in_words(loss) for loss in survived.losses[:LOSSES_TOLD]]
     if len(survived.losses) > LOSSES_TOLD:
         sentences.append(f"{len(survived.losses) - LOSSES_TOLD} more losses of vehicles are in run.json")
-    if survived.losses:
+    if survived.losses and survived.gone is not None and survived.completed is not None:
         sentences.append(f"at the end {_of(survived.gone, survived.completed)} {_is(survived.gone)} gone")
+    elif survived.losses:
+        sentences.append("at the end nobody knows how many completed blocks are gone")
     if survived.before_final_reconcile is not None:
         sentences.append(f"before the final reconcile {_least_held_in_words(survived.before_final_reconcile)}")
     if survived.at_end is not None:

@@ -30,6 +30,7 @@ from harness.archive.exports import (
 from harness.archive.lenient import fit
 from harness.archive.opened import Opened
 from harness.archive.traces import read_trace
+from harness.archive.vocabulary import unknown_words
 from harness.depot.same_mission import INCEPTION, ROSTER, Carried, UnreadableFileError
 from harness.depot.same_mission import read as read_carried
 from harness.errors import ExportError
@@ -152,6 +153,8 @@ def _look_beside(home: CameHome, carried: Iterable[Carried]) -> None:
         if each.kind == "trace" and each.agent_id is not None and each.agent_id not in home.latest:
             trace = read_trace(each.path, skim=True)
             home.traced.setdefault(each.agent_id, []).extend(trace.completed() if trace else ())
+            if unknown := unknown_words(trace.runs if trace else ()).get("operation"):
+                home.remarks.append(f"{each.path}: {unknown}, so nobody knows all that agent {each.agent_id} completed")
         if ROSTER in each.shared:
             home.roster.update(each.shared[ROSTER].value)  # type: ignore[arg-type]
         if each.mission is not None and each.mission.events.source == "random":

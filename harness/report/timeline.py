@@ -15,6 +15,7 @@ from harness.archive.connectivity import Connectivity
 from harness.archive.history import LATEST_S, History, Message, Reconcile, Vote, ends_at, history_of, possible
 from harness.archive.record import RunRecord
 from harness.archive.replication import replication_of
+from harness.archive.vocabulary import first_of, unknown_words
 from harness.present import words
 from harness.present.colours import Ink
 from harness.report import facts, timeline_charts, timeline_cycle, timeline_lanes
@@ -74,6 +75,13 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
     faults = possible(left.record.faults)
     ends_s = end_s(left)
     course = history_of(traces, faults, ends_s, whole=not left.archive.large)
+    unknown = {agent: unknown_words(trace.runs) for agent, trace in sorted(traces.items())}
+    untold = [agent for agent, words_of_agent in unknown.items() if words_of_agent]
+    all_held = not any("operation" in unknown[agent] for agent in untold)
+    if untold:
+        first, more = first_of(unknown[untold[0]]), len(untold) - 1
+        others = f", and such words in {more} more" if more else ""
+        notes.append(f"not all that agent {untold[0]} did is shown: {first} in its trace{others}")
     shades, shades_left_out = _shades(left.network, ends_s)
     if shades_left_out:
         notes.append(f"{shades_left_out} shorter stretches of a parted network are not shaded")
@@ -83,7 +91,13 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
     agents = [(agent, ink[agent]) for agent in sorted(traces)]
     messages, without = _messages(course.messages, [agent for agent, _ in agents], names)
     picture = timeline_lanes.draw(
-        course, faults, shades, [agent for agent, _ in agents], names, ends_s, _in_words(course, len(agents), ends_s)
+        course,
+        faults,
+        shades,
+        [agent for agent, _ in agents],
+        names,
+        ends_s,
+        _in_words(course, len(agents), ends_s, bool(untold)),
     )
     drawn = Drawn(
         ends_s,
@@ -93,7 +107,7 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
         picture.legend,
         [
             *([timeline_cycle.row(left.record.cycle, ends_s)] if left.record.cycle else []),
-            *timeline_charts.draw(replication_of(traces, faults), faults, shades, ends_s),
+            *(timeline_charts.draw(replication_of(traces, faults), faults, shades, ends_s) if all_held else []),
         ],
         axis(ends_s),
         messages,
@@ -183,11 +197,12 @@ def _reconcile_row(reconcile: Reconcile) -> list[str]:
     ]
 
 
-def _in_words(course: History, agents: int, end_s: float) -> str:
-    """What the lanes show, for who does not see them."""
+def _in_words(course: History, agents: int, end_s: float, unknown: bool) -> str:
+    """What the lanes show, for who does not see them; with `unknown` words in traces there may be more."""
     approved = sum(vote.outcome == "approved" for vote in course.votes)
     return (
         f"Timeline of {agents} agents over {words.duration(round(end_s, 1))}: {len(course.votes)} votes, {approved} of"
         f" them approved, {len(course.commits)} commits, {len(course.reconciles)} reconciles, {len(course.ties)} ties."
         " The tables below list votes and reconciles."
+        f"{' There may be more, in words that are not known.' if unknown else ''}"
     )

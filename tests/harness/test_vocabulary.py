@@ -2,12 +2,19 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
+from harness.archive.archive import RunArchive
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import MESSAGES, OPERATIONS, TIMERS, TRIGGERS, VOTES
 from harness.checker import Evidence, check
+from harness.checker.survival import in_words, survival
+from harness.field.replay import Player, open_record
+from harness.play.progress import Silent
+from harness.report.write import write_report
+from harness.run.run import run
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
 from ucp.agent import HANDLERS
@@ -163,3 +170,44 @@ def test_a_known_handler_with_another_s_number_is_a_contradiction_in_the_evidenc
     assert result.bad == ("records",)
     (finding,) = result.beside["records"].evidence
     assert finding.detail == "its trace has receive_commit_block as Algorithm 7, and that is Algorithm 6"
+
+
+def test_what_was_lost_is_not_known_where_nobody_knows_what_was_completed(honest: Evidence) -> None:
+    told = told_by(honest, operation_renamed("complete"), {2})
+    survived = survival(told)
+    assert (survived.completed, survived.gone, survived.losses[0].completed) == (None, None, None)
+    assert "nobody knows how many completed blocks are gone" in " ".join(in_words(survived))
+    assert check(told).figures["blocks"] is None
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of which agent 1 has other words for its voting timer, for a branch, and for what it completes."""
+    path = tmp_path_factory.mktemp("run") / "run"
+    assert not run(scenario(**EVENTFUL), 3, path, Silent(), "sim").result.bad
+    for agent, old, new in (
+        (1, '{"timer":"voting"}', '{"timer":"vote"}'),
+        (3, '"branch":"building"', '"branch":"builds"'),
+        (4, '["complete",', '["done",'),
+    ):
+        trace = path / "agents" / f"{agent}.trace.jsonl"
+        text = trace.read_text()
+        assert old in text
+        trace.write_text(text.replace(old, new))
+    return path
+
+
+def test_a_report_says_that_it_does_not_show_all(directory: Path) -> None:
+    page = write_report(RunArchive(directory)).read_text()
+    assert "not all that agent 1 did is shown: unknown timer name &#39;vote&#39; in its trace" in page
+    assert "and such words in 2 more" in page
+    assert "There may be more, in words that are not known" in page
+
+
+@pytest.mark.parametrize(("agent", "because"), [(1, "unknown timer name 'vote'"), (3, "unknown branch 'builds' of")])
+def test_a_replay_accuses_nobody_over_a_word(directory: Path, agent: int, because: str) -> None:
+    found = Player(open_record(directory / "agents" / f"{agent}.trace.jsonl")).to_end()
+    assert not found.deviations
+    assert found.steps
+    assert found.unjudged
+    assert because in found.lost[0]

@@ -10,7 +10,7 @@ from collections import Counter
 from itertools import islice
 
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import Kind, first_of, unknown_words
+from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.steps.deviation import Deviation
@@ -22,9 +22,6 @@ from ucp.messages import MalformedDatagramError
 from ucp.trace import Commanded, Dropped
 
 NAME = "every step"
-
-COMPARED_WITHOUT: frozenset[Kind] = frozenset(("branch", "tally"))
-"""Of a step with unknown words of these kinds all the rest is compared; with others it is not known what it was."""
 
 
 def check(evidence: Evidence) -> Judgement:

@@ -7,6 +7,7 @@ from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
 from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
@@ -71,6 +72,7 @@ class Player:
         self.position = 0
         self.found = Found()
         self._tells = Tells.of(record.trace)
+        self._unknown = unknown_words(record.trace.runs)
         self._blocks = RecordedBlocks(record)
         self._clock_set = ClockSet(record)
         self._resumption = Resumption(record, self._blocks)
@@ -159,12 +161,23 @@ class Player:
                 found.lost[-1] += f"; on from line {entry.line}, after which it was idle with a chain that is"
                 self._follower = resumed
             return
+        words = unknown_words([run]) if self._unknown else {}
+        if words:
+            found.unjudged += 1
+            if words.keys() - COMPARED_WITHOUT:
+                follower.lost = f"line {entry.line} is not understood: {first_of(words)}"
+                found.lost.append(follower.lost)
+                return
+            if (sentence := f"not all of line {entry.line} is understood: {first_of(words)}") not in found.lost:
+                found.lost.append(sentence)
+        else:
+            found.steps += 1
         follower.follow(entry.line, run)
-        found.steps += 1
         if follower.deviations and (why := self._excused(follower.deviations)) is not None:
             follower.deviations.clear()
             follower.lost = f"before line {entry.line} {why} and what the agent held then is not on record"
-            found.steps, found.unjudged = found.steps - 1, found.unjudged + 1
+            if not words:
+                found.steps, found.unjudged = found.steps - 1, found.unjudged + 1
         if follower.deviations:
             found.differ(self.position + 1, follower.deviations)
             follower.deviations.clear()
