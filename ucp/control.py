@@ -3,13 +3,15 @@
 A Unix stream socket; one JSON object per line in, one per line out (see CONTRACT.md).
 """
 
-import asyncio
+import contextlib
 import json
 import os
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ucp.loop import Loop
 from ucp.request import check_request
 
 MAX_LINE_BYTES = 64 * 1024
@@ -26,42 +28,42 @@ class CommandError(Exception):
 class ControlServer:
     """Serves `commands` by name. The socket lies beside the agent's other files and goes when the agent does."""
 
-    def __init__(self, path: Path, commands: dict[str, Command]) -> None:
+    def __init__(self, path: Path, commands: dict[str, Command], loop: Loop) -> None:
         self._path = path
         self._commands = commands
-        self._server: asyncio.Server | None = None
+        self._loop = loop
+        self._listener: socket.socket | None = None
 
-    async def start(self) -> None:
+    def start(self) -> None:
         """Raises OSError. A socket that a dead agent left is replaced."""
+        self._listener = listener = socket.socket(socket.AF_UNIX)
+        listener.setblocking(False)
         # Under its name it is there only once it listens: whoever sees it can connect.
         unready = self._path.with_name(f".{self._path.name}")
         unready.unlink(missing_ok=True)
         # A socket's address holds 107 bytes, and run directories lie deep: name it from its own directory.
         directory = os.open(self._path.parent, os.O_PATH)
         try:
-            self._server = await asyncio.start_unix_server(
-                self._serve, f"/proc/self/fd/{directory}/{unready.name}", limit=MAX_LINE_BYTES
-            )
+            listener.bind(f"/proc/self/fd/{directory}/{unready.name}")
         finally:
             os.close(directory)
+        listener.listen()
+        self._loop.watch(listener, readable=self._accept)
         unready.replace(self._path)
 
     def close(self) -> None:
-        if self._server is not None:
-            self._server.close()
+        if self._listener is not None:
+            self._loop.watch(self._listener)
+            self._listener.close()
         self._path.unlink(missing_ok=True)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            while line := await reader.readline():
-                writer.write(json.dumps(self._answer(line)).encode("ascii") + b"\n")
-                await writer.drain()
-        except (ValueError, ConnectionError):
-            pass  # a line over the limit, or a client that went away: its connection ends, nothing else
-        finally:
-            writer.close()
+    def _accept(self) -> None:
+        assert self._listener is not None, "it listens"
+        with contextlib.suppress(OSError):  # a client that went away before
+            _Client(self._listener.accept()[0], self.answer, self._loop)
 
-    def _answer(self, line: bytes) -> dict[str, Any]:
+    def answer(self, line: bytes) -> dict[str, Any]:
+        """What is answered to one line."""
         try:
             request = json.loads(line)
             if not isinstance(request, dict):
@@ -78,3 +80,60 @@ class ControlServer:
             return {"ok": True, **command(request)}
         except CommandError as error:
             return {"ok": False, "error": str(error)}
+
+
+class _Client:
+    """A connection: line after line is answered, as fast as the client reads the answers.
+
+    One that goes away, or sends a line over the limit, ends; nothing else does.
+    """
+
+    def __init__(self, connection: socket.socket, answer: Callable[[bytes], dict[str, Any]], loop: Loop) -> None:
+        connection.setblocking(False)
+        self._connection = connection
+        self._answer = answer
+        self._loop = loop
+        self._received = b""
+        self._unsent = b""
+        loop.watch(connection, readable=self._read)
+
+    def _read(self) -> None:
+        try:
+            data = self._connection.recv(MAX_LINE_BYTES)
+        except OSError:
+            data = b""
+        self._received += data
+        if data:
+            self._go_on()
+        else:
+            self._close()
+
+    def _write(self) -> None:
+        try:
+            self._unsent = self._unsent[self._connection.send(self._unsent) :]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._close()
+            return
+        if not self._unsent:
+            self._loop.watch(self._connection, readable=self._read)
+            self._go_on()
+
+    def _go_on(self) -> None:
+        """Answer the next line, if a whole one is there."""
+        line, newline, rest = self._received.partition(b"\n")
+        if newline:
+            self._received = rest
+            try:
+                self._unsent = json.dumps(self._answer(line)).encode("ascii") + b"\n"
+            except Exception:
+                self._close()  # there will be no answer
+                raise
+            self._loop.watch(self._connection, writable=self._write)
+        elif len(line) > MAX_LINE_BYTES:
+            self._close()
+
+    def _close(self) -> None:
+        self._loop.watch(self._connection)
+        self._connection.close()

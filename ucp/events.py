@@ -6,6 +6,7 @@ big-endian (Section 4.1).
 
 from dataclasses import dataclass
 from random import Random
+from typing import Literal
 
 from ucp.wire import Kind, struct_of
 
@@ -21,6 +22,12 @@ MAX_MEAN_S = 31 * 86400.0
 """No mission is longer; and to find out that nothing happens for years takes minutes."""
 TRIAL_PERIOD_S = 1.0
 EVENT_DATA_BYTES = (32, 64, 128, 256)
+
+
+EventKind = Literal["mode", "arming", "text", "waypoint", "failsafe", "position", "battery"]
+"""What a mission can choose to log of a vehicle's telemetry."""
+
+DEFAULT_LOG: tuple[EventKind, ...] = ("mode", "arming", "text", "position")
 
 
 class MalformedEventsError(ValueError):

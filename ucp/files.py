@@ -1,8 +1,9 @@
-"""What an agent leaves on disk: its chain export, written whole or not at all, and its trace, line by line."""
+"""What an agent leaves on disk: its chain export, written whole or not at all, its trace and its log, line by line."""
 
 import contextlib
 import json
 import os
+import time
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,6 +31,22 @@ def write_atomically(path: Path, text: str) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
+
+
+class LogFile:
+    """Appends what the agent has to say to people, a line each; one that the disk refuses is lost."""
+
+    def __init__(self, path: Path) -> None:
+        self._file: BinaryIO = path.open("ab", buffering=0)
+
+    def say(self, sentence: str) -> None:
+        now = time.time()
+        at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(now))
+        with contextlib.suppress(OSError):
+            self._file.write(f"{at},{int(now % 1 * 1000):03d} {sentence}\n".encode(errors="replace"))
+
+    def close(self) -> None:
+        self._file.close()
 
 
 class TraceFile:

@@ -6,11 +6,9 @@ runs; and its store, if the mission names one. SIGTERM exports the chain and end
 under test must do; this is the default.
 """
 
-import asyncio
 import base64
 import contextlib
 import dataclasses
-import logging
 import signal
 import socket
 import sys
@@ -26,19 +24,16 @@ from ucp.control import CommandError, ControlServer
 from ucp.events import EVENT_HEADER_BYTES, LoggableEvent, RandomEvents
 from ucp.export import export_chain
 from ucp.features import UNSUPPORTED
-from ucp.files import TraceFile, write_json_atomically
+from ucp.files import LogFile, TraceFile, write_json_atomically
+from ucp.loop import Loop, Timer
 from ucp.mission import Mission, MissionError, UnsupportedMissionError, is_epoch, load_mission
-from ucp.quirks import check_quirk, wrong_handlers
 from ucp.status import status_of
 from ucp.store import Store, StoreError
-from ucp.telemetry import TelemetryEvents, follow
 from ucp.trace import Commanded, Entry, HandlerRun, header_line
 
 MAX_READ_BYTES = 65536
 DATAGRAMS_PER_TURN = 64
 WRONG_MISSION = 2
-
-log = logging.getLogger("ucp.node")
 
 
 class Node:
@@ -53,20 +48,22 @@ class Node:
             mission.roster,
             mission.initial_data,
             mission.settings,
-            handlers=wrong_handlers(mission.quirks, self._lots),
         )
+        if any(mission.quirks.values()):
+            self._make_wrong()
         self.generating = False
         self.handled = 0
         self.bytes_sent = 0
         self.send_failures = 0
         self._born_s = 0.0  # mission seconds at which the agent joined a mission that was under way
         self._directory = directory
+        self._log_file = LogFile(directory / f"{mission.agent_id}.log")
         self._trace = TraceFile(directory / f"{mission.agent_id}.trace.jsonl")
         self._store = Store(directory / mission.store, self.agent.state) if mission.store else None
         self._socket = _broadcast_socket(mission)
-        self._timer: asyncio.TimerHandle | None = None
-        self._source: asyncio.Task[None] | None = None
-        self._ended = asyncio.Event()
+        self._loop = Loop(self._failed)
+        self._timer: Timer | None = None
+        self._end_source: Callable[[], object] = lambda: None
         self._control = ControlServer(
             directory / f"{mission.agent_id}.control",
             {
@@ -78,36 +75,39 @@ class Node:
                 "quirk": self._quirk,
                 "reconcile": self._reconcile,
             },
+            self._loop,
         )
 
-    async def run(self) -> int:
+    def run(self) -> int:
         """Serve until SIGTERM or SIGINT; the exit status, 1 if the chain could not be exported."""
-        loop = asyncio.get_running_loop()
-        for signal_number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(signal_number, self._ended.set)
-        loop.add_reader(self._socket, self._receive)
-        await self._control.start()
-        log.info("agent %d of %s ready", self.mission.agent_id, list(self.mission.roster))
+        self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
+        self._loop.watch(self._socket, readable=self._receive)
+        self._control.start()
+        self._say(f"agent {self.mission.agent_id} of {list(self.mission.roster)} ready")
         if self.mission.epoch_us is not None:
             self._begin(self.mission.epoch_us)
-        await self._ended.wait()
+        self._loop.run()
         self._stop_source()
-        if self._timer is not None:
-            self._timer.cancel()
-        loop.remove_reader(self._socket)
         self._socket.close()
         status = 0
         try:
             self.export()
         except OSError as error:
-            log.error("could not export the chain: %s", error.strerror)
+            self._say(f"could not export the chain: {error.strerror}")
             status = 1
         self._trace.close()
         if self._store is not None:
             self._store.close()
         self._control.close()
-        log.info("agent %d ended", self.mission.agent_id)
+        self._loop.close()
+        self._say(f"agent {self.mission.agent_id} ended")
         return status
+
+    def _failed(self, error: Exception) -> None:
+        """An input was not handled to its end, by a mistake of ours: it is on record, and the others still need us."""
+        import traceback
+
+        self._say("".join(traceback.format_exception(error)).rstrip())
 
     def export(self) -> Path:
         """Write the chain export whole or not at all. Raises OSError."""
@@ -116,13 +116,21 @@ class Node:
         write_json_atomically(path, export_chain(self.agent.state, self.clock.timestamp_us(now)))
         return path
 
+    def _make_wrong(self) -> None:
+        from ucp.quirks import wrong_handlers
+
+        self.agent.replace_handlers(wrong_handlers(self.mission.quirks, self._lots))
+
+    def _say(self, sentence: str) -> None:
+        self._log_file.say(sentence)
+
     # Inputs of the agent
 
     def _receive(self) -> None:
         for _ in range(DATAGRAMS_PER_TURN):
             try:
                 data, (address, _) = self._socket.recvfrom(MAX_READ_BYTES)
-            except BlockingIOError:
+            except OSError:  # nothing more, or the network is gone for a while
                 return
             if address == self.mission.network.address or not self.clock.running:
                 continue  # the echo of our own broadcast
@@ -135,7 +143,7 @@ class Node:
         try:
             self._drive(partial(self.agent.add_event, event))
         except ValueError as error:  # larger than this mission allows
-            log.warning("event %d not logged: %s", event_id, error)
+            self._say(f"event {event_id} not logged: {error}")
 
     def _handle_timer(self) -> None:
         self._timer = None
@@ -154,14 +162,14 @@ class Node:
                 self.bytes_sent += len(datagram)
             except OSError as error:  # a radio that cannot send loses the message, as radios do
                 self.send_failures += 1
-                log.warning("could not broadcast: %s", error.strerror)
+                self._say(f"could not broadcast: {error.strerror}")
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         deadline = self.agent.next_timer()
         if deadline is not None:
             delay = self.clock.wall_s(deadline - self.clock.now())
-            self._timer = asyncio.get_running_loop().call_later(max(0.0, delay), self._handle_timer)
+            self._timer = self._loop.call_later(delay, self._handle_timer)
 
     def _keep(self, entries: list[Entry]) -> None:
         runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
@@ -169,11 +177,11 @@ class Node:
         if self._store is not None and self._store.problem is None:
             self._store.write([change for run in runs for change in run.changes])
             if self._store.problem:
-                log.error("the store ends here: %s", self._store.problem)
+                self._say(f"the store ends here: {self._store.problem}")
         if self._trace.problem is None:
             self._trace.write("".join(entry.to_line() for entry in entries))
             if self._trace.problem:
-                log.error("the trace ends here: %s", self._trace.problem)
+                self._say(f"the trace ends here: {self._trace.problem}")
 
     # Event sources
 
@@ -192,22 +200,27 @@ class Node:
         )
         if self._store is not None and self._store.recovered is not None:
             self._drive(partial(self.agent.boot, self._store.recovered))
-            log.info("went on from a store of %d blocks", len(self.agent.state.chain))
+            self._say(f"went on from a store of {len(self.agent.state.chain)} blocks")
         self.generating = True
-        if self.mission.events.source != "none":
-            source = self._random_events if self.mission.events.source == "random" else self._vehicle_events
-            self._source = asyncio.create_task(source())
-            self._source.add_done_callback(self._source_ended)
-        log.info("mission started, events from %s", self.mission.events.source)
+        if self.mission.events.source == "random":
+            self._expect_random_event(RandomEvents(Random(self.mission.seed), self.mission.events.mean_s))
+        elif self.mission.events.source == "mavlink":
+            self._follow_vehicle()
+        self._say(f"mission started, events from {self.mission.events.source}")
 
-    async def _random_events(self) -> None:
-        source = RandomEvents(Random(self.mission.seed), self.mission.events.mean_s)
-        while True:
-            due, event_id, data = source.next()
-            await asyncio.sleep(self.clock.wall_s(self._born_s + due - self.clock.now()))
+    def _expect_random_event(self, source: RandomEvents) -> None:
+        due, event_id, data = source.next()
+
+        def log() -> None:
+            self._expect_random_event(source)
             self._log_event(event_id, data)
 
-    async def _vehicle_events(self) -> None:
+        expected = self._loop.call_later(self.clock.wall_s(self._born_s + due - self.clock.now()), log)
+        self._end_source = expected.cancel
+
+    def _follow_vehicle(self) -> None:
+        from ucp.telemetry import TelemetryEvents, VehicleConnection  # for whom there is a vehicle
+
         source = self.mission.events
         events = TelemetryEvents(source.position_interval_s, Random(self.mission.seed), source.log)
 
@@ -215,17 +228,11 @@ class Node:
             for event_id, event_data in events.receive(data, self.clock.now()):
                 self._log_event(event_id, event_data)
 
-        await follow(source.vehicle_host, source.vehicle_port, sink)
-
-    def _source_ended(self, task: "asyncio.Task[None]") -> None:
-        if not task.cancelled() and task.exception() is not None:
-            log.error("the event source failed", exc_info=task.exception())
-            self.generating = False
+        self._end_source = VehicleConnection(self._loop, source.vehicle_host, source.vehicle_port, sink).close
 
     def _stop_source(self) -> None:
         self.generating = False
-        if self._source is not None:
-            self._source.cancel()
+        self._end_source()
 
     # Commands of the control socket
 
@@ -276,18 +283,20 @@ class Node:
         try:
             return {"path": str(self.export())}
         except OSError as error:
-            log.error("could not export the chain: %s", error.strerror)
+            self._say(f"could not export the chain: {error.strerror}")
             raise CommandError(f"could not export the chain: {error.strerror}") from None
 
     def _quirk(self, request: dict[str, Any]) -> dict[str, Any]:
         name: str = str(request.get("name"))
         value: Any = request.get("value")
+        from ucp.quirks import check_quirk  # of which a right agent knows none
+
         try:
             check_quirk(name, value)
         except ValueError as error:
             raise CommandError(str(error)) from None
         self.mission.quirks[name] = value
-        self.agent.replace_handlers(wrong_handlers(self.mission.quirks, self._lots))
+        self._make_wrong()
         self._take_down_command(request)
         return self.mission.quirks
 
@@ -332,21 +341,14 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"{error}\n")
         return UNSUPPORTED if isinstance(error, UnsupportedMissionError) else WRONG_MISSION
 
-    async def run() -> int:
-        return await Node(mission, path.parent).run()
-
     try:
-        logging.basicConfig(
-            filename=path.parent / f"{mission.agent_id}.log", format="%(asctime)s %(message)s", level=logging.INFO
-        )
-        return asyncio.run(run())
+        return Node(mission, path.parent).run()
     except StoreError as error:
         sys.stderr.write(f"{error}\n")
         return WRONG_MISSION
     except OSError as error:
         what = f"UDP port {mission.network.port}: " if error.filename is None else ""
         message = f"agent {mission.agent_id}: {what}{error.strerror}{f': {error.filename}' if error.filename else ''}"
-        log.error(message)
         sys.stderr.write(
             f"{message}; another agent may be running here, or choose another port\n" if what else f"{message}\n"
         )

@@ -66,8 +66,8 @@ def test_a_reader_that_raises_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_command_that_is_answered_by_nothing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ucp.control.ControlServer._answer", lambda server, line: {}[line])
-    with pytest.raises(FailedError, match="no answer"):
+    monkeypatch.setattr("ucp.control.ControlServer.answer", lambda server, line: {}[line])
+    with pytest.raises(FailedError, match="KeyError"):
         _some_mutation_fails("control", 0)
 
 

@@ -9,14 +9,14 @@ import sys
 import ucp.node
 from ucp.control import ControlServer
 
-answer = ControlServer._answer
+answer = ControlServer.answer
 
 def lacking(self, line):
     if b'"{command}"' in line:
         return {{"ok": False, "unsupported": True, "error": "mine has no {command}"}}
     return answer(self, line)
 
-ControlServer._answer = lacking
+ControlServer.answer = lacking
 sys.exit(ucp.node.main(sys.argv[1:]))
 """
 

@@ -28,6 +28,12 @@ from ucp.node import Node
 from ucp.store import Store
 
 DEADLINE_S = 10.0
+NEEDED = {
+    *("agent", "block", "chain", "clock", "commit", "control", "core", "events", "export", "features", "files"),
+    *("handler", "loop", "messages", "mission", "reconcile", "request", "settings", "shown", "state", "status"),
+    *("store", "timers", "trace", "wire"),
+}
+"""The modules of `ucp` that every agent loads."""
 
 
 def free_port() -> int:
@@ -124,6 +130,38 @@ def test_it_waits_for_the_start_and_then_builds_commits_and_exports_blocks(direc
         "7.mission.json",
         "7.trace.jsonl",
     ]
+
+
+def test_an_agent_loads_what_it_needs_and_no_more(directory: Path) -> None:
+    """It is ready sooner, and smaller: what a mission does not ask for is not there."""
+    loaded = modules_of(directory, mission(events={"source": "random"}))
+    assert not loaded & {"asyncio", "logging", "ssl", "subprocess", "threading", "pymavlink", "scapy", "difflib"}
+    ours = {name.removeprefix("ucp.") for name in loaded if name.startswith("ucp.")}
+    assert ours == NEEDED
+
+
+@pytest.mark.parametrize(
+    ("asked", "module"),
+    [({"quirks": {"ignore_commit": 0.5}}, "ucp.quirks"), ({"events": {"source": "mavlink"}}, "ucp.telemetry")],
+)
+def test_what_a_mission_asks_for_is_loaded(directory: Path, asked: dict[str, Any], module: str) -> None:
+    assert module in modules_of(directory, mission(**asked))
+
+
+def modules_of(directory: Path, document: dict[str, Any]) -> set[str]:
+    """What an agent has imported by the time at which it has ended, for a mission that has begun."""
+    path = directory / "7.mission.json"
+    path.write_text(json.dumps(document | {"epoch_us": round(time.time() * 1e6)}))
+    command = [sys.executable, "-X", "importtime", "-m", "ucp.node", str(path)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + DEADLINE_S
+    while not (directory / "7.trace.jsonl").exists() or not (directory / "7.trace.jsonl").stat().st_size:
+        assert time.monotonic() < deadline, "it never began"
+        time.sleep(0.005)
+    process.terminate()
+    _, told = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 0, told
+    return {line.rpartition("|")[2].strip() for line in told.splitlines()}
 
 
 def test_it_exports_on_command_while_it_runs(agent: AgentUnderTest) -> None:
@@ -429,16 +467,12 @@ def test_what_an_agent_sends_is_traced_and_stored_before(tmp_path: Path) -> None
             assert [block.block_hash for block in found.deque] == [message.block_hash]
             sent.append(message)
 
-    async def fly() -> None:
-        node._socket.close()
-        node._socket = Radio()  # type: ignore[assignment]
-        node._begin(round(time.time() * 1e6))
-        node.generating = True
-        for _ in range(3):
-            node._log_event(1, bytes(256))
-
     node = Node(parse_mission(mission(store="7.store")), tmp_path)
-    asyncio.run(fly())
+    node._socket.close()
+    node._socket = Radio()  # type: ignore[assignment]
+    node._begin(round(time.time() * 1e6))
+    for _ in range(3):
+        node._log_event(1, bytes(256))
     assert len(sent) == 1
 
 

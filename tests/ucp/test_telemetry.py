@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-import asyncio
 import itertools
 import random
+import socket
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
+from tests.ucp.loops import run_until
 from ucp import telemetry
+from ucp.loop import Loop
 from ucp.telemetry import (
     ARMED,
     DISARMED,
@@ -22,8 +24,8 @@ from ucp.telemetry import (
     POSITION,
     STATUS_TEXT,
     TelemetryEvents,
+    VehicleConnection,
     describe,
-    follow,
     position_of,
 )
 
@@ -241,67 +243,56 @@ def test_what_is_no_event_of_ours_is_unreadable(event_id: int) -> None:
 
 
 class FakeVehicle:
-    """A server that counts what it is sent, says one thing to each client, and hangs up when told."""
+    """Counts what it is sent, says one thing to each client, and hangs up when told."""
 
-    def __init__(self) -> None:
+    def __init__(self, loop: Loop) -> None:
         self.requested: set[int] = set()
-        self.clients = 0
-        self._writer: asyncio.StreamWriter | None = None
+        self._loop = loop
+        self._clients = 0
+        self._client: socket.socket | None = None
+        self._listener: socket.socket | None = None
         self._mav = mavlink.MAVLink(None)
 
-    async def serve(self, port: int = 0) -> asyncio.Server:
-        return await asyncio.start_server(self._client, "127.0.0.1", port)
+    def serve(self, port: int = 0) -> int:
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self._loop.watch(self._listener, readable=self._accept)
+        return int(self._listener.getsockname()[1])
 
-    async def _client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.clients += 1
-        self._writer = writer
-        writer.write(b"hello %d" % self.clients)
-        while data := await reader.read(1000):
-            for message in self._mav.parse_buffer(data) or ():
-                assert message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
-                self.requested.add(int(message.param1))
+    def _accept(self) -> None:
+        assert self._listener is not None
+        self._client = self._listener.accept()[0]
+        self._clients += 1
+        self._client.send(b"hello %d" % self._clients)
+        self._loop.watch(self._client, readable=self._read)
+
+    def _read(self) -> None:
+        assert self._client is not None
+        for message in self._mav.parse_buffer(self._client.recv(1000)) or ():
+            assert message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+            self.requested.add(int(message.param1))
 
     def hang_up(self) -> None:
-        assert self._writer is not None
-        self._writer.transport.abort()
+        assert self._client is not None
+        self._loop.watch(self._client)
+        self._client.close()
 
-
-async def reached(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10.0):
-        while not condition():
-            await asyncio.sleep(0.005)
+    def close(self) -> None:
+        assert self._listener is not None
+        self._loop.watch(self._listener)
+        self._listener.close()
 
 
 def test_the_connection_waits_for_the_vehicle_asks_and_comes_back_after_a_restart() -> None:
-    async def story() -> None:
-        vehicle, heard = FakeVehicle(), bytearray()
-        port = (probe := await vehicle.serve()).sockets[0].getsockname()[1]
-        probe.close()
-        await probe.wait_closed()
-        following = asyncio.create_task(follow("127.0.0.1", port, heard.extend))
-        await asyncio.sleep(0)  # the first attempt finds nobody
-        server = await vehicle.serve(port)
-        await reached(lambda: vehicle.requested == {1, 2, 30, 33})
-        vehicle.hang_up()
-        await reached(lambda: b"hello 2" in heard)
-        assert bytes(heard) == b"hello 1hello 2"
-        following.cancel()
-        server.close()
-
-    asyncio.run(story())
-
-
-def test_what_the_sink_raises_ends_the_following() -> None:
-    async def story() -> None:
-        vehicle = FakeVehicle()
-        server = await vehicle.serve()
-
-        def full(_data: bytes) -> None:
-            raise OSError("no space left")
-
-        async with asyncio.timeout(10.0):
-            with pytest.raises(OSError, match="no space left"):
-                await follow("127.0.0.1", server.sockets[0].getsockname()[1], full)
-        server.close()
-
-    asyncio.run(story())
+    loop, heard = Loop(), bytearray()
+    vehicle = FakeVehicle(loop)
+    port = vehicle.serve()
+    vehicle.close()
+    connection = VehicleConnection(loop, "127.0.0.1", port, heard.extend)
+    run_until(loop, lambda: True, after_s=0.02)  # the first attempt finds nobody
+    vehicle.serve(port)
+    run_until(loop, lambda: vehicle.requested == {1, 2, 30, 33})
+    vehicle.hang_up()
+    run_until(loop, lambda: b"hello 2" in heard)
+    assert bytes(heard) == b"hello 1hello 2"
+    connection.close()
+    vehicle.close()

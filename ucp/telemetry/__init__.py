@@ -1,8 +1,8 @@
 """The `mavlink` event source: what a vehicle says about itself becomes loggable events.
 
 `TelemetryEvents` is the translator: bytes from the vehicle in, (event ID, data) out, with time as an argument.
-`follow` is the thin connection that feeds it. `describe` turns an event's data back into words, `position_of` into a
-position. A mission chooses what is logged, by kind (`EVENT_KINDS`).
+`VehicleConnection` is the thin connection that feeds it. `describe` turns an event's data back into words,
+`position_of` into a position. A mission chooses what is logged, by kind (`EVENT_KINDS`).
 
     ID  kind      event             data, big-endian (MAVLink messages it comes from)
     1   mode      mode change       `>IBII`   vehicle time ms, MAV_TYPE, mode before (0xFFFFFFFF: unknown), mode
@@ -32,11 +32,11 @@ Battery levels are every 10 %, and every 5 % from 20 % down. A level reached is 
 charged or changed. A vehicle that does not know its percentage has no levels; its battery failsafe is event 7.
 """
 
-from ucp.telemetry.connection import follow
+from ucp.events import DEFAULT_LOG, EventKind
+from ucp.telemetry.connection import VehicleConnection
 from ucp.telemetry.records import (
     ARMED,
     BATTERY,
-    DEFAULT_LOG,
     DISARMED,
     EVENT_KINDS,
     FAILSAFE,
@@ -45,7 +45,6 @@ from ucp.telemetry.records import (
     POSITION,
     STATUS_TEXT,
     WAYPOINT,
-    EventKind,
     Position,
     position_of,
 )
@@ -67,7 +66,7 @@ __all__ = [
     "EventKind",
     "Position",
     "TelemetryEvents",
+    "VehicleConnection",
     "describe",
-    "follow",
     "position_of",
 ]

@@ -1,12 +1,11 @@
 """Event IDs of the `mavlink` source and the layout of their data; the package's docstring has them as a table."""
 
 import struct
-from typing import Literal, NamedTuple
+from typing import NamedTuple
+
+from ucp.events import EventKind
 
 MODE_CHANGE, ARMED, DISARMED, STATUS_TEXT, POSITION, WAYPOINT, FAILSAFE, BATTERY = range(1, 9)
-
-EventKind = Literal["mode", "arming", "text", "waypoint", "failsafe", "position", "battery"]
-"""What a mission can choose to log."""
 
 EVENT_KINDS: dict[EventKind, tuple[int, ...]] = {
     "mode": (MODE_CHANGE,),
@@ -18,8 +17,6 @@ EVENT_KINDS: dict[EventKind, tuple[int, ...]] = {
     "battery": (BATTERY,),
 }
 """The event IDs of each kind."""
-
-DEFAULT_LOG: tuple[EventKind, ...] = ("mode", "arming", "text", "position")
 
 MAX_DATA_BYTES = 256  # longer data is cut
 

@@ -7,8 +7,9 @@ import random
 from collections.abc import Iterable
 from typing import Any
 
+from ucp.events import DEFAULT_LOG, EventKind
 from ucp.telemetry import records
-from ucp.telemetry.records import EventKind, Position
+from ucp.telemetry.records import Position
 
 _AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 _CHUNK_CHARS = 50  # STATUSTEXT: a full text is followed by more when it has an ID
@@ -22,9 +23,7 @@ class TelemetryEvents:
     Counts what it could not read in `garbage`.
     """
 
-    def __init__(
-        self, position_interval_s: float, rng: random.Random, log: Iterable[EventKind] = records.DEFAULT_LOG
-    ) -> None:
+    def __init__(self, position_interval_s: float, rng: random.Random, log: Iterable[EventKind] = DEFAULT_LOG) -> None:
         """`position_interval_s` is the mean time between two position events, in mission seconds; `log` what to log.
 
         Each is due 0.5 to 1.5 intervals after the last, drawn from `rng`: vehicles that logged in lockstep would

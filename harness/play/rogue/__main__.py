@@ -5,8 +5,6 @@ agents that it imitates. In its working directory it has `rogue.control`, which 
 `rogue.jsonl`. SIGTERM ends it.
 """
 
-import asyncio
-import contextlib
 import json
 import signal
 import socket
@@ -23,6 +21,7 @@ from harness.scenario.injection import MODELS
 from netem.frames import udp_broadcast
 from ucp.clock import MissionClock
 from ucp.control import CommandError, ControlServer
+from ucp.loop import Loop, Timer
 from ucp.messages import PORT
 
 LINK = "eth0"
@@ -36,8 +35,8 @@ class RogueNode:
     def __init__(self, directory: Path) -> None:
         self._rogue: Rogue | None = None
         self._clock = MissionClock(1.0)
-        self._timer: asyncio.TimerHandle | None = None
-        self._ended = asyncio.Event()
+        self._timer: Timer | None = None
+        self._loop = Loop()
         self._ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._ear.setblocking(False)
         self._ear.bind(("", PORT))
@@ -46,20 +45,21 @@ class RogueNode:
         self._file = (directory / ROGUE_FILE).open("a", encoding="utf-8", buffering=1)
         self._journal = Journal(self._write)
         self._control = ControlServer(
-            directory / ROGUE_CONTROL, {"start": self._start, "inject": self._inject, "status": self._status}
+            directory / ROGUE_CONTROL,
+            {"start": self._start, "inject": self._inject, "status": self._status},
+            self._loop,
         )
 
-    async def run(self) -> None:
+    def run(self) -> None:
         """Serve until SIGTERM or SIGINT."""
-        loop = asyncio.get_running_loop()
-        for signal_number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(signal_number, self._ended.set)
-        loop.add_reader(self._ear, self._hear)
-        await self._control.start()
-        await self._ended.wait()
+        self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
+        self._loop.watch(self._ear, readable=self._hear)
+        self._control.start()
+        self._loop.run()
         self._journal.close()
         self._file.close()
         self._control.close()
+        self._loop.close()
 
     def _hear(self) -> None:
         for _ in range(DATAGRAMS_PER_TURN):
@@ -90,7 +90,7 @@ class RogueNode:
         soonest = self._rogue.next_timer()
         if soonest is not None:
             delay_s = self._clock.wall_s(soonest - self._clock.now())
-            self._timer = asyncio.get_running_loop().call_later(max(0.0, delay_s), self._due)
+            self._timer = self._loop.call_later(delay_s, self._due)
 
     def _write(self, record: dict[str, Any]) -> None:
         self._file.write(json.dumps(record, separators=(",", ":")) + "\n")
@@ -121,12 +121,8 @@ class RogueNode:
 
 def main() -> int:
     """Exit status 0; 1 if it cannot be on the air."""
-
-    async def run() -> None:
-        await RogueNode(Path.cwd()).run()
-
     try:
-        asyncio.run(run())
+        RogueNode(Path.cwd()).run()
     except OSError as error:
         sys.stderr.write(f"the rogue node: {error.strerror}\n")
         return 1
@@ -134,5 +130,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(KeyboardInterrupt):
-        sys.exit(main())
+    sys.exit(main())

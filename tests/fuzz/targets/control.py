@@ -1,12 +1,12 @@
 """The control socket of an agent that runs: whatever a client sends, each line gets one, and it lives."""
 
-import asyncio
 import json
-import logging
 import os
 import signal
 import socket
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,52 +24,45 @@ _ANSWER_S = 10.0
 
 def run(data: bytes) -> None:
     lines = [line for line in data.split(b"\n")[:MOST_LINES] if len(line) < MAX_LINE_BYTES - 1]
-    with TemporaryDirectory() as directory:
-        logged = _Logged()
-        log = logging.getLogger("ucp.node")
-        log.addHandler(logged)
-        log.propagate = False
-        try:
-            asyncio.run(_converse(Path(directory), lines, logged.problems))
-        finally:
-            log.removeHandler(logged)
-        require(not logged.problems, f"it logs {logged.problems[:1]}")
-        require(not (Path(directory) / "1.control").exists(), "the socket is left behind")
-        read_export(Path(directory) / "1.chain.json")
-        trace_file = Path(directory) / "1.trace.jsonl"
+    with TemporaryDirectory() as folder:
+        directory = Path(folder)
+        node = Node(_mission(), directory)
+        with ThreadPoolExecutor(1) as client:
+            conversation = client.submit(_converse, directory, lines)
+            status = node.run()
+        logged = (directory / "1.log").read_text()
+        require("Traceback" not in logged, f"it logs {logged[-300:]}")
+        conversation.result()
+        require(status == 0, "it fails in the end")
+        require(not (directory / "1.control").exists(), "the socket is left behind")
+        read_export(directory / "1.chain.json")
+        trace_file = directory / "1.trace.jsonl"
         if trace_file.stat().st_size:
             trace = read_trace(trace_file)
             require(trace is not None and not trace.problem and not trace.cut_off, "its trace cannot be read")
 
 
-class _Logged(logging.Handler):
-    """Takes down what an agent logs of its own mistakes."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.ERROR)
-        self.problems: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.problems.append(f"{record.getMessage()}: {record.exc_info}")
-
-
-async def _converse(directory: Path, lines: list[bytes], problems: list[str]) -> None:
-    loop = asyncio.get_running_loop()
-    loop.set_exception_handler(lambda _, context: problems.append(f"{context['message']}: {context.get('exception')}"))
-    running = asyncio.create_task(Node(_mission(), directory).run())
-    path = directory / "1.control"
-    while not path.exists():
-        require(not running.done(), "it ended before it began")
-        await asyncio.sleep(0)
-    reader, writer = await asyncio.open_unix_connection(str(path), limit=16 * 1024 * 1024)
-    for line in (*lines, b'{"command":"status"}'):
-        writer.write(line + b"\n")
-        answer = await asyncio.wait_for(reader.readline(), _ANSWER_S)
-        require(answer.endswith(b"\n"), f"no answer to {line[:200]!r}; {problems[:1]}")
-        _judge(line, answer)
-    writer.close()
-    os.kill(os.getpid(), signal.SIGTERM)
-    require(await asyncio.wait_for(running, _ANSWER_S) == 0, "it fails in the end")
+def _converse(directory: Path, lines: list[bytes]) -> None:
+    """From a thread beside the agent, which it ends."""
+    try:
+        path = directory / "1.control"
+        deadline = time.monotonic() + _ANSWER_S
+        while not path.exists():
+            require(time.monotonic() < deadline, "it does not begin")
+            time.sleep(0.001)
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.settimeout(_ANSWER_S)
+            connection.connect(str(path))
+            answers = connection.makefile("rb")
+            for line in (*lines, b'{"command":"status"}'):
+                connection.sendall(line + b"\n")
+                answer = answers.readline()
+                require(answer.endswith(b"\n"), f"no answer to {line[:200]!r}")
+                _judge(line, answer)
+    except OSError as error:
+        raise FailedError(f"no answer: {error}") from None
+    finally:
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _judge(line: bytes, answer: bytes) -> None:

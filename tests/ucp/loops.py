@@ -1,0 +1,27 @@
+"""Running a loop until something has happened."""
+
+import time
+from collections.abc import Callable
+
+from ucp.loop import Loop
+
+DEADLINE_S = 10.0
+LOOK_EVERY_S = 0.005
+
+
+def run_until(loop: Loop, condition: Callable[[], bool], *, after_s: float = 0.0) -> None:
+    """Run it until the condition holds, looked at after `after_s` first."""
+    deadline = time.monotonic() + DEADLINE_S
+    met = False
+
+    def look() -> None:
+        nonlocal met
+        met = condition()
+        if met or time.monotonic() > deadline:
+            loop.stop()
+        else:
+            loop.call_later(LOOK_EVERY_S, look)
+
+    loop.call_later(after_s, look)
+    loop.run()
+    assert met, "it never happened"

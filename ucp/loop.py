@@ -1,0 +1,104 @@
+"""What a process of ours waits for: its sockets, the next moment at which something is due, and its end.
+
+`asyncio` does that, too. But to import it takes longer than all else that an agent does until it is ready, and as much
+memory: with more agents than processors they would wait for that, and nothing else.
+"""
+
+import heapq
+import selectors
+import signal
+import socket
+import time
+from collections.abc import Callable
+from itertools import count
+
+Callback = Callable[[], object]
+
+
+class Timer:
+    """Something that is due; `cancel` as long as it is not."""
+
+    __slots__ = ("callback",)
+
+    def __init__(self, callback: Callback) -> None:
+        self.callback: Callback | None = callback
+
+    def cancel(self) -> None:
+        self.callback = None
+
+
+class Loop:
+    """`run` calls back what waits, one after the other, until `stop`.
+
+    `failed` is told of what a callback raises, and the loop goes on; without it that ends the loop.
+    """
+
+    def __init__(self, failed: Callable[[Exception], object] | None = None) -> None:
+        self._failed = failed
+        self._selector = selectors.DefaultSelector()
+        self._waiting: dict[socket.socket, tuple[Callback | None, Callback | None]] = {}
+        self._due: list[tuple[float, int, Timer]] = []
+        self._number = count()
+        self._running = True
+        self._awakens: socket.socket | None = None
+
+    def watch(self, sock: socket.socket, *, readable: Callback | None = None, writable: Callback | None = None) -> None:
+        """Call back whenever `sock` can be read, or written; with neither it is watched no longer."""
+        events = (selectors.EVENT_READ if readable else 0) | (selectors.EVENT_WRITE if writable else 0)
+        if sock in self._waiting and events:
+            self._selector.modify(sock, events)
+        elif events:
+            self._selector.register(sock, events)
+        elif self._waiting.pop(sock, None):
+            self._selector.unregister(sock)
+        if events:
+            self._waiting[sock] = readable, writable
+
+    def call_later(self, delay_s: float, callback: Callback) -> Timer:
+        """`delay_s` is wall time; what is less than 0 is due at once."""
+        timer = Timer(callback)
+        heapq.heappush(self._due, (time.monotonic() + max(0.0, delay_s), next(self._number), timer))
+        return timer
+
+    def stop_on(self, *signals: int) -> None:
+        """Stop on these signals, until `close`."""
+        awoken, self._awakens = socket.socketpair()
+        for end in (awoken, self._awakens):
+            end.setblocking(False)
+        signal.set_wakeup_fd(self._awakens.fileno(), warn_on_full_buffer=False)
+        self.watch(awoken, readable=lambda: awoken.recv(64))
+        for number in signals:
+            signal.signal(number, lambda *_: self.stop())
+
+    def stop(self) -> None:
+        self._running = False
+
+    def run(self) -> None:
+        """Until it is stopped; it may run again then."""
+        while self._running:
+            timeout_s = max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
+            for key, events in self._selector.select(timeout_s):
+                readable, writable = self._waiting.get(key.fileobj, (None, None))  # type: ignore[call-overload]
+                self._call(readable if events & selectors.EVENT_READ and readable else writable)
+            now = time.monotonic()
+            while self._running and self._due and self._due[0][0] <= now:
+                self._call(heapq.heappop(self._due)[2].callback)
+        self._running = True
+
+    def close(self) -> None:
+        """Nothing is watched any more, and no signal heard; the sockets are whoever opened them's to close."""
+        if self._awakens is not None:
+            signal.set_wakeup_fd(-1)
+            self._awakens.close()
+        self._waiting.clear()
+        self._selector.close()
+
+    def _call(self, callback: Callback | None) -> None:
+        if callback is None or not self._running:
+            return
+        try:
+            callback()
+        except Exception as error:
+            if self._failed is None:
+                raise
+            self._failed(error)
