@@ -12,7 +12,7 @@ EVENT_BYTES = 256
 """What a scripted event has by itself."""
 
 _IDS = r"(\d{1,7}(?: \d{1,7})*)"
-_LOGS = re.compile(rf"{_IDS} logs?(?: (\d{1, 7}) bytes)?")
+_LOGS = re.compile(rf"{_IDS} logs?(?: (\d{{1,7}}) bytes)?")
 _CUT = re.compile(rf"{_IDS} do(?:es)? not reach {_IDS}")
 _JOINED = re.compile(rf"{_IDS} reach(?:es)? {_IDS} again")
 _PARTITION = re.compile(rf"partition {_IDS}((?: \| {_IDS})+)")
