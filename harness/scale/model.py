@@ -1,5 +1,6 @@
 """What is asked: how many agents, for how long, at which loss, how often."""
 
+import shlex
 from collections.abc import Callable
 from itertools import product
 from typing import Annotated, NamedTuple, TypeVar
@@ -8,6 +9,7 @@ from pydantic import Field
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
+from harness.scenario.agent_command import AgentCommand
 from harness.scenario.events import Events
 from harness.scenario.model import MAX_AGENTS, Model, Probability, Seconds
 from harness.scenario.network import NetworkModel
@@ -42,6 +44,7 @@ class Scale(Model):
     loss: Annotated[list[Probability], Field(min_length=1)]
     seeds: Annotated[int, Field(ge=1, le=MAX_SEEDS)] = SEEDS
     settle_minutes: Annotated[float, Field(gt=0, allow_inf_nan=False)] = SETTLE_MINUTES
+    agent_command: AgentCommand = None
 
     @property
     def sizes(self) -> list[Size]:
@@ -56,10 +59,13 @@ class Scale(Model):
             events=Events(source="random"),
             vehicles=Vehicles(kind="none"),
             settle=Settle(limit_s=60 * self.settle_minutes),
+            agent_command=self.agent_command,
         )
 
 
-def read_request(agents: str, minutes: str, loss: str, seeds: int, settle_minutes: float) -> Scale:
+def read_request(
+    agents: str, minutes: str, loss: str, seeds: int, settle_minutes: float, agent_command: str | None = None
+) -> Scale:
     """From the command line, where lists have commas. Raises ScenarioError: one sentence with option and value."""
     _within("--seeds", str(seeds), 1 <= seeds <= MAX_SEEDS, f"a number of seeds is 1..{MAX_SEEDS}")
     allowed = f"minutes are more than 0 and at most {MAX_MINUTES:g}"
@@ -72,7 +78,17 @@ def read_request(agents: str, minutes: str, loss: str, seeds: int, settle_minute
         loss=_numbers("--loss", loss, float, lambda number: 0 <= number <= 1, "a loss is a probability 0..1"),
         seeds=seeds,
         settle_minutes=settle_minutes,
+        agent_command=None if agent_command is None else _words(agent_command),
     )
+
+
+def _words(command: str) -> list[str]:
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ScenarioError(f"--agent-command {command!r} is no command: {error}") from None
+    _within("--agent-command", repr(command), bool(words), "a command is a program and its arguments")
+    return words
 
 
 def _numbers(option: str, text: str, kind: type[N], possible: Callable[[N], bool], allowed: str) -> list[N]:

@@ -45,6 +45,10 @@ def run_scale(scale: Scale, jobs: int, judge: Judge | None = None, *, shown: boo
         figures = {**measure(scenario, played, result), **{name: round(value, 3) for name, value in cost.items()}}
         return Run(size, seed, figures, result.bad)
 
+    if scale.agent_command is not None:
+        from harness.run.simulate import same_twice
+
+        same_twice(scale.scenario_at(scale.sizes[0]), 1)
     runs: list[Run] = []
     interrupted = False
     tasks = sorted(

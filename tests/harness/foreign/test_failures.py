@@ -53,9 +53,9 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
         (EVENT + "del said['trace']", "crashed", "without a list `trace`, which its mission asked for"),
         (EVENT + "said['trace'] = [{'t': 1}]", "crashed", "with `trace.0`, which is no line of a trace"),
         (
-            EVENT + "said['trace'] = [{'t': t, 'dropped': 'x', 'datagram': ''} for t in (2, 1)]",
+            EVENT + "said['trace'] = [{'t': 1, 'dropped': 'x', 'datagram': ''}]",
             "crashed",
-            "t=1.0 into its",
+            "wrote t=1.0 into its trace of an input at 12.5 s",
         ),
         (EVENT + "print(json.dumps(said))", "crashed", "wrote what nobody asked for"),
         (EVENT + "said = {'error': 'no, not I'}", "crashed", "refused an event at 12.5 s: no, not I"),

@@ -6,14 +6,13 @@ Each process of ours has its own; a process that it forks takes none of them ove
 import atexit
 import os
 import time
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
 from harness.play.simulation.foreign.program import Program
 
-MAX_IDLE = 64
-"""So many wait; more are ended."""
+MAX_IDLE = 128
+"""So many wait; who has waited longest is ended."""
 GRACE_S = 1.0
 
 
@@ -22,36 +21,41 @@ class Programs:
 
     def __init__(self, logs: Path | None = None) -> None:
         self._logs = logs
-        self._idle: dict[tuple[tuple[str, ...], Path | None], list[Program]] = defaultdict(list)
+        self._idle: list[Program] = []
+        """Who came last has waited least."""
         self._taken: set[Program] = set()
 
     def take(self, command: Sequence[str], agent_id: int) -> Program:
         """One that plays nothing, to be given back. Raises OSError if it cannot be started."""
         log = self._logs / f"{agent_id}.log" if self._logs is not None else None
-        idle = self._idle[tuple(command), log]
-        while idle:
-            program = idle.pop()
-            if program.runs:
-                break
-            program.end()
-        else:
-            program = Program(command, log)
+        program = self._waiting(tuple(command), log) or Program(command, log)
         self._taken.add(program)
         return program
+
+    def _waiting(self, command: tuple[str, ...], log: Path | None) -> Program | None:
+        for program in reversed(self._idle):
+            if (program.command, program.log) == (command, log):
+                self._idle.remove(program)
+                if program.runs:
+                    return program
+                program.close()
+                return self._waiting(command, log)
+        return None
 
     def give_back(self, program: Program) -> None:
         """Nobody asks it any more, for now."""
         self._taken.discard(program)
-        idle = sum(map(len, self._idle.values()))
-        if program.owes_an_answer or idle >= MAX_IDLE:
-            program.end()
-        else:
-            program.forget_words()
-            self._idle[program.command, program.log].append(program)
+        if program.owes_an_answer:
+            program.close()
+            return
+        program.forget_words()
+        self._idle.append(program)
+        if len(self._idle) > MAX_IDLE:
+            self._idle.pop(0).close()
 
     def close(self) -> None:
         """End all of them."""
-        programs = [*self._taken, *(program for idle in self._idle.values() for program in idle)]
+        programs = [*self._taken, *self._idle]
         self._taken.clear()
         self._idle.clear()
         for program in programs:
@@ -62,7 +66,7 @@ class Programs:
 
     def forget(self) -> None:
         """They are another process's."""
-        for program in [*self._taken, *(program for idle in self._idle.values() for program in idle)]:
+        for program in [*self._taken, *self._idle]:
             program.let_go()
         self._taken.clear()
         self._idle.clear()
