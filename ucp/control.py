@@ -25,6 +25,10 @@ class CommandError(Exception):
     """A command that cannot be carried out: one sentence."""
 
 
+class UnsupportedCommandError(CommandError):
+    """A command for what this agent does not have."""
+
+
 class ControlServer:
     """Serves `commands` by name. The socket lies beside the agent's other files and goes when the agent does."""
 
@@ -78,6 +82,8 @@ class ControlServer:
             return {"ok": False, "unsupported": True, "error": error}
         try:
             return {"ok": True, **command(request)}
+        except UnsupportedCommandError as error:
+            return {"ok": False, "unsupported": True, "error": str(error)}
         except CommandError as error:
             return {"ok": False, "error": str(error)}
 

@@ -97,7 +97,7 @@ def load_mission(path: Path) -> Mission:
 
 
 def parse_mission(document: Any) -> Mission:
-    """Raises MissionError; UnsupportedMissionError if it lists a feature that there is not."""
+    """Raises MissionError; UnsupportedMissionError if it needs what this agent does not have."""
     if not isinstance(document, dict):
         raise MissionError("not a mission: a JSON object is needed")
     if document.get("schema") != SCHEMA:
@@ -218,11 +218,13 @@ def _quirks(document: Any) -> dict[str, bool | float]:
         raise MissionError("`quirks` must be a JSON object")
     asked = {name: value for name, value in document.items() if value is not False and value != 0}
     if asked:
-        from ucp.quirks import check_quirk  # of which a right agent knows none
+        from ucp.quirks import UnknownQuirkError, check_quirk  # of which a right agent knows none
 
         try:
             for name, value in asked.items():
                 check_quirk(name, value)
+        except UnknownQuirkError as error:
+            raise UnsupportedMissionError(f"`quirks`: {error}") from None
         except ValueError as error:
             raise MissionError(f"`quirks`: {error}") from None
     return document

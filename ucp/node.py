@@ -20,7 +20,7 @@ from typing import Any
 
 from ucp.agent import Agent
 from ucp.clock import MissionClock
-from ucp.control import CommandError, ControlServer
+from ucp.control import CommandError, ControlServer, UnsupportedCommandError
 from ucp.events import EVENT_HEADER_BYTES, LoggableEvent, RandomEvents
 from ucp.export import export_chain
 from ucp.features import UNSUPPORTED
@@ -289,10 +289,12 @@ class Node:
     def _quirk(self, request: dict[str, Any]) -> dict[str, Any]:
         name: str = str(request.get("name"))
         value: Any = request.get("value")
-        from ucp.quirks import check_quirk  # of which a right agent knows none
+        from ucp.quirks import UnknownQuirkError, check_quirk  # of which a right agent knows none
 
         try:
             check_quirk(name, value)
+        except UnknownQuirkError as error:
+            raise UnsupportedCommandError(str(error)) from None
         except ValueError as error:
             raise CommandError(str(error)) from None
         self.mission.quirks[name] = value

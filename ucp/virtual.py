@@ -21,7 +21,7 @@ from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.export import export_chain
 from ucp.mission import MAX_MISSION_BYTES, MissionError, UnsupportedMissionError, parse_mission
-from ucp.quirks import check_quirk, wrong_handlers
+from ucp.quirks import UnknownQuirkError, check_quirk, wrong_handlers
 from ucp.request import check_request
 from ucp.status import status_of
 from ucp.store import StoredState, block_on_disk
@@ -184,6 +184,8 @@ class VirtualAgent:
         name, value = str(given.get("name")), given.get("value")
         try:
             check_quirk(name, value)
+        except UnknownQuirkError as error:
+            return {"ok": False, "unsupported": True, "error": str(error)}
         except ValueError as error:
             return {"ok": False, "error": str(error)}
         quirks = self._mission.quirks

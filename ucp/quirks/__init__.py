@@ -20,7 +20,7 @@ from ucp.handler import EventHandler
 from ucp.quirks import commit, core, reconcile
 from ucp.quirks.quirk import CRASHED, Quirk, ending_by_exceptions
 
-__all__ = ["CRASHED", "QUIRKS", "Quirk", "Quirks", "check_quirk", "in_force", "wrong_handlers"]
+__all__ = ["CRASHED", "QUIRKS", "Quirk", "Quirks", "UnknownQuirkError", "check_quirk", "in_force", "wrong_handlers"]
 
 Quirks = dict[str, bool | float]
 """Quirk -> true, or its probability. False, 0 and a quirk that is left out are the same."""
@@ -37,12 +37,16 @@ MAX_NAME = 40
 """More of a wrong name is not shown."""
 
 
+class UnknownQuirkError(ValueError):
+    """A mistake that this agent cannot make."""
+
+
 def check_quirk(name: str, value: object) -> None:
-    """Raises ValueError: which quirks there are, or what the value may be."""
+    """Raises ValueError: what the value may be; UnknownQuirkError: which quirks there are."""
     if name not in QUIRKS:
         name = name[:MAX_NAME]
         near = ", ".join(get_close_matches(name, QUIRKS, cutoff=0.0))
-        raise ValueError(f"unknown quirk {name!r}: of the {len(QUIRKS)} in ucp/quirks the nearest are {near}")
+        raise UnknownQuirkError(f"unknown quirk {name!r}: of the {len(QUIRKS)} in ucp/quirks the nearest are {near}")
     QUIRKS[name].check(value)
 
 
