@@ -42,8 +42,7 @@ enum {
 
 typedef struct { uint8_t *data; size_t len, cap; } Buf;
 
-static void *grow(void *old, size_t size)
-{
+static void *grow(void *old, size_t size) {
     void *memory = realloc(old, size);
     if (memory == NULL) {
         fprintf(stderr, "no memory\n");
@@ -52,8 +51,7 @@ static void *grow(void *old, size_t size)
     return memory;
 }
 
-static uint8_t *buf_room(Buf *b, size_t n)              /* room for n more bytes; returns where they go */
-{
+static uint8_t *buf_room(Buf *b, size_t n) {            /* room for n more bytes; returns where they go */
     if (b->cap - b->len < n) {
         b->cap = b->cap * 2 > b->len + n ? b->cap * 2 : b->len + n + 64;
         b->data = grow(b->data, b->cap);
@@ -61,8 +59,7 @@ static uint8_t *buf_room(Buf *b, size_t n)              /* room for n more bytes
     return b->data + b->len;
 }
 
-static void put(Buf *b, const void *bytes, size_t n)
-{
+static void put(Buf *b, const void *bytes, size_t n) {
     if (n > 0) {
         memcpy(buf_room(b, n), bytes, n);
         b->len += n;
@@ -73,9 +70,8 @@ static void put_text(Buf *b, const char *text) { put(b, text, strlen(text)); }
 
 static void put_byte(Buf *b, uint8_t byte) { put(b, &byte, 1); }
 
-__attribute__((format(printf, 2, 3))) static void put_format(Buf *b, const char *format, ...)
-{
-    char text[512];
+__attribute__((format(printf, 2, 3))) static void put_format(Buf *b, const char *format, ...) {
+    char text[1024];
     va_list values;
     va_start(values, format);
     int n = vsnprintf(text, sizeof text, format, values);
@@ -83,42 +79,29 @@ __attribute__((format(printf, 2, 3))) static void put_format(Buf *b, const char 
     put(b, text, n < (int)sizeof text ? (size_t)n : sizeof text - 1);
 }
 
-static void put_uint(Buf *b, uint64_t value)            /* in decimal */
-{
-    char text[20];
-    int at = 20;
-    do text[--at] = (char)('0' + value % 10); while ((value /= 10) > 0);
-    put(b, text + at, 20 - (size_t)at);
-}
-
-static void buf_drop(Buf *b, size_t n)                  /* the first n bytes away */
-{
+static void buf_drop(Buf *b, size_t n) {                /* the first n bytes away */
     memmove(b->data, b->data + n, b->len - n);
     b->len -= n;
 }
 
-static void write_be(uint8_t *to, uint64_t value, int bytes)
-{
+static void write_be(uint8_t *to, uint64_t value, int bytes) {
     for (int i = bytes - 1; i >= 0; i--, value >>= 8)
         to[i] = (uint8_t)value;
 }
 
-static uint64_t read_be(const uint8_t *from, int bytes)
-{
+static uint64_t read_be(const uint8_t *from, int bytes) {
     uint64_t value = 0;
     for (int i = 0; i < bytes; i++)
         value = value << 8 | from[i];
     return value;
 }
 
-static void put_be(Buf *b, uint64_t value, int bytes)
-{
+static void put_be(Buf *b, uint64_t value, int bytes) {
     write_be(buf_room(b, (size_t)bytes), value, bytes);
     b->len += (size_t)bytes;
 }
 
-static void put_hex(Buf *b, const uint8_t *bytes, size_t n)
-{
+static void put_hex(Buf *b, const uint8_t *bytes, size_t n) {
     uint8_t *to = buf_room(b, 2 * n);
     for (size_t i = 0; i < n; i++) {
         *to++ = (uint8_t)"0123456789abcdef"[bytes[i] >> 4];
@@ -129,8 +112,7 @@ static void put_hex(Buf *b, const uint8_t *bytes, size_t n)
 
 static const char BASE64[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 
-static void put_base64(Buf *b, const uint8_t *bytes, size_t n)
-{
+static void put_base64(Buf *b, const uint8_t *bytes, size_t n) {
     uint8_t *to = buf_room(b, (n + 2) / 3 * 4);
     for (size_t i = 0; i < n; i += 3) {
         uint32_t v = (uint32_t)bytes[i] << 16 | (i + 1 < n ? (uint32_t)bytes[i + 1] << 8 : 0)
@@ -143,21 +125,18 @@ static void put_base64(Buf *b, const uint8_t *bytes, size_t n)
     b->len += (n + 2) / 3 * 4;
 }
 
-static bool from_base64(Buf *out, const char *text, size_t n)  /* padded, nothing but the standard alphabet */
-{
+static bool from_base64(Buf *out, const char *text, size_t n) {   /* padded, nothing but the standard alphabet */
     static uint8_t value[256];                          /* 1..64: a digit's value and one; 0: no digit */
     if (value['A'] == 0)
         for (int i = 0; i < 64; i++)
             value[(uint8_t)BASE64[i]] = (uint8_t)(i + 1);
-    if (n % 4 != 0)
-        return false;
+    if (n % 4 != 0) return false;
     for (size_t i = 0; i < n; i += 4) {
         uint32_t v = 0;
         int pad = i + 4 < n ? 0 : text[i + 2] == '=' && text[i + 3] == '=' ? 2 : text[i + 3] == '=' ? 1 : 0;
         for (int k = 0; k < 4; k++) {
             uint8_t digit = k < 4 - pad ? value[(uint8_t)text[i + (size_t)k]] : 1;
-            if (digit == 0)
-                return false;
+            if (digit == 0) return false;
             v = v << 6 | (uint32_t)(digit - 1);
         }
         uint8_t bytes[3] = {(uint8_t)(v >> 16), (uint8_t)(v >> 8), (uint8_t)v};
@@ -186,8 +165,7 @@ static const uint32_t SHA_K[64] = {
 
 #define ROTATE(x, n) ((x) >> (n) | (x) << (32 - (n)))
 
-static void sha256_chunk(uint32_t state[8], const uint8_t *chunk)
-{
+static void sha256_chunk(uint32_t state[8], const uint8_t *chunk) {
     uint32_t w[64], s[8];
     for (int i = 0; i < 16; i++)
         w[i] = (uint32_t)chunk[4 * i] << 24 | (uint32_t)chunk[4 * i + 1] << 16
@@ -209,8 +187,7 @@ static void sha256_chunk(uint32_t state[8], const uint8_t *chunk)
         state[i] += s[i];
 }
 
-static Hash H(const uint8_t *bytes, size_t n)
-{
+static Hash H(const uint8_t *bytes, size_t n) {
     uint32_t state[8] = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a,
                          0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
     uint8_t last[128] = {0};
@@ -229,8 +206,7 @@ static Hash H(const uint8_t *bytes, size_t n)
     return hash;
 }
 
-static Hash H_chain(const Hash *below, const Hash *block)       /* CH_n = H(CH_(n-1) || BH_n) */
-{
+static Hash H_chain(const Hash *below, const Hash *block) {   /* CH_n = H(CH_(n-1) || BH_n) */
     uint8_t both[64];
     memcpy(both, below->b, 32);
     memcpy(both + 32, block->b, 32);
@@ -246,65 +222,50 @@ static Hash H_chain(const Hash *below, const Hash *block)       /* CH_n = H(CH_(
 typedef struct { char kind; uint32_t end; size_t at, len; } Node;   /* kind: { [ " 0 t f n; strings without quotes */
 typedef struct { const char *text; size_t len, at; Node *node; size_t n, cap; Buf scratch; } Json;
 
-static bool json_word(Json *j, const char *word)
-{
+static bool json_word(Json *j, const char *word) {
     size_t n = strlen(word);
-    if (j->len - j->at < n || memcmp(j->text + j->at, word, n) != 0)
-        return false;
+    if (j->len - j->at < n || memcmp(j->text + j->at, word, n) != 0) return false;
     j->at += n;
     return true;
 }
 
-static char json_peek(Json *j)                          /* the next character that is not white space, or 0 */
-{
+static char json_peek(Json *j) {                        /* the next character that is not white space, or 0 */
     while (j->at < j->len && memchr(" \t\n\r", j->text[j->at], 4) != NULL)
         j->at++;
     return j->at < j->len ? j->text[j->at] : '\0';
 }
 
-static size_t utf8_length(const uint8_t *s, size_t n)   /* of the character at s, 0 if there is none */
-{
+static size_t utf8_length(const uint8_t *s, size_t n) {   /* of the character at s, 0 if there is none */
     size_t size = s[0] < 0x80 ? 1 : s[0] < 0xc2 ? 0 : s[0] < 0xe0 ? 2 : s[0] < 0xf0 ? 3 : s[0] < 0xf5 ? 4 : 0;
-    if (size > n)
+    if (size > n || (size > 2 && ((s[0] == 0xe0 && s[1] < 0xa0) || (s[0] == 0xed && s[1] > 0x9f)
+                                  || (s[0] == 0xf0 && s[1] < 0x90) || (s[0] == 0xf4 && s[1] > 0x8f))))
         return 0;
     for (size_t i = 1; i < size; i++)
-        if ((s[i] & 0xc0) != 0x80)
-            return 0;
-    if ((s[0] == 0xe0 && s[1] < 0xa0) || (s[0] == 0xed && s[1] > 0x9f) || (s[0] == 0xf0 && s[1] < 0x90)
-        || (s[0] == 0xf4 && s[1] > 0x8f))
-        return 0;
+        if ((s[i] & 0xc0) != 0x80) return 0;
     return size;
 }
 
-static int hex_digit(char c)
-{
+static int hex_digit(char c) {
     return c >= '0' && c <= '9' ? c - '0' : c >= 'a' && c <= 'f' ? c - 'a' + 10 : c >= 'A' && c <= 'F' ? c - 'A' + 10
          : -1;
 }
 
-static bool json_string(Json *j)                        /* from behind the opening quote to behind the closing one */
-{
+static bool json_string(Json *j) {                      /* from behind the opening quote to behind the closing one */
     while (j->at < j->len) {
         uint8_t c = (uint8_t)j->text[j->at];
-        if (c == '"')
-            return j->at++, true;
-        if (c < 0x20)
-            return false;
+        if (c == '"') return j->at++, true;
+        if (c < 0x20) return false;
         if (c != '\\') {
             size_t size = c < 0x80 ? 1 : utf8_length((const uint8_t *)j->text + j->at, j->len - j->at);
-            if (size == 0)
-                return false;
+            if (size == 0) return false;
             j->at += size;
             continue;
         }
-        if (j->len - j->at < 2 || memchr("\"\\/bfnrtu", j->text[j->at + 1], 9) == NULL)
-            return false;
+        if (j->len - j->at < 2 || memchr("\"\\/bfnrtu", j->text[j->at + 1], 9) == NULL) return false;
         if (j->text[j->at + 1] == 'u') {
-            if (j->len - j->at < 6)
-                return false;
+            if (j->len - j->at < 6) return false;
             for (int i = 2; i < 6; i++)
-                if (hex_digit(j->text[j->at + (size_t)i]) < 0)
-                    return false;
+                if (hex_digit(j->text[j->at + (size_t)i]) < 0) return false;
             j->at += 4;
         }
         j->at += 2;
@@ -312,21 +273,17 @@ static bool json_string(Json *j)                        /* from behind the openi
     return false;
 }
 
-static bool json_digits(Json *j)
-{
+static bool json_digits(Json *j) {
     size_t from = j->at;
     while (j->at < j->len && j->text[j->at] >= '0' && j->text[j->at] <= '9')
         j->at++;
     return j->at > from;
 }
 
-static bool json_number(Json *j)
-{
+static bool json_number(Json *j) {
     json_word(j, "-");
-    if (!json_word(j, "0") && !json_digits(j))
-        return false;
-    if (json_word(j, ".") && !json_digits(j))
-        return false;
+    if (!json_word(j, "0") && !json_digits(j)) return false;
+    if (json_word(j, ".") && !json_digits(j)) return false;
     if (json_word(j, "e") || json_word(j, "E")) {
         if (!json_word(j, "+"))
             json_word(j, "-");
@@ -335,8 +292,7 @@ static bool json_number(Json *j)
     return true;
 }
 
-static bool json_value(Json *j, int depth)
-{
+static bool json_value(Json *j, int depth) {
     char c = json_peek(j);
     if (j->n == j->cap) {
         j->cap = j->cap * 2 + 64;
@@ -345,20 +301,17 @@ static bool json_value(Json *j, int depth)
     size_t me = j->n++, from = j->at + (c == '"');
     bool good = depth < MAX_DEPTH;
     j->node[me].kind = c == '-' || (c >= '0' && c <= '9') ? '0' : c;
-    if (!good)
-        return false;
+    if (!good) return false;
     if (c == '{' || c == '[') {
         char close = c == '{' ? '}' : ']';
         j->at++;
         if (json_peek(j) != close) {
             do {
                 if (c == '{') {
-                    if (json_peek(j) != '"' || !json_value(j, depth + 1) || json_peek(j) != ':')
-                        return false;
+                    if (json_peek(j) != '"' || !json_value(j, depth + 1) || json_peek(j) != ':') return false;
                     j->at++;
                 }
-                if (!json_value(j, depth + 1))
-                    return false;
+                if (!json_value(j, depth + 1)) return false;
             } while (json_peek(j) == ',' && j->at++ < j->len);
         }
         good = json_peek(j) == close && j->at++ < j->len;
@@ -376,8 +329,7 @@ static bool json_value(Json *j, int depth)
 }
 
 /* The text must be followed by a NUL (of which numbers are read), and stay as long as the nodes are used. */
-static bool json_parse(Json *j, const char *text, size_t len)
-{
+static bool json_parse(Json *j, const char *text, size_t len) {
     j->text = text;
     j->len = len;
     j->at = 0;
@@ -390,37 +342,22 @@ static bool json_parse(Json *j, const char *text, size_t len)
 
 static char kind(const Json *j, uint32_t i) { return j->node[i].kind; }
 
-static void put_utf8(Buf *b, uint32_t c)
-{
-    if (c < 0x80) {
-        put_byte(b, (uint8_t)c);
-    } else if (c < 0x800) {
-        put_byte(b, (uint8_t)(0xc0 | c >> 6));
-        put_byte(b, (uint8_t)(0x80 | (c & 63)));
-    } else {
-        if (c < 0x10000) {
-            put_byte(b, (uint8_t)(0xe0 | c >> 12));
-        } else {
-            put_byte(b, (uint8_t)(0xf0 | c >> 18));
-            put_byte(b, (uint8_t)(0x80 | (c >> 12 & 63)));
-        }
-        put_byte(b, (uint8_t)(0x80 | (c >> 6 & 63)));
-        put_byte(b, (uint8_t)(0x80 | (c & 63)));
-    }
+static void put_utf8(Buf *b, uint32_t c) {
+    int more = c < 0x80 ? 0 : c < 0x800 ? 1 : c < 0x10000 ? 2 : 3;      /* bytes behind the first */
+    put_byte(b, (uint8_t)((more > 0 ? 0xf00 >> (more + 1) : 0) | c >> 6 * more));
+    while (more-- > 0)
+        put_byte(b, (uint8_t)(0x80 | (c >> 6 * more & 63)));
 }
 
-static uint32_t four_hex(const char *s)
-{
+static uint32_t four_hex(const char *s) {
     return (uint32_t)(hex_digit(s[0]) << 12 | hex_digit(s[1]) << 8 | hex_digit(s[2]) << 4 | hex_digit(s[3]));
 }
 
 /* What a string says; good until the next call. Mostly there is no escape in it, and nothing is copied. */
-static const char *json_text(Json *j, uint32_t i, size_t *len)
-{
+static const char *json_text(Json *j, uint32_t i, size_t *len) {
     const char *s = j->text + j->node[i].at, *stop = s + j->node[i].len;
     *len = j->node[i].len;
-    if (*len == 0 || memchr(s, '\\', *len) == NULL)
-        return s;
+    if (*len == 0 || memchr(s, '\\', *len) == NULL) return s;
     j->scratch.len = 0;
     while (s < stop) {
         if (*s != '\\') {
@@ -444,17 +381,14 @@ static const char *json_text(Json *j, uint32_t i, size_t *len)
     return (const char *)j->scratch.data;
 }
 
-static bool says(Json *j, uint32_t i, const char *text)
-{
+static bool says(Json *j, uint32_t i, const char *text) {
     size_t n;
-    if (kind(j, i) != '"')
-        return false;
+    if (kind(j, i) != '"') return false;
     const char *s = json_text(j, i, &n);
     return n == strlen(text) && memcmp(s, text, n) == 0;
 }
 
-static uint32_t member(Json *j, uint32_t object, const char *key)   /* 0 if there is none; of equal keys the last */
-{
+static uint32_t member(Json *j, uint32_t object, const char *key) {   /* 0 if there is none; of equal keys the last */
     uint32_t found = 0;
     if (kind(j, object) == '{')
         for (uint32_t i = object + 1; i < j->node[object].end; i = j->node[i + 1].end)
@@ -463,86 +397,64 @@ static uint32_t member(Json *j, uint32_t object, const char *key)   /* 0 if ther
     return found;
 }
 
-static bool json_uint(const Json *j, uint32_t i, uint64_t lowest, uint64_t highest, uint64_t *value)
-{
-    if (kind(j, i) != '0')
-        return false;
+static bool json_uint(const Json *j, uint32_t i, uint64_t lowest, uint64_t highest, uint64_t *value) {
+    if (kind(j, i) != '0') return false;
     const char *s = j->text + j->node[i].at;
     size_t n = j->node[i].len;
     *value = 0;
     for (size_t k = n == 2 && s[0] == '-' && s[1] == '0' ? 1 : 0; k < n; k++) {   /* -0 is 0 */
-        if (s[k] < '0' || s[k] > '9')
-            return false;
+        if (s[k] < '0' || s[k] > '9') return false;
         uint64_t digit = (uint64_t)(s[k] - '0');
-        if (*value > (UINT64_MAX - digit) / 10)
-            return false;
+        if (*value > (UINT64_MAX - digit) / 10) return false;
         *value = *value * 10 + digit;
     }
     return *value >= lowest && *value <= highest;
 }
 
-static bool json_double(const Json *j, uint32_t i, double *value)
-{
-    if (kind(j, i) != '0')
-        return false;
+static bool json_double(const Json *j, uint32_t i, double *value) {
+    if (kind(j, i) != '0') return false;
     *value = strtod(j->text + j->node[i].at, NULL);
     return isfinite(*value);
 }
 
-static bool json_bytes(Json *j, uint32_t i, Buf *out)   /* base64 */
-{
+static bool json_bytes(Json *j, uint32_t i, Buf *out) {   /* base64 */
     size_t n;
     out->len = 0;
-    if (kind(j, i) != '"')
-        return false;
+    if (kind(j, i) != '"') return false;
     const char *text = json_text(j, i, &n);
     return from_base64(out, text, n);
 }
 
-/* The node again, in ASCII and on one line; members of that name are left out of the outermost object. */
-static void put_json(Buf *b, Json *j, uint32_t i, const char *without)
-{
-    const Node *node = &j->node[i];
-    if (node->kind == '{' || node->kind == '[') {
-        bool first = true;
-        put_byte(b, (uint8_t)node->kind);
-        for (uint32_t k = i + 1; k < node->end; k = j->node[k].end) {
-            if (node->kind == '{' && without != NULL && says(j, k, without)) {
-                k++;
-                continue;
-            }
-            if (!first)
-                put_byte(b, ',');
-            first = false;
-            put_json(b, j, k, NULL);
-            if (node->kind == '{') {
-                put_byte(b, ':');
-                put_json(b, j, ++k, NULL);
-            }
-        }
-        put_byte(b, node->kind == '{' ? '}' : ']');
-        return;
-    }
-    if (node->kind == '"')
-        put_byte(b, '"');
-    const uint8_t *s = (const uint8_t *)j->text + node->at;
-    for (size_t k = 0; k < node->len;) {
-        size_t size = s[k] < 0x80 ? 1 : utf8_length(s + k, node->len - k);
+/* Text of JSON again, in ASCII. */
+static void put_ascii(Buf *b, const uint8_t *s, size_t n) {
+    for (size_t size; n > 0; s += size, n -= size) {
+        size = utf8_length(s, n);
         if (size == 1) {
-            put_byte(b, s[k]);
-        } else {
-            uint32_t c = s[k] & (0xffu >> (size + 1));
-            for (size_t m = 1; m < size; m++)
-                c = c << 6 | (s[k + m] & 63);
-            if (c >= 0x10000)
-                put_format(b, "\\u%04x\\u%04x", 0xd800 + ((c - 0x10000) >> 10), 0xdc00 + ((c - 0x10000) & 0x3ff));
-            else
-                put_format(b, "\\u%04x", c);
+            put_byte(b, s[0]);
+            continue;
         }
-        k += size;
+        uint32_t c = s[0] & (0xffu >> (size + 1));
+        for (size_t i = 1; i < size; i++)
+            c = c << 6 | (s[i] & 63);
+        if (c < 0x10000)
+            put_format(b, "\\u%04x", c);
+        else
+            put_format(b, "\\u%04x\\u%04x", 0xd7c0 + (c >> 10), 0xdc00 + (c & 0x3ff));
     }
-    if (node->kind == '"')
-        put_byte(b, '"');
+}
+
+/* An object again, in ASCII and on one line, without the member of that name. */
+static void put_object(Buf *b, Json *j, uint32_t object, const char *without) {
+    const char *comma = "{";
+    for (uint32_t i = object + 1; i < j->node[object].end; i = j->node[i + 1].end) {
+        if (without != NULL && says(j, i, without)) continue;
+        const Node *key = &j->node[i], *value = key + 1;
+        put_text(b, comma);
+        size_t from = key->at - 1, to = value->at + value->len + (value->kind == '"');
+        put_ascii(b, (const uint8_t *)j->text + from, to - from);
+        comma = ",";
+    }
+    put_text(b, comma[0] == '{' ? "{}" : "}");
 }
 
 /* ================================================================================================================
@@ -570,8 +482,7 @@ typedef struct {
 
 typedef struct { int status; char text[160]; } Fault;   /* what is wrong, in one sentence of ASCII without quotes */
 
-__attribute__((format(printf, 3, 4))) static bool fail(Fault *fault, int status, const char *format, ...)
-{
+__attribute__((format(printf, 3, 4))) static bool fail(Fault *fault, int status, const char *format, ...) {
     va_list values;
     va_start(values, format);
     vsnprintf(fault->text, sizeof fault->text, format, values);
@@ -584,17 +495,14 @@ __attribute__((format(printf, 3, 4))) static bool fail(Fault *fault, int status,
 }
 
 /* Features come before all values: one that is lacking may be the reason why a value is not known. */
-static bool mission_features(Json *j, uint32_t root, Fault *fault)
-{
+static bool mission_features(Json *j, uint32_t root, Fault *fault) {
     static const char *const has[] = {"store", "vote_names_chain", "changed_before_tally", "phase1_tie=pop",
                                       "phase2_tie=block"};
     uint32_t list = member(j, root, "features"), quirks = member(j, root, "quirks");
-    if (list != 0 && kind(j, list) != '[')
-        return fail(fault, STATUS_WRONG, "features is no list of strings.");
+    if (list != 0 && kind(j, list) != '[') return fail(fault, STATUS_WRONG, "features is no list of strings.");
     for (uint32_t i = list + 1; list != 0 && i < j->node[list].end; i = j->node[i].end) {
         bool known = false;
-        if (kind(j, i) != '"')
-            return fail(fault, STATUS_WRONG, "features is no list of strings.");
+        if (kind(j, i) != '"') return fail(fault, STATUS_WRONG, "features is no list of strings.");
         for (size_t k = 0; k < sizeof has / sizeof *has; k++)
             known = known || says(j, i, has[k]);
         if (!known) {
@@ -606,8 +514,7 @@ static bool mission_features(Json *j, uint32_t root, Fault *fault)
     }
     if (says(j, member(j, member(j, root, "events"), "source"), "mavlink"))
         return fail(fault, STATUS_LACKS, "This agent does not have the feature 'telemetry'.");
-    if (quirks != 0 && kind(j, quirks) != '{')
-        return fail(fault, STATUS_WRONG, "quirks is no object.");
+    if (quirks != 0 && kind(j, quirks) != '{') return fail(fault, STATUS_WRONG, "quirks is no object.");
     for (uint32_t i = quirks + 1; quirks != 0 && i < j->node[quirks].end; i = j->node[i + 1].end) {
         double value = 0;
         if (kind(j, i + 1) != 't' && kind(j, i + 1) != 'f' && !json_double(j, i + 1, &value))
@@ -618,11 +525,9 @@ static bool mission_features(Json *j, uint32_t root, Fault *fault)
     return true;
 }
 
-static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault)
-{
+static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault) {
     *s = (Settings){10.0, 5.0, 5.0, 5.0, 0.1, 1024, 267, false, false, false, false};
-    if (object != 0 && kind(j, object) != '{')
-        return fail(fault, STATUS_WRONG, "settings is no object.");
+    if (object != 0 && kind(j, object) != '{') return fail(fault, STATUS_WRONG, "settings is no object.");
     struct { const char *key; double *value; bool zero; } numbers[] = {
         {"vote_timeout_s", &s->vote_timeout, false}, {"phase1_timeout_s", &s->phase1_timeout, false},
         {"phase2_timeout_s", &s->phase2_timeout, false}, {"phase3_timeout_s", &s->phase3_timeout, false},
@@ -635,7 +540,7 @@ static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault
         {"phase1_tie", "phase2", "pop", &s->phase1_tie_pop}, {"phase2_tie", "oldest", "block", &s->phase2_tie_block}};
     for (uint32_t i = 0, at; object != 0 && i < 5; i++)
         if ((at = member(j, object, numbers[i].key)) != 0
-            && (!json_double(j, at, numbers[i].value) || *numbers[i].value < 0
+            && (!json_double(j, at, numbers[i].value) || *numbers[i].value < 0 || *numbers[i].value > 1e9
                 || (*numbers[i].value == 0 && !numbers[i].zero)))
             return fail(fault, STATUS_WRONG, "The setting %s is out of range.", numbers[i].key);
     for (uint32_t i = 0, at; object != 0 && i < 2; i++) {
@@ -658,29 +563,24 @@ static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault
     return true;
 }
 
-static bool mission_address(Json *j, uint32_t network, const char *key, struct in_addr *address)
-{
+static bool mission_address(Json *j, uint32_t network, const char *key, struct in_addr *address) {
     char text[16];
     size_t n;
     uint32_t at = member(j, network, key);
-    if (kind(j, at) != '"')
-        return false;
+    if (kind(j, at) != '"') return false;
     const char *s = json_text(j, at, &n);
-    if (n >= sizeof text || memchr(s, '\0', n) != NULL)
-        return false;
+    if (n >= sizeof text || memchr(s, '\0', n) != NULL) return false;
     memcpy(text, s, n);
     text[n] = '\0';
     return inet_pton(AF_INET, text, address) == 1;
 }
 
-static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault)
-{
+static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault) {
     uint64_t value;
     uint32_t at;
     if (kind(j, root) != '{' || !says(j, member(j, root, "schema"), "ucp-mission/1"))
         return fail(fault, STATUS_WRONG, "It is no mission of the schema ucp-mission/1.");
-    if (!mission_features(j, root, fault))
-        return false;
+    if (!mission_features(j, root, fault)) return false;
     if ((at = member(j, root, "contract")) != 0 && !json_uint(j, at, 1, UINT64_MAX, &value))
         return fail(fault, STATUS_WRONG, "contract is no version.");
     if (!json_uint(j, member(j, root, "agent_id"), 1, AGENT_IDS - 1, &value))
@@ -692,15 +592,13 @@ static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault)
     for (uint32_t i = roster + 1; kind(j, roster) == '[' && i < j->node[roster].end; i = j->node[i].end) {
         if (!json_uint(j, i, 1, AGENT_IDS - 1, &value))
             return fail(fault, STATUS_WRONG, "roster has what is none of 1..65535.");
-        if (named[value])
-            continue;
+        if (named[value]) continue;
         named[value] = true;
         if (m->roster_len % 64 == 0)
             m->roster = grow(m->roster, (m->roster_len + 64) * sizeof *m->roster);
         m->roster[m->roster_len++] = (uint16_t)value;
     }
-    if (!named[m->agent_id])
-        return fail(fault, STATUS_WRONG, "roster is no list with this agent on it.");
+    if (!named[m->agent_id]) return fail(fault, STATUS_WRONG, "roster is no list with this agent on it.");
     if (!json_bytes(j, member(j, root, "initial_data"), &m->initial_data))
         return fail(fault, STATUS_WRONG, "initial_data is no base64.");
     uint32_t network = member(j, root, "network"), events = member(j, root, "events");
@@ -714,14 +612,14 @@ static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault)
         return fail(fault, STATUS_WRONG, "The source of events is not known.");
     m->random_events = says(j, member(j, events, "source"), "random");
     m->mean_s = 30;
-    if ((at = member(j, events, "mean_s")) != 0 && (!json_double(j, at, &m->mean_s) || m->mean_s <= 0))
-        return fail(fault, STATUS_WRONG, "mean_s is not above 0.");
-    if (!mission_settings(j, member(j, root, "settings"), &m->settings, fault))
-        return false;
+    if ((at = member(j, events, "mean_s")) != 0
+        && (!json_double(j, at, &m->mean_s) || m->mean_s <= 0 || m->mean_s > 2678400))
+        return fail(fault, STATUS_WRONG, "mean_s is not above 0 and at most 31 days.");
+    if (!mission_settings(j, member(j, root, "settings"), &m->settings, fault)) return false;
     if (!json_uint(j, member(j, root, "seed"), 0, UINT64_MAX, &m->seed))
         return fail(fault, STATUS_WRONG, "seed is none of 0..2^64-1.");
-    if (!json_double(j, member(j, root, "speedup"), &m->speedup) || m->speedup <= 0)
-        return fail(fault, STATUS_WRONG, "speedup is not above 0.");
+    if (!json_double(j, member(j, root, "speedup"), &m->speedup) || m->speedup <= 0 || m->speedup > 1000)
+        return fail(fault, STATUS_WRONG, "speedup is not above 0 and at most 1000.");
     at = member(j, root, "epoch_us");
     m->has_epoch = at != 0 && kind(j, at) != 'n';
     m->epoch_us = 0;
@@ -756,8 +654,7 @@ typedef struct {
 
 typedef struct { Block **at; size_t len, cap; } List;
 
-static Block *block_new(const uint8_t *data, size_t size)
-{
+static Block *block_new(const uint8_t *data, size_t size) {
     Block *block = grow(NULL, sizeof *block + size);
     memcpy(block->data, data, size);
     block->hash = H(data, size);
@@ -767,45 +664,38 @@ static Block *block_new(const uint8_t *data, size_t size)
     return block;
 }
 
-static bool block_well_formed(const uint8_t *data, size_t size)
-{
+static bool block_well_formed(const uint8_t *data, size_t size) {
     return size > BLOCK_HEADER && size <= BLOCK_HEADER + MAX_EVENT_DATA
         && read_be(data, 4) >= 1 && read_be(data, 4) < AGENT_IDS;
 }
 
-static void list_push(List *list, Block *block)
-{
+static void list_push(List *list, Block *block) {
     if (list->len == list->cap)
         list->at = grow(list->at, (list->cap = list->cap * 2 + 32) * sizeof *list->at);
     list->at[list->len++] = block;
 }
 
-static Block *list_take(List *list, size_t i)
-{
+static Block *list_take(List *list, size_t i) {
     Block *block = list->at[i];
     memmove(list->at + i, list->at + i + 1, (--list->len - i) * sizeof *list->at);
     return block;
 }
 
-static void list_clear(List *list)
-{
+static void list_clear(List *list) {
     while (list->len > 0)
         free(list->at[--list->len]);
 }
 
-static ptrdiff_t list_find(const List *list, const Hash *hash)  /* by block hash; -1: it is not there */
-{
+static ptrdiff_t list_find(const List *list, const Hash *hash) {   /* by block hash; -1: it is not there */
     for (size_t i = list->len; i-- > 0;)
-        if (same(&list->at[i]->hash, hash))
-            return (ptrdiff_t)i;
+        if (same(&list->at[i]->hash, hash)) return (ptrdiff_t)i;
     return -1;
 }
 
 /* A set of agents; it is emptied by counting on. */
 typedef struct { uint32_t round, mark[AGENT_IDS]; } Set;
 
-static void set_clear(Set *set)
-{
+static void set_clear(Set *set) {
     if (++set->round == 0) {
         memset(set->mark, 0, sizeof set->mark);
         set->round = 1;
@@ -912,50 +802,43 @@ typedef struct {
     const Input *in;
     bool counts;                                        /* it has a tally */
     unsigned started_timers;                            /* a bit for each */
+    Buf body;                                           /* of the message that it is about to send */
     Buf changes, sent;                                  /* JSON */
 } Agent;
 
 static size_t completed_len(const Agent *a) { return a->completed.len / 32; }
 
-static bool holds(const Agent *a, const Hash *hash)
-{
+static bool holds(const Agent *a, const Hash *hash) {
     return list_find(&a->chain, hash) >= 0 || list_find(&a->deque, hash) >= 0 || list_find(&a->stack, hash) >= 0;
 }
 
 enum { NOT_IN_CHAIN = -2, INCEPTION = -1 };
 
-static ptrdiff_t chain_find(const Agent *a, const Hash *chain)  /* by chain hash */
-{
+static ptrdiff_t chain_find(const Agent *a, const Hash *chain) {   /* by chain hash */
     for (size_t i = a->chain.len; i-- > 0;)
-        if (same(&a->chain.at[i]->chain, chain))
-            return (ptrdiff_t)i;
+        if (same(&a->chain.at[i]->chain, chain)) return (ptrdiff_t)i;
     return same(chain, &a->ch0) ? INCEPTION : NOT_IN_CHAIN;
 }
 
-static bool is_idle(const Agent *a)
-{
+static bool is_idle(const Agent *a) {
     for (int i = 0; i < TIMERS; i++)
-        if (a->timer[i].runs)
-            return false;
+        if (a->timer[i].runs) return false;
     return !a->reconciling && a->local_len == 0;
 }
 
 /* The chain's ends. Everything that changes a list goes through here or through `change` below. */
-static void chain_push(Agent *a, Block *block)
-{
+static void chain_push(Agent *a, Block *block) {
     a->top = block->chain = H_chain(&a->top, &block->hash);
     list_push(&a->chain, block);
 }
 
-static Block *chain_pop(Agent *a)
-{
+static Block *chain_pop(Agent *a) {
     Block *block = list_take(&a->chain, a->chain.len - 1);
     a->top = a->chain.len > 0 ? a->chain.at[a->chain.len - 1]->chain : a->ch0;
     return block;
 }
 
-static void put_change(Buf *b, enum change what, const uint8_t *hash)
-{
+static void put_change(Buf *b, enum change what, const uint8_t *hash) {
     put_text(b, b->len > 0 ? ",[\"" : "[\"");
     put_text(b, CHANGE[what]);
     put_text(b, "\",\"");
@@ -963,8 +846,7 @@ static void put_change(Buf *b, enum change what, const uint8_t *hash)
     put_text(b, "\"]");
 }
 
-static void change(Agent *a, enum change what, const Block *block)      /* record it: for the trace, for the store */
-{
+static void change(Agent *a, enum change what, const Block *block) {   /* record it: for the trace, for the store */
     if (a->tracing)
         put_change(&a->changes, what, block->hash.b);
     if (a->keeping) {
@@ -978,8 +860,7 @@ static void change(Agent *a, enum change what, const Block *block)      /* recor
     }
 }
 
-static void complete(Agent *a, Block *block)
-{
+static void complete(Agent *a, Block *block) {
     put(&a->completed, block->hash.b, 32);
     a->has_newest = true;
     a->newest = block->timestamp;
@@ -988,22 +869,19 @@ static void complete(Agent *a, Block *block)
     change(a, DEQUE_PUSH, block);
 }
 
-static void commit(Agent *a, Block *block)
-{
+static void commit(Agent *a, Block *block) {
     chain_push(a, block);
     change(a, CHAIN_PUSH, block);
 }
 
-static void trigger(Agent *a, int algorithm)
-{
+static void trigger(Agent *a, int algorithm) {
     if (a->local_len < sizeof a->local / sizeof *a->local) {    /* each is followed by at most one other */
         a->local[a->local_len].algorithm = algorithm;
         a->local[a->local_len++].by = a->running;
     }
 }
 
-static void start_timer(Agent *a, enum timer timer, double duration)
-{
+static void start_timer(Agent *a, enum timer timer, double duration) {
     a->timer[timer].runs = true;
     a->timer[timer].duration = duration;
     a->timer[timer].deadline = a->now + duration;
@@ -1011,100 +889,55 @@ static void start_timer(Agent *a, enum timer timer, double duration)
     a->started_timers |= 1u << timer;
 }
 
-/* --- Messages out. `block` is what the trace says that the message names or carries. ------------------------------ */
+/* --- Messages out: the body is put together in `body`; `block` is what the trace says that it names. --------------- */
 
-static void send_message(Agent *a, enum message_type type, const Hash *block, const Buf *body)
-{
-    size_t at = a->out.len + 2, size = HEADER + body->len;
+static void put_hash(Buf *b, const Hash *hash) { put(b, hash->b, 32); }
+
+static void send_message(Agent *a, enum message_type type, const Hash *block) {
+    size_t at = a->out.len + 2, size = HEADER + a->body.len;
     put_be(&a->out, size, 2);
     put(&a->out, "UC\1", 3);
     put_byte(&a->out, (uint8_t)type);
     put_be(&a->out, a->m.agent_id, 4);
     put_be(&a->out, a->sequence, 4);
-    put_be(&a->out, body->len, 2);
-    put(&a->out, body->data, body->len);
+    put_be(&a->out, a->body.len, 2);
+    put(&a->out, a->body.data, a->body.len);
+    a->body.len = 0;
     if (a->tracing) {
-        put_text(&a->sent, a->sent.len > 0 ? ",{\"message\":\"" : "{\"message\":\"");
-        put_text(&a->sent, MESSAGES[type].name);
-        put_text(&a->sent, "\",\"seq\":");
-        put_uint(&a->sent, a->sequence);
-        put_text(&a->sent, block != NULL ? ",\"block\":\"" : ",\"block\":null");
-        if (block != NULL) {
+        put_format(&a->sent, "%s{\"message\":\"%s\",\"seq\":%" PRIu32 ",\"block\":%s", a->sent.len > 0 ? "," : "",
+                   MESSAGES[type].name, a->sequence, block != NULL ? "\"" : "null");
+        if (block != NULL)
             put_hex(&a->sent, block->b, 32);
-            put_byte(&a->sent, '"');
-        }
-        put_text(&a->sent, ",\"datagram\":\"");
+        put_text(&a->sent, block != NULL ? "\",\"datagram\":\"" : ",\"datagram\":\"");
         put_base64(&a->sent, a->out.data + at, size);
         put_text(&a->sent, "\"}");
     }
     a->sequence++;
 }
 
-static void send_hashes(Agent *a, enum message_type type, const Hash *block, const Hash *first, const Hash *second)
-{
-    uint8_t bytes[64];
-    memcpy(bytes, first->b, 32);
-    if (second != NULL)
-        memcpy(bytes + 32, second->b, 32);
-    send_message(a, type, block, &(Buf){bytes, second != NULL ? 64 : 32, sizeof bytes});
-}
-
-static void send_verdict(Agent *a, enum message_type type, bool yes, const Hash *block, const Hash *first,
-                         const Hash *second)
-{
-    uint8_t bytes[65] = {yes};
-    memcpy(bytes + 1, first->b, 32);
-    if (second != NULL)
-        memcpy(bytes + 33, second->b, 32);
-    send_message(a, type, block, &(Buf){bytes, second != NULL ? 65 : 33, sizeof bytes});
-}
-
-static void send_successor(Agent *a, uint64_t timestamp, const Hash *chain, const Hash *block)
-{
-    uint8_t bytes[72];
-    write_be(bytes, timestamp, 8);
-    memcpy(bytes + 8, chain->b, 32);
-    if (block != NULL)
-        memcpy(bytes + 40, block->b, 32);
-    send_message(a, NEXT_IN_SEQUENCE_RESPONSE, block, &(Buf){bytes, block != NULL ? 72 : 40, sizeof bytes});
-}
-
-static void send_block(Agent *a, enum message_type type, const Block *block)    /* Commit Block, Block Response */
-{
-    uint8_t bytes[32 + BLOCK_HEADER + MAX_EVENT_DATA];
-    size_t n = type == COMMIT_BLOCK ? 32 : 0;
-    memcpy(bytes, block->chain.b, n);
-    memcpy(bytes + n, block->data, block->size);
-    send_message(a, type, &block->hash, &(Buf){bytes, n + block->size, sizeof bytes});
+static void send_commit(Agent *a, const Block *block) {
+    put_hash(&a->body, &block->chain);                  /* its own chain hash, the new top */
+    put(&a->body, block->data, block->size);
+    send_message(a, COMMIT_BLOCK, &block->hash);
 }
 
 /* --- Messages in: the first test that fails says why a datagram is dropped. --------------------------------------- */
 
-static enum drop read_datagram(const Agent *a, const uint8_t *d, size_t n, Input *in)
-{
-    if (n < HEADER)
-        return TRUNCATED;
-    if (n > MAX_DATAGRAM)
-        return OVERSIZED;
-    if (d[0] != 'U' || d[1] != 'C')
-        return WRONG_MAGIC;
-    if (d[2] != 1)
-        return WRONG_VERSION;
+static enum drop read_datagram(const Agent *a, const uint8_t *d, size_t n, Input *in) {
+    if (n < HEADER) return TRUNCATED;
+    if (n > MAX_DATAGRAM) return OVERSIZED;
+    if (d[0] != 'U' || d[1] != 'C') return WRONG_MAGIC;
+    if (d[2] != 1) return WRONG_VERSION;
     uint32_t sender = (uint32_t)read_be(d + 4, 4);
-    if (sender < 1 || sender >= AGENT_IDS)
-        return IMPOSSIBLE_SENDER;
+    if (sender < 1 || sender >= AGENT_IDS) return IMPOSSIBLE_SENDER;
     const uint8_t *body = d + HEADER;
     size_t size = n - HEADER;
     int type = d[3];
-    if (read_be(d + 12, 2) != size)
-        return WRONG_LENGTH;
-    if (type < BLOCK_ADD_REQUEST || type > BLOCK_RESPONSE)
-        return UNKNOWN_TYPE;
-    if ((type == BLOCK_ADD_RESPONSE || type == CHAIN_CONTAIN_RESPONSE) && (size == 0 || body[0] > 1))
-        return BAD_VOTE;
+    if (read_be(d + 12, 2) != size) return WRONG_LENGTH;
+    if (type < BLOCK_ADD_REQUEST || type > BLOCK_RESPONSE) return UNKNOWN_TYPE;
+    if ((type == BLOCK_ADD_RESPONSE || type == CHAIN_CONTAIN_RESPONSE) && (size == 0 || body[0] > 1)) return BAD_VOTE;
     size_t least = MESSAGES[type].least, most = MESSAGES[type].most;
-    if (MESSAGES[type].between ? size < least || size > most : size != least && size != most)
-        return WRONG_LENGTH;
+    if (MESSAGES[type].between ? size < least || size > most : size != least && size != most) return WRONG_LENGTH;
 
     *in = (Input){.raw = d, .raw_len = n, .type = type, .sender = (uint16_t)sender,
                   .sequence = (uint32_t)read_be(d + 8, 4)};
@@ -1127,14 +960,10 @@ static enum drop read_datagram(const Agent *a, const uint8_t *d, size_t n, Input
     if ((in->has_chain = chain != NULL))
         memcpy(in->chain.b, chain, 32);
 
-    if (in->data != NULL && !block_well_formed(in->data, in->data_len))
-        return IMPOSSIBLE_AGENT;
-    if (sender == a->m.agent_id)
-        return OWN_SENDER;
-    if (!set_has(&a->roster, (uint16_t)sender))
-        return STRANGER;
-    if (in->data != NULL && !set_has(&a->roster, (uint16_t)read_be(in->data, 4)))
-        return STRANGERS_BLOCK;
+    if (in->data != NULL && !block_well_formed(in->data, in->data_len)) return IMPOSSIBLE_AGENT;
+    if (sender == a->m.agent_id) return OWN_SENDER;
+    if (!set_has(&a->roster, (uint16_t)sender)) return STRANGER;
+    if (in->data != NULL && !set_has(&a->roster, (uint16_t)read_be(in->data, 4))) return STRANGERS_BLOCK;
     return GOOD;
 }
 
@@ -1150,12 +979,10 @@ enum algorithm {                                        /* those that are trigge
 /* --- Commit ------------------------------------------------------------------------------------------------------- */
 
 /* Algorithm 1: an event is logged. */
-static const char *build_data_block(Agent *a)
-{
+static const char *build_data_block(Agent *a) {
     memcpy(a->current + a->current_len, a->in->raw, a->in->raw_len);
     a->current_len += a->in->raw_len;
-    if (a->current_len + a->m.settings.max_event_bytes < a->m.settings.max_block_bytes)
-        return "building";
+    if (a->current_len + a->m.settings.max_event_bytes < a->m.settings.max_block_bytes) return "building";
     uint64_t timestamp = a->in->timestamp;
     if (a->has_newest && timestamp <= a->newest)
         timestamp = a->newest + (a->newest < UINT64_MAX);       /* at the end of time it stands still */
@@ -1170,46 +997,41 @@ static const char *build_data_block(Agent *a)
 }
 
 /* Algorithm 2: the front of the deque is proposed. */
-static const char *process_next_deque_block(Agent *a)
-{
-    if (a->reconciling)
-        return "reconcile in progress";
-    if (a->timer[VOTING].runs)
-        return "vote running";
-    if (a->deque.len == 0)
-        return "deque empty";
+static const char *process_next_deque_block(Agent *a) {
+    if (a->reconciling) return "reconcile in progress";
+    if (a->timer[VOTING].runs) return "vote running";
+    if (a->deque.len == 0) return "deque empty";
     a->votes = (Count){1, 0};                           /* its own approval counts */
     set_clear(&a->voters);
     a->top_at_initiation = a->top;
     a->candidate = a->deque.at[0]->hash;                /* it stays in the deque */
     start_timer(a, VOTING, a->m.settings.vote_timeout);
-    send_hashes(a, BLOCK_ADD_REQUEST, &a->candidate, &a->candidate, &a->top);
+    put_hash(&a->body, &a->candidate);
+    put_hash(&a->body, &a->top);
+    send_message(a, BLOCK_ADD_REQUEST, &a->candidate);
     a->counts = true;
     return "proposed";
 }
 
 /* Algorithm 3: Block Add Request. */
-static const char *receive_request_add_block(Agent *a)
-{
-    if (a->reconciling)
-        return "reconcile in progress";
+static const char *receive_request_add_block(Agent *a) {
+    if (a->reconciling) return "reconcile in progress";
     bool approve = same(&a->in->chain, &a->top);
-    send_verdict(a, BLOCK_ADD_RESPONSE, approve, &a->in->block, &a->in->block,
-                 a->m.settings.vote_names_chain ? &a->in->chain : NULL);
+    put_byte(&a->body, approve);
+    put_hash(&a->body, &a->in->block);
+    if (a->m.settings.vote_names_chain)
+        put_hash(&a->body, &a->in->chain);
+    send_message(a, BLOCK_ADD_RESPONSE, &a->in->block);
     return approve ? "approve" : "disapprove";
 }
 
 /* Algorithm 4: Block Add Response. */
-static const char *receive_vote_add_block(Agent *a)
-{
-    if (!a->timer[VOTING].runs)
-        return "no vote running";
-    if (!same(&a->in->block, &a->candidate))
-        return "another block";
+static const char *receive_vote_add_block(Agent *a) {
+    if (!a->timer[VOTING].runs) return "no vote running";
+    if (!same(&a->in->block, &a->candidate)) return "another block";
     if (a->m.settings.vote_names_chain && (!a->in->has_chain || !same(&a->in->chain, &a->top_at_initiation)))
         return "another round";
-    if (set_has(&a->voters, a->in->sender))
-        return "counted already";
+    if (set_has(&a->voters, a->in->sender)) return "counted already";
     set_add(&a->voters, a->in->sender);
     *(a->in->yes ? &a->votes.yes : &a->votes.no) += 1;
     a->counts = true;
@@ -1217,10 +1039,8 @@ static const char *receive_vote_add_block(Agent *a)
 }
 
 /* Algorithm 5: the voting timer. */
-static const char *vote_timer_expiration(Agent *a)
-{
-    if (a->reconciling)
-        return "reconcile in progress";
+static const char *vote_timer_expiration(Agent *a) {
+    if (a->reconciling) return "reconcile in progress";
     bool changed = !same(&a->top, &a->top_at_initiation);
     bool approved = a->votes.yes > a->votes.no;         /* a tie is not approved */
     if (changed && (approved || a->m.settings.changed_before_tally)) {
@@ -1234,21 +1054,17 @@ static const char *vote_timer_expiration(Agent *a)
     Block *block = list_take(&a->deque, 0);
     change(a, DEQUE_POP, block);
     commit(a, block);
-    send_block(a, COMMIT_BLOCK, block);
+    send_commit(a, block);
     trigger(a, PROCESS_NEXT_DEQUE_BLOCK);
     return "approved";
 }
 
 /* Algorithm 6: Commit Block. */
-static const char *receive_commit_block(Agent *a)
-{
-    if (a->reconciling)
-        return "reconcile in progress";
+static const char *receive_commit_block(Agent *a) {
+    if (a->reconciling) return "reconcile in progress";
     Hash hash = H(a->in->data, a->in->data_len), successor = H_chain(&a->top, &hash);
-    if (!same(&a->in->chain, &successor))
-        return "does not succeed";
-    if (holds(a, &hash))
-        return "held already";
+    if (!same(&a->in->chain, &successor)) return "does not succeed";
+    if (holds(a, &hash)) return "held already";
     commit(a, block_new(a->in->data, a->in->data_len));
     return "committed";
 }
@@ -1256,10 +1072,8 @@ static const char *receive_commit_block(Agent *a)
 /* --- Reconcile ---------------------------------------------------------------------------------------------------- */
 
 /* Algorithm 7: Reconcile Begin. */
-static const char *reconcile_begin(Agent *a)
-{
-    if (a->reconciling)
-        return "already in progress";
+static const char *reconcile_begin(Agent *a) {
+    if (a->reconciling) return "already in progress";
     a->reconciling = true;
     a->reconciles++;
     trigger(a, RECONCILE_PHASE_1);
@@ -1267,35 +1081,31 @@ static const char *reconcile_begin(Agent *a)
 }
 
 /* Algorithm 8: is my top block in your chains? */
-static const char *reconcile_phase_1(Agent *a)
-{
+static const char *reconcile_phase_1(Agent *a) {
     a->answers = (Count){0, 0};
     set_clear(&a->responders);
-    send_hashes(a, CHAIN_CONTAIN_QUERY, NULL, &a->top, NULL);
+    put_hash(&a->body, &a->top);
+    send_message(a, CHAIN_CONTAIN_QUERY, NULL);
     start_timer(a, PHASE_ONE, a->m.settings.phase1_timeout);
     a->counts = true;
     return "asked";
 }
 
 /* Algorithm 9: Chain Contain Query. */
-static const char *receive_request_chain_contain(Agent *a)
-{
-    if (a->reconciling)
-        return "reconcile in progress";
+static const char *receive_request_chain_contain(Agent *a) {
+    if (a->reconciling) return "reconcile in progress";
     bool contained = chain_find(a, &a->in->chain) != NOT_IN_CHAIN;
-    send_verdict(a, CHAIN_CONTAIN_RESPONSE, contained, NULL, &a->in->chain, NULL);
+    put_byte(&a->body, contained);
+    put_hash(&a->body, &a->in->chain);
+    send_message(a, CHAIN_CONTAIN_RESPONSE, NULL);
     return contained ? "yes" : "no";
 }
 
 /* Algorithm 10: Chain Contain Response. */
-static const char *receive_phase_1_response(Agent *a)
-{
-    if (!a->timer[PHASE_ONE].runs)
-        return "not in phase 1";
-    if (!same(&a->in->chain, &a->top))
-        return "another chain";
-    if (set_has(&a->responders, a->in->sender))
-        return "counted already";
+static const char *receive_phase_1_response(Agent *a) {
+    if (!a->timer[PHASE_ONE].runs) return "not in phase 1";
+    if (!same(&a->in->chain, &a->top)) return "another chain";
+    if (set_has(&a->responders, a->in->sender)) return "counted already";
     set_add(&a->responders, a->in->sender);
     *(a->in->yes ? &a->answers.yes : &a->answers.no) += 1;
     a->counts = true;
@@ -1303,8 +1113,7 @@ static const char *receive_phase_1_response(Agent *a)
 }
 
 /* Algorithm 11: the phase one timer. */
-static const char *reconcile_phase_1_timer_expiration(Agent *a)
-{
+static const char *reconcile_phase_1_timer_expiration(Agent *a) {
     uint64_t yes = a->answers.yes, no = a->answers.no;
     if (yes + no == 0) {
         trigger(a, RECONCILE_FINALIZE);
@@ -1327,44 +1136,39 @@ static const char *reconcile_phase_1_timer_expiration(Agent *a)
 }
 
 /* Algorithm 12: what comes next in your chains? */
-static const char *reconcile_phase_2(Agent *a)
-{
+static const char *reconcile_phase_2(Agent *a) {
     a->candidates_len = 0;
     set_clear(&a->responders);
     start_timer(a, PHASE_TWO, a->m.settings.phase2_timeout);
-    send_hashes(a, CHAIN_HASH_SUCCESSOR_QUERY, NULL, &a->top, NULL);
+    put_hash(&a->body, &a->top);
+    send_message(a, CHAIN_HASH_SUCCESSOR_QUERY, NULL);
     a->counts = true;
     return "asked";
 }
 
 /* Algorithm 13: Chain Hash Successor Query. */
-static const char *receive_request_next_in_sequence(Agent *a)
-{
-    if (a->reconciling)
-        return "reconcile in progress";
+static const char *receive_request_next_in_sequence(Agent *a) {
+    if (a->reconciling) return "reconcile in progress";
     ptrdiff_t at = chain_find(a, &a->in->chain);
     if (at == NOT_IN_CHAIN) {                           /* its own chain has diverged */
         trigger(a, RECONCILE_BEGIN);
         return "diverged";
     }
-    if (same(&a->in->chain, &a->top)) {
-        send_successor(a, at == INCEPTION ? 0 : a->chain.at[at]->timestamp, &a->in->chain, NULL);
-        return "top of chain";
-    }
-    const Block *next = a->chain.at[at + 1];
-    send_successor(a, next->timestamp, &a->in->chain, &next->hash);
-    return "successor";
+    bool is_top = same(&a->in->chain, &a->top);
+    const Block *block = is_top && at == INCEPTION ? NULL : a->chain.at[is_top ? at : at + 1];
+    put_be(&a->body, block != NULL ? block->timestamp : 0, 8);
+    put_hash(&a->body, &a->in->chain);
+    if (!is_top)
+        put_hash(&a->body, &block->hash);
+    send_message(a, NEXT_IN_SEQUENCE_RESPONSE, is_top ? NULL : &block->hash);
+    return is_top ? "top of chain" : "successor";
 }
 
 /* Algorithm 14: Next in Sequence Response. */
-static const char *receive_response_next_in_sequence(Agent *a)
-{
-    if (!a->timer[PHASE_TWO].runs)
-        return "not in phase 2";
-    if (!same(&a->in->chain, &a->top))
-        return "another chain";
-    if (set_has(&a->responders, a->in->sender))
-        return "counted already";
+static const char *receive_response_next_in_sequence(Agent *a) {
+    if (!a->timer[PHASE_TWO].runs) return "not in phase 2";
+    if (!same(&a->in->chain, &a->top)) return "another chain";
+    if (set_has(&a->responders, a->in->sender)) return "counted already";
     set_add(&a->responders, a->in->sender);
     a->counts = true;
     for (Candidate *c = a->candidates; c < a->candidates + a->candidates_len; c++)
@@ -1376,18 +1180,15 @@ static const char *receive_response_next_in_sequence(Agent *a)
     return "new candidate";
 }
 
-static bool goes_before(const Candidate *x, const Candidate *y)         /* of those with the highest count */
-{
-    if (x->timestamp != y->timestamp)
-        return x->timestamp < y->timestamp;
+static bool goes_before(const Candidate *x, const Candidate *y) {   /* of those with the highest count */
+    if (x->timestamp != y->timestamp) return x->timestamp < y->timestamp;
     if (x->is_top || y->is_top)
         return x->is_top;                               /* lower than any hash */
     return memcmp(x->block.b, y->block.b, 32) < 0;
 }
 
 /* Algorithm 15: the phase two timer. */
-static const char *reconcile_phase_2_timer_expiration(Agent *a)
-{
+static const char *reconcile_phase_2_timer_expiration(Agent *a) {
     if (a->candidates_len == 0) {
         trigger(a, RECONCILE_FINALIZE);
         return "no response";
@@ -1420,8 +1221,7 @@ static const char *reconcile_phase_2_timer_expiration(Agent *a)
 }
 
 /* Algorithm 16: get the block that the majority has next. */
-static const char *reconcile_phase_3(Agent *a)
-{
+static const char *reconcile_phase_3(Agent *a) {
     ptrdiff_t at = list_find(&a->stack, &a->majority);
     if (at >= 0) {
         Block *block = list_take(&a->stack, (size_t)at);
@@ -1437,27 +1237,25 @@ static const char *reconcile_phase_3(Agent *a)
         return "held already";
     }
     start_timer(a, PHASE_THREE, a->m.settings.phase3_timeout);
-    send_hashes(a, REQUEST_FOR_BLOCK, &a->majority, &a->majority, NULL);
+    put_hash(&a->body, &a->majority);
+    send_message(a, REQUEST_FOR_BLOCK, &a->majority);
     return "asked";
 }
 
 /* Algorithm 17: Request for Block. */
-static const char *receive_request_block_for_hash(Agent *a)
-{
-    if (a->reconciling)
-        return "reconcile in progress";
+static const char *receive_request_block_for_hash(Agent *a) {
+    if (a->reconciling) return "reconcile in progress";
     ptrdiff_t at = list_find(&a->chain, &a->in->block);
-    if (at < 0)
-        return "not held";
-    send_block(a, BLOCK_RESPONSE, a->chain.at[at]);
+    if (at < 0) return "not held";
+    const Block *block = a->chain.at[at];
+    put(&a->body, block->data, block->size);
+    send_message(a, BLOCK_RESPONSE, &block->hash);
     return "sent";
 }
 
 /* Algorithm 18: Block Response. */
-static const char *receive_response_block_for_hash(Agent *a)
-{
-    if (!a->timer[PHASE_THREE].runs)
-        return "not in phase 3";
+static const char *receive_response_block_for_hash(Agent *a) {
+    if (!a->timer[PHASE_THREE].runs) return "not in phase 3";
     Hash hash = H(a->in->data, a->in->data_len);
     if (!a->has_majority || !same(&hash, &a->majority))
         return "another block";                         /* the timer runs on as it was */
@@ -1469,21 +1267,19 @@ static const char *receive_response_block_for_hash(Agent *a)
 }
 
 /* Algorithm 19: the phase three timer. What was rebuilt stays. */
-static const char *reconcile_phase_3_timer_expiration(Agent *a)
-{
+static const char *reconcile_phase_3_timer_expiration(Agent *a) {
     a->has_majority = false;
     trigger(a, RECONCILE_FINALIZE);
     return "gave up";
 }
 
 /* Algorithm 20: what is left on the stack goes back on the chain. */
-static const char *reconcile_finalize(Agent *a)
-{
+static const char *reconcile_finalize(Agent *a) {
     while (a->stack.len > 0) {
         Block *block = list_take(&a->stack, a->stack.len - 1);
         change(a, STACK_TAKE, block);
         commit(a, block);
-        send_block(a, COMMIT_BLOCK, block);
+        send_commit(a, block);
         if (a->stack.len > 0 && a->m.settings.finalize_gap > 0) {
             start_timer(a, FINALIZE_GAP, a->m.settings.finalize_gap);
             return "recommitted, more to come";
@@ -1521,8 +1317,9 @@ static const struct { const char *name; const char *(*run)(Agent *); } ALGORITHM
  * 7  How an agent runs: inputs, one after another, each with the handlers that it leads to
  * ============================================================================================================= */
 
-static void put_tally(Buf *b, const Agent *a, int algorithm)
-{
+static const char *truth(bool it) { return it ? "true" : "false"; }
+
+static void put_tally(Buf *b, const Agent *a, int algorithm) {
     if (algorithm == 2 || algorithm == 4 || algorithm == 8 || algorithm == 10) {
         const Count *count = algorithm <= 4 ? &a->votes : &a->answers;
         put_format(b, "\"yes\":%" PRIu64 ",\"no\":%" PRIu64, count->yes, count->no);
@@ -1530,8 +1327,7 @@ static void put_tally(Buf *b, const Agent *a, int algorithm)
     }
     for (size_t i = 0; i < a->candidates_len; i++) {
         const Candidate *c = &a->candidates[i];
-        if (algorithm == 15 && i != a->chosen)
-            continue;
+        if (algorithm == 15 && i != a->chosen) continue;
         put_text(b, i > 0 && algorithm != 15 ? ",\"" : "\"");
         put_hex(b, c->block.b, c->is_top ? 0 : 32);
         if (algorithm == 15)
@@ -1541,75 +1337,47 @@ static void put_tally(Buf *b, const Agent *a, int algorithm)
     }
 }
 
-static void put_line(Buf *b, const Agent *a)            /* the beginning of a line for the trace */
-{
-    put_text(b, "{\"t\":");
-    put_text(b, a->t);
-}
-
-static void put_run(Agent *a, int algorithm, enum trigger by, uint64_t which, const char *branch)
-{
-    static const char *const names[] = {"message", "timer", "event", "local", "operator", "boot"};
+static void put_run(Agent *a, int algorithm, enum trigger by, uint64_t which, const char *branch) {
     Buf *b = &a->lines;
-    put_line(b, a);
-    put_text(b, ",\"handler\":\"");
-    put_text(b, ALGORITHM[algorithm].name);
-    put_text(b, "\",\"algorithm\":");
-    put_uint(b, (uint64_t)algorithm);
-    put_text(b, ",\"trigger\":{\"");
-    put_text(b, names[by]);
-    put_text(b, by == BY_EVENT || by == BY_BOOT ? "\":" : "\":\"");
-    if (by == BY_EVENT || by == BY_BOOT)
-        put_uint(b, which);
-    else
-        put_text(b, by == BY_MESSAGE ? MESSAGES[a->in->type].name : by == BY_TIMER ? TIMER[which].name
-                 : by == BY_LOCAL ? ALGORITHM[which].name : "reconcile");
-    if (by == BY_MESSAGE) {
-        put_text(b, "\",\"from\":");
-        put_uint(b, a->in->sender);
-        put_text(b, ",\"seq\":");
-        put_uint(b, a->in->sequence);
+    put_format(b, "{\"t\":%s,\"handler\":\"%s\",\"algorithm\":%d,\"trigger\":", a->t, ALGORITHM[algorithm].name,
+               algorithm);
+    switch (by) {
+    case BY_MESSAGE:
+        put_format(b, "{\"message\":\"%s\",\"from\":%u,\"seq\":%" PRIu32 "}", MESSAGES[a->in->type].name, a->in->sender,
+                   a->in->sequence);
+        break;
+    case BY_TIMER:      put_format(b, "{\"timer\":\"%s\"}", TIMER[which].name); break;
+    case BY_EVENT:      put_format(b, "{\"event\":%" PRIu64 "}", which); break;
+    case BY_LOCAL:      put_format(b, "{\"local\":\"%s\"}", ALGORITHM[which].name); break;
+    case BY_OPERATOR:   put_text(b, "{\"operator\":\"reconcile\"}"); break;
+    case BY_BOOT:       put_format(b, "{\"boot\":%" PRIu64 "}", which); break;
     }
-    put_text(b, by == BY_TIMER || by == BY_LOCAL || by == BY_OPERATOR ? "\"}" : "}");
     if (a->in != NULL) {
         put_text(b, ",\"input\":\"");
         put_base64(b, a->in->raw, a->in->raw_len);
         put_byte(b, '"');
     }
-    put_text(b, ",\"branch\":\"");
-    put_text(b, branch);
-    put_text(b, "\",\"changes\":[");
+    put_format(b, ",\"branch\":\"%s\",\"changes\":[", branch);
     put(b, a->changes.data, a->changes.len);
     put_text(b, "],\"sent\":[");
     put(b, a->sent.data, a->sent.len);
+    put_byte(b, ']');
     if (a->counts) {
-        put_text(b, "],\"tally\":{");
+        put_text(b, ",\"tally\":{");
         put_tally(b, a, algorithm);
+        put_byte(b, '}');
     }
-    if (a->started_timers != 0) {
-        put_text(b, a->counts ? "},\"started\":{" : "],\"started\":{");
-        const char *comma = "";
-        for (int i = 0; i < TIMERS; i++)
-            if (a->started_timers & 1u << i) {
-                put_format(b, "%s\"%s\":%.17g", comma, TIMER[i].name, a->timer[i].duration);
-                comma = ",";
-            }
-    }
-    put_text(b, a->counts || a->started_timers != 0 ? "},\"state\":{\"chain\":" : "],\"state\":{\"chain\":");
-    put_uint(b, a->chain.len);
-    put_text(b, ",\"deque\":");
-    put_uint(b, a->deque.len);
-    put_text(b, ",\"stack\":");
-    put_uint(b, a->stack.len);
-    put_text(b, a->reconciling ? ",\"reconciling\":true,\"idle\":" : ",\"reconciling\":false,\"idle\":");
-    put_text(b, is_idle(a) ? "true,\"top\":\"" : "false,\"top\":\"");
+    for (int i = 0; i < TIMERS; i++)                    /* a handler starts one at most */
+        if (a->started_timers & 1u << i)
+            put_format(b, ",\"started\":{\"%s\":%.17g}", TIMER[i].name, a->timer[i].duration);
+    put_format(b, ",\"state\":{\"chain\":%zu,\"deque\":%zu,\"stack\":%zu,\"reconciling\":%s,\"idle\":%s,\"top\":\"",
+               a->chain.len, a->deque.len, a->stack.len, truth(a->reconciling), truth(is_idle(a)));
     put_hex(b, a->top.b, 32);
     put_text(b, "\"}}\n");
 }
 
 /* One handler, from its beginning to its end. What was put into `changes` before it is part of its line. */
-static void run_handler(Agent *a, int algorithm, enum trigger by, uint64_t which, const Input *in)
-{
+static void run_handler(Agent *a, int algorithm, enum trigger by, uint64_t which, const Input *in) {
     a->running = algorithm;
     a->in = in;
     a->counts = false;
@@ -1622,8 +1390,7 @@ static void run_handler(Agent *a, int algorithm, enum trigger by, uint64_t which
 }
 
 /* The handler of an input, then those of local events, first in first out. */
-static void run_all(Agent *a, int algorithm, enum trigger by, uint64_t which, const Input *in)
-{
+static void run_all(Agent *a, int algorithm, enum trigger by, uint64_t which, const Input *in) {
     run_handler(a, algorithm, by, which, in);
     while (a->local_len > 0) {
         int next = a->local[0].algorithm, from = a->local[0].by;
@@ -1632,16 +1399,14 @@ static void run_all(Agent *a, int algorithm, enum trigger by, uint64_t which, co
     }
 }
 
-static void begin_input(Agent *a, double now)
-{
+static void begin_input(Agent *a, double now) {
     a->now = now;
     a->inputs++;
     if (a->tracing)
         snprintf(a->t, sizeof a->t, "%.6f", now);
 }
 
-static void take_datagram(Agent *a, double now, const uint8_t *datagram, size_t n)
-{
+static void take_datagram(Agent *a, double now, const uint8_t *datagram, size_t n) {
     Input in;
     begin_input(a, now);
     enum drop drop = read_datagram(a, datagram, n, &in);
@@ -1651,10 +1416,7 @@ static void take_datagram(Agent *a, double now, const uint8_t *datagram, size_t 
     }
     a->dropped[drop]++;
     if (a->tracing) {
-        put_line(&a->lines, a);
-        put_text(&a->lines, ",\"dropped\":\"");
-        put_text(&a->lines, DROP[drop]);
-        put_text(&a->lines, "\",\"datagram\":\"");
+        put_format(&a->lines, "{\"t\":%s,\"dropped\":\"%s\",\"datagram\":\"", a->t, DROP[drop]);
         put_base64(&a->lines, datagram, n);
         put_text(&a->lines, "\"}\n");
     }
@@ -1662,12 +1424,10 @@ static void take_datagram(Agent *a, double now, const uint8_t *datagram, size_t 
 
 static bool event_fits(const Agent *a, size_t n) { return EVENT_HEADER + n <= a->m.settings.max_event_bytes; }
 
-static void take_event(Agent *a, double now, uint8_t event_id, uint64_t timestamp, const uint8_t *data, size_t n)
-{
+static void take_event(Agent *a, double now, uint8_t event_id, uint64_t timestamp, const uint8_t *data, size_t n) {
     uint8_t event[MAX_EVENT_DATA];
     begin_input(a, now);
-    if (a->no_events)
-        return;
+    if (a->no_events) return;
     write_be(event, timestamp, 8);
     event[8] = event_id;
     write_be(event + 9, n, 2);
@@ -1678,12 +1438,10 @@ static void take_event(Agent *a, double now, uint8_t event_id, uint64_t timestam
 }
 
 /* The timer whose turn it is: of those that have come the earliest, those started during this very input last. */
-static enum timer timer_that_came(const Agent *a)
-{
+static enum timer timer_that_came(const Agent *a) {
     enum timer first = NO_TIMER;
     for (int i = 0; i < TIMERS; i++) {
-        if (!a->timer[i].runs || a->timer[i].deadline > a->now)
-            continue;
+        if (!a->timer[i].runs || a->timer[i].deadline > a->now) continue;
         bool late = a->timer[i].since == a->inputs;
         if (first == NO_TIMER || late < (a->timer[first].since == a->inputs)
             || (late == (a->timer[first].since == a->inputs) && a->timer[i].deadline < a->timer[first].deadline))
@@ -1692,8 +1450,7 @@ static enum timer timer_that_came(const Agent *a)
     return first;
 }
 
-static void take_timers(Agent *a, double now)
-{
+static void take_timers(Agent *a, double now) {
     begin_input(a, now);
     for (enum timer i; (i = timer_that_came(a)) != NO_TIMER;) {
         a->timer[i].runs = false;
@@ -1701,8 +1458,7 @@ static void take_timers(Agent *a, double now)
     }
 }
 
-static double next_deadline(const Agent *a)             /* infinity if no timer runs */
-{
+static double next_deadline(const Agent *a) {           /* infinity if no timer runs */
     double first = INFINITY;
     for (int i = 0; i < TIMERS; i++)
         if (a->timer[i].runs && a->timer[i].deadline < first)
@@ -1711,21 +1467,15 @@ static double next_deadline(const Agent *a)             /* infinity if no timer 
 }
 
 /* A command that runs no handler leaves a line of its own. */
-static void note_command(Agent *a, Json *j, uint32_t request, const char *command, const char *without)
-{
-    if (!a->tracing)
-        return;
-    put_line(&a->lines, a);
-    put_text(&a->lines, ",\"command\":\"");
-    put_text(&a->lines, command);
-    put_text(&a->lines, "\",\"request\":");
-    put_json(&a->lines, j, request, without);
+static void note_command(Agent *a, Json *j, uint32_t request, const char *command, const char *without) {
+    if (!a->tracing) return;
+    put_format(&a->lines, "{\"t\":%s,\"command\":\"%s\",\"request\":", a->t, command);
+    put_object(&a->lines, j, request, without);
     put_text(&a->lines, "}\n");
 }
 
 /* An agent as it is at first; the memory that an earlier life had is used again. */
-static void agent_new(Agent *a)
-{
+static void agent_new(Agent *a) {
     set_clear(&a->roster);
     for (size_t i = 0; i < a->m.roster_len; i++)
         set_add(&a->roster, a->m.roster[i]);
@@ -1747,8 +1497,7 @@ static void agent_new(Agent *a)
 }
 
 /* An agent that found a store goes on as if nobody had answered its reconcile: Algorithm 20. */
-static void boot(Agent *a, double now)
-{
+static void boot(Agent *a, double now) {
     Buf found = {0};
     const List *lists[] = {&a->chain, &a->deque, &a->stack};
     const enum change changes[] = {CHAIN_PUSH, DEQUE_PUSH, STACK_PUSH};
@@ -1776,16 +1525,13 @@ static void boot(Agent *a, double now)
  * 8  What an agent tells: trace header, status, chain export; and timestamps
  * ============================================================================================================= */
 
-static uint64_t timestamp_at(const Agent *a, double now)        /* microseconds, never below 0 nor above 2^64 - 1 */
-{
+static uint64_t timestamp_at(const Agent *a, double now) {   /* microseconds, never below 0 nor above 2^64 - 1 */
     double us = rint(now * 1e6);
-    if (us < 0)
-        return -us >= (double)a->m.epoch_us ? 0 : a->m.epoch_us - (uint64_t)-us;
+    if (us < 0) return -us >= (double)a->m.epoch_us ? 0 : a->m.epoch_us - (uint64_t)-us;
     return us >= 9.2e18 ? UINT64_MAX : a->m.epoch_us + (uint64_t)us;
 }
 
-static void put_header(Buf *b, const Agent *a)
-{
+static void put_header(Buf *b, const Agent *a) {
     const Settings *s = &a->m.settings;
     put_format(b, "{\"schema\":\"ucp-trace/2\",\"agent_id\":%u,\"roster\":[", a->m.agent_id);
     for (size_t i = 0; i < a->m.roster_len; i++)
@@ -1797,16 +1543,15 @@ static void put_header(Buf *b, const Agent *a)
                s->phase2_timeout, s->phase3_timeout, s->finalize_gap);
     put_format(b, "\"max_block_bytes\":%" PRIu64 ",\"max_event_bytes\":%" PRIu64 ",\"vote_names_chain\":%s,"
                "\"changed_before_tally\":%s,\"phase1_tie\":\"%s\",\"phase2_tie\":\"%s\"}", s->max_block_bytes,
-               s->max_event_bytes, s->vote_names_chain ? "true" : "false", s->changed_before_tally ? "true" : "false",
+               s->max_event_bytes, truth(s->vote_names_chain), truth(s->changed_before_tally),
                s->phase1_tie_pop ? "pop" : "phase2", s->phase2_tie_block ? "block" : "oldest");
     put_format(b, ",\"clock\":{\"epoch_us\":%" PRIu64 ",\"speedup\":%.17g}}\n", a->m.epoch_us, a->m.speedup);
 }
 
-static void put_status(Buf *b, const Agent *a, double now, const char *trace_problem)
-{
+static void put_status(Buf *b, const Agent *a, double now, const char *trace_problem) {
     put_format(b, "{\"ok\":true,\"started\":%s,\"idle\":%s,\"reconcile_in_progress\":%s,\"chain\":%zu,\"deque\":%zu,"
-               "\"stack\":%zu,\"completed\":%zu,\"reconciles\":%" PRIu64, a->started ? "true" : "false",
-               is_idle(a) ? "true" : "false", a->reconciling ? "true" : "false", a->chain.len, a->deque.len,
+               "\"stack\":%zu,\"completed\":%zu,\"reconciles\":%" PRIu64, truth(a->started),
+               truth(is_idle(a)), truth(a->reconciling), a->chain.len, a->deque.len,
                a->stack.len, completed_len(a), a->reconciles);
     put_text(b, ",\"top_chain_hash\":\"");
     put_hex(b, a->top.b, 32);
@@ -1825,8 +1570,7 @@ static void put_status(Buf *b, const Agent *a, double now, const char *trace_pro
     put_byte(b, '}');
 }
 
-static void put_blocks(Buf *b, const char *name, const List *list, bool in_chain)
-{
+static void put_blocks(Buf *b, const char *name, const List *list, bool in_chain) {
     put_format(b, ",\"%s\":[", name);
     for (size_t i = 0; i < list->len; i++) {
         const Block *block = list->at[i];
@@ -1844,8 +1588,7 @@ static void put_blocks(Buf *b, const char *name, const List *list, bool in_chain
     put_byte(b, ']');
 }
 
-static void put_hashes(Buf *b, const Agent *a)          /* of `completed` */
-{
+static void put_hashes(Buf *b, const Agent *a) {        /* of `completed` */
     put_text(b, ",\"completed\":[");
     for (size_t i = 0; i < completed_len(a); i++) {
         put_text(b, i > 0 ? ",\"" : "\"");
@@ -1855,8 +1598,7 @@ static void put_hashes(Buf *b, const Agent *a)          /* of `completed` */
     put_byte(b, ']');
 }
 
-static void put_export(Buf *b, const Agent *a, uint64_t exported_at)
-{
+static void put_export(Buf *b, const Agent *a, uint64_t exported_at) {
     put_format(b, "{\"schema\":\"ucp-chain-export/1\",\"agent_id\":%u,\"exported_at_us\":%" PRIu64
                ",\"inception\":{\"block_data\":\"", a->m.agent_id, exported_at);
     put_base64(b, a->m.initial_data.data, a->m.initial_data.len);
@@ -1870,15 +1612,14 @@ static void put_export(Buf *b, const Agent *a, uint64_t exported_at)
     put_blocks(b, "reconcile_stack", &a->stack, false);
     put_text(b, ",\"current_block\":{\"event_data\":\"");
     put_base64(b, a->current, a->current_len);
-    put_format(b, "\"},\"reconcile_in_progress\":%s,\"idle\":%s", a->reconciling ? "true" : "false",
-               is_idle(a) ? "true" : "false");
+    put_format(b, "\"},\"reconcile_in_progress\":%s,\"idle\":%s", truth(a->reconciling),
+               truth(is_idle(a)));
     put_hashes(b, a);
     put_byte(b, '}');
 }
 
 /* The answer to a command that failed, or that this agent does not have. */
-static void put_error(Buf *b, bool unsupported, const char *error)
-{
+static void put_error(Buf *b, bool unsupported, const char *error) {
     put_format(b, "{\"ok\":false,%s\"error\":\"%s\"}", unsupported ? "\"unsupported\":true," : "", error);
 }
 
@@ -1889,15 +1630,13 @@ static void put_error(Buf *b, bool unsupported, const char *error)
 /* record    length u32 || changes (length bytes) || the first 8 bytes of H(changes)
    change    what u8, then: complete, stack-: block hash; chain+, deque+, stack+: length u16 || BD; others: nothing */
 
-static void put_store_header(Buf *b, const Agent *a)
-{
+static void put_store_header(Buf *b, const Agent *a) {
     put(b, "UCP store of ucp_agent.c, 1\n", 28);
     put_be(b, a->m.agent_id, 4);
     put(b, a->bh0.b, 32);
 }
 
-static bool store_replay(Agent *a, const uint8_t *at, const uint8_t *end)
-{
+static bool store_replay(Agent *a, const uint8_t *at, const uint8_t *end) {
     while (at < end) {
         enum change what = (enum change)*at++;
         Block *block = NULL;
@@ -1913,17 +1652,14 @@ static bool store_replay(Agent *a, const uint8_t *at, const uint8_t *end)
             continue;
         }
         if (what == CHAIN_POP) {
-            if (a->chain.len == 0)
-                return false;
+            if (a->chain.len == 0) return false;
             block = chain_pop(a);
         } else if (what == DEQUE_POP) {
-            if (a->deque.len == 0)
-                return false;
+            if (a->deque.len == 0) return false;
             block = list_take(&a->deque, 0);
         } else {
             Hash hash;
-            if ((what != COMPLETE && what != STACK_TAKE) || end - at < 32)
-                return false;
+            if ((what != COMPLETE && what != STACK_TAKE) || end - at < 32) return false;
             memcpy(hash.b, at, 32);
             at += 32;
             if (what == COMPLETE) {
@@ -1931,8 +1667,7 @@ static bool store_replay(Agent *a, const uint8_t *at, const uint8_t *end)
                 continue;
             }
             ptrdiff_t i = list_find(&a->stack, &hash);
-            if (i < 0)
-                return false;
+            if (i < 0) return false;
             block = list_take(&a->stack, (size_t)i);
         }
         free(block);
@@ -1940,12 +1675,10 @@ static bool store_replay(Agent *a, const uint8_t *at, const uint8_t *end)
     return true;
 }
 
-static size_t store_read(Agent *a, const uint8_t *bytes, size_t at, size_t n)   /* returns how much of it is good */
-{
+static size_t store_read(Agent *a, const uint8_t *bytes, size_t at, size_t n) {   /* returns how much of it is good */
     while (n - at >= 12) {
         size_t size = (size_t)read_be(bytes + at, 4);
-        if (n - at - 12 < size)
-            break;
+        if (n - at - 12 < size) break;
         Hash hash = H(bytes + at + 4, size);
         if (memcmp(hash.b, bytes + at + 4 + size, 8) != 0 || !store_replay(a, bytes + at + 4, bytes + at + 4 + size))
             break;
@@ -1954,19 +1687,16 @@ static size_t store_read(Agent *a, const uint8_t *bytes, size_t at, size_t n)   
     return at;
 }
 
-static bool write_all(int fd, const uint8_t *bytes, size_t n)
-{
+static bool write_all(int fd, const uint8_t *bytes, size_t n) {
     for (ssize_t written; n > 0; bytes += written, n -= (size_t)written)
         if ((written = write(fd, bytes, n)) < 0) {
-            if (errno != EINTR)
-                return false;
+            if (errno != EINTR) return false;
             written = 0;
         }
     return true;
 }
 
-static bool read_file(const char *path, size_t limit, Buf *b)   /* at most a byte more than the limit */
-{
+static bool read_file(const char *path, size_t limit, Buf *b) {   /* at most a byte more than the limit */
     int fd = open(path, O_RDONLY | O_CLOEXEC);
     ssize_t n = fd < 0 ? -1 : 1;
     while (n > 0 && b->len <= limit)
@@ -1980,18 +1710,14 @@ static bool read_file(const char *path, size_t limit, Buf *b)   /* at most a byt
 }
 
 /* The file is there whole, or it is as it was before. */
-static bool replace_file(const char *path, const Buf *content)
-{
+static bool replace_file(const char *path, const Buf *content) {
     char new[4096];
-    if ((size_t)snprintf(new, sizeof new, "%s.new", path) >= sizeof new)
-        return errno = ENAMETOOLONG, false;
+    if ((size_t)snprintf(new, sizeof new, "%s.new", path) >= sizeof new) return errno = ENAMETOOLONG, false;
     int fd = open(new, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666);
-    if (fd < 0)
-        return false;
+    if (fd < 0) return false;
     bool good = write_all(fd, content->data, content->len) && fsync(fd) == 0;
     int error = errno;
-    if (close(fd) == 0 && good && rename(new, path) == 0)
-        return true;
+    if (close(fd) == 0 && good && rename(new, path) == 0) return true;
     errno = good ? errno : error;
     error = errno;
     unlink(new);
@@ -2023,44 +1749,30 @@ static volatile sig_atomic_t told_to_end;
 
 static void on_signal(int number) { told_to_end = number; }
 
-static double seconds(clockid_t clock)
-{
+static double seconds(clockid_t clock) {
     struct timespec time;
     clock_gettime(clock, &time);
     return (double)time.tv_sec + (double)time.tv_nsec / 1e9;
 }
 
-static double mission_now(const Station *s)             /* never goes back */
-{
+static double mission_now(const Station *s) {           /* never goes back */
     double now = (s->wall0 - (double)s->a->m.epoch_us / 1e6 + seconds(CLOCK_MONOTONIC) - s->mono0) * s->a->m.speedup;
     return now > s->a->now ? fmin(now, 1e15) : s->a->now;
 }
 
 /* --- Trace -------------------------------------------------------------------------------------------------------- */
 
-static bool trace_open(Station *s, const char *name)
-{
-    uint8_t chunk[65536];
-    struct stat stat;
+static bool trace_open(Station *s, const char *name) {
+    char last = '\0';
     s->trace = open(name, O_RDWR | O_CREAT | O_APPEND | O_CLOEXEC, 0666);
-    if (s->trace < 0 || fstat(s->trace, &stat) != 0)
-        return false;
-    off_t end = stat.st_size;                           /* half a line that an earlier life left is cut away */
-    for (bool found = end == 0; !found;) {
-        off_t from = end > (off_t)sizeof chunk ? end - (off_t)sizeof chunk : 0;
-        ssize_t n = pread(s->trace, chunk, (size_t)(end - from), from);
-        if (n != end - from)
-            return false;
-        const uint8_t *last = memrchr(chunk, '\n', (size_t)n);
-        end = last != NULL ? from + (last - chunk) + 1 : from;
-        found = last != NULL || from == 0;
-    }
-    s->trace_end = end;
-    return end == stat.st_size || ftruncate(s->trace, end) == 0;
+    s->trace_end = s->trace < 0 ? -1 : lseek(s->trace, 0, SEEK_END);
+    off_t end = s->trace_end;                           /* half a line that an earlier life left is cut away */
+    while (s->trace_end > 0 && pread(s->trace, &last, 1, s->trace_end - 1) == 1 && last != '\n')
+        s->trace_end--;
+    return end >= 0 && (end == s->trace_end || ftruncate(s->trace, s->trace_end) == 0);
 }
 
-static void trace_write(Station *s)   /* each line in one write; a full disk ends it at a whole line */
-{
+static void trace_write(Station *s) { /* each line in one write; a full disk ends it at a whole line */
     Buf *lines = &s->a->lines;
     for (size_t at = 0; at < lines->len && s->trace >= 0;) {
         const uint8_t *line = lines->data + at;
@@ -2083,8 +1795,7 @@ static void trace_write(Station *s)   /* each line in one write; a full disk end
 
 /* --- Store -------------------------------------------------------------------------------------------------------- */
 
-static void sync_folder(const char *path)               /* so that a file that was renamed is found after a brown-out */
-{
+static void sync_folder(const char *path) {             /* so that a file that was renamed is found after a brown-out */
     char folder[4096];
     const char *slash = strrchr(path, '/');
     snprintf(folder, sizeof folder, "%.*s", slash != NULL ? (int)(slash - path + 1) : 1, slash != NULL ? path : ".");
@@ -2095,8 +1806,7 @@ static void sync_folder(const char *path)               /* so that a file that w
     }
 }
 
-static bool store_open(Station *s)                      /* reads what is there, or begins a new one */
-{
+static bool store_open(Station *s) {                    /* reads what is there, or begins a new one */
     Agent *a = s->a;
     Buf file = {0}, header = {0};
     bool good = true;
@@ -2130,11 +1840,9 @@ static bool store_open(Station *s)                      /* reads what is there, 
     return good;
 }
 
-static void store_write(Station *s)
-{
+static void store_write(Station *s) {
     Agent *a = s->a;
-    if (a->journal.len == 0)
-        return;
+    if (a->journal.len == 0) return;
     Hash hash = H(a->journal.data, a->journal.len);
     s->bytes.len = 0;
     put_be(&s->bytes, a->journal.len, 4);
@@ -2155,8 +1863,7 @@ static void store_write(Station *s)
 
 /* --- What follows an input: store, trace, messages, in this order. ------------------------------------------------ */
 
-static void settle(Station *s)
-{
+static void settle(Station *s) {
     Agent *a = s->a;
     struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons(a->m.port), .sin_addr = a->m.broadcast};
     store_write(s);
@@ -2172,8 +1879,7 @@ static void settle(Station *s)
     a->out.len = 0;
 }
 
-static void begin_mission(Station *s, uint64_t epoch_us)
-{
+static void begin_mission(Station *s, uint64_t epoch_us) {
     Agent *a = s->a;
     a->m.epoch_us = epoch_us;
     s->wall0 = seconds(CLOCK_REALTIME);
@@ -2194,8 +1900,7 @@ static void begin_mission(Station *s, uint64_t epoch_us)
 
 /* --- Events: Algorithm 21 ----------------------------------------------------------------------------------------- */
 
-static uint64_t draw(Station *s)                        /* SplitMix64 */
-{
+static uint64_t draw(Station *s) {                      /* SplitMix64 */
     uint64_t z = s->random += 0x9e3779b97f4a7c15u;
     z = (z ^ z >> 30) * 0xbf58476d1ce4e5b9u;
     z = (z ^ z >> 27) * 0x94d049bb133111ebu;
@@ -2204,21 +1909,18 @@ static uint64_t draw(Station *s)                        /* SplitMix64 */
 
 static double draw_part(Station *s) { return (double)(draw(s) >> 11) * 0x1p-53; }      /* of 0..1 */
 
-static void random_events(Station *s, double now)       /* the seconds that have come since it was here last */
-{
+static void random_events(Station *s, double now) {     /* the seconds that have come since it was here last */
     Agent *a = s->a;
     if (now - s->next_second > 1000)                    /* it was stopped for long: nothing happened meanwhile */
         s->next_second = now;
     while (s->next_second <= now) {
         s->next_second += 1;
-        if (draw_part(s) >= 1 / fmax(1, a->m.mean_s))
-            continue;
+        if (draw_part(s) >= 1 / fmax(1, a->m.mean_s)) continue;
         uint8_t data[256], event_id = (uint8_t)(1 + draw(s) % 254);
         size_t n = (size_t)32 << (draw(s) >> 62);
         for (size_t i = 0; i < n; i += 8)
             write_be(data + i, draw(s), 8);
-        if (a->no_events)
-            continue;
+        if (a->no_events) continue;
         if (event_fits(a, n)) {
             take_event(a, now, event_id, timestamp_at(a, now), data, n);
             settle(s);
@@ -2228,10 +1930,8 @@ static void random_events(Station *s, double now)       /* the seconds that have
     }
 }
 
-static void tick(Station *s)                            /* all that time alone brings */
-{
-    if (!s->a->started)
-        return;
+static void tick(Station *s) {                          /* all that time alone brings */
+    if (!s->a->started) return;
     double now = mission_now(s);
     if (next_deadline(s->a) <= now) {
         take_timers(s->a, now);
@@ -2243,20 +1943,17 @@ static void tick(Station *s)                            /* all that time alone b
 
 /* --- Control socket ----------------------------------------------------------------------------------------------- */
 
-static bool export_chain(Station *s)
-{
+static bool export_chain(Station *s) {
     Agent *a = s->a;
     s->bytes.len = 0;
     put_export(&s->bytes, a, a->started ? timestamp_at(a, mission_now(s)) : 0);
     put_byte(&s->bytes, '\n');
-    if (replace_file(s->export_name, &s->bytes))
-        return true;
+    if (replace_file(s->export_name, &s->bytes)) return true;
     fprintf(stderr, "The chain export cannot be written: %s.\n", strerror(errno));
     return false;
 }
 
-static void answer(Station *s, uint32_t request, Buf *b)
-{
+static void answer(Station *s, uint32_t request, Buf *b) {
     static const char ok[] = "{\"ok\":true}";
     Agent *a = s->a;
     Json *j = &s->json;
@@ -2318,8 +2015,7 @@ static void answer(Station *s, uint32_t request, Buf *b)
     }
 }
 
-static void client_close(Station *s, int i)
-{
+static void client_close(Station *s, int i) {
     close(s->client[i].fd);
     free(s->client[i].in.data);
     free(s->client[i].out.data);
@@ -2328,8 +2024,7 @@ static void client_close(Station *s, int i)
 
 /* Take the requests that are there, give the answers that go; false: the connection is over. A client that does not
    take its answers is not read from meanwhile. */
-static bool client_serve(Station *s, Client *c)
-{
+static bool client_serve(Station *s, Client *c) {
     for (;;) {
         bool idle = true;
         if (!c->ended && c->in.len <= MAX_REQUEST) {
@@ -2348,8 +2043,7 @@ static bool client_serve(Station *s, Client *c)
         while (c->out.len - c->given < (1 << 20) && at < c->in.len
                && (end = memchr(line + at, '\n', c->in.len - at)) != NULL) {
             size_t n = (size_t)(end - line) - at;
-            if (n > MAX_REQUEST)
-                return false;
+            if (n > MAX_REQUEST) return false;
             c->in.data[at + n] = '\0';
             if (json_parse(&s->json, line + at, n) && kind(&s->json, ROOT) == '{')
                 answer(s, ROOT, &c->out);
@@ -2363,23 +2057,19 @@ static bool client_serve(Station *s, Client *c)
             buf_drop(&c->in, at);
         while (c->given < c->out.len) {
             ssize_t n = send(c->fd, c->out.data + c->given, c->out.len - c->given, MSG_NOSIGNAL);
-            if (n < 0 && (errno == EAGAIN || errno == EWOULDBLOCK || errno == EINTR))
-                return true;
-            if (n < 0)
-                return false;
+            if (n < 0 && (errno == EAGAIN || errno == EWOULDBLOCK || errno == EINTR)) return true;
+            if (n < 0) return false;
             c->given += (size_t)n;
         }
         c->given = c->out.len = 0;
         if (c->in.len > MAX_REQUEST && memchr(c->in.data, '\n', c->in.len) == NULL)
             return false;                               /* too long a request */
-        if (idle)
-            return !c->ended;
+        if (idle) return !c->ended;
         tick(s);
     }
 }
 
-static bool control_open(Station *s)
-{
+static bool control_open(Station *s) {
     struct sockaddr_un name = {.sun_family = AF_UNIX};
     snprintf(name.sun_path, sizeof name.sun_path, "%s.new", s->control_name);
     unlink(name.sun_path);
@@ -2388,28 +2078,24 @@ static bool control_open(Station *s)
         && listen(s->listener, 64) == 0 && rename(name.sun_path, s->control_name) == 0;
 }
 
-static bool udp_open(Station *s)
-{
+static bool udp_open(Station *s) {
     int yes = 1, room = 4 << 20;
     struct sockaddr_in name = {.sin_family = AF_INET, .sin_port = htons(s->a->m.port)};
     s->udp = socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
-    if (s->udp < 0)
-        return false;
+    if (s->udp < 0) return false;
     setsockopt(s->udp, SOL_SOCKET, SO_RCVBUF, &room, sizeof room);     /* as much as is allowed */
     setsockopt(s->udp, SOL_SOCKET, SO_SNDBUF, &room, sizeof room);
     return setsockopt(s->udp, SOL_SOCKET, SO_BROADCAST, &yes, sizeof yes) == 0
         && bind(s->udp, (struct sockaddr *)&name, sizeof name) == 0;
 }
 
-static void udp_receive(Station *s)                     /* some of what is there: timers and commands have their turn */
-{
+static void udp_receive(Station *s) {                   /* some of what is there: timers and commands have their turn */
     static uint8_t datagram[65536];
     for (int i = 0; i < 64; i++) {
         struct sockaddr_in from = {0};
         socklen_t size = sizeof from;
         ssize_t n = recvfrom(s->udp, datagram, sizeof datagram, 0, (struct sockaddr *)&from, &size);
-        if (n < 0)
-            return;
+        if (n < 0) return;
         if (!s->a->started || from.sin_addr.s_addr == s->a->m.address.s_addr)
             continue;                                   /* not yet; its own echo */
         take_datagram(s->a, mission_now(s), datagram, (size_t)n);
@@ -2418,8 +2104,7 @@ static void udp_receive(Station *s)                     /* some of what is there
     }
 }
 
-static struct timespec time_to_wait(const Station *s)   /* until the next timer or event, at most a minute */
-{
+static struct timespec time_to_wait(const Station *s) {   /* until the next timer or event, at most a minute */
     double wait = 60;
     if (s->a->started) {
         double at = fmin(next_deadline(s->a), s->next_second);
@@ -2429,8 +2114,7 @@ static struct timespec time_to_wait(const Station *s)   /* until the next timer 
     return (struct timespec){(time_t)wait + ns / 1000000000, ns % 1000000000};
 }
 
-static void station_run(Station *s, const sigset_t *unblocked)  /* until SIGTERM or SIGINT */
-{
+static void station_run(Station *s, const sigset_t *unblocked) {   /* until SIGTERM or SIGINT */
     struct pollfd polled[2 + MAX_CLIENTS];
     while (!told_to_end) {
         tick(s);
@@ -2453,8 +2137,7 @@ static void station_run(Station *s, const sigset_t *unblocked)  /* until SIGTERM
     }
 }
 
-static int play_over_udp(Agent *a, const char *mission_file)
-{
+static int play_over_udp(Agent *a, const char *mission_file) {
     static Station station = {.udp = -1, .listener = -1, .trace = -1, .store = -1};
     Station *s = &station;
     Fault fault;
@@ -2490,8 +2173,7 @@ static int play_over_udp(Agent *a, const char *mission_file)
     snprintf(s->export_name, sizeof s->export_name, "%u.chain.json", a->m.agent_id);
     snprintf(s->control_name, sizeof s->control_name, "%u.control", a->m.agent_id);
     snprintf(trace_name, sizeof trace_name, "%u.trace.jsonl", a->m.agent_id);
-    if (a->m.store != NULL && !store_open(s))
-        return STATUS_WRONG;
+    if (a->m.store != NULL && !store_open(s)) return STATUS_WRONG;
     const char *missing = !trace_open(s, trace_name) ? "trace" : !udp_open(s) ? "UDP port"
                         : !control_open(s) ? "control socket" : NULL;
     if (missing != NULL) {
@@ -2517,15 +2199,13 @@ static int play_over_udp(Agent *a, const char *mission_file)
 
 typedef struct { Agent *a; Json json; Buf bytes, out; } Virtual;
 
-static bool virtual_error(Virtual *v, const char *error, bool unsupported)
-{
+static bool virtual_error(Virtual *v, const char *error, bool unsupported) {
     put_format(&v->out, "{\"error\":\"%s\"%s}", error, unsupported ? ",\"unsupported\":true" : "");
     return false;
 }
 
 /* The store's value: what is found after a brown-out, as blocks in base64 and hashes in hex. */
-static void put_store(Buf *b, const Agent *a)
-{
+static void put_store(Buf *b, const Agent *a) {
     const List *lists[] = {&a->chain, &a->deque, &a->stack};
     const char *const names[] = {"chain", "deque", "stack"};
     put_format(b, "{\"agent_id\":%u,\"inception\":\"", a->m.agent_id);
@@ -2544,24 +2224,19 @@ static void put_store(Buf *b, const Agent *a)
     put_byte(b, '}');
 }
 
-static bool json_hash(Json *j, uint32_t i, Hash *hash)
-{
+static bool json_hash(Json *j, uint32_t i, Hash *hash) {
     size_t n;
-    if (kind(j, i) != '"')
-        return false;
+    if (kind(j, i) != '"') return false;
     const char *text = json_text(j, i, &n);
-    if (n != 64)
-        return false;
+    if (n != 64) return false;
     for (size_t k = 0; k < 64; k++)
-        if (hex_digit(text[k]) < 0)
-            return false;
+        if (hex_digit(text[k]) < 0) return false;
     for (size_t k = 0; k < 32; k++)
         hash->b[k] = (uint8_t)(hex_digit(text[2 * k]) << 4 | hex_digit(text[2 * k + 1]));
     return true;
 }
 
-static bool virtual_store(Virtual *v, uint32_t value)   /* into an agent that is new */
-{
+static bool virtual_store(Virtual *v, uint32_t value) {   /* into an agent that is new */
     static const char *const names[] = {"chain", "deque", "stack"};
     Agent *a = v->a;
     Json *j = &v->json;
@@ -2572,16 +2247,13 @@ static bool virtual_store(Virtual *v, uint32_t value)   /* into an agent that is
         || !json_hash(j, member(j, value, "inception"), &hash) || !same(&hash, &a->bh0))
         return false;
     for (uint32_t i = list + 1; i < j->node[list].end; i = j->node[i].end) {
-        if (!json_hash(j, i, &hash))
-            return false;
+        if (!json_hash(j, i, &hash)) return false;
         put(&a->completed, hash.b, 32);
     }
     for (int k = 0; k < 3; k++) {
-        if (kind(j, list = member(j, value, names[k])) != '[')
-            return false;
+        if (kind(j, list = member(j, value, names[k])) != '[') return false;
         for (uint32_t i = list + 1; i < j->node[list].end; i = j->node[i].end) {
-            if (!json_bytes(j, i, &v->bytes) || !block_well_formed(v->bytes.data, v->bytes.len))
-                return false;
+            if (!json_bytes(j, i, &v->bytes) || !block_well_formed(v->bytes.data, v->bytes.len)) return false;
             Block *block = block_new(v->bytes.data, v->bytes.len);
             if (k == 0)
                 chain_push(a, block);
@@ -2593,15 +2265,13 @@ static bool virtual_store(Virtual *v, uint32_t value)   /* into an agent that is
     return true;
 }
 
-static bool virtual_mission(Virtual *v, double t, uint32_t mission)
-{
+static bool virtual_mission(Virtual *v, double t, uint32_t mission) {
     Agent *a = v->a;
     Json *j = &v->json;
     Fault fault;
     uint32_t trace = member(j, ROOT, "trace"), store = member(j, ROOT, "store");
     a->started = false;                                 /* whatever comes of it, the agent that was is gone */
-    if (!mission_read(&a->m, j, mission, &fault))
-        return virtual_error(v, fault.text, fault.status == STATUS_LACKS);
+    if (!mission_read(&a->m, j, mission, &fault)) return virtual_error(v, fault.text, fault.status == STATUS_LACKS);
     if (!a->m.has_epoch || a->m.speedup != 1 || a->m.random_events || a->m.store != NULL
         || (trace != 0 && kind(j, trace) != 't' && kind(j, trace) != 'f'))
         return virtual_error(v, "This is no mission in virtual time.", false);
@@ -2617,8 +2287,7 @@ static bool virtual_mission(Virtual *v, double t, uint32_t mission)
 }
 
 /* Returns false for a command that is answered before it is a command: none. Puts the answer behind the output. */
-static void virtual_command(Virtual *v, double t, uint32_t command, Buf *b)
-{
+static void virtual_command(Virtual *v, double t, uint32_t command, Buf *b) {
     Agent *a = v->a;
     Json *j = &v->json;
     begin_input(a, t);
@@ -2644,8 +2313,7 @@ static void virtual_command(Virtual *v, double t, uint32_t command, Buf *b)
 }
 
 /* One input; false: the output is an error. */
-static bool virtual_input(Virtual *v, const char *line, size_t n)
-{
+static bool virtual_input(Virtual *v, const char *line, size_t n) {
     Agent *a = v->a;
     Json *j = &v->json;
     double t;
@@ -2659,13 +2327,10 @@ static bool virtual_input(Virtual *v, const char *line, size_t n)
         v->bytes.len = 0;
         return good;
     }
-    if (!a->started)
-        return virtual_error(v, "There is no mission yet.", false);
-    if (t < a->now)
-        return virtual_error(v, "Time never goes back.", false);
+    if (!a->started) return virtual_error(v, "There is no mission yet.", false);
+    if (t < a->now) return virtual_error(v, "Time never goes back.", false);
     if ((at = member(j, ROOT, "datagram")) != 0) {
-        if (!json_bytes(j, at, &v->bytes))
-            return virtual_error(v, "The datagram is no base64.", false);
+        if (!json_bytes(j, at, &v->bytes)) return virtual_error(v, "The datagram is no base64.", false);
         take_datagram(a, t, v->bytes.data, v->bytes.len);
         v->bytes.len = 0;
     } else if (kind(j, member(j, ROOT, "timer")) == 't') {
@@ -2685,8 +2350,7 @@ static bool virtual_input(Virtual *v, const char *line, size_t n)
     return true;
 }
 
-static void virtual_output(Virtual *v)                  /* what the input did, and the answer if it was a command */
-{
+static void virtual_output(Virtual *v) {                /* what the input did, and the answer if it was a command */
     Agent *a = v->a;
     Buf *out = &v->out;
     double timer = next_deadline(a);
@@ -2719,8 +2383,7 @@ static void virtual_output(Virtual *v)                  /* what the input did, a
     a->out.len = a->lines.len = 0;
 }
 
-static int play_in_virtual_time(Agent *a)
-{
+static int play_in_virtual_time(Agent *a) {
     static Virtual virtual;
     Virtual *v = &virtual;
     Buf in = {0};
@@ -2728,10 +2391,8 @@ static int play_in_virtual_time(Agent *a)
     v->a = a;
     for (;;) {
         ssize_t n = read(STDIN_FILENO, buf_room(&in, 1 << 16), 1 << 16);
-        if (n < 0 && errno == EINTR)
-            continue;
-        if (n <= 0)
-            break;
+        if (n < 0 && errno == EINTR) continue;
+        if (n <= 0) break;
         size_t from = in.len, at = 0;
         in.len += (size_t)n;
         for (uint8_t *end; (end = memchr(in.data + from, '\n', in.len - from)) != NULL; from = at) {
@@ -2763,20 +2424,18 @@ static int play_in_virtual_time(Agent *a)
 
 /* ================================================================================================================ */
 
-static void agent_free(Agent *a)
-{
+static void agent_free(Agent *a) {
     list_clear(&a->chain);
     list_clear(&a->deque);
     list_clear(&a->stack);
     void *const all[] = {a->chain.at, a->deque.at, a->stack.at, a->completed.data, a->candidates, a->out.data,
-                         a->lines.data, a->journal.data, a->changes.data, a->sent.data, a->m.roster,
+                         a->lines.data, a->journal.data, a->body.data, a->changes.data, a->sent.data, a->m.roster,
                          a->m.initial_data.data, a->m.store};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++)
         free(all[i]);
 }
 
-int main(int argc, char **argv)
-{
+int main(int argc, char **argv) {
     static Agent agent;
     if (argc != 2) {
         fprintf(stderr, "usage: %s MISSION_FILE | --virtual\n", argv[0]);
