@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from harness.archive.traces import Gap, read_trace
+from harness.archive.traces import MAX_LINE_BYTES, Gap, read_trace
 from harness.errors import FieldError
 from harness.field.homecoming import Homecoming, sort_out
 from tests.harness.field.flights import flown, trace_of
@@ -95,7 +95,9 @@ def test_a_loss_of_power_leaves_nul_at_the_end_or_before_the_next_life(home: Pat
     path.write_bytes(content + b"\0" * 5000)
     trace = sort_out([home]).largest().traces[3]
     assert len(trace.runs) == len(lines) - 1 and trace.cut_off
-    path.write_bytes(b"".join(lines[:10]) + lines[10][:30] + b"\0" * 3_000_000 + b"".join([lines[0], *lines[1:20]]))
+    path.write_bytes(
+        b"".join(lines[:10]) + lines[10][:30] + b"\0" * 2 * MAX_LINE_BYTES + b"".join([lines[0], *lines[1:20]])
+    )
     homecoming = sort_out([trace_of(home, 3)])
     assert "NUL" in why(homecoming)
     assert len(homecoming.largest().traces[3].runs) == 19, "the life that was begun anew has the first in it"

@@ -168,7 +168,7 @@ def test_what_a_record_has_for_words_does_nothing_to_a_terminal(home: Path) -> N
     change(home / "2.trace.jsonl", swear)
     commands = "goto 21\ns\ncompare\nl\no\n"
     ended = harness("replay", home, "--agent", 2, "--step", input=commands)
-    assert ended.returncode == 1
+    assert ended.returncode == 0, "what nobody understands is no accusation"
     assert "[bold]" in ended.stdout
     assert not any(character in ended.stdout + ended.stderr for character in "\x1b\x07")
 
