@@ -77,6 +77,10 @@ COMMANDS = {
         "harness.commands.again:app",
         "Play a scenario or record once more: exit status 0 as it was, 1 changed, 125 cannot be tried, 128 stop.",
     ),
+    "conformance": (
+        "harness.commands.conformance:conformance_command",
+        "Test one agent alone, its peers played by the harness: thousands of generated cases, over UDP.",
+    ),
     "matrix": (
         "harness.commands.matrix:matrix_command",
         "Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated.",

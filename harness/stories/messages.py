@@ -3,7 +3,7 @@
 import base64
 import binascii
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from harness.stories.names import Names
 from ucp.messages import (
@@ -22,12 +22,23 @@ from ucp.messages import (
 )
 from ucp.trace import Sent
 
+
+class Naming(Protocol):
+    """What knows how blocks and chains are called."""
+
+    def block(self, block_hash: str) -> str: ...
+
+    def chain(self, chain_hash: bytes) -> str: ...
+
+    def chain_below(self, chain_hash: bytes) -> str: ...
+
+
 ANSWERS = frozenset(
     message.NAME for message in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse, BlockResponse)
 )
 """They are for whoever asked."""
 
-_SAYS: dict[type[Message], Callable[[Any, Names], str]] = {
+_SAYS: dict[type[Message], Callable[[Any, Naming], str]] = {
     BlockAddRequest: lambda message, names: (
         f"{names.block(message.block_hash.hex())} on {names.chain(message.chain_hash)}"
     ),
@@ -59,4 +70,9 @@ def told(sent: Sent, names: Names) -> str:
         message = decode(base64.b64decode(sent.datagram.text, validate=True)).message
     except (MalformedDatagramError, binascii.Error):
         return f"{sent.message} (not well-formed)"
+    return in_words(message, names)
+
+
+def in_words(message: Message, names: Naming) -> str:
+    """ "Chain Contain Query (1.1 2.1)"."""
     return f"{message.NAME} ({_SAYS[type(message)](message, names)})"

@@ -1,0 +1,74 @@
+"""`ucp-harness conformance`: does an agent do what Algorithms 1-20 say, alone, with its peers played?"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from harness.commands.new_file import refuse_existing, write_new
+from harness.commands.terminal import complain, print_json
+from harness.conformance.file import to_lines
+from harness.conformance.progress import progress
+from harness.conformance.results import TITLES
+from harness.conformance.run import Asked, conform
+from harness.conformance.table import render, summary, to_junit
+from harness.conformance.vectors import generate
+from harness.errors import HarnessError
+from harness.run.sweep import terminated_is_interrupted
+from ucp.agent import HANDLERS
+
+
+class ConformanceRequestError(HarnessError):
+    """What was asked for is not there."""
+
+
+def conformance_command(
+    command: Annotated[
+        list[str] | None, typer.Argument(metavar="-- COMMAND...", help="The agent, as ucp/CONTRACT.md starts it.")
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option(metavar="ALG", help="One Algorithm: 13, or receive_request_next_in_sequence.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The results, as JSON on standard output.")] = False,
+    junit: Annotated[Path | None, typer.Option(metavar="FILE", help="The results as JUnit XML; must be new.")] = None,
+    keep: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where failures are put, with vector and capture; must be new."),
+    ] = None,
+    write: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Only write the generated vectors, as JSON lines; must be new.")
+    ] = None,
+) -> None:
+    """Test one agent alone, its peers played by the harness: thousands of generated cases, over UDP."""
+    refuse_existing(path for path in (junit, keep, write) if path is not None)
+    if only is not None and only not in HANDLERS and only not in map(str, TITLES):
+        raise ConformanceRequestError(f"--only {only[:60]}: there are Algorithms 1 to 20, by number or by handler")
+    if write is not None:
+        write_new(write, to_lines(generate(only)))
+        return
+    if not command:
+        raise ConformanceRequestError("which agent? `ucp-harness conformance -- python3 -m ucp.node` tests ours")
+    console = Console(stderr=as_json, highlight=False)
+    place = keep or Path("conformance-failures")
+    with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
+        results = conform(Asked(tuple(command), only, _fresh(place)), Path(scratch), told)
+    if junit is not None:
+        write_new(junit, [to_junit(results)])
+    if as_json:
+        print_json(results.to_json())
+    else:
+        console.print(render(results), soft_wrap=True)
+    if results.interrupted:
+        complain(f"interrupted; until then {summary(results)}")
+    raise typer.Exit(results.exit_status)
+
+
+def _fresh(place: Path) -> Path:
+    """Beside what an earlier run has left."""
+    number, fresh = 1, place
+    while fresh.exists():
+        number += 1
+        fresh = place.with_name(f"{place.name}-{number}")
+    return fresh

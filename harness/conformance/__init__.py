@@ -1,0 +1,11 @@
+"""Conformance: one agent under test, whose peers the harness plays. Does it do what Algorithms 1-20 say?
+
+model.py      the reference beside the agent: what must come of an input, and in which state that leaves it
+alphabet.py   the inputs that there are in a state: each message in the variants that matter, events, timers, commands
+states.py     states as far as they differ to an agent, and the walk over all of them, breadth first
+vectors.py    the generated vectors, and the file of them that others use without this harness
+tours.py      one agent led through as many vectors as it takes, by the shortest ways
+subject.py    the agent: what it is given, and what is seen of it; over UDP (air.py) or in virtual time (virtual.py)
+blame.py      which branch explains all failures
+cases/        what no state explains, written by hand: malformed datagrams, floods, reboots, wrong missions
+"""

@@ -1,0 +1,82 @@
+"""Which handler is wrong, as far as that can be told from outside.
+
+A failure shows at an input, of which several handlers come to run, one after the other, and the wrong one may have run
+before. What is missing or too much, which branches pass elsewhere, and when it fails tell them apart.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from harness.conformance.model import Run
+from harness.conformance.suite import Failure, Tally
+from ucp.agent import HANDLERS
+
+Branch = tuple[str, str]
+"""Handler and branch."""
+
+STARTS = {timer: handler.name for handler in HANDLERS.values() for timer in handler.starts}
+ENDS = {
+    "vote_timer_expiration": "process_next_deque_block",
+    "reconcile_phase_1_timer_expiration": "reconcile_phase_1",
+    "reconcile_phase_2_timer_expiration": "reconcile_phase_2",
+    "reconcile_phase_3_timer_expiration": "reconcile_phase_3",
+}
+"""What runs when a timer has ended -> what began the count that it decides by."""
+
+
+@dataclass(frozen=True)
+class Blamed:
+    """`branch` is that which the reference takes there."""
+
+    handler: str
+    branch: str
+
+    @property
+    def algorithm(self) -> int:
+        return HANDLERS[self.handler].algorithm
+
+    @property
+    def title(self) -> str:
+        return HANDLERS[self.handler].title
+
+
+class Evidence:
+    """How often each branch was in a vector that passed."""
+
+    def __init__(self, tallies: Iterable[Tally]) -> None:
+        self._passed: Counter[Branch] = Counter()
+        for tally in tallies:
+            for pair in tally.passed:
+                step = tally.vectors.by_pair.get(pair)
+                if step is not None:
+                    self._passed.update({(run.handler, run.branch) for run in step.outcome.runs})
+
+    def blame(self, failure: Failure) -> Blamed:
+        hidden, runs = failure.seen.hidden, failure.seen.outcome.runs
+        if hidden is not None:
+            return Blamed(hidden.handler, hidden.branch)
+        early = next((words for words in failure.seen.wrong if "before its timer" in words), None)
+        if early is not None:
+            timer = early.split("before its timer ")[1].removesuffix(" ends")
+            return Blamed(STARTS[timer], "")
+        if failure.of_an_earlier_round and runs[0].handler in ENDS:
+            return Blamed(ENDS[runs[0].handler], "")
+        run = self._suspect(runs, failure)
+        return Blamed(run.handler, run.branch)
+
+    def _suspect(self, runs: Sequence[Run], failure: Failure) -> Run:
+        """Who should have sent what is missing, or sends what is too much; of these, whose branch passes least."""
+        seen = failure.seen
+        if len(runs) == 1:
+            return runs[0]
+        never = [run for run in runs if not self._passed[run.handler, run.branch]]
+        if never:
+            return never[0]
+        missing = [run for run in runs if {message.NAME for message in run.sent} & set(seen.missing)]
+        if missing:
+            return missing[0]
+        sends = [run for run in runs if {kind.NAME for kind in HANDLERS[run.handler].sends} & set(seen.unexpected)]
+        if sends:
+            return sends[0]
+        return min(runs, key=lambda run: self._passed[run.handler, run.branch])

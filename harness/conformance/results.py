@@ -1,0 +1,141 @@
+"""What came of it: cases passed, failed and not applicable, by Algorithm; each failure with what should have come."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from harness.conformance.subject import Exchange
+from harness.errors import INTERRUPTED, VIOLATED
+from ucp.agent import HANDLERS
+from ucp.trace import in_base64
+
+SCHEMA = "ucp-conformance/1"
+
+Verdict = Literal["passed", "failed", "not applicable", "not tried"]
+TITLES = {handler.algorithm: handler.title for handler in HANDLERS.values()}
+BESIDE = 0
+"""In the place of an Algorithm: what none of them is about."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case. `reason` is a sentence; `inputs` lead to where it failed, the last of which was answered wrongly."""
+
+    name: str
+    algorithm: int
+    verdict: Verdict
+    handler: str = ""
+    branch: str = ""
+    reason: str = ""
+    settings: str = ""
+    inputs: tuple[str, ...] = ()
+    expected: tuple[str, ...] = ()
+    came: tuple[str, ...] = ()
+    wrong: tuple[str, ...] = ()
+    exchanges: tuple[Exchange, ...] = ()
+    directory: str | None = None
+    section: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        words = {
+            "case": self.name,
+            "algorithm": self.algorithm or None,
+            "handler": self.handler or None,
+            "branch": self.branch or None,
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "section": self.section or None,
+        }
+        if self.verdict != "failed":
+            return words
+        return {
+            **words,
+            "settings": self.settings,
+            "inputs": list(self.inputs),
+            "expected": list(self.expected),
+            "came": list(self.came),
+            "wrong": list(self.wrong),
+            "exchanges": [
+                {
+                    "t": exchange.t,
+                    "from": "agent" if exchange.sent else "peers",
+                    "says": exchange.text,
+                    "datagram": in_base64(exchange.data),
+                }
+                for exchange in self.exchanges
+            ],
+            "directory": self.directory,
+        }
+
+
+@dataclass
+class Row:
+    """An Algorithm's counts."""
+
+    algorithm: int
+    passed: int = 0
+    failed: int = 0
+    not_applicable: int = 0
+    not_tried: int = 0
+
+    @property
+    def title(self) -> str:
+        return TITLES.get(self.algorithm, "The program, its datagrams and its files")
+
+    @property
+    def tried(self) -> int:
+        return self.passed + self.failed
+
+
+@dataclass
+class Results:
+    """`counted` are the generated vectors that passed or were not tried, which have no case of their own."""
+
+    command: Sequence[str]
+    wall_s: float
+    started_at: str
+    cases: list[Case] = field(default_factory=list)
+    counted: dict[int, Row] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    interrupted: bool = False
+
+    def rows(self) -> list[Row]:
+        rows = {number: Row(number) for number in (*sorted(TITLES), BESIDE)}
+        for number, counted in self.counted.items():
+            rows[number] = Row(number, counted.passed, counted.failed, counted.not_applicable, counted.not_tried)
+        for case in self.cases:
+            row, key = rows[case.algorithm], case.verdict.replace(" ", "_")
+            setattr(row, key, getattr(row, key) + 1)
+        return [row for row in rows.values() if row.tried or row.not_applicable or row.not_tried]
+
+    @property
+    def failures(self) -> list[Case]:
+        return [case for case in self.cases if case.verdict == "failed"]
+
+    @property
+    def exit_status(self) -> int:
+        if self.interrupted:
+            return INTERRUPTED
+        return VIOLATED if self.failures else 0
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "schema": SCHEMA,
+            "command": list(self.command),
+            "started_at": self.started_at,
+            "wall_s": round(self.wall_s, 1),
+            "interrupted": self.interrupted,
+            "algorithms": [
+                {
+                    "algorithm": row.algorithm or None,
+                    "title": row.title,
+                    "passed": row.passed,
+                    "failed": row.failed,
+                    "not_applicable": row.not_applicable,
+                    "not_tried": row.not_tried,
+                }
+                for row in self.rows()
+            ],
+            "cases": [case.to_json() for case in self.cases],
+            "notes": self.notes,
+        }

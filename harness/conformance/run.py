@@ -1,0 +1,111 @@
+"""A whole run over UDP: the vectors by tours, then what is suspected alone; and what is to be kept of each failure."""
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from harness.conformance.air import Air
+from harness.conformance.blame import Evidence
+from harness.conformance.keep import keep
+from harness.conformance.results import Case, Results, Row
+from harness.conformance.suite import FAILURES_OF_A_KIND, SIDE_BY_SIDE, Failure, Suite, Tally
+from harness.conformance.vectors import Vectors, generate
+
+LIMIT_S = 100.0
+"""Of the tours, in wall time; what has not been seen by then is not tried."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be tested: `only` names one Algorithm, `keep` is where failures are written to."""
+
+    command: tuple[str, ...]
+    only: str | None
+    keep: Path | None
+    limit_s: float = LIMIT_S
+
+
+def conform(asked: Asked, place: Path, told: Callable[[int, int], None]) -> Results:
+    """Raises MachineError, NoAgentError. `told` is called with how many vectors have passed, of how many."""
+    results = Results(asked.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
+    began = time.monotonic()
+    generated = generate(asked.only)
+    total = sum(len(vectors.wanted) for vectors in generated)
+    try:
+        asyncio.run(_run(asked, place, generated, lambda count: told(count, total), results))
+    except KeyboardInterrupt:
+        results.interrupted = True
+    results.wall_s = time.monotonic() - began
+    return results
+
+
+async def _run(
+    asked: Asked, place: Path, generated: Sequence[Vectors], told: Callable[[int], None], results: Results
+) -> None:
+    async with Air(place, asked.command, SIDE_BY_SIDE) as air:
+        suite = Suite(air, generated, told)
+        try:
+            await suite.run(time.monotonic() + asked.limit_s)
+        finally:
+            _conclude(suite.tallies, asked, results)
+
+
+def _conclude(tallies: Sequence[Tally], asked: Asked, results: Results) -> None:
+    evidence = Evidence(tallies)
+    for tally in tallies:
+        failed = {failure.seen.pair for failure in tally.failures}
+        for pair, step in tally.vectors.wanted.items():
+            algorithm = step.outcome.algorithm
+            row = results.counted.setdefault(algorithm, Row(algorithm))
+            if pair in tally.passed:
+                row.passed += 1
+            elif tally.unsupported is not None:
+                row.not_applicable += 1
+            elif pair not in failed:
+                row.not_tried += 1
+        if tally.unsupported is not None:
+            features = ", ".join(tally.vectors.variant.features) or "the base"
+            results.notes.append(f"not supported: {features}: {tally.unsupported}")
+        results.cases += [_case(failure, evidence) for failure in tally.failures]
+        if tally.set_aside:
+            results.notes.append(
+                f"{tally.set_aside} vectors were set aside: the branches that they take had failed "
+                f"{FAILURES_OF_A_KIND} times"
+            )
+    if asked.keep is not None:
+        results.cases = _kept(results.cases, asked.keep)
+
+
+def _case(failure: Failure, evidence: Evidence) -> Case:
+    blamed = evidence.blame(failure)
+    seen = failure.seen
+    return Case(
+        f"{seen.before.text}; {seen.given}",
+        blamed.algorithm,
+        "failed",
+        blamed.handler,
+        blamed.branch,
+        seen.wrong[0],
+        failure.variant,
+        failure.way,
+        seen.expected,
+        seen.came,
+        seen.wrong,
+        failure.exchanges,
+    )
+
+
+def _kept(cases: Sequence[Case], directory: Path) -> list[Case]:
+    """Each failure with its directory."""
+    numbered = []
+    for number, case in enumerate(cases, 1):
+        if case.verdict == "failed":
+            place = directory / f"{number:02d}-{case.handler or 'program'}"
+            keep(case, place)
+            numbered.append(replace(case, directory=str(place)))
+        else:
+            numbered.append(case)
+    return numbered

@@ -1,0 +1,251 @@
+"""All generated vectors, by agents side by side; then what is suspected, alone."""
+
+import asyncio
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from harness.conformance.air import AgentEndedError, Air, NoAgentError, UnsupportedError
+from harness.conformance.alphabet import INPUTS
+from harness.conformance.model import Model, Run
+from harness.conformance.states import COUNTING, Pair, Variant, advance, in_short, walk
+from harness.conformance.subject import ALONE, BESIDE_OTHERS, Exchange, OverUdp, Pace, Seen
+from harness.conformance.tours import Map, Suspicion, Tour
+from harness.conformance.vectors import Vectors
+
+SIDE_BY_SIDE = 24
+ALONE_AT_ONCE = 3
+"""What is suspected is tried again by so few agents that none is in another's way."""
+FAILURES_OF_A_KIND = 3
+"""After so many suspicions further vectors in which the same branches are to be taken are set aside."""
+MOST_SUSPICIONS_OF_A_KIND = 2
+MOST_SUSPICIONS = 24
+"""That are tried again."""
+MOST_HIDDEN = 16
+LONGEST_WAY = 80
+TIMES = 2
+"""A failure is one only if it comes so often."""
+STARTS_IN_VAIN = 3
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A vector that failed alone, each time that it was tried; `way` are all inputs, of which the last was wrong."""
+
+    variant: str
+    way: tuple[str, ...]
+    seen: Seen
+    exchanges: tuple[Exchange, ...]
+    """What crossed the air."""
+    of_an_earlier_round: bool = False
+    """It fails only after what was long over."""
+
+
+@dataclass
+class Tally:
+    """What came of a variant's vectors."""
+
+    vectors: Vectors
+    passed: set[Pair] = field(default_factory=set)
+    suspicions: list[Suspicion] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    unsupported: str | None = None
+    set_aside: int = 0
+
+
+class Suite:
+    """`told` is called with how many vectors have been seen, whenever that changes."""
+
+    def __init__(self, air: Air, generated: Sequence[Vectors], told: Callable[[int], None]) -> None:
+        self._air = air
+        self._told = told
+        self.tallies = [Tally(vectors) for vectors in generated if vectors.wanted]
+        self._maps = [
+            Map(tally.vectors.variant, list(tally.vectors.steps), set(tally.vectors.wanted)) for tally in self.tallies
+        ]
+        self._at_work: Counter[int] = Counter()
+        self._kinds: Counter[object] = Counter()
+        self._in_vain = 0
+
+    async def run(self, until: float) -> None:
+        """All vectors, until that second of the monotonic clock; then what is suspected.
+
+        Raises NoAgentError if the agent never starts.
+        """
+        workers = min(SIDE_BY_SIDE, 1 + sum(atlas.left for atlas in self._maps) // 10)
+        await _together([self._work(until) for _ in range(workers)])
+        once_more = [(tally, suspicion) for tally in self.tallies for suspicion in self._worth(tally)]
+        waiting = iter(once_more[:MOST_SUSPICIONS])
+        await _together([self._try_again(waiting) for _ in range(ALONE_AT_ONCE)])
+
+    async def _work(self, until: float) -> None:
+        port = self._air.take_port()
+        try:
+            while time.monotonic() < until and (number := self._most_left()) is not None:
+                self._at_work[number] += 1
+                try:
+                    await self._tour(number, port, until)
+                finally:
+                    self._at_work[number] -= 1
+        finally:
+            self._air.give_back(port)
+
+    def _most_left(self) -> int | None:
+        """The variant in which an agent finds most that is yet to be seen."""
+        shares = [
+            (atlas.left / (self._at_work[number] + 1), number)
+            for number, atlas in enumerate(self._maps)
+            if atlas.left > len(atlas.claimed)
+        ]
+        return max(shares, default=(0, None))[1]
+
+    async def _tour(self, number: int, port: int, until: float) -> None:
+        tally, atlas = self.tallies[number], self._maps[number]
+        if atlas.way_from(atlas.start) is None:
+            if not self._at_work[number] > 1:
+                atlas.give_up()
+            await asyncio.sleep(0.1)
+            return
+        try:
+            subject = await OverUdp.start(self._air, port, tally.vectors.variant, BESIDE_OTHERS)
+        except UnsupportedError as error:
+            tally.unsupported = str(error)
+            atlas.give_up()
+            return
+        except AgentEndedError as error:
+            self._in_vain += 1
+            if self._in_vain >= STARTS_IN_VAIN:
+                raise NoAgentError(f"the agent does not start: {error}") from None
+            return
+        self._in_vain = 0
+
+        def passed(pair: Pair) -> None:
+            tally.passed.add(pair)
+            self._told(sum(len(each.passed) for each in self.tallies))
+
+        try:
+            suspicion = await Tour(atlas, subject, passed).go_on(until)
+            if suspicion is not None:
+                self._suspect(number, suspicion)
+        finally:
+            await subject.close()
+            shutil.rmtree(subject.process.directory, ignore_errors=True)
+
+    def _suspect(self, number: int, suspicion: Suspicion) -> None:
+        tally, atlas = self.tallies[number], self._maps[number]
+        tally.suspicions.append(suspicion)
+        atlas.avoid(suspicion.seen.pair)
+        kind = in_short(suspicion.seen.outcome)
+        self._kinds[kind] += 1
+        if self._kinds[kind] >= FAILURES_OF_A_KIND:
+            alike = [pair for pair, step in tally.vectors.wanted.items() if in_short(step.outcome) == kind]
+            tally.set_aside += sum(atlas.take(pair) for pair in alike)
+
+    @staticmethod
+    def _worth(tally: Tally) -> Iterator[Suspicion]:
+        """A few of each kind, the shortest ways first."""
+        kinds: Counter[object] = Counter()
+        for suspicion in sorted(tally.suspicions, key=lambda suspicion: len(suspicion.way)):
+            kind = in_short(suspicion.seen.outcome)
+            kinds[kind] += 1
+            if kinds[kind] <= MOST_SUSPICIONS_OF_A_KIND:
+                yield suspicion
+
+    # Alone
+
+    async def _try_again(self, waiting: Iterator[tuple[Tally, Suspicion]]) -> None:
+        for tally, suspicion in waiting:
+            failure = await self._alone(tally, suspicion)
+            if failure is None:
+                tally.passed.add(suspicion.seen.pair)  # it was the machine
+            else:
+                tally.failures.append(failure)
+                tally.passed.discard(failure.seen.pair)
+
+    async def _alone(self, tally: Tally, suspicion: Suspicion) -> Failure | None:
+        """By the shortest way; after each input on the way that should have changed nothing; and at last as it was."""
+        variant = tally.vectors.variant
+        name = suspicion.way[-1]
+        step = tally.vectors.by_pair.get(suspicion.seen.pair)
+        if step is not None:
+            failure = await self._repeated(variant, (*step.way, name))
+            if failure is not None:
+                return failure
+            for hidden in list(dict.fromkeys(reversed(suspicion.way[:-1])))[:MOST_HIDDEN]:
+                run = _run_without_effect(variant, step.way, hidden)
+                if run is not None and run.handler in COUNTING:
+                    failure = await self._repeated(variant, (*step.way, hidden, name))
+                    if failure is not None:
+                        return replace(failure, seen=replace(failure.seen, hidden=run))
+        for way in _tails(variant, suspicion.way):
+            failure = await self._repeated(variant, way)
+            if failure is not None:
+                return replace(failure, of_an_earlier_round=True)
+        return None
+
+    async def _repeated(self, variant: Variant, way: Sequence[str]) -> Failure | None:
+        failure = None
+        for _ in range(TIMES):
+            failure = await self.play(variant, way)
+            if failure is None:
+                return None
+        return failure
+
+    async def play(self, variant: Variant, way: Sequence[str], pace: Pace = ALONE) -> Failure | None:
+        """An agent is given all these inputs: where it was wrong first, if it was not the machine that was late."""
+        port = self._air.take_port()
+        try:
+            subject = await OverUdp.start(self._air, port, variant, pace)
+            try:
+                for number, name in enumerate(way, 1):
+                    seen = await subject.step(INPUTS[name])
+                    if seen is not None and seen.wrong:
+                        return (
+                            None if seen.late else Failure(variant.name, tuple(way[:number]), seen, subject.exchanges())
+                        )
+            finally:
+                await subject.close()
+                shutil.rmtree(subject.process.directory, ignore_errors=True)
+        except (AgentEndedError, UnsupportedError):
+            return None
+        finally:
+            self._air.give_back(port)
+        return None
+
+
+def _run_without_effect(variant: Variant, way: tuple[str, ...], name: str) -> Run | None:
+    """What comes of an input after this way, if that is only one handler's run."""
+    model, now = walk(variant, way)
+    advanced = advance(model, INPUTS[name], now)
+    return advanced[0].runs[0] if advanced is not None and len(advanced[0].runs) == 1 else None
+
+
+def _tails(variant: Variant, way: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """The last inputs of a way, since the agent was idle, or since it was so before that; and all, if they are few."""
+    model, now = Model(variant.settings), 0.0
+    idle = [0]
+    for number, name in enumerate(way[:-1], 1):
+        advanced = advance(model, INPUTS[name], now)
+        if advanced is not None:
+            now = advanced[1]
+        if model.state.idle and not model.state.blocks_to_be_committed:
+            idle.append(number)
+    for place in (*idle[:-4:-1], 0):
+        if len(way) - place <= LONGEST_WAY:
+            yield way[place:]
+
+
+async def _together(work: Sequence[Coroutine[Any, Any, None]]) -> None:
+    """All of it; the first error ends all."""
+    try:
+        async with asyncio.TaskGroup() as group:
+            for each in work:
+                group.create_task(each)
+    except BaseExceptionGroup as errors:
+        error: BaseException = errors
+        while isinstance(error, BaseExceptionGroup):
+            error = error.exceptions[0]
+        raise error from None

@@ -1,0 +1,99 @@
+"""The results on the terminal, and as JUnit XML."""
+
+from collections.abc import Iterator
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from harness.conformance.results import Case, Results, Row
+from harness.present.junit import Case as JunitCase
+from harness.present.junit import to_xml
+
+EXCHANGES_SHOWN = 14
+FAILURES_SHOWN = 12
+WRONG_SHOWN = 6
+
+
+def render(results: Results) -> RenderableType:
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    table.add_column("Algorithm")
+    for head in ("passed", "failed", "not applicable", "not tried"):
+        table.add_column(head, justify="right")
+    for row in results.rows():
+        table.add_row(row.title, *_counts(row))
+    parts: list[RenderableType] = [table]
+    for case in results.failures[:FAILURES_SHOWN]:
+        parts += ["", *_failure(case)]
+    if len(results.failures) > FAILURES_SHOWN:
+        parts.append(Text(f"and {len(results.failures) - FAILURES_SHOWN} more, in --json", style="red"))
+    for case in results.cases:
+        if case.verdict == "not applicable":
+            parts.append(Text(f"not applicable: {case.name}: {case.reason}", style="yellow"))
+    parts += [Text(note, style="yellow") for note in results.notes]
+    parts.append(Text(summary(results), style="bold red" if results.failures else "bold green"))
+    return Group(*parts)
+
+
+def summary(results: Results) -> str:
+    rows = results.rows()
+    passed, failed = sum(row.passed for row in rows), sum(row.failed for row in rows)
+    words = f"{passed} passed, {failed} failed"
+    if not_applicable := sum(row.not_applicable for row in rows):
+        words += f", {not_applicable} not applicable"
+    if not_tried := sum(row.not_tried for row in rows):
+        words += f", {not_tried} not tried"
+    return f"{words}; {results.wall_s:.0f} s"
+
+
+def _counts(row: Row) -> list[Text]:
+    styled = ((row.passed, "green"), (row.failed, "bold red"), (row.not_applicable, "yellow"), (row.not_tried, ""))
+    return [Text(str(count), style=style) if count else Text("\u2013", style="dim") for count, style in styled]
+
+
+def headline(case: Case) -> str:
+    """ "Algorithm 4 Receive Vote Add Block, counted already: vote no of who has voted"."""
+    where = f"Algorithm {case.algorithm} {case.handler}" if case.algorithm else case.handler or "the program"
+    branch = f", branch {case.branch!r}" if case.branch else ""
+    settings = f" (settings: {case.settings})" if case.settings not in ("", "default") else ""
+    section = f" [{case.section}]" if case.section else ""
+    return f"{where}{branch}: {case.name}{settings}{section}"
+
+
+def lines_of(case: Case) -> Iterator[str]:
+    """All of a failure, for people."""
+    yield headline(case)
+    if case.inputs:
+        yield f"  after {'; '.join(case.inputs[:-1])}" if case.inputs[:-1] else "  from its start"
+        yield f"  given {case.inputs[-1]}"
+    yield f"  expected {'; '.join(case.expected) or 'nothing'}"
+    yield f"  came     {'; '.join(case.came) or 'nothing'}"
+    for sentence in case.wrong[:WRONG_SHOWN]:
+        yield f"  {sentence}"
+    for exchange in case.exchanges[-EXCHANGES_SHOWN:]:
+        yield f"  {exchange.t:10.3f} s  {'agent ' if exchange.sent else 'peers '} {exchange.text}"
+    if case.directory:
+        yield f"  look into {case.directory}"
+
+
+def _failure(case: Case) -> list[Text]:
+    first, *others = lines_of(case)
+    return [Text(f"✘ {first}", style="bold red"), *(Text(line) for line in others)]
+
+
+def to_junit(results: Results) -> str:
+    """A test case for each failure and each case by hand; one for each Algorithm's vectors that passed."""
+    return to_xml("conformance", "conformance", results.started_at, results.wall_s, _junit_cases(results))
+
+
+def _junit_cases(results: Results) -> Iterator[JunitCase]:
+    for number, row in sorted(results.counted.items()):
+        if row.passed:
+            yield JunitCase(f"Algorithm {row.title}: {row.passed} vectors" if number else f"{row.passed} vectors")
+        elif row.not_applicable or row.not_tried:
+            yield JunitCase(f"Algorithm {row.title}", skipped="not tried")
+    for case in results.cases:
+        if case.verdict == "failed":
+            yield JunitCase(headline(case), list(lines_of(case)))
+        else:
+            yield JunitCase(headline(case), skipped=None if case.verdict == "passed" else case.reason or case.verdict)

@@ -1,0 +1,43 @@
+"""The generated vectors: for each reachable pair of a state and an input the shortest way there, and what must come.
+
+Other settings make other agents. Of theirs only those count that differ from the agent with default settings.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from harness.conformance.model import Outcome
+from harness.conformance.states import VARIANTS, Pair, Step, Variant, explore, in_short
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """Of one variant of the settings: all steps, and those that count."""
+
+    variant: Variant
+    steps: Sequence[Step]
+    wanted: Mapping[Pair, Step]
+
+    @cached_property
+    def by_pair(self) -> dict[Pair, Step]:
+        return {step.pair: step for step in self.steps}
+
+
+def generate(only: str | None = None) -> list[Vectors]:
+    """The same at each call. `only`: a number or name of a handler, to whose branches the vectors are limited."""
+    usual: dict[Pair, tuple[object, ...]] = {}
+    generated = []
+    for variant in VARIANTS.values():
+        steps = list(explore(variant))
+        told = {step.pair: in_short(step.outcome) for step in steps}
+        wanted = {step.pair: step for step in steps if usual.get(step.pair) != told[step.pair]}
+        usual = usual or told
+        if only is not None:
+            wanted = {pair: step for pair, step in wanted.items() if is_of(step.outcome, only)}
+        generated.append(Vectors(variant, steps, wanted))
+    return generated
+
+
+def is_of(outcome: Outcome, only: str) -> bool:
+    return any(only in (str(run.algorithm), run.handler) for run in outcome.runs)
