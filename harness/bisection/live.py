@@ -20,9 +20,10 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from harness.archive.vocabulary import first_of, unknown_words
 from harness.bisection.outcome import Difference
 from harness.checker.steps.inputs import decoded
-from harness.errors import HarnessError, MachineError
+from harness.errors import FieldError, HarnessError, MachineError
 from harness.field.replay import Record
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError
 from harness.play.process.mission_file import mission_file
@@ -188,7 +189,12 @@ def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
 
 
 def play_live(record: Record, command: Sequence[str], place: Path, *, speedup: float) -> list[Difference]:
-    """What the agent says otherwise than the record. Raises MachineError, NoAgentError, AgentFailedError."""
+    """What the agent says otherwise than the record.
+
+    Raises MachineError, NoAgentError, AgentFailedError; FieldError if the record is in words that nobody knows.
+    """
+    if unknown := first_of(unknown_words(record.trace.runs), ("trigger", "handler", "branch", "timer")):
+        raise FieldError(f"{record.path}: {unknown}, so nobody knows what is to be played; give another record")
     script = script_of(record)
     try:
         heard = asyncio.run(_Air(record, script, command, place, speedup).play())

@@ -113,6 +113,24 @@ def test_files_of_others_are_left_alone(pytester: pytest.Pytester) -> None:
     run(pytester).assert_outcomes()
 
 
+def test_what_an_agent_tells_in_words_that_nobody_knows_is_not_compared(pytester: pytest.Pytester) -> None:
+    agent = pytester.makepyfile(
+        agent="""
+        import sys
+        from ucp.node import main
+        from ucp.trace import HandlerRun
+
+        known = HandlerRun.to_line
+        HandlerRun.to_line = lambda run: known(run).replace('"branch":"approve"', '"branch":"agrees"')
+        sys.exit(main(sys.argv[1:]))
+        """
+    )
+    command = f"2={shlex.quote(sys.executable)} -P {shlex.quote(str(agent))}"
+    result = run(pytester, written(pytester), "--ucp-agent", command, "-rs")
+    result.assert_outcomes(skipped=1)
+    result.stdout.fnmatch_lines(["*cannot be compared: unknown branch 'agrees' of receive_request_add_block in the *"])
+
+
 @pytest.mark.lab
 def test_what_an_agent_does_not_support_is_skipped(pytester: pytest.Pytester) -> None:
     agent = refusing_to_start(pytester.path / "agent")

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from harness.bisection.live import script_of
+from harness.bisection.live import play_live, script_of
 from harness.bisection.peers import Lateness, what
+from harness.errors import FieldError
 from harness.field.replay import open_record
 from tests.harness.command import harness
 from ucp.messages import ChainContainQuery, encode
@@ -61,6 +62,12 @@ def test_what_an_agent_asked_itself_is_answered_when_it_asks(records: Path) -> N
     assert answers and all(given.asked_s < given.t < given.asked_s + 6 for given in answers)
     assert {question for _, question in script.questions} >= {given.after for given in answers}
     assert script.expected == sorted(script.expected, key=lambda said: said.line)
+
+
+def test_a_record_in_words_that_nobody_knows_is_not_played(records: Path, tmp_path: Path) -> None:
+    (tmp_path / "2.trace.jsonl").write_text((records / "2.trace.jsonl").read_text().replace("vote_timer_", "poll_"))
+    with pytest.raises(FieldError, match=r"unknown handler name 'poll_expiration', so nobody knows what is to be"):
+        play_live(open_record(tmp_path, 2), ["no-such-agent"], tmp_path, speedup=1.0)
 
 
 def test_whoever_is_late_is_heard_late_for_as_long_as_it_reconciles() -> None:
