@@ -32,6 +32,7 @@ MAY_BE_MISSING: dict[str, Schema] = {
     "dropped": {"type": "object", "additionalProperties": COUNT},
     "send_failures": COUNT,
     "trace_problem": {"type": ["string", "null"]},
+    "version": {"type": "string"},
 }
 
 DONE: Schema = {"ok": {"const": True}}
