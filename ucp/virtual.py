@@ -21,7 +21,6 @@ from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.export import export_chain
 from ucp.mission import MAX_MISSION_BYTES, MissionError, UnsupportedMissionError, parse_mission
-from ucp.quirks import UnknownQuirkError, check_quirk, wrong_handlers
 from ucp.request import check_request
 from ucp.status import status_of
 from ucp.store import StoredState, block_on_disk
@@ -80,9 +79,10 @@ class VirtualAgent:
             mission.roster,
             mission.initial_data,
             mission.settings,
-            handlers=wrong_handlers(mission.quirks, self._lots),
             tracing=self._tracing,
         )
+        if any(mission.quirks.values()):
+            self._make_wrong()
         self._now = -math.inf
         self._generating = True
         self._handled = self._bytes_sent = 0
@@ -181,6 +181,8 @@ class VirtualAgent:
         return {"ok": True}
 
     def _quirk(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        from ucp.quirks import UnknownQuirkError, check_quirk  # of which a right agent knows none
+
         name, value = str(given.get("name")), given.get("value")
         try:
             check_quirk(name, value)
@@ -190,9 +192,14 @@ class VirtualAgent:
             return {"ok": False, "error": str(error)}
         quirks = self._mission.quirks
         quirks[name] = value  # type: ignore[assignment]  # it was checked
-        self._agent.replace_handlers(wrong_handlers(quirks, self._lots))
+        self._make_wrong()
         self._note(given, now)
         return {"ok": True, **quirks}
+
+    def _make_wrong(self) -> None:
+        from ucp.quirks import wrong_handlers
+
+        self._agent.replace_handlers(wrong_handlers(self._mission.quirks, self._lots))
 
     def _note(self, given: dict[str, Any], now: float) -> None:
         """Commands that trigger no handler are in the trace, too."""

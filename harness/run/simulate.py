@@ -66,9 +66,11 @@ def simulate_in_memory(
         evidence = memory.evidence(simulation)
     result = checker.check(evidence)
     if (records := simulation.records()) and (again or result.bad):
-        from harness.play.simulation.foreign.again import compare_again
+        from harness.play.simulation.foreign.again import Again
 
-        compare_again(records)
+        with closing(Again()) as second:
+            for record in records:
+                second.compare(record)
     return Simulated(simulation.played, evidence, result)
 
 

@@ -1,7 +1,7 @@
 """The backend of virtual time: the very same agents on a simulated air, into a run directory as any other run."""
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, closing, contextmanager
 from typing import TYPE_CHECKING
 
@@ -82,7 +82,7 @@ class VirtualTime(Backend):
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
             if simulation.records() and simulation.played.outcome == "completed":
-                _compare_again(simulation, progress)
+                await _compare_again(simulation, breathe)
             for agent_id, problem in files.problems().items():
                 simulation.played.agents[str(agent_id)]["trace_problem"] = problem
 
@@ -98,16 +98,20 @@ def _export(simulation: Simulation, files: OnDisk) -> None:
             simulation.fail(error)
 
 
-def _compare_again(simulation: Simulation, progress: Progress) -> None:
+async def _compare_again(simulation: Simulation, breathe: Callable[[Simulation], Awaitable[None]]) -> None:
     """Play the lives of agents that are not ours again, to see whether they are the same twice."""
-    from harness.play.simulation.foreign.again import NotTheSameError, compare_again
+    from harness.play.simulation.foreign.again import Again, NotTheSameError
 
     simulation.enter("the same again")
-    progress.show(_snapshot(simulation))
-    try:
-        compare_again(simulation.records())
-    except NotTheSameError as error:
-        simulation.played.end_early("failed", error)
+    with closing(Again()) as again:
+        try:
+            for record in simulation.records():
+                await breathe(simulation)
+                again.compare(record)
+        except NotTheSameError as error:
+            simulation.played.end_early("failed", error)
+        except InterruptedRunError as error:
+            simulation.played.end_early("interrupted", error)
 
 
 @contextmanager

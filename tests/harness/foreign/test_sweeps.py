@@ -31,7 +31,7 @@ count = 0 if 'mission' in given else count + ('event_id' in given)
 if count > 2:
     sys.exit('the third event was too much')
 """
-BUSY = {"agents": 2, "duration_s": 100, "events": {"source": "random", "mean_s": 10}}
+BUSY = {"agents": 2, "duration_s": 150, "events": {"source": "random", "mean_s": 15}}
 
 
 def living(word: Path) -> list[int]:

@@ -5,7 +5,7 @@ Then no seed would mean anything, so it is found out, and named.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import zip_longest
 from typing import Any
@@ -29,19 +29,23 @@ class NotTheSameError(HarnessError):
         self.agent_id = agent_id
 
 
-def compare_again(records: Iterable[LifeRecord]) -> None:
-    """Give each life its inputs again, one after another in one process of each make. Raises NotTheSameError."""
-    programs: dict[tuple[str, ...], Program] = {}
-    try:
-        for record in records:
-            used = record.command in programs
-            if not used:
-                programs[record.command] = Program(record.command)
-            difference = _given_to(programs[record.command], record)
-            if difference is not None:
-                raise NotTheSameError(record.agent_id, _explained(record, difference, used=used))
-    finally:
-        for program in programs.values():
+class Again:
+    """Gives lives their inputs again, one after another in one process of each make. Close it."""
+
+    def __init__(self) -> None:
+        self._programs: dict[tuple[str, ...], Program] = {}
+
+    def compare(self, record: LifeRecord) -> None:
+        """Raises NotTheSameError."""
+        used = record.command in self._programs
+        if not used:
+            self._programs[record.command] = Program(record.command)
+        difference = _given_to(self._programs[record.command], record)
+        if difference is not None:
+            raise NotTheSameError(record.agent_id, _explained(record, difference, used=used))
+
+    def close(self) -> None:
+        for program in self._programs.values():
             program.close()
 
 

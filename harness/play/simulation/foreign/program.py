@@ -120,7 +120,7 @@ class Program:
                 raise NoAnswerError("crashed", f"answers with a line of more than {MAX_ANSWER_BYTES >> 20} MiB")
             left_s = deadline - time.monotonic()
             if left_s <= 0 or not self._readable.poll(left_s * 1000):
-                raise NoAnswerError("hung", f"did not answer within {limit_s:g} s")
+                raise NoAnswerError("hung", f"did not answer within {limit_s:g} s (with a whole line, flushed)")
             pieces.append(os.read(self._out, CHUNK_BYTES))
             length += len(pieces[-1])
             if not pieces[-1]:
@@ -193,7 +193,8 @@ class Program:
         try:
             self._process.wait(within_s)
         except subprocess.TimeoutExpired:
-            self._process.kill()
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)  # a script, and what it has started
             self._process.wait()
         self.let_go()
 

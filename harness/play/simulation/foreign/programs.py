@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from threading import Lock
 
 from harness.play.simulation.foreign.program import Program
 
@@ -24,12 +25,14 @@ class Programs:
         self._idle: list[Program] = []
         """Who came last has waited least."""
         self._taken: set[Program] = set()
+        self._lock = Lock()
 
     def take(self, command: Sequence[str], agent_id: int) -> Program:
         """One that plays nothing, to be given back. Raises OSError if it cannot be started."""
         log = self._logs / f"{agent_id}.log" if self._logs is not None else None
-        program = self._waiting(tuple(command), log) or Program(command, log)
-        self._taken.add(program)
+        with self._lock:
+            program = self._waiting(tuple(command), log) or Program(command, log)
+            self._taken.add(program)
         return program
 
     def _waiting(self, command: tuple[str, ...], log: Path | None) -> Program | None:
@@ -44,14 +47,15 @@ class Programs:
 
     def give_back(self, program: Program) -> None:
         """Nobody asks it any more, for now."""
-        self._taken.discard(program)
-        if program.owes_an_answer:
-            program.close()
-            return
-        program.forget_words()
-        self._idle.append(program)
-        if len(self._idle) > MAX_IDLE:
-            self._idle.pop(0).close()
+        with self._lock:
+            self._taken.discard(program)
+            if program.owes_an_answer:
+                program.close()
+                return
+            program.forget_words()
+            self._idle.append(program)
+            if len(self._idle) > MAX_IDLE:
+                self._idle.pop(0).close()
 
     def close(self) -> None:
         """End all of them."""
@@ -70,6 +74,7 @@ class Programs:
             program.let_go()
         self._taken.clear()
         self._idle.clear()
+        self._lock = Lock()
 
 
 SHARED = Programs()
