@@ -14,7 +14,7 @@ from ucp.block import MAX_AGENT_ID
 from ucp.events import DEFAULT_LOG, MAX_MEAN_S, MEAN_TIME_BETWEEN_EVENTS_S, EventKind
 from ucp.features import FEATURES
 from ucp.settings import Settings
-from ucp.shown import shown
+from ucp.shown import shown, shown_key
 
 SCHEMA = "ucp-mission/1"
 MAX_MISSION_BYTES = 4 * 1024 * 1024
@@ -151,18 +151,18 @@ def _get(document: dict[str, Any], key: str, kind: type) -> Any:
     return value
 
 
-def _integer(document: dict[str, Any], key: str, low: int, high: int) -> int:
+def _integer(document: dict[str, Any], key: str, low: int, high: int, within: str = "") -> int:
     value = document.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise MissionError(f"`{key}` must be a whole number {low}..{high}, not {shown(value)}")
+        raise MissionError(f"`{within}{key}` must be a whole number {low}..{high}, not {shown(value)}")
     return value
 
 
-def _positive(document: dict[str, Any], key: str, most: float = sys.float_info.max) -> float:
+def _positive(document: dict[str, Any], key: str, most: float = sys.float_info.max, within: str = "") -> float:
     value = document.get(key)
     if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value <= most:
         at_most = f", at most {most:g}" if most < sys.float_info.max else ""
-        raise MissionError(f"`{key}` must be a number above 0{at_most}, not {shown(value)}")
+        raise MissionError(f"`{within}{key}` must be a number above 0{at_most}, not {shown(value)}")
     return float(value)
 
 
@@ -182,7 +182,7 @@ def _network(document: dict[str, Any]) -> Network:
             socket.inet_pton(socket.AF_INET, str(document.get(key)))
         except (OSError, ValueError):
             raise MissionError(f"`network.{key}` must be an IPv4 address, not {shown(document.get(key))}") from None
-    return Network(document["address"], document["broadcast"], _integer(document, "port", 1, 65535))
+    return Network(document["address"], document["broadcast"], _integer(document, "port", 1, 65535, "network."))
 
 
 def _event_source(document: dict[str, Any]) -> EventSource:
@@ -191,12 +191,19 @@ def _event_source(document: dict[str, Any]) -> EventSource:
         raise MissionError(f"`events.source` must be random, mavlink or none, not {shown(document['source'])}")
     return EventSource(
         document["source"],
-        max(1.0, _positive(document, "mean_s", MAX_MEAN_S)),
-        _positive(document, "position_interval_s"),
+        max(1.0, _positive(document, "mean_s", MAX_MEAN_S, "events.")),
+        _positive(document, "position_interval_s", within="events."),
         _log(document["log"]),
-        _get(document, "vehicle_host", str),
-        _integer(document, "vehicle_port", 1, 65535),
+        _host(document["vehicle_host"]),
+        _integer(document, "vehicle_port", 1, 65535, "events."),
     )
+
+
+def _host(name: Any) -> str:
+    labels = name.removesuffix(".").split(".") if isinstance(name, str) and name.isprintable() else [""]
+    if not all(0 < len(label) < 64 for label in labels):
+        raise MissionError(f"`events.vehicle_host` must be an address or the name of a host, not {shown(name)}")
+    return str(name)
 
 
 def _log(kinds: Any) -> tuple[EventKind, ...]:
@@ -236,5 +243,5 @@ def _known(document: Any, key: str, kind: type) -> dict[str, Any]:
     names = [field.name for field in dataclasses.fields(kind)]
     for name in document:
         if name not in names:
-            raise MissionError(f"`{key}.{shown(name)[1:-1]}` is unknown: there are {', '.join(names)}")
+            raise MissionError(f"`{key}.{shown_key(name)}` is unknown: there are {', '.join(names)}")
     return document

@@ -17,6 +17,11 @@ class _Short(reprlib.Repr):
             return "a number of thousands of digits"
 
 
+def shown_key(key: object) -> str:
+    """A key of a mapping, as it stands there; or its beginning."""
+    return key if isinstance(key, str) and key.isprintable() and len(key) <= MOST_CHARACTERS else shown(key)
+
+
 def shown(value: object) -> str:
     """The value as Python writes it, or its beginning."""
     text = _Short().repr(value)

@@ -117,6 +117,10 @@ class Store:
         self.recovered = self._read()
 
     def _read(self) -> StoredState | None:
+        if not self._path.parent.is_dir():
+            raise StoreError(f"{self._path} cannot be kept: there is no directory {self._path.parent}")
+        if self._path.exists() and not self._path.is_file():
+            raise StoreError(f"{self._path} is no file: name another as `store`")
         try:
             return self._replayed(_entries(self._path))
         except (ValueError, TypeError, LookupError, RecursionError):

@@ -8,6 +8,7 @@ fates:
   - {sender: 3, receiver: 4, arrivals: 0@12.3 1@12.75 4@31}
 """
 
+import re
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -27,7 +28,8 @@ MessageName = Literal[
     "Block Response",
 ]
 
-BlockName = Annotated[str, Field(pattern=r"^[1-9]\d{0,4}\.[1-9]\d{0,6}$")]
+_BLOCK_NAME = r"^[1-9]\d{0,4}\.[1-9]\d{0,6}$"
+BlockName = Annotated[str, Field(pattern=_BLOCK_NAME)]
 """`<agent>.<ordinal>`, the ordinal counting from 1 that agent's completed blocks. YAML needs quotes: "4.10"."""
 
 OUTCOMES = ("drop", "delay_s", "hold_until_s", "after", "arrivals")
@@ -39,6 +41,8 @@ FateName = Annotated[str, Field(min_length=1, max_length=100)]
 def _quoted(value: Any) -> Any:
     if isinstance(value, float):
         raise ValueError(f'should be quoted, as in "{value}": 4.1 and 4.10 are one number and two blocks')
+    if isinstance(value, str) and not re.match(_BLOCK_NAME, value):
+        raise ValueError('should be an agent and the number of its block, as in "4.11"')
     return value
 
 

@@ -11,10 +11,11 @@ from pydantic import BaseModel, ValidationError
 from harness.errors import ScenarioError
 from harness.scenario import library
 from harness.scenario.scenario import Scenario
-from ucp.shown import shown
+from ucp.shown import shown, shown_key
 
 MAX_PROBLEM = 200
 """More of what is wrong with a file is not shown."""
+MAX_NESTING = 50
 MAX_SCENARIO_BYTES = 8 * 1024 * 1024
 """A flight of two hours with twenty vehicles, word for word, is half of that."""
 
@@ -37,13 +38,21 @@ def parse(document: dict[str, Any]) -> Scenario:
 
 
 class _Loader(yaml.SafeLoader):
-    """One to whom a key that is there twice is a mistake: YAML forbids it, and the safe loader takes the last."""
+    """One to whom a key that is there twice is a mistake: YAML forbids it, and the safe loader takes the last.
+
+    Nor is anything nested without an end, which would take the scanner long.
+    """
+
+    def fetch_flow_collection_start(self, TokenClass: Any) -> None:  # noqa: N803  (its name in yaml)
+        if self.flow_level >= MAX_NESTING:
+            raise yaml.scanner.ScannerError(problem="it is nested too deeply", problem_mark=self.get_mark())
+        super().fetch_flow_collection_start(TokenClass)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[str] = set()
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
             if key.value in seen:
-                problem = f"{shown(key.value)[1:-1]} is there twice"
+                problem = f"{shown_key(key.value)} is there twice"
                 raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
@@ -93,13 +102,13 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
     """The first problem that pydantic found, as one sentence for a person."""
     problems: list[Any] = error.errors()
-    problem = max(problems, key=lambda candidate: len(candidate["loc"]))
-    key = ".".join(str(part) for part in problem["loc"])
+    problem = max(problems, key=lambda candidate: (len(candidate["loc"]), candidate["type"] == "extra_forbidden"))
+    key = ".".join(shown_key(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
         return f"`{key}` is unknown: there are {', '.join(_siblings(model, problem['loc']))}"
     if problem["type"] == "missing":
         return f"`{key}` is missing"
-    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").removeprefix("String ")
     if not key:
         return str(message)
     value = shown(problem["input"])

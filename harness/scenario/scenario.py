@@ -29,6 +29,7 @@ from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError
 from sitl.plan import PlanError
 from ucp.block import MAX_AGENT_ID
+from ucp.events import EVENT_HEADER_BYTES
 from ucp.quirks import Quirks, in_force
 from ucp.settings import Settings
 from ucp.shown import shown
@@ -249,6 +250,15 @@ class Scenario(Model):
                     flight.planned().check(self.vehicles.type_of(vehicle))
                 except PlanError as error:
                     raise ValueError(f"flight.{index}.plan, for vehicle {vehicle}: {error}") from None
+        return self
+
+    @model_validator(mode="after")
+    def _events_fit(self) -> "Scenario":
+        largest = self.settings.max_event_bytes - EVENT_HEADER_BYTES
+        for index, event in enumerate(self.events.script):
+            if (size := len(event.event_data)) > largest:
+                why = f"by `settings.max_event_bytes` an event has at most {largest} bytes of data, not {size}"
+                raise ValueError(f"events.script.{index}: {why}")
         return self
 
     @model_validator(mode="after")

@@ -14,7 +14,7 @@ What is indented is the answer, up to the next sentence that comes later: it is 
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -28,6 +28,7 @@ from harness.stories.sentences import Course
 MAX_BYTES = 1024 * 1024
 MAX_LINES = 20_000
 _SENTENCE = re.compile(r"(\d{1,7}) s: (.+?)\s*")
+_ENTRY = re.compile(r"(`?)(timeline|events\.script)\.(\d+)(?:\.|: )")
 INDENT = "    "
 DELAY_S = 0.02
 SPEEDUP = 10.0
@@ -109,6 +110,7 @@ def _parsed(path: Path, text: str) -> Story:
         begins -= 1
     lines, course = [*given[:begins], ""], Course()
     told: list[tuple[int, int, bool]] = []  # line, second, whether chains are asked for
+    told_in: dict[str, list[int]] = {"events.script": [], "timeline": []}  # the line of each entry
     for number, line in enumerate(given[begins:], begins + 1):
         if line.startswith((" ", "\t")) or not line.strip():
             continue
@@ -127,11 +129,23 @@ def _parsed(path: Path, text: str) -> Story:
             course.tell(at_s, words)
         except ScenarioError as error:
             raise ScenarioError(f"line {number}: {error}") from None
+        for entries, of in zip((course.script, course.timeline), told_in.values(), strict=True):
+            of += [number] * (len(entries) - len(of))
         lines.append(line)
         told.append((len(lines) - 1, at_s, words in ("chains", "end")))
     if course.ends_at_s is None:
         raise ScenarioError("it has no end: the last sentence should be one such as `60 s: end`")
-    return Story(path, text, lines, _scenario(path, given[:begins], course), _sections(told))
+    try:
+        scenario = _scenario(path, given[:begins], course)
+    except ScenarioError as error:
+        raise ScenarioError(_in_its_line(str(error), told_in)) from None
+    return Story(path, text, lines, scenario, _sections(told))
+
+
+def _in_its_line(problem: str, told_in: Mapping[str, Sequence[int]]) -> str:
+    """What is wrong with a scenario's entry, as that of the sentence which told it."""
+    entry = _ENTRY.match(problem)
+    return f"line {told_in[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
 
 
 def _gap(lines: Sequence[str]) -> list[str]:

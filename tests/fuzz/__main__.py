@@ -8,6 +8,7 @@ from one time to the next, and inputs that fail in .fuzz/failures; the exit stat
 import argparse
 import hashlib
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -57,13 +58,13 @@ def _guided(name: str, seconds: int) -> bool:
     with TemporaryDirectory(prefix="ucp-fuzz-") as scratch, log.open("wb") as output:
         command = [sys.executable, "-m", "tests.fuzz.guided", name, *options, str(grown), str(FOLDER / name)]
         began = time.monotonic()
+        running = subprocess.Popen(["env", f"TMPDIR={scratch}", *command], stdout=output, stderr=output)
         try:
-            ended = subprocess.run(
-                ["env", f"TMPDIR={scratch}", *command], stdout=output, stderr=output, timeout=seconds + PATIENCE_S
-            )
-            problem = "" if ended.returncode == 0 else f"ended with status {ended.returncode}"
+            status = running.wait(seconds + PATIENCE_S)
+            problem = f"ended with status {status}" if status else ""
         except subprocess.TimeoutExpired:
             problem = "hangs"
+            _where_it_hangs(running)
         left = [path.name for path in Path(scratch).iterdir() if not path.name.startswith("fuzz-")]
     if left and not problem:
         problem = f"leaves {left[0]} behind"
@@ -72,6 +73,15 @@ def _guided(name: str, seconds: int) -> bool:
     edges = (re.findall(r"cov: (\d+)", told) or ["0"])[-1]
     _tell(name, inputs, time.monotonic() - began, f"{edges} edges", f"{problem}, see {log}" if problem else "")
     return not problem
+
+
+def _where_it_hangs(running: "subprocess.Popen[bytes]") -> None:
+    """Into its log; the input that it is at is kept, as of one that crashes."""
+    for number in (signal.SIGUSR1, signal.SIGABRT):
+        running.send_signal(number)
+        time.sleep(1)
+    running.kill()
+    running.wait()
 
 
 def _at_random(name: str, seconds: int) -> bool:

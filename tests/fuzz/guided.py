@@ -4,7 +4,9 @@ Half of the mutations are libFuzzer's, half those of `tests.fuzz.mutations`. `--
 and learns nothing from what that covers: to compare. An input that fails stays in the file that is named last.
 """
 
+import faulthandler
 import random
+import signal
 import sys
 
 import atheris
@@ -32,6 +34,7 @@ def main(arguments: list[str]) -> None:
             return mutated
         return damaged(data, chance)[:most_bytes]
 
+    faulthandler.register(signal.SIGUSR1)
     atheris.Setup([sys.argv[0], *options], target.run, custom_mutator=mutate)
     atheris.Fuzz()
 

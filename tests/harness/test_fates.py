@@ -161,7 +161,7 @@ def test_a_fate_that_never_matched_is_reported_and_the_run_is_no_proof(tmp_path:
         ({"drop": True, "delay_s": 1}, "needs exactly one of"),
         ({"message": "Commit", "drop": True}, "'Block Add Request', 'Block Add Response'"),
         ({"block": 4.1, "drop": True}, "should be quoted, as in"),
-        ({"block": "4", "drop": True}, "should match pattern"),
+        ({"block": "4", "drop": True}, "the number of its block"),
         ({"sender": 9, "drop": True}, "fates.0.sender names vehicle 9, which does not exist: there are 1, 2, 3"),
         ({"block": "9.1", "drop": True}, "fates.0.block names vehicle 9"),
         ({"after": "x"}, "fates.0.after 'x' is the name of no fate"),

@@ -46,6 +46,7 @@ def _written(mission: Mission) -> dict[str, Any]:
 def _fly(mission: Mission) -> None:
     """What ucp.node does with it first."""
     lots = Random(mission.seed)
+    mission.events.vehicle_host.encode("idna")
     agent = Agent(
         mission.agent_id,
         mission.roster,
