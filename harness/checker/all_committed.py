@@ -24,6 +24,9 @@ def check(evidence: Evidence) -> Judgement:
         missing = [block_hash for block_hash in completed if block_hash not in in_chain]
         if missing:
             lacking[agent_id] = missing
+    if not lacking and (untold := evidence.not_told_completed()):
+        why = evidence.unknown_word("operation", agent_id=min(untold))
+        return Judgement(NAME, "not applicable", f"nothing tells all that {agents(untold)} completed: {why}")
     if not lacking:
         but = f"; {gone} more were gone with the agents that {_left(evidence)}" if gone else ""
         whole = f"all {len(completed)} completed blocks are in every chain"

@@ -150,7 +150,7 @@ def _loss_in_words(loss: Loss) -> str:
     alone = len(loss.vehicles) == 1
     sentence = f"at {loss.at_s:.0f} s {_vehicles(loss.vehicles)} {'was' if alone else 'were'} lost ({loss.what})"
     if loss.completed is None or loss.gone is None:
-        return f"{sentence}; without all traces nobody knows what was where"
+        return f"{sentence}; the traces do not tell what was where"
     return f"{sentence}, and with {'it' if alone else 'them'} {_of(loss.gone, loss.completed)}"
 
 

@@ -97,7 +97,7 @@ def test_without_all_traces_only_the_end_is_known() -> None:
     survived = survival(evidence([PAIRS, {"at_s": 100, "kill": [1, 2]}], tracing=False))
     assert counts(survived.losses[0]) == (None, None, None, None)
     assert survived.gone == 1
-    assert "without all traces nobody knows what was where" in in_words(survived)[0]
+    assert "the traces do not tell what was where" in in_words(survived)[0]
 
 
 def test_nothing_at_all_is_no_survival() -> None:
