@@ -11,7 +11,7 @@ TESTS ?= -n 2
 FUZZ_SECONDS ?= 10
 TARGETS ?=
 
-.PHONY: run test test-netem fuzz docs lint setup clean
+.PHONY: run test test-netem test-ros fuzz docs lint setup clean
 
 run: setup
 	$(BIN)/ucp-harness run $(SCENARIO)
@@ -22,6 +22,16 @@ test: setup
 # The tests of real tc netem, inside User Mode Linux: for machines whose kernel lacks sch_netem.
 test-netem: setup
 	$(BIN)/python -m tests.netem.uml
+
+# The agent that is a ROS 2 node, with ROS from the Python package index in an environment of its own.
+test-ros: setup .ros/installed
+	$(BIN)/python -m pytest tests/ros
+
+.ros/installed:
+	$(PYTHON) -m venv .ros
+	.ros/bin/pip install -q 'ros-rclpy[fastrtps]' ros-std-msgs
+	.ros/bin/pip install -q --no-deps -e .
+	@touch $@
 
 # Hostile input for all that reads any, so many seconds for each target: `make fuzz FUZZ_SECONDS=600 TARGETS="agent store"`.
 fuzz: setup
@@ -56,4 +66,4 @@ $(VENV)/installed: pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .fuzz .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .ros .fuzz .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,7 +1,7 @@
 """What this machine can do, for tests that need more than Python.
 
-`UCP_REQUIRE` is a list of "lab", "netem", "nftables", "uml", "cc", "browser", "tshark" and "docker" (comma between):
-what it names may not be missing, a test that would be skipped for the lack of it fails instead.
+`UCP_REQUIRE` is a list of "lab", "netem", "nftables", "uml", "cc", "browser", "tshark", "docker" and "ros" (comma
+between): what it names may not be missing, a test that would be skipped for the lack of it fails instead.
 """
 
 from __future__ import annotations

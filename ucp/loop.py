@@ -34,7 +34,7 @@ class Loop:
     """
 
     def __init__(self, failed: Callable[[Exception], object] | None = None) -> None:
-        self._failed = failed
+        self.failed = failed
         self._selector = selectors.DefaultSelector()
         self._waiting: dict[socket.socket, tuple[Callback | None, Callback | None]] = {}
         self._due: list[tuple[float, int, Timer]] = []
@@ -76,13 +76,8 @@ class Loop:
     def run(self) -> None:
         """Until it is stopped; it may run again then."""
         while self._running:
-            timeout_s = max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
-            for key, events in self._selector.select(timeout_s):
-                readable, writable = self._waiting.get(key.fileobj, (None, None))  # type: ignore[call-overload]
-                self._call(readable if events & selectors.EVENT_READ and readable else writable)
-            now = time.monotonic()
-            while self._running and self._due and self._due[0][0] <= now:
-                self._call(heapq.heappop(self._due)[2].callback)
+            self._call_back(self._selector.select(self._due_in_s()))
+            self._call_what_is_due()
         self._running = True
 
     def close(self) -> None:
@@ -93,12 +88,27 @@ class Loop:
         self._waiting.clear()
         self._selector.close()
 
+    def _call_back(self, ready: list[tuple[selectors.SelectorKey, int]]) -> None:
+        """What the selector says can be read, or written."""
+        for key, events in ready:
+            readable, writable = self._waiting.get(key.fileobj, (None, None))  # type: ignore[call-overload]
+            self._call(readable if events & selectors.EVENT_READ and readable else writable)
+
+    def _due_in_s(self) -> float | None:
+        """How long nothing is due; None: never."""
+        return max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
+
+    def _call_what_is_due(self) -> None:
+        now = time.monotonic()
+        while self._running and self._due and self._due[0][0] <= now:
+            self._call(heapq.heappop(self._due)[2].callback)
+
     def _call(self, callback: Callback | None) -> None:
         if callback is None or not self._running:
             return
         try:
             callback()
         except Exception as error:
-            if self._failed is None:
+            if self.failed is None:
                 raise
-            self._failed(error)
+            self.failed(error)

@@ -37,9 +37,12 @@ WRONG_MISSION = 2
 
 
 class Node:
-    """Files go to `directory`. Raises OSError if the port or a file cannot be had, StoreError for another's store."""
+    """Files go to `directory`; `loop` is the main loop of whoever has one (examples/ros2 is one of rclpy).
 
-    def __init__(self, mission: Mission, directory: Path) -> None:
+    Raises OSError if the port or a file cannot be had, StoreError for another's store.
+    """
+
+    def __init__(self, mission: Mission, directory: Path, loop: Loop | None = None) -> None:
         self.mission = mission
         self.clock = MissionClock(mission.speedup)
         self._lots = Random(mission.seed)  # of what is random about its quirks
@@ -61,7 +64,8 @@ class Node:
         self._trace = TraceFile(directory / f"{mission.agent_id}.trace.jsonl")
         self._store = Store(directory / mission.store, self.agent.state) if mission.store else None
         self._socket = _broadcast_socket(mission)
-        self._loop = Loop(self._failed)
+        self._loop = Loop() if loop is None else loop
+        self._loop.failed = self._failed
         self._timer: Timer | None = None
         self._end_source: Callable[[], object] = lambda: None
         self._control = ControlServer(
@@ -136,7 +140,8 @@ class Node:
                 continue  # the echo of our own broadcast
             self._drive(partial(self.agent.receive_datagram, data))
 
-    def _log_event(self, event_id: int, data: bytes) -> None:
+    def log_event(self, event_id: int, data: bytes) -> None:
+        """The vehicle, or whoever else, has something to be kept; before the mission, and at its end, it is not."""
         if not self.generating:
             return
         event = LoggableEvent(self.clock.timestamp_us(self.clock.now()), event_id, data)
@@ -213,7 +218,7 @@ class Node:
 
         def log() -> None:
             self._expect_random_event(source)
-            self._log_event(event_id, data)
+            self.log_event(event_id, data)
 
         expected = self._loop.call_later(self.clock.wall_s(self._born_s + due - self.clock.now()), log)
         self._end_source = expected.cancel
@@ -226,7 +231,7 @@ class Node:
 
         def sink(data: bytes) -> None:
             for event_id, event_data in events.receive(data, self.clock.now()):
-                self._log_event(event_id, event_data)
+                self.log_event(event_id, event_data)
 
         self._end_source = VehicleConnection(self._loop, source.vehicle_host, source.vehicle_port, sink).close
 
@@ -270,7 +275,7 @@ class Node:
         largest = self.mission.settings.max_event_bytes - EVENT_HEADER_BYTES
         if len(event_data) > largest:
             raise CommandError(f"an event of this mission has at most {largest} bytes of data, not {len(event_data)}")
-        self._log_event(event_id, event_data)
+        self.log_event(event_id, event_data)
         return {}
 
     def _stop_events(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -327,7 +332,7 @@ def _broadcast_socket(mission: Mission) -> socket.socket:
     return sock
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments: list[str], node: Callable[[Mission, Path], Node] = Node) -> int:
     """Exit status 0; 1: no export; 2: the mission file is wrong, or its port in use; 127: it lacks a feature."""
     if arguments == ["--virtual"]:
         from ucp.virtual import main as serve
@@ -344,7 +349,7 @@ def main(arguments: list[str]) -> int:
         return UNSUPPORTED if isinstance(error, UnsupportedMissionError) else WRONG_MISSION
 
     try:
-        return Node(mission, path.parent).run()
+        return node(mission, path.parent).run()
     except StoreError as error:
         sys.stderr.write(f"{error}\n")
         return WRONG_MISSION

@@ -481,7 +481,7 @@ def test_what_an_agent_sends_is_traced_and_stored_before(tmp_path: Path) -> None
     node._socket = Radio()  # type: ignore[assignment]
     node._begin(round(time.time() * 1e6))
     for _ in range(3):
-        node._log_event(1, bytes(256))
+        node.log_event(1, bytes(256))
     assert len(sent) == 1
 
 

@@ -1,0 +1,48 @@
+"""The agent that is a ROS 2 node, as its page shows it; `make test-ros` brings ROS along."""
+
+from pathlib import Path
+
+import pytest
+from scapy.layers.inet import UDP
+from scapy.layers.l2 import ARP
+from scapy.utils import PcapNgReader
+
+from harness.archive.archive import RunArchive
+from tests.machine import do_without
+from tests.pages import REPOSITORY, play
+from ucp.messages import PORT
+
+pytestmark = pytest.mark.lab
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory in which all that the page says has been done."""
+    if not (REPOSITORY / ".ros" / "installed").exists():
+        do_without("ros", "there is no ROS 2 in .ros: make test-ros installs it")
+    directory = tmp_path_factory.mktemp("a clone")
+    for name in (".ros", "ucp"):
+        (directory / name).symlink_to(REPOSITORY / name)
+    assert play(REPOSITORY / "docs" / "ros.md", directory) == 5
+    return directory
+
+
+def test_it_does_as_specified_among_others_with_loss_and_a_partition(played: Path) -> None:
+    record = RunArchive(played / "mixed").record
+    assert {key: judgement.verdict for key, judgement in record.judgements.items()} == {
+        **dict.fromkeys("123456", "holds"),
+        **{"steps": "as specified", "records": "agree", "liveness": "finished"},
+    }
+    assert record.agents["2"].version == "rclpy on rmw_fastrtps_cpp"
+    assert record.figures["blocks"]
+    partition = next(change for change in record.network if change.what == "partition")
+    assert "1 2 | 3" in partition.detail
+
+
+def test_nothing_of_ros_is_on_the_air(played: Path) -> None:
+    captures = sorted((played / "mixed" / "capture").glob("*.pcapng"))
+    assert len(captures) == 3
+    for capture in captures:
+        with PcapNgReader(str(capture)) as frames:
+            others = [frame for frame in frames if ARP not in frame and (UDP not in frame or frame[UDP].dport != PORT)]
+        assert not others, [frame.summary() for frame in others[:5]]
