@@ -94,6 +94,8 @@ class Simulation(Clockwork):
         await self.apply(first)
         self._at_once = None
         self._move()
+        if self._foreigners is not None:
+            self._foreigners.start()
         for number in range(len(self.roster)):
             self._start(number)
         for event in self.scenario.events.script:

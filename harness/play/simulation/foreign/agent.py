@@ -35,24 +35,24 @@ MAX_SENT_PER_S = 5000
 """Datagrams in a mission second: more are a storm, which feeds itself where others answer."""
 ROUNDED_S = 2e-6
 """The times of a trace have six digits after the point."""
-MAX_RECORD_BYTES = 64 * 1024 * 1024
 NO_VIRTUAL_TIME = (2, 127)
 """Exit statuses of agents that take `--virtual` for a mission file that is wrong, or say that they lack it."""
 
 
 @dataclass
 class LifeRecord:
-    """What an agent was given in one life, and what it answered, in lines; the first of it, if that is very much."""
+    """What an agent was given in one life, and what it answered, in lines: the first `limit` bytes of it."""
 
     agent_id: int
     command: tuple[str, ...]
     after_another: bool
     """Its process had played another life before."""
+    limit: int
     exchanges: list[tuple[bytes, bytes]] = field(default_factory=list)
     length: int = 0
 
     def add(self, line: bytes, answer: bytes) -> None:
-        if self.length < MAX_RECORD_BYTES:
+        if self.length < self.limit:
             self.length += len(line) + len(answer)
             self.exchanges.append((line, answer))
 
@@ -73,6 +73,7 @@ class ForeignAgent:
         *,
         tracing: bool,
         store: Stored | None = None,
+        record_bytes: int,
     ) -> None:
         self.agent_id: int = mission["agent_id"]
         self.roster: frozenset[int] = frozenset(mission["roster"])
@@ -80,7 +81,7 @@ class ForeignAgent:
         self.settings = settings
         self.messages_sent = 0
         self.chain_changed_at: float | None = 0.0 if tracing else None
-        self.record = LifeRecord(self.agent_id, program.command, after_another=not program.is_new)
+        self.record = LifeRecord(self.agent_id, program.command, after_another=not program.is_new, limit=record_bytes)
         self.failed: AgentFailedError | AgentLacksError | None = None
         self._program = program
         self._tracing = tracing

@@ -13,6 +13,9 @@ from harness.play.simulation.foreign.programs import SHARED, Programs
 from harness.scenario import Scenario
 from netem import addresses
 
+MAX_RECORD_BYTES = 128 * 1024 * 1024
+"""Of all that agents are given and answer in a mission, so much is kept, to be given to them again."""
+
 
 def commands_of(scenario: Scenario) -> dict[int, list[str]]:
     """What starts which foreign agent. Raises ScenarioError if there is no such program."""
@@ -41,15 +44,23 @@ class Foreigners:
         """What starts the agent, but for --virtual."""
         return self._commands[agent_id]
 
+    def start(self) -> None:
+        """Start whoever will play, all at the same time. Raises ScenarioError if a program cannot be started."""
+        for agent_id in self._commands:
+            self._start(agent_id)
+
+    def _start(self, agent_id: int) -> None:
+        command = self._commands[agent_id]
+        try:
+            self._playing[agent_id] = self._programs.take(command, agent_id)
+        except OSError as error:
+            raise ScenarioError(f"`agent_command`: {command[0]} cannot be started: {error.strerror}") from None
+
     def begin(self, agent_id: int, life: int, now: float, stored: Stored | None) -> ForeignAgent:
         """A life of the agent, which goes on from what is `stored` of an earlier one. Raises HarnessError."""
-        try:
-            program = self._programs.take(self._commands[agent_id], agent_id)
-        except OSError as error:
-            raise ScenarioError(
-                f"`agent_command`: {self._commands[agent_id][0]} cannot be started: {error.strerror}"
-            ) from None
-        self._playing[agent_id] = program
+        if agent_id not in self._playing:
+            self._start(agent_id)
+        program = self._playing[agent_id]
         agent = ForeignAgent(
             self._mission(agent_id, life),
             self._initial_data,
@@ -58,6 +69,7 @@ class Foreigners:
             now,
             tracing=self._tracing,
             store=stored,
+            record_bytes=MAX_RECORD_BYTES // len(self._commands),
         )
         self.records.append(agent.record)
         return agent
