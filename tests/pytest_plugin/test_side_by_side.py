@@ -136,7 +136,7 @@ def test_a_project_that_does_not_use_it_pays_for_no_import(pytester: pytest.Pyte
 
 def test_nothing_needs_to_be_imported_and_markers_are_known(pytester: pytest.Pytester) -> None:
     (found,) = entry_points(group="pytest11", name="ucp-harness")
-    assert found.value == "harness.pytest_plugin"
+    assert found.value == "ucp_harness_pytest"
     result = run(pytester, "--markers")
     result.stdout.fnmatch_lines(["@pytest.mark.swarm(*", "@pytest.mark.scenario(*"])
     pytester.makepyfile("def test_story(swarm): swarm.run_for(10)")
