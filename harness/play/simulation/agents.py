@@ -66,7 +66,7 @@ class VirtualAgent(Protocol):
     def status(self) -> Status: ...
 
     def known_status(self) -> Status | None:
-        """The last that is known: of one that failed, from before; None if there was none."""
+        """None of an agent that failed: what it said before is no longer so."""
 
     def completed(self) -> list[bytes]:
         """Hashes of the blocks that it completed, in order."""

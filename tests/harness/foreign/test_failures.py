@@ -1,6 +1,7 @@
 """What an agent in virtual time can do wrong: one sentence that names it, and what became of it on record."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,26 @@ def test_what_goes_wrong_is_one_sentence_and_on_record(
     assert record["agents"]["2"]["outcome"] == outcome
     assert record["agents"]["1"]["outcome"] == "exported"
     assert finished.exit_status == (3 if outcome == "not supported" else 1)
+
+
+ENDS_IN_PHASE_TWO = """
+import os, sys
+from ucp import virtual
+answer = virtual.VirtualAgent.answer
+def dying(agent):
+    said = answer(agent)
+    return said if '"handler":"reconcile_phase_2"' not in said else os._exit(7)
+virtual.VirtualAgent.answer = dying
+virtual.main()
+"""
+
+
+def test_of_a_run_that_an_agent_ended_nobody_is_accused(tmp_path: Path) -> None:
+    (tmp_path / "dying.py").write_text(ENDS_IN_PHASE_TWO)
+    dying = [sys.executable, str(tmp_path / "dying.py")]
+    finished = run(played_by({2: dying}, network={"loss": 0.3}), 1, tmp_path / "run", Silent(), "sim")
+    assert "agent 2 ended by itself with status 7" in str(finished.played.outcome_detail)
+    assert finished.exit_status == 1 and not finished.result.bad
 
 
 def test_a_storm_that_feeds_itself_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ own questions, and no part of the mission: what the agent's trace says of them i
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -96,7 +96,6 @@ class ForeignAgent:
         """None if it has to be asked for."""
         self._status: Status | None = None
         """None if it may be another by now."""
-        self._last_status: Status | None = None
         self._export: dict[str, Any] | None = None
         """What it left."""
         first = {
@@ -164,14 +163,14 @@ class ForeignAgent:
         if self._status is None:
             told = self._ask("status", self._now)
             try:
-                self._status = self._last_status = Status.model_validate(told)
+                self._status = Status.model_validate(told)
             except ValidationError as error:
                 where = ".".join(str(part) for part in error.errors()[0]["loc"])
                 raise self._failure("crashed", f"answered to the command status without a proper `{where}`") from None
         return self._status
 
     def known_status(self) -> Status | None:
-        return self._last_status if self.failed else self.status()
+        return None if self.failed else self.status()
 
     def completed(self) -> list[bytes]:
         if self._completed is not None:
@@ -223,15 +222,19 @@ class ForeignAgent:
         return told
 
     def _give(self, line: str, what: str, now: float) -> Answer:
-        """An input, of which may come whatever it likes."""
+        """An input, of which may come whatever it likes; nothing does of one over which it fails."""
         answer = self._exchange(line, what, now)
+        self._count_sent(len(answer.sent), now)
+        completed = self._check(answer.trace)
         self._status = None
         self._timer = answer.timer
         self._sent += answer.sent
         self.messages_sent += len(answer.sent)
-        self._count_sent(len(answer.sent), now)
-        if self._tracing:
-            self._look_at(answer.trace)
+        self._trace += answer.trace
+        if self._completed is not None:
+            self._completed += completed
+        if any(operation.startswith("chain") for operation, _ in _changes(answer.trace)):
+            self.chain_changed_at = self._now
         return answer
 
     def _exchange(self, line: str, what: str, now: float) -> Answer:
@@ -257,24 +260,15 @@ class ForeignAgent:
         self._now = max(now, self._now)
         return answer
 
-    def _look_at(self, entries: list[Entry]) -> None:
-        """See from the trace what else would have to be asked for."""
-        assert self._completed is not None, "a traced agent says what it completes"
+    def _check(self, entries: list[Entry]) -> list[bytes]:
+        """Hashes of the blocks that were completed, as the trace says it. Raises AgentFailedError."""
         for entry in entries:
             if abs(entry.t - self._now) > ROUNDED_S:
                 raise self._failure("crashed", f"wrote t={entry.t!r} into its trace of an input at {self._now:g} s")
-            for operation, block in entry.changes if isinstance(entry, HandlerRun) else ():
-                if operation == "complete":
-                    self._completed.append(self._hash(block))
-                elif operation.startswith("chain"):
-                    self.chain_changed_at = self._now
-        self._trace += entries
-
-    def _hash(self, text: str) -> bytes:
         try:
-            return bytes.fromhex(text)
+            return [bytes.fromhex(block) for operation, block in _changes(entries) if operation == "complete"]
         except ValueError:
-            raise self._failure("crashed", f"completed a block whose hash is {text[:40]!r} in its trace") from None
+            raise self._failure("crashed", "completed a block whose hash in its trace is none") from None
 
     def _count_sent(self, count: int, now: float) -> None:
         second, before = self._sent_in
@@ -302,3 +296,8 @@ class ForeignAgent:
             f"with --virtual it ends with status {status}{words and ', and says: '}{words}; use --backend process, or "
             "see docs/virtual-time.md"
         )
+
+
+def _changes(entries: list[Entry]) -> Iterator[tuple[str, str]]:
+    """Operation and block hash."""
+    return (change for entry in entries if isinstance(entry, HandlerRun) for change in entry.changes)
