@@ -81,7 +81,7 @@ def _begun(line: bytes, matrix: Matrix, directory: Path) -> str:
     """When the matrix in `directory` was begun, if it is this one."""
     try:
         header = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         header = None
     if not isinstance(header, dict) or header.get("schema") != SCHEMA:
         raise RunDirectoryError(f"{directory} is not empty: choose another --out, nothing is overwritten")

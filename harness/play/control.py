@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from harness.errors import VIOLATED, HarnessError
+from harness.play.last_words import last_words
 
 ANSWER_LIMIT_BYTES = 1024 * 1024
 
@@ -37,7 +38,7 @@ class Status(BaseModel):
     top_chain_hash: str
     handled: int
     bytes_sent: int
-    mission_s: float | None = None
+    mission_s: Annotated[float, Field(allow_inf_nan=False)] | None = None
     dropped: dict[str, int] = {}
     send_failures: int | None = None
     trace_problem: str | None = None
@@ -84,7 +85,7 @@ class AgentControl:
                 raise
         if not answer.get("ok"):
             refused = AgentUnsupportedError if answer.get("unsupported") is True else AgentRefusedError
-            raise refused(str(answer.get("error", "no reason given")))
+            raise refused(last_words(str(answer.get("error", ""))) or "no reason given")
         return answer
 
     def close(self) -> None:

@@ -90,6 +90,8 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ScenarioError(f"{path}: not YAML: it is not UTF-8 text") from None
+    except ValueError:  # NUL
+        raise ScenarioError(f"{shown(str(path))}: no file can be called that") from None
     try:
         document = parse_yaml(text)
     except ScenarioError as error:

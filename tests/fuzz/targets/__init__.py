@@ -5,6 +5,9 @@ agent       an agent driven by a program: what liars send, timers, events, reboo
 store       what a brown-out left on the disk
 mission     the mission file
 control     the control socket of an agent that runs
+answer      what somebody's agent answers on its control socket
+virtual     the lines that an agent is given in virtual time
+foreign     the lines that an agent of somebody's answers there, and what becomes of the run
 telemetry   MAVLink from the vehicle, and what is said of its events
 scenario    a scenario in YAML: read, written, and a short one played
 story       a story's file
@@ -17,6 +20,8 @@ capture     pcapng and pcap
 csv         records of others in CSV
 bag         ROS bags of both versions, by any storage and packing
 packed      a trace that gzip packed
+depot       exports, mission files and manifests at the depot
+matrix      a matrix, an earlier night's record, results
 """
 
 from collections.abc import Iterator
@@ -25,8 +30,9 @@ from pathlib import Path
 from typing import Protocol
 
 NAMES = (
-    *("datagram", "agent", "store", "mission", "control", "virtual", "foreign", "telemetry", "scenario", "story"),
-    *("trace", "events", "export", "run_record", "network", "tracks", "capture", "csv", "bag", "packed"),
+    *("datagram", "agent", "store", "mission", "control", "answer", "virtual", "foreign"),
+    *("telemetry", "scenario", "story", "trace", "events", "export", "run_record", "network"),
+    *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix"),
 )
 
 

@@ -1,0 +1,50 @@
+"""What somebody's agent answers on its control socket: a sentence says what is wrong with it, or it is its status."""
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from pydantic import ValidationError
+
+from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, Status
+from tests.fuzz.finding import require, sound
+from ucp.agent import Agent
+from ucp.status import status_of
+
+
+def run(data: bytes) -> None:
+    with TemporaryDirectory() as directory:
+        asyncio.run(_ask(Path(directory) / "1.control", data))
+
+
+async def _ask(path: Path, data: bytes) -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(data)
+        writer.close()
+
+    server = await asyncio.start_unix_server(serve, str(path))
+    control = AgentControl(path)
+    try:
+        answer = await control.ask("status", timeout_s=10)
+    except (AgentSilentError, AgentRefusedError) as error:
+        sound(str(error))
+    else:
+        json.dumps(answer)
+        try:
+            status = Status.model_validate(answer)
+        except ValidationError:
+            return
+        require(Status.model_validate_json(status.model_dump_json()) == status, "a status is read otherwise")
+    finally:
+        control.close()
+        server.close()
+
+
+def seeds(flown: Path) -> Iterator[bytes]:
+    more = {"started": True, "handled": 3, "bytes_sent": 100, "mission_s": 1.5, "version": "mine 1.0"}
+    yield json.dumps({"ok": True, **status_of(Agent(1, (1, 2), b"")), **more}).encode() + b"\n"
+    yield b'{"ok": false, "error": "no"}\n'
+    yield b'{"ok": false, "unsupported": true, "error": "never heard of"}\n'

@@ -1,0 +1,57 @@
+"""A file that a vehicle brought to the depot, a chain export, mission file or manifest: consolidated, and compared."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from harness.depot.came_home import came_home
+from harness.depot.consolidation import consolidate
+from harness.depot.mission_files import Plan, write
+from harness.depot.outputs import lines, table, tracks
+from harness.depot.same_mission import compare
+from harness.depot.words import in_words
+from harness.errors import HarnessError
+from tests.fuzz.finding import sound
+from tests.fuzz.targets.home import sound_run
+from tests.harness.virtual import scenario
+
+_NAMES = {b'"ucp-mission-manifest': "manifest.json", b'"ucp-mission/': "1.mission.json"}
+
+
+def run(data: bytes) -> None:
+    name = next((name for schema, name in _NAMES.items() if schema in data[:200]), "1.chain.json")
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / name
+        path.write_bytes(data)
+        beside = sound_run() / "agents" / "2.chain.json"
+        for paths in ([path], [path, beside]):
+            _consolidate(paths)
+            comparison = compare(paths)
+            json.dumps(comparison.to_json())
+            for difference in comparison.differences:
+                sound(difference.sentence)
+            if comparison.verdict == "same":
+                sound(comparison.in_words())
+
+
+def _consolidate(paths: list[Path]) -> None:
+    try:
+        record = consolidate(came_home(paths))
+    except HarnessError as error:
+        sound(str(error))
+        return
+    for sentence in (*record.home.problems, *record.home.left_out, *record.home.remarks, *in_words(record, None)):
+        sound(sentence)
+    for line in "".join(lines(record)).splitlines():
+        json.loads(line)
+    table(record)
+    tracks(record)
+
+
+def seeds(flown: Path) -> Iterator[bytes]:
+    yield (flown / "agents" / "1.chain.json").read_bytes()
+    with TemporaryDirectory() as directory:
+        for path in write(Plan(scenario(agents=3), b"fuzz"), Path(directory)):
+            if path.name in _NAMES.values():
+                yield path.read_bytes()
