@@ -16,6 +16,7 @@ from harness.conformance.run import Asked, conform
 from harness.conformance.table import render, summary, to_junit
 from harness.conformance.vectors import generate
 from harness.errors import HarnessError
+from harness.play.program import located
 from harness.run.sweep import terminated_is_interrupted
 from ucp.agent import HANDLERS
 
@@ -53,7 +54,7 @@ def conformance_command(
     console = Console(stderr=as_json, highlight=False)
     place = keep or Path("conformance-failures")
     with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
-        results = conform(Asked(tuple(command), only, _fresh(place)), Path(scratch), told)
+        results = conform(Asked(tuple(located(command, "the agent")), only, _fresh(place)), Path(scratch), told)
     if junit is not None:
         write_new(junit, [to_junit(results)])
     if as_json:

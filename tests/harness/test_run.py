@@ -265,8 +265,7 @@ open({str(tmp_path / "started")!r}, "a").write(sys.argv[1])
 class Mine(ucp.node.Node):
     def _status(self, request):
         return {{**super()._status(request), "version": "mine\\n1.4"}}
-ucp.node.Node = Mine
-sys.exit(ucp.node.main(sys.argv[1:]))
+sys.exit(ucp.node.main(sys.argv[1:], Mine))
 """
     )
     commands = {2: [sys.executable, os.path.relpath(agent)]}

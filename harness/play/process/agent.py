@@ -8,7 +8,6 @@ import asyncio
 import contextlib
 import json
 import os
-import shutil
 import signal
 import sys
 from collections import Counter
@@ -21,11 +20,12 @@ from pydantic import ValidationError
 
 from harness.archive.directory import RunDirectory
 from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
-from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError, UnsupportedError
+from harness.errors import VIOLATED, HarnessError, MachineError, UnsupportedError
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, AgentUnsupportedError, Status
 from harness.play.last_words import UNSUPPORTED, last_words, last_words_in, of_a_shell
 from harness.play.process.lab import MissionLab, Program
 from harness.play.process.mission_file import mission_file
+from harness.play.program import located
 from harness.scenario import Scenario
 from ucp.trace import HandlerRun
 
@@ -45,23 +45,8 @@ def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
     command = scenario.command_of(agent_id)
     if command is None:
         return [sys.executable, "-P", "-m", "ucp.node"]
-    program, *arguments = command
-    path = shutil.which(program)
-    if path is None:
-        raise ScenarioError(f"`agent_command`{_of_whom(scenario, agent_id)}: {_why_no_program(program)}")
-    # Agents work in a directory of their own.
-    files = (str(Path(word).absolute()) if Path(word).is_file() else word for word in arguments)
-    return [str(Path(path).absolute()), *files]
-
-
-def _of_whom(scenario: Scenario, agent_id: int) -> str:
-    return f" of agent {agent_id}" if isinstance(scenario.agent_command, dict) else ""
-
-
-def _why_no_program(program: str) -> str:
-    if Path(program).name != program and Path(program).is_file():
-        return f"{program} is a file that may not be executed: chmod +x, or name its interpreter before it"
-    return f"{program} is no program: give a path, or a name on PATH"
+    of_whom = f" of agent {agent_id}" if isinstance(scenario.agent_command, dict) else ""
+    return located(command, f"`agent_command`{of_whom}")
 
 
 class AgentFailedError(HarnessError):
