@@ -16,6 +16,7 @@ from harness.play.progress import Silent
 from harness.report.write import write_report
 from harness.run.run import run
 from harness.run.simulate import simulate
+from tests.harness.command import harness
 from tests.harness.virtual import scenario
 from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun
@@ -211,3 +212,13 @@ def test_a_replay_accuses_nobody_over_a_word(directory: Path, agent: int, becaus
     assert found.steps
     assert found.unjudged
     assert because in found.lost[0]
+
+
+def test_a_reconstruction_plays_an_agent_up_to_the_first_line_that_nobody_understands(
+    directory: Path, tmp_path: Path
+) -> None:
+    ended = harness("reconstruct", directory, "--out", tmp_path / "again.yaml")
+    said = ended.stdout + ended.stderr
+    assert "agent 1 cannot be played to the end of its trace: line" in said
+    assert "unknown timer name 'vote'" in said
+    assert "does not do what the protocol says" not in said

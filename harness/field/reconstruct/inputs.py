@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from harness.archive.traces import Trace
+from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
 from harness.checker.steps.header import CheckedHeader
 from harness.checker.steps.inputs import event_of
 from ucp.events import LoggableEvent, MalformedEventsError
@@ -98,6 +99,9 @@ class _Reader:
         current: Input | None = None
         last_s = float("-inf")
         for line, run in life:
+            words = unknown_words([run])
+            if words.keys() - COMPARED_WITHOUT:
+                raise UnusableInputError(f"line {line}: {first_of(words)}")
             if "local" in run.trigger:
                 if current is None:
                     raise UnusableInputError(f"line {line}: {run.handler} ran for a local event before anything came")
