@@ -158,7 +158,7 @@ def _least_held_in_words(least: LeastHeld) -> str:
     if len(least.holders) == least.vehicles:
         what = "the block is" if least.of == 1 else f"all {least.of} blocks are"
         return f"{what} on all {least.vehicles} vehicles"
-    also = f", and {least.blocks} of {least.of} blocks have no more copies" if least.blocks > 1 else ""
+    also = f", and {least.blocks} of {least.of} blocks are on no more vehicles than that" if least.blocks > 1 else ""
     losing = f"losing {_vehicles(least.holders)} would lose block {least.block}{also}"
     bearable = len(least.holders) - 1
     if not bearable:

@@ -12,7 +12,7 @@ from typer.core import TyperCommand
 from typer.exceptions import TyperException
 
 from harness.bisection import CannotBeTriedError, Outcome, Workshop, differences, subject_of
-from harness.bisection.code import interrupted_by_sigterm
+from harness.bisection.code import ROOT, interrupted_by_sigterm
 from harness.bisection.outcome import read
 from harness.commands.terminal import complain, print_json
 from harness.errors import HarnessError, InterruptedRunError, MachineError
@@ -78,7 +78,7 @@ def again_command(
                 console.print(Text(f"{command or code.resolve()}: {outcome.sentence}"), soft_wrap=True)
                 outcomes.append(outcome)
     except CannotBeTriedError as error:
-        complain(f"it cannot be tried: {error}")
+        complain(f"{code.resolve()} cannot be tried: {error}; --code names another state, {ROOT} is the installed one")
         raise typer.Exit(CANNOT_BE_TRIED) from None
     except InterruptedRunError:
         raise

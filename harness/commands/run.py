@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from harness.archive.directory import default_path
+from harness.archive.played import scenario_of
 from harness.archive.record import CapturedFrames
 from harness.backend_names import BackendName
 from harness.commands.terminal import complain, show_programs, show_result, show_rogue, show_survival
@@ -19,7 +20,7 @@ from harness.play import progress
 from harness.play.backends import BACKENDS
 from harness.report.capture import gaps
 from harness.run.run import Run, run
-from harness.scenario import Scenario, load_scenario
+from harness.scenario import Scenario
 from harness.scenario.load import explain
 from harness.scenario.quirks import in_words
 
@@ -31,9 +32,15 @@ class Vehicles(StrEnum):
 
 
 def run_command(
-    scenario: Annotated[Path, typer.Argument(help="Scenario file (YAML).")],
+    scenario: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SCENARIO|RUN",
+            help="A scenario's file (YAML), or the name of one that comes along; or a run, to play once more.",
+        ),
+    ],
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of all that we draw; drawn itself if not given.")
+        int | None, typer.Option(min=0, help="Seed of all that we draw; drawn itself if not given, or that of RUN.")
     ] = None,
     speedup: Annotated[float | None, typer.Option(help="Mission seconds per second of wall time.")] = None,
     vehicles: Annotated[Vehicles | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
@@ -56,8 +63,10 @@ def run_command(
 ) -> None:
     """Play a scenario, check the six characteristics, write a report."""
     console = Console()
-    request = _with_options(load_scenario(scenario), speedup, vehicles, capture, image_from_host)
+    asked, own_seed = scenario_of(scenario)
+    request = _with_options(asked, speedup, vehicles, capture, image_from_host)
     directory = (out or default_path(request.name)).absolute()
+    seed = own_seed if seed is None else seed
     chosen_seed = secrets.randbelow(2**32) if seed is None else seed
     if emit_compose is not None:
         _emit_compose(console, request, chosen_seed, emit_compose)

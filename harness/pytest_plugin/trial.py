@@ -1,5 +1,6 @@
 """A run that a test is about, and whether it is what its scenario expects."""
 
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -32,7 +33,7 @@ class Trial:
         if finished.played.outcome == "not supported":
             pytest.skip(finished.played.outcome_detail or "not supported")
         if lines := self._unexpected(finished):
-            pytest.fail("\n".join([*lines, f"report: {finished.report}"]), pytrace=False)
+            pytest.fail("\n".join([*lines, *_where(finished)]), pytrace=False)
         self.passed = True
 
     def end_of_failed_test(self) -> str:
@@ -41,7 +42,7 @@ class Trial:
             finished = self._finish(False)
         except HarnessError as error:
             return str(error)
-        return "\n".join([*self._unexpected(finished), f"report: {finished.report}"])
+        return "\n".join([*self._unexpected(finished), *_where(finished)])
 
     def _unexpected(self, finished: Run) -> list[str]:
         played = finished.played
@@ -66,6 +67,12 @@ class Trial:
             return []
         exports = RunArchive(finished.directory).exports.by_agent
         return [*self._expect.other_chains({agent: export.top_chain_hash for agent, export in exports.items()})]
+
+
+def _where(finished: Run) -> list[str]:
+    """Where the report is, and what plays the run once more."""
+    again = shlex.join(["ucp-harness", "run", str(finished.directory), "--backend", str(finished.record.backend)])
+    return [f"report: {finished.report}", f"again, with seed {finished.record.seed}: {again}"]
 
 
 @contextmanager

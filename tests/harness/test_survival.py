@@ -118,7 +118,7 @@ def test_it_is_told_in_words() -> None:
     ]
     assert in_words(survival(evidence([PAIRS]))) == [
         "losing any one vehicle loses no block; "
-        "losing vehicles 1 and 2 would lose block 1.1, and 2 of 2 blocks have no more copies"
+        "losing vehicles 1 and 2 would lose block 1.1, and 2 of 2 blocks are on no more vehicles than that"
     ]
     many = [{"at_s": 20.0 * n, what: [4]} for n in range(1, 15) for what in (("kill", "restart")[(n + 1) % 2],)]
     assert in_words(survival(evidence(many)))[5] == "2 more losses of vehicles are in run.json"

@@ -158,7 +158,7 @@ class Player:
             found.unjudged += 1
             resumed = self._born()
             if self._resumption.goes_on(resumed, self.position):
-                found.lost[-1] += f"; on from line {entry.line}, after which it was idle with a chain that is"
+                found.lost[-1] += f"; on from line {entry.line}, after which it was idle with a chain that is on record"
                 self._follower = resumed
             return
         words = unknown_words([run]) if self._unknown else {}

@@ -124,7 +124,10 @@ def test_exit_statuses_are_those_that_git_bisect_run_takes(repository: Path, sce
     finally:
         git(repository, "worktree", "remove", "--force", str(tmp_path / "good"))
     nothing = harness("again", scenario, "--code", tmp_path)
-    assert nothing.returncode == 125 and "it cannot be tried: there is no ucp/ in it" in nothing.stderr
+    assert (
+        nothing.returncode == 125
+        and "cannot be tried: there is no ucp/ in it; --code names another state" in nothing.stderr
+    )
     for mistake in (["--sed", 3], ["--expect", scenario], ["--expect", tmp_path / "none.json"], ["--agent", 1]):
         assert harness("again", scenario, "--code", repository, *mistake).returncode == 128
     assert harness("again", tmp_path / "none.yaml", "--code", repository).returncode == 128

@@ -1,0 +1,23 @@
+"""What to play: a scenario, or once more what a run directory says was played."""
+
+from pathlib import Path
+
+from harness.archive.archive import RunArchive
+from harness.archive.exports import RUN_FILE
+from harness.errors import ScenarioError
+from harness.scenario import Scenario, load_scenario
+
+
+def scenario_of(path: Path) -> tuple[Scenario, int | None]:
+    """The scenario of a file, or of the library by its name; of a run directory its scenario, and the seed it had.
+
+    Raises HarnessError.
+    """
+    if not (path / RUN_FILE).is_file():
+        return load_scenario(path), None
+    archive = RunArchive(path)
+    if archive.record_error is not None:
+        raise archive.record_error
+    if archive.record.scenario is None:
+        raise ScenarioError(f"{path / RUN_FILE}: it does not say what was played; name a scenario")
+    return archive.record.scenario, archive.record.seed

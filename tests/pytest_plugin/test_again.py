@@ -1,0 +1,48 @@
+"""A failing test says what plays its run once more, outside of pytest; and a run can be explored as a scenario can."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from harness.archive.played import scenario_of
+from harness.errors import HarnessError
+from tests.harness.command import harness
+from tests.pytest_plugin.inner import run
+
+pytest_plugins = "pytester"
+
+
+def test_the_run_of_a_failing_test_is_played_again_and_explored(pytester: pytest.Pytester, tmp_path: Path) -> None:
+    pytester.makepyfile("""
+    import pytest
+
+    @pytest.mark.swarm(agents=3, seed=7, network={"loss": 0.3}, quirks={"approve_everything": {"agents": [3]}})
+    def test_wrong(swarm):
+        swarm.run_for(200)
+        swarm.kill(1)
+        swarm.run_for(600)
+    """)
+    failed = run(pytester, "--ucp-keep", "kept in here")
+    failed.assert_outcomes(failed=1)
+    (said,) = re.findall(r"^again, with seed 7: ucp-harness (run .*)$", failed.stdout.str(), re.MULTILINE)
+    command = shlex.split(said)
+    again = harness(*command, "--out", tmp_path / "again")
+    assert again.returncode == 1, again.stderr
+    assert "seed 7" in again.stdout
+    same = harness("diff", command[1], tmp_path / "again")
+    assert same.returncode == 0 and "identical" in same.stdout, same.stdout
+    explored = harness("explore", command[1], "--seeds", 1, "--out", tmp_path / "small.yaml")
+    assert explored.returncode == 1 and explored.stdout.startswith("seed 7: steps deviate"), explored.stdout
+    assert (tmp_path / "small.yaml").is_file()
+
+
+@pytest.mark.parametrize(
+    ("record", "sentence"),
+    [('{"schema": "ucp-run/1"}', "it does not say what was played; name a scenario"), ("{", "truncated or damaged")],
+)
+def test_a_record_without_a_scenario_is_one_sentence(tmp_path: Path, record: str, sentence: str) -> None:
+    (tmp_path / "run.json").write_text(record)
+    with pytest.raises(HarnessError, match=sentence):
+        scenario_of(tmp_path)
