@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+from harness.play.simulation.foreign.programs import SHARED
 from harness.run.simulate import Simulated, simulate
 from harness.run.sweep import Failed, sweep
 from harness.scenario import Scenario, library, load_scenario
@@ -38,6 +39,24 @@ def measure(scenario: Scenario, missions: int, jobs: int) -> tuple[float, int]:
                 sys.exit(f"seed {seed}: {outcome.reason}")
             runs += outcome
     return time.monotonic() - began, runs
+
+
+def processor_s(scenario: Scenario, missions: int = 10) -> tuple[float, float]:
+    """Seconds of a processor that a mission takes of this process, and of the agents' without their start."""
+
+    def used(who: int) -> float:
+        usage = resource.getrusage(who)
+        return usage.ru_utime + usage.ru_stime
+
+    spent = []
+    for count in (1, 1 + missions):  # the first alone is mostly their start
+        before = used(resource.RUSAGE_SELF), used(resource.RUSAGE_CHILDREN)
+        for seed in range(count):
+            simulate(scenario, seed, tracing=True, deliver_all=True)
+        SHARED.close()
+        spent.append((used(resource.RUSAGE_SELF) - before[0], used(resource.RUSAGE_CHILDREN) - before[1]))
+    (ours, theirs), (ours_of_all, theirs_of_all) = spent
+    return (ours_of_all - ours) / missions, (theirs_of_all - theirs) / missions
 
 
 def left_behind(simulated: Simulated) -> object:
@@ -81,9 +100,9 @@ def main() -> int:
     for words, command in (("in the simulation", None), (" ".join(asked.command), asked.command)):
         wall_s, runs = measure(of_library("loss_15", command), asked.missions, asked.jobs)
         rate = f"{asked.missions / wall_s * 60:.0f} missions a minute, {runs / wall_s:.0f} handler runs a second"
-        sys.stdout.write(f"{words}: {asked.missions} missions in {wall_s:.1f} s, {rate}\n")
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    sys.stdout.write(f"processor time of both: {used.ru_utime:.1f} s, and {used.ru_stime:.1f} s of the kernel\n")
+        ours_s, theirs_s = processor_s(of_library("loss_15", command))
+        cost = f"{1000 * ours_s:.0f} ms of a processor a mission, and {1000 * theirs_s:.0f} ms the agents"
+        sys.stdout.write(f"{words}: {asked.missions} missions in {wall_s:.1f} s, {rate}; {cost}\n")
     return 0
 
 
