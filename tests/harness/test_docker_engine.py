@@ -202,6 +202,12 @@ def test_an_image_has_its_own_interpreter_environment_and_files(tmp_path: Path) 
     assert host.environment(env) == env
     assert {program} < set(host.shared(argv))
     assert any(Path(sys.executable).is_relative_to(path) for path in host.mounted)
+    interpreter = tmp_path / "environment" / "bin" / "python"
+    interpreter.parent.mkdir(parents=True)
+    interpreter.touch()
+    assert interpreter in ours.shared([str(interpreter)])
+    (tmp_path / "environment" / "pyvenv.cfg").touch()
+    assert ours.shared([str(interpreter)]) == [tmp_path / "environment"]
 
 
 def emitted(tmp_path: Path, *options: object, **keys: Any) -> dict[str, Any]:

@@ -53,7 +53,7 @@ class Image:
     def shared(self, argv: Sequence[str]) -> list[Path]:
         """What of this machine to mount so that `argv` can be started: programs and scripts by their paths."""
         files = [Path(word) for word in self.command(argv) if Path(word).is_absolute() and Path(word).is_file()]
-        return outermost([*self.mounted, *([] if self.foreign else files)])
+        return outermost([*self.mounted, *([] if self.foreign else map(_with_environment, files))])
 
 
 def from_host(engine: Engine) -> Image:
@@ -150,6 +150,12 @@ def _tar(files: Mapping[str, bytes]) -> bytes:
             entry.size, entry.mode = len(content), 0o644
             tar.addfile(entry, io.BytesIO(content))
     return archive.getvalue()
+
+
+def _with_environment(program: Path) -> Path:
+    """The Python environment that it is a program of, for without that it is another program; else itself."""
+    environment = program.parent.parent
+    return environment if (environment / "pyvenv.cfg").is_file() else program
 
 
 def _exists(engine: Engine, name: str) -> bool:

@@ -14,7 +14,7 @@ from rclpy.task import Future
 from std_msgs.msg import String, UInt8MultiArray
 
 from ucp.events import decode_events
-from ucp.examples.ros2.ucp_node import LATER_TOO, ON_THIS_VEHICLE
+from ucp.examples.ros2.ucp_node import LATER_TOO, NO_FILES, ON_THIS_VEHICLE
 
 EVENT_ID = 1
 EVERY_S = 1.0
@@ -54,6 +54,6 @@ class Talker:
 
 if __name__ == "__main__":
     os.environ.update(ON_THIS_VEHICLE)
-    rclpy.init(args=[])
+    rclpy.init(args=NO_FILES)
     talker = Talker(int(sys.argv[1]), sys.argv[2])
     rclpy.spin_until_future_complete(talker.ros, talker.done)

@@ -42,6 +42,9 @@ ON_THIS_VEHICLE = {
 """ROS sends to loopback, and not through shared memory either, which vehicles of one machine would share: what is on
 the air is UCP's."""
 
+NO_FILES = ["--ros-args", "--disable-external-lib-logs"]
+"""ROS leaves none: in a container an agent can write only where its mission file is."""
+
 
 class RosLoop(Loop):
     """The loop of `ucp.loop`, run by a ROS executor: one ROS timer is set to what is due next.
@@ -127,5 +130,5 @@ class RosAgent(Node):
 
 if __name__ == "__main__":
     os.environ.update(ON_THIS_VEHICLE)
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=NO_FILES, signal_handler_options=SignalHandlerOptions.NO)
     sys.exit(main(sys.argv[1:], RosAgent))
