@@ -12,6 +12,9 @@ from typing import Any
 import pytest
 
 import ucp
+from harness.conformance.file import to_lines
+from harness.conformance.states import VARIANTS, explore
+from harness.conformance.vectors import Vectors
 from harness.play.progress import Silent
 from harness.run.run import run
 from tests.harness.command import harness, write_scenario
@@ -83,6 +86,27 @@ def vectors(name: str) -> Any:
 @pytest.mark.parametrize("name", json.loads(INDEX.read_text(encoding="ascii")))
 def test_a_transcript(name: str, player: Player) -> None:
     assert play(player, INDEX.with_name(f"{name}.jsonl")) is None
+
+
+def test_generated_vectors(agent: Path) -> None:
+    """Pairs of a state and an input, each path of them from its mission to its end."""
+    steps = list(explore(VARIANTS["default"]))[::8]
+    lines = to_lines([Vectors(VARIANTS["default"], steps, {step.pair: step for step in steps})])
+    by_number = {step["step"]: step for step in map(json.loads, lines) if "step" in step}
+    ends = by_number.keys() - {step["after"] for step in by_number.values()}
+    played = []
+    for end in sorted(ends):
+        way = [by_number[end]]
+        while way[-1]["after"] is not None:
+            way.append(by_number[way[-1]["after"]])
+        played += reversed(way)
+    told = "".join(json.dumps(step["in"]) + "\n" for step in played)
+    done = subprocess.run([agent, "--virtual"], input=told, capture_output=True, text=True, check=True)
+    answers = [json.loads(answer) for answer in done.stdout.splitlines()]
+    assert len(ends) > 500
+    for step, answer in zip(played, answers, strict=True):
+        if step["after"] is not None:
+            assert {key: answer[key] for key in step["out"]} == step["out"], step
 
 
 def test_what_is_dropped_and_why(player: Player) -> None:
@@ -163,6 +187,8 @@ def test_a_mission_in_virtual_time_with_ours_among_them(agent: Path, tmp_path: P
     finished = run(mixed, 1, tmp_path / "run", Silent(), "sim")
     assert finished.exit_status == 0
     assert_nothing_to_find(tmp_path / "run")
+    record = json.loads((tmp_path / "run" / "run.json").read_text(encoding="utf-8"))
+    assert record["agents"]["1"]["version"] == "ucp_agent.c, 1"
 
 
 @pytest.mark.lab

@@ -889,7 +889,7 @@ static void start_timer(Agent *a, enum timer timer, double duration) {
     a->started_timers |= 1u << timer;
 }
 
-/* --- Messages out: the body is put together in `body`; `block` is what the trace says that it names. --------------- */
+/* --- Messages out: the body is put together in `body`; `block` is what the trace says that it names. ------------- */
 
 static void put_hash(Buf *b, const Hash *hash) { put(b, hash->b, 32); }
 
@@ -921,7 +921,7 @@ static void send_commit(Agent *a, const Block *block) {
     send_message(a, COMMIT_BLOCK, &block->hash);
 }
 
-/* --- Messages in: the first test that fails says why a datagram is dropped. --------------------------------------- */
+/* --- Messages in: the first test that fails says why a datagram is dropped. -------------------------------------- */
 
 static enum drop read_datagram(const Agent *a, const uint8_t *d, size_t n, Input *in) {
     if (n < HEADER) return TRUNCATED;
@@ -976,7 +976,7 @@ enum algorithm {                                        /* those that are trigge
     RECONCILE_PHASE_3 = 16, RECONCILE_FINALIZE = 20
 };
 
-/* --- Commit ------------------------------------------------------------------------------------------------------- */
+/* --- Commit ------------------------------------------------------------------------------------------------------ */
 
 /* Algorithm 1: an event is logged. */
 static const char *build_data_block(Agent *a) {
@@ -1069,7 +1069,7 @@ static const char *receive_commit_block(Agent *a) {
     return "committed";
 }
 
-/* --- Reconcile ---------------------------------------------------------------------------------------------------- */
+/* --- Reconcile --------------------------------------------------------------------------------------------------- */
 
 /* Algorithm 7: Reconcile Begin. */
 static const char *reconcile_begin(Agent *a) {
@@ -1549,10 +1549,10 @@ static void put_header(Buf *b, const Agent *a) {
 }
 
 static void put_status(Buf *b, const Agent *a, double now, const char *trace_problem) {
-    put_format(b, "{\"ok\":true,\"started\":%s,\"idle\":%s,\"reconcile_in_progress\":%s,\"chain\":%zu,\"deque\":%zu,"
-               "\"stack\":%zu,\"completed\":%zu,\"reconciles\":%" PRIu64, truth(a->started),
-               truth(is_idle(a)), truth(a->reconciling), a->chain.len, a->deque.len,
-               a->stack.len, completed_len(a), a->reconciles);
+    put_format(b, "{\"ok\":true,\"version\":\"ucp_agent.c, 1\",\"started\":%s,\"idle\":%s,\"reconcile_in_progress\":%s",
+               truth(a->started), truth(is_idle(a)), truth(a->reconciling));
+    put_format(b, ",\"chain\":%zu,\"deque\":%zu,\"stack\":%zu,\"completed\":%zu,\"reconciles\":%" PRIu64, a->chain.len,
+               a->deque.len, a->stack.len, completed_len(a), a->reconciles);
     put_text(b, ",\"top_chain_hash\":\"");
     put_hex(b, a->top.b, 32);
     put_format(b, "\",\"handled\":%" PRIu64 ",\"bytes_sent\":%" PRIu64 ",\"send_failures\":%" PRIu64 ",\"dropped\":{",
@@ -1760,7 +1760,7 @@ static double mission_now(const Station *s) {           /* never goes back */
     return now > s->a->now ? fmin(now, 1e15) : s->a->now;
 }
 
-/* --- Trace -------------------------------------------------------------------------------------------------------- */
+/* --- Trace ------------------------------------------------------------------------------------------------------- */
 
 static bool trace_open(Station *s, const char *name) {
     char last = '\0';
@@ -1793,7 +1793,7 @@ static void trace_write(Station *s) { /* each line in one write; a full disk end
     lines->len = 0;
 }
 
-/* --- Store -------------------------------------------------------------------------------------------------------- */
+/* --- Store ------------------------------------------------------------------------------------------------------- */
 
 static void sync_folder(const char *path) {             /* so that a file that was renamed is found after a brown-out */
     char folder[4096];
@@ -1861,7 +1861,7 @@ static void store_write(Station *s) {
     a->keeping = false;
 }
 
-/* --- What follows an input: store, trace, messages, in this order. ------------------------------------------------ */
+/* --- What follows an input: store, trace, messages, in this order. ----------------------------------------------- */
 
 static void settle(Station *s) {
     Agent *a = s->a;
@@ -1898,7 +1898,7 @@ static void begin_mission(Station *s, uint64_t epoch_us) {
     }
 }
 
-/* --- Events: Algorithm 21 ----------------------------------------------------------------------------------------- */
+/* --- Events: Algorithm 21 ---------------------------------------------------------------------------------------- */
 
 static uint64_t draw(Station *s) {                      /* SplitMix64 */
     uint64_t z = s->random += 0x9e3779b97f4a7c15u;
@@ -1941,7 +1941,7 @@ static void tick(Station *s) {                          /* all that time alone b
         random_events(s, now);
 }
 
-/* --- Control socket ----------------------------------------------------------------------------------------------- */
+/* --- Control socket ---------------------------------------------------------------------------------------------- */
 
 static bool export_chain(Station *s) {
     Agent *a = s->a;
