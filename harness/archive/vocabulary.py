@@ -43,8 +43,13 @@ TALLIES = {
 }
 """Handler -> the keys of its tally; None if they are block hashes."""
 
-COMPARED_WITHOUT: frozenset[Kind] = frozenset(("branch", "tally"))
-"""Of a step with unknown words of these kinds all the rest can be judged; with others it is not known what it was."""
+COMPARED_WITHOUT: frozenset[Kind] = frozenset(("branch", "tally", "timer"))
+"""Of a step with unknown words of these kinds all the rest can be judged; with others it is not known what it was.
+
+Which timer ended, its handler tells.
+"""
+
+_TIMER_OF = {handler.name: timer for timer, handler in ON_TIMER.items()}
 
 SHOWN = 40
 """More of an unknown word is not shown."""
@@ -67,7 +72,8 @@ def unknown_words(runs: Iterable[HandlerRun]) -> Unknown:
                 unknown.setdefault("message", f"unknown message name {_shown(trigger['message'])}")
         elif "timer" in trigger:
             if trigger["timer"] not in TIMERS:
-                unknown.setdefault("timer", f"unknown timer name {_shown(trigger['timer'])}")
+                kind: Kind = "timer" if run.handler in _TIMER_OF else "trigger"
+                unknown.setdefault(kind, f"unknown timer name {_shown(trigger['timer'])}")
         elif "local" in trigger and trigger["local"] not in HANDLERS:
             unknown.setdefault("handler", f"unknown handler name {_shown(trigger['local'])}")
         for operation, _ in run.changes:
@@ -89,6 +95,17 @@ def tally_is_known(run: HandlerRun) -> bool:
     """Whether all keys of its tally are of that handler's."""
     keys = TALLIES.get(run.handler)
     return not run.tally or keys is None or keys.issuperset(run.tally)
+
+
+def timer_that_ended(run: HandlerRun) -> str:
+    """The timer that triggered it: as it names it; by another name the one whose handler this is, if it is any's."""
+    name = str(run.trigger["timer"])
+    return name if name in TIMERS else _TIMER_OF.get(run.handler, name)
+
+
+def timers_are_known(run: HandlerRun) -> bool:
+    """Whether all timers that it started are named as they are known."""
+    return not run.started or TIMERS.issuperset(run.started)
 
 
 def branch_is_known(run: HandlerRun) -> bool:

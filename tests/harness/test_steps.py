@@ -358,7 +358,7 @@ def test_handlers_that_there_are_not_are_not_judged_however_many_names_they_have
 
     judgement = steps.check(edited(honest, 3, rename))
     assert judgement.verdict == "not applicable"
-    assert judgement.reason.startswith("of agent 3 the trace is not understood: unknown handler name 'handler_0")
+    assert judgement.reason.startswith("of agent 3 the trace is not wholly understood: unknown handler name 'handler_0")
     assert len(judgement.reason) < 500
 
 

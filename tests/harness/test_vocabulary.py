@@ -173,6 +173,22 @@ def test_a_known_handler_with_another_s_number_is_a_contradiction_in_the_evidenc
     assert finding.detail == "its trace has receive_commit_block as Algorithm 7, and that is Algorithm 6"
 
 
+def test_a_mistake_is_found_though_timers_and_branches_have_other_names(honest: Evidence) -> None:
+    def otherwise(run: HandlerRun) -> HandlerRun:
+        for timer in TIMERS:
+            run = timer_renamed(timer)(run)
+        return dataclasses.replace(run, branch=foreign(run.branch))
+
+    told = told_by(honest, otherwise, {1})
+    assert not check(told).bad
+    wrong = next(run for run in told.traces[1].runs if run.handler == "vote_timer_expiration" and run.changes)
+    wrong.sent.clear()
+    judgement = check(told).beside["steps"]
+    assert judgement.verdict == "deviates"
+    (finding, *_) = judgement.evidence
+    assert "it sent nothing; it should have sent Commit Block" in finding.detail
+
+
 def test_what_was_lost_is_not_known_where_nobody_knows_what_was_completed(honest: Evidence) -> None:
     told = told_by(honest, operation_renamed("complete"), {2})
     survived = survival(told)
@@ -219,6 +235,7 @@ def test_a_reconstruction_plays_an_agent_up_to_the_first_line_that_nobody_unders
 ) -> None:
     ended = harness("reconstruct", directory, "--out", tmp_path / "again.yaml")
     said = ended.stdout + ended.stderr
-    assert "agent 1 cannot be played to the end of its trace: line" in said
-    assert "unknown timer name 'vote'" in said
+    assert "agent 4 cannot be played to the end of its trace: line" in said
+    assert "unknown operation 'done'" in said
+    assert "agent 1" not in said, "which timer ended, its handler tells"
     assert "does not do what the protocol says" not in said

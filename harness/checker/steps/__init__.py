@@ -51,7 +51,7 @@ def check(evidence: Evidence) -> Judgement:
     for agent_id in sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):
         unjudged[agent_id] = "there is no trace"
     for agent_id, words in evidence.unknown.items():
-        unjudged.setdefault(agent_id, f"the trace is not understood: {first_of(words)}")
+        unjudged.setdefault(agent_id, f"the trace is not wholly understood: {first_of(words)}")
     unjudged |= {agent_id: f"the trace is not whole: {why}" for agent_id, why in evidence.examination.short.items()}
     if unjudged or not evidence.traces:
         return Judgement(NAME, "not applicable", _why(unjudged))

@@ -6,7 +6,7 @@ from copy import deepcopy
 from typing import Any, NamedTuple
 
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import branch_is_known, tally_is_known
+from harness.archive.vocabulary import branch_is_known, tally_is_known, timer_that_ended, timers_are_known
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.header import CheckedHeader
 from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, stored_blocks
@@ -248,7 +248,7 @@ class Follower:
         if "local" in trigger:
             handler, inputs = self._local(run), ()
         elif "timer" in trigger:
-            handler, inputs = self._timer(str(trigger["timer"]), now), ()
+            handler, inputs = self._timer(timer_that_ended(run), now), ()
         elif "event" in trigger:
             handler, inputs = ON_LOCAL_EVENT["Build Data Block"], self._event(run.input, trigger["event"])
         elif trigger.get("operator") == "reconcile":
@@ -345,7 +345,7 @@ class Follower:
             return True
         if (run.sent or core.outbox) and not core.has_sent(run.sent):
             return True
-        if self._tells.timers and (run.started or {}) != core.started:
+        if self._tells.timers and (run.started or {}) != core.started and timers_are_known(run):
             return True
         tells_tally = branch in COUNTING and run.handler in self._tells.tallying
         if tells_tally and run.tally != tally_of(core, handler) and tally_is_known(run):
@@ -383,7 +383,7 @@ class Follower:
         taken = branch if branch_is_known(run) else run.branch
         expected = HandlerRun(run.t, handler.name, handler.algorithm, run.trigger, taken, changes, sent, state)
         tells_tally = branch in COUNTING and run.handler in self._tells.tallying and tally_is_known(run)
-        expected.started = dict(core.started) if self._tells.timers else run.started
+        expected.started = dict(core.started) if self._tells.timers and timers_are_known(run) else run.started
         expected.tally = tally_of(core, handler) if tells_tally else run.tally
         return expected
 

@@ -242,7 +242,7 @@ class ReferenceCore(Core):
         for timer in self.timers:
             if (duration := (run.started or {}).get(timer.name)) is not None:
                 timer.start(self.now, duration)
-        if run.branch == "recommitted, more to come" and not run.started:
+        if run.branch == "recommitted, more to come" and self.finalize_timer.name not in (run.started or ()):
             self.finalize_timer.start(self.now, self.settings.finalize_gap_s)
         if run.handler == "receive_response_block_for_hash" and run.changes:
             self.phase_three_timer.stop()

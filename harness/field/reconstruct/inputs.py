@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
+from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, timer_that_ended, unknown_words
 from harness.checker.steps.header import CheckedHeader
 from harness.checker.steps.inputs import event_of
 from ucp.events import LoggableEvent, MalformedEventsError
@@ -126,7 +126,7 @@ class _Reader:
         except (ValueError, MalformedEventsError):
             raise UnusableInputError(f"line {line}: the input of {run.handler} is damaged") from None
         if "timer" in trigger:
-            return TimerEnded(str(trigger["timer"]))
+            return TimerEnded(timer_that_ended(run))
         if "operator" in trigger:
             return Asked()
         if "boot" in trigger:
