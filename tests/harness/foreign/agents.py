@@ -1,5 +1,6 @@
 """Agents of other makes for virtual time: ours behind standard input and output, and small ones that go wrong."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,15 @@ for number, line in enumerate(sys.stdin):
 """
 """An agent that does nothing but answer; CODE may have it go wrong."""
 
+EXPORT = """
+if given.get('command') == 'export':
+    said['answer'] = {
+        'schema': 'ucp-chain-export/1', 'agent_id': 1, 'exported_at_us': 0, 'chain': [], 'completed': [], 'idle': True,
+        'inception': {'block_data': '', 'block_hash': '00' * 32, 'chain_hash': '00' * 32}, 'reconcile_stack': [],
+        'blocks_to_be_committed': [], 'current_block': {'event_data': ''}, 'reconcile_in_progress': False}
+"""
+"""Code with which it has an export, of nothing."""
+
 
 def small(directory: Path, code: str = "pass") -> list[str]:
     """The command of an agent that does nothing, but for `code`, which runs before each answer is written."""
@@ -34,3 +44,17 @@ def small(directory: Path, code: str = "pass") -> list[str]:
 
 def played_by(command: list[str] | dict[int, list[str]], **keys: Any) -> Scenario:
     return scenario(agent_command=command, **keys)
+
+
+def living(word: Path) -> list[int]:
+    """Processes that have to do with these files."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                said = (entry / "cmdline").read_bytes()
+            except OSError:
+                continue
+            if str(word).encode() in said and b"--virtual" in said:
+                found.append(int(entry.name))
+    return found

@@ -12,7 +12,7 @@ from harness.play.progress import Silent
 from harness.play.simulation.foreign import agent, program
 from harness.run.run import Run, run
 from harness.run.simulate import simulate
-from tests.harness.foreign.agents import played_by, small
+from tests.harness.foreign.agents import EXPORT, living, played_by, small
 from ucp.messages import BlockAddRequest, encode
 from ucp.trace import in_base64
 
@@ -125,10 +125,9 @@ def test_what_is_no_message_of_its_own_reaches_the_others_and_is_dropped(tmp_pat
     assert [line["trigger"]["from"] for line in lines if "trigger" in line] == [1]
 
 
-def test_an_agent_that_cannot_end_is_ended(tmp_path: Path) -> None:
-    one = played_by(small(tmp_path, "import signal; signal.signal(15, 1)"), **SHORT)
-    finished = run(one, 1, tmp_path / "run", Silent(), "sim")
-    assert finished.played.outcome == "failed"  # it has no export, and that is all
+def test_an_agent_that_does_not_end_by_itself_is_ended(tmp_path: Path) -> None:
+    run_with(tmp_path, "import atexit, time\nif number == 0:\n    atexit.register(time.sleep, 99)")
+    assert not living(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -140,12 +139,10 @@ def test_an_agent_that_cannot_end_is_ended(tmp_path: Path) -> None:
     ],
 )
 def test_an_agent_that_is_not_the_same_twice_is_named(tmp_path: Path, code: str, why: str) -> None:
-    export = "if given.get('command') == 'export': said['answer'] = {'completed': []}\n"
-    one = played_by({2: small(tmp_path, export + code), 3: small(tmp_path, export + code)}, **{**SHORT, "agents": 3})
-    finished = run(one, 1, tmp_path / "run", Silent(), "sim")
+    finished = run_with(tmp_path, EXPORT + code)
     detail = str(finished.played.outcome_detail)
     assert finished.exit_status == 1
-    assert "is not the same twice: given" in detail and why in detail, detail
+    assert "agent 2 is not the same twice: given" in detail and why in detail, detail
 
 
 def test_what_virtual_time_lacks_is_not_supported(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """Agents of other makes over many missions: explored and shrunk, in a matrix, and nobody left behind."""
 
 import json
-import os
 import signal
 import subprocess
 import time
@@ -17,35 +16,14 @@ from harness.matrix.play import Player
 from harness.play.simulation.foreign.programs import Programs
 from harness.run.simulate import simulate
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
-from tests.harness.foreign.agents import played_by, small
+from tests.harness.foreign.agents import EXPORT, living, played_by, small
 
-EXPORT = """
-if given.get('command') == 'export':
-    said['answer'] = {
-        'schema': 'ucp-chain-export/1', 'agent_id': 1, 'exported_at_us': 0, 'chain': [], 'completed': [], 'idle': True,
-        'inception': {'block_data': '', 'block_hash': '00' * 32, 'chain_hash': '00' * 32}, 'reconcile_stack': [],
-        'blocks_to_be_committed': [], 'current_block': {'event_data': ''}, 'reconcile_in_progress': False}
-"""
 THIRD_EVENT_KILLS = """
 count = 0 if 'mission' in given else count + ('event_id' in given)
 if count > 2:
     sys.exit('the third event was too much')
 """
 BUSY = {"agents": 2, "duration_s": 150, "events": {"source": "random", "mean_s": 15}}
-
-
-def living(word: Path) -> list[int]:
-    """Processes that have to do with these files."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                said = (entry / "cmdline").read_bytes()
-            except OSError:
-                continue
-            if str(word).encode() in said and b"--virtual" in said:
-                found.append(int(entry.name))
-    return found
 
 
 def nobody_is_left(word: Path) -> bool:

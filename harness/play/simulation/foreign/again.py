@@ -36,13 +36,17 @@ class Again:
         self._programs: dict[tuple[str, ...], Program] = {}
 
     def compare(self, record: LifeRecord) -> None:
-        """Raises NotTheSameError."""
+        """The first life of each make is given its inputs twice, so that a process plays more than one.
+
+        Raises NotTheSameError.
+        """
         used = record.command in self._programs
         if not used:
             self._programs[record.command] = Program(record.command)
-        difference = _given_to(self._programs[record.command], record)
-        if difference is not None:
-            raise NotTheSameError(record.agent_id, _explained(record, difference, used=used))
+        for after_another in (used,) if used else (False, True):
+            difference = _given_to(self._programs[record.command], record)
+            if difference is not None:
+                raise NotTheSameError(record.agent_id, _explained(record, difference, used=after_another))
 
     def close(self) -> None:
         for program in self._programs.values():

@@ -263,7 +263,7 @@ class ForeignAgent:
     def _check(self, entries: list[Entry]) -> list[bytes]:
         """Hashes of the blocks that were completed, as the trace says it. Raises AgentFailedError."""
         for entry in entries:
-            if abs(entry.t - self._now) > ROUNDED_S:
+            if not abs(entry.t - self._now) <= ROUNDED_S:
                 raise self._failure("crashed", f"wrote t={entry.t!r} into its trace of an input at {self._now:g} s")
         try:
             return [bytes.fromhex(block) for operation, block in _changes(entries) if operation == "complete"]

@@ -11,7 +11,7 @@ from pydantic_core import from_json
 
 from harness.archive.traces import ASIDE, HANDLER_RUN
 from ucp.messages import Datagram, MalformedDatagramError, decode
-from ucp.trace import Entry, Recorded
+from ucp.trace import Entry, HandlerRun, Recorded
 
 MAX_SENT = 1000
 """No input makes an agent broadcast more."""
@@ -99,9 +99,8 @@ def _entries(trace: list[Any]) -> Iterable[Entry]:
             where = ".".join(str(part) for part in problem["loc"])
             wrong = f": {where}: {problem['msg'].lower()}" if kind is HANDLER_RUN else ""
             raise AnswerError(f"with `trace.{number}`, which is no line of a trace{wrong}: {shown(line)}") from None
-        durations = getattr(entry, "started", None) or {}
-        if not all(math.isfinite(number) for number in (entry.t, *durations.values())):
-            raise AnswerError(f"with `trace.{number}`, in which a number is not finite: {shown(line)}")
+        if isinstance(entry, HandlerRun) and entry.started and not all(map(math.isfinite, entry.started.values())):
+            raise AnswerError(f"with `trace.{number}`, in which a timer runs for ever: {shown(line)}")
         yield entry
 
 
