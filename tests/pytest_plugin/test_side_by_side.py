@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pytest
 
@@ -142,3 +143,23 @@ def test_nothing_needs_to_be_imported_and_markers_are_known(pytester: pytest.Pyt
     pytester.makepyfile("def test_story(swarm): swarm.run_for(10)")
     pytester.makeini("[pytest]\naddopts = --strict-markers --strict-config -W error")
     run(pytester).assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize("ours", ["harness", "ucp", "sitl", "netem"])
+def test_a_project_with_a_package_of_the_same_name_keeps_its_tests(pytester: pytest.Pytester, ours: str) -> None:
+    package = pytester.mkpydir(ours)
+    (package / "theirs.py").write_text("ANSWER = 42")
+    pytester.makepyfile(f"""
+    from {ours}.theirs import ANSWER
+
+    def test_theirs():
+        assert ANSWER == 42
+
+    def test_story(swarm):
+        swarm.run_for(10)
+    """)
+    pytester.makeconftest("")
+    for command in ([sys.executable, "-m", "pytest"], [Path(sys.executable).with_name("pytest")]):
+        result = pytester.run(*command)
+        result.assert_outcomes(passed=1, errors=1)
+        result.stdout.fnmatch_lines([f"*ucp-harness is not there: *{ours} has the name of one of its packages; *"])
