@@ -49,7 +49,8 @@ class UnsupportedError(MachineError):
     @classmethod
     def of(cls, agent_id: int, command: Sequence[str], words: str) -> Self:
         """`words` are the agent's own, and may be none."""
-        return cls(f"not supported by agent {agent_id} ({shlex.join(command)}): {words or 'it does not say why'}")
+        why = words.rstrip(".") or "it does not say why"
+        return cls(f"not supported by agent {agent_id} ({shlex.join(command)}): {why}")
 
 
 class InterruptedRunError(HarnessError):

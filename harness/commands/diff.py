@@ -12,7 +12,7 @@ from rich.text import Text
 
 from harness.commands.terminal import complain, print_json
 from harness.difference import AgentDifference, Difference, Parting, Step, compare
-from harness.report.programs import in_words
+from harness.report.programs import in_sentence
 
 DIFFERENT = 1
 VALUE_CHARACTERS = 60
@@ -57,9 +57,9 @@ def _programs(difference: Difference) -> Iterator[str]:
     """Who ran what, unless all agents of both runs were the harness's own."""
     a, b = difference.programs["a"], difference.programs["b"]
     if a == b:
-        yield from [f"in both runs {in_words(a)}"] if a else []
+        yield from [f"in both runs {in_sentence(a)}"] if a else []
     else:
-        yield from (f"in {run} {in_words(ran) or OURS}" for run, ran in (("A", a), ("B", b)))
+        yield from (f"in {run} {in_sentence(ran) or OURS}" for run, ran in (("A", a), ("B", b)))
 
 
 def _differences(difference: Difference) -> Iterator[str]:

@@ -9,6 +9,7 @@ import pytest
 from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, MachineError
 from harness.pytest_plugin.findings import JudgementInTest
+from harness.report.programs import in_sentence, programs
 from harness.run.run import Run
 from harness.scenario import Scenario
 from harness.scenario.expect import Expect
@@ -59,8 +60,11 @@ class Trial:
         lines += self._expect.other_common(finished.result.chains)
         lines += self._expect.other_deviations(deviating)
         lines += self._other_chains(finished)
+        if not lines:
+            return []
         wrong = ", ".join(in_words(self._quirks))
-        return [*lines, f"wrong on purpose: {wrong}"] if lines and wrong else lines
+        ran = in_sentence(programs(finished.record))
+        return [*lines, *([f"wrong on purpose: {wrong}"] if wrong else []), *([ran] if ran else [])]
 
     def _other_chains(self, finished: Run) -> list[str]:
         if not self._expect.chains:

@@ -43,5 +43,5 @@ def programs(record: RunRecord) -> list[Program]:
     return [Program(tuple(agents), command, version) for (command, version), agents in alike.items()]
 
 
-def in_words(ran: Iterable[Program]) -> str:
+def in_sentence(ran: Iterable[Program]) -> str:
     return "; ".join(program.in_words for program in ran)

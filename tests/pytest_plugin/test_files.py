@@ -2,6 +2,8 @@
 
 import json
 import os
+import shlex
+import sys
 
 import pytest
 import yaml
@@ -169,3 +171,13 @@ def test_an_option_that_means_nothing_is_one_sentence(
     result.assert_outcomes(errors=1)
     result.stdout.fnmatch_lines([sentence])
     no_internals(result)
+
+
+def test_a_failed_test_says_who_ran_what_where_not_all_ran_ours(pytester: pytest.Pytester) -> None:
+    write_scenario(pytester, "mixed.yaml", expect={"figures": {"blocks": 999}})
+    agent = f"2={shlex.quote(sys.executable)} -P -m ucp.node"
+    result = run(pytester, "mixed.yaml", "--ucp-agent", agent)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        ["blocks *999*", "agents 1, 3 ran the harness's own; agent 2 ran * -P -m ucp.node", "report: *"]
+    )
