@@ -1,7 +1,7 @@
 """The command line: which commands there are; each is imported when it is called.
 
 Exit status 0: ran, and no characteristic is violated. 1: at least one is violated, or an agent failed. 2: the request
-was wrong. 3: this machine cannot do it. 130: interrupted.
+was wrong. 3: this machine cannot do it. 4: `prove` could not look at everything. 130: interrupted.
 """
 
 import os
@@ -88,6 +88,10 @@ COMMANDS = {
     "explore": (
         "harness.commands.explore:explore_command",
         "Play seed after seed in virtual time until a characteristic is violated; then find the smallest such run.",
+    ),
+    "prove": (
+        "harness.commands.prove:prove_command",
+        "Look at every state that the agents can come to within bounds: is any wrong, or without a way out?",
     ),
     "scale": (
         "harness.commands.scale:scale_command",

@@ -1,0 +1,115 @@
+"""`ucp-harness prove`: look at everything that can happen within bounds."""
+
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, Self
+
+import typer
+import yaml
+from rich.console import Console
+
+from harness import prove
+from harness.commands.terminal import complain, print_json
+from harness.prove import Bounds, BoundsError, Limits, Progress
+
+LINE_EVERY_S = 10.0
+GIGABYTE = 1e9
+
+
+def prove_command(
+    agents: Annotated[int, typer.Option(help="How many agents there are.")] = 2,
+    blocks: Annotated[int, typer.Option(help="How many blocks they complete in all, anybody at any moment.")] = 3,
+    network: Annotated[str, typer.Option(help="lossless, or lossy: anybody may lose any message.")] = "lossy",
+    faults: Annotated[
+        str, typer.Option(help="Of reboot, death (each once, at any moment) and duplicate, with commas between.")
+    ] = "",
+    timers: Annotated[str, typer.Option(help="When timers end: by duration, or any, in whatever order.")] = "duration",
+    settings: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=VALUE", help="A setting of all agents; may be repeated.")
+    ] = None,
+    quirk: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="A mistake that all agents make; may be repeated.")
+    ] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Take no two states for one, though they behave alike.")
+    ] = False,
+    memory: Annotated[float, typer.Option(help="Gigabytes at which to give up.")] = 4.0,
+    for_s: Annotated[float | None, typer.Option("--for", help="Seconds after which to give up.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File of the scenario that shows what was found; new.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Look at every state that the agents can come to within bounds: is any wrong, or without a way out?
+
+    Exit status 0: everything holds. 1: something does not, and a scenario shows it. 4: a bound was reached before
+    everything had been looked at. 130: interrupted.
+    """
+    if timers not in ("duration", "any"):
+        raise BoundsError(f"--timers must be duration or any, not {timers!r}")
+    quirks = _pairs("--quirk", quirk)
+    bounds = Bounds(
+        agents,
+        blocks,
+        network,  # type: ignore[arg-type]  # it is checked
+        tuple(name for name in faults.split(",") if name),
+        timers == "any",
+        _pairs("--settings", settings),
+        quirks,
+        reduced=not whole and not quirks,
+    )
+    limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s)
+    with _Watcher() as watcher:
+        proof = prove.prove(bounds, limits, out, watch=watcher.show)
+    if as_json:
+        print_json(proof.to_json())
+    else:
+        console = Console()
+        for line in prove.in_words(proof):
+            console.print(line, highlight=False, soft_wrap=True, markup=False)
+    if proof.graph.ended == "interrupted":
+        complain("interrupted")
+    raise typer.Exit(proof.exit_status)
+
+
+def _pairs(option: str, texts: list[str] | None) -> dict[str, Any]:
+    pairs = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise BoundsError(f"{option} {text!r} should be a name, =, and a value")
+        try:
+            pairs[name] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise BoundsError(f"{option} {name} cannot be {value!r}") from None
+    return pairs
+
+
+class _Watcher:
+    """Says on standard error how far it is: in place on a terminal, and now and then a line elsewhere."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._status = self._console.status("begins")
+        self._last_s = time.monotonic()
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._status.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        self._status.stop()
+
+    def show(self, progress: Progress) -> None:
+        frontier = progress.states - progress.looked_at
+        rate = progress.transitions / max(progress.seconds, 0.001)
+        words = (
+            f"{progress.states:,} states, {frontier:,} of them not looked at, {progress.depth} instants, {rate:,.0f}/s"
+        )
+        if self._console.is_terminal:
+            self._status.update(words)
+        elif time.monotonic() - self._last_s > LINE_EVERY_S:
+            self._last_s = time.monotonic()
+            self._console.print(words, highlight=False)

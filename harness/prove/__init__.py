@@ -1,0 +1,22 @@
+"""Proof by exhaustion: all that the real agent can come to within bounds, and whether it may. See docs/proof.md.
+
+bounds.py     within which everything is looked at
+snapshot.py   an agent's whole state: copied, put back, as a key
+local.py      local states by number; each step computed once, by the real agent
+zones.py      how long timers have yet to run, compared with each other
+instant.py    what an instant makes of the agents: who hears what in which order, and loses what
+swarm.py      global states, and all that may happen next
+explore.py    all of them, breadth first
+liveness.py   whether there is always a way to rest with one chain, and whether one goes round for ever
+times.py      mission seconds for a way through the graph
+script.py     a way through the graph as a scenario that the simulation plays
+prove.py      all of that together
+words.py      what came out, for people
+"""
+
+from harness.prove.bounds import Bounds, BoundsError, Network
+from harness.prove.explore import Progress
+from harness.prove.prove import INCOMPLETE, Limits, Proof, prove
+from harness.prove.words import in_words
+
+__all__ = ["INCOMPLETE", "Bounds", "BoundsError", "Limits", "Network", "Progress", "Proof", "in_words", "prove"]

@@ -1,0 +1,73 @@
+"""Within which bounds everything is looked at."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from harness.errors import HarnessError
+from ucp.quirks import check_quirk
+from ucp.settings import Settings
+
+Network = Literal["lossless", "lossy", "any"]
+FAULTS = ("reboot", "death", "duplicate")
+MAX_AGENTS = 9
+MAX_BLOCKS = 9
+EVENT_FILLS_BLOCK = {"max_block_bytes": 267}
+"""An event completes a block."""
+
+
+class BoundsError(HarnessError):
+    """These are no bounds within which anything can be looked at."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """`agents` that complete `blocks` blocks in all; each of `faults` but "duplicate" happens once at most.
+
+    `timers_any`: a timer may end whenever it runs, however long it should. `reduced`: states that behave alike are one.
+    """
+
+    agents: int = 2
+    blocks: int = 2
+    network: Network = "lossy"
+    faults: tuple[str, ...] = ()
+    timers_any: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    quirks: Mapping[str, bool | float] = field(default_factory=dict)
+    reduced: bool = True
+
+    def __post_init__(self) -> None:
+        for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):
+            if not 1 <= count <= most:
+                raise BoundsError(f"--{name} must be 1..{most}, not {count}")
+        if self.network not in get_args(Network):
+            raise BoundsError(f"--network must be one of {', '.join(get_args(Network))}, not {self.network!r}")
+        for fault in self.faults:
+            if fault not in FAULTS:
+                raise BoundsError(f"--faults must be some of {', '.join(FAULTS)}, not {fault!r}")
+        known = [field.name for field in dataclasses.fields(Settings)]
+        for name in self.settings:
+            if name not in known:
+                raise BoundsError(f"--settings {name} is unknown: there are {', '.join(known)}")
+        try:
+            self.agent_settings()
+            for name, value in self.quirks.items():
+                check_quirk(name, value)
+        except (TypeError, ValueError) as error:
+            raise BoundsError(f"{error}") from None
+
+    def agent_settings(self) -> Settings:
+        return Settings(**{**EVENT_FILLS_BLOCK, **self.settings})
+
+    def in_words(self) -> str:
+        parts = [
+            f"{self.agents} agent{'s' if self.agents > 1 else ''}",
+            f"{self.blocks} block{'s' if self.blocks > 1 else ''}",
+            f"network {self.network}",
+        ]
+        parts += [f"faults {', '.join(self.faults)}"] if self.faults else []
+        parts += ["timers in any order"] if self.timers_any else []
+        parts += [f"{name} {value}" for name, value in self.settings.items()]
+        parts += [f"quirk {name}" for name in self.quirks]
+        return ", ".join(parts)

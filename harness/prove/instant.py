@@ -1,0 +1,256 @@
+"""What an instant makes of the agents: timers end and blocks are completed, and then all that is said of it is heard.
+
+Some agents act, none having heard of the others yet: so their messages cross. What they send is heard, in any order
+between different senders; then what was answered to it, and so on until nobody says anything. Who loses messages may
+lose any of them. Of a sender's messages in one go the first is heard first; what else may be is the network `any`.
+
+For each agent the outcomes of all orders, and of all losses, are worked out once and are mostly one or two.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import product
+from typing import NamedTuple
+
+from harness.prove.bounds import Bounds
+from harness.prove.local import DEAD, LocalStates, Started, Step
+
+Heard = tuple[tuple[int, int], ...]
+"""What reaches an agent in one go: (sender, as the agent knows it, and message), in the order of the senders."""
+
+
+ANSWERED = 2
+"""In the first round of an instant questions are heard, in the second what is answered."""
+
+
+class Action(NamedTuple):
+    """What an agent does of its own: "timer" and its number, "complete" and the block's ordinal, or a fault."""
+
+    place: int
+    what: str
+    number: int = 0
+
+
+class Agents(NamedTuple):
+    """The agents, and the timers that each has started in this instant."""
+
+    locals: tuple[int, ...]
+    started: tuple[Started, ...]
+
+
+class Wave(NamedTuple):
+    """One round of hearing: what was on the air as (place of the sender, message), and what each heard of it.
+
+    `heard` has for each place the numbers of what it heard in `air`, in order.
+    """
+
+    before: "Wave | None"
+    air: tuple[tuple[int, int], ...]
+    heard: tuple[tuple[int, ...], ...]
+
+
+class Instants:
+    """What instants make of agents."""
+
+    def __init__(self, local: LocalStates, bounds: Bounds) -> None:
+        self._local = local
+        self._bounds = bounds
+        self._twice = "duplicate" in bounds.faults
+        self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], dict[Agents, Wave | None]] = {}
+        self._outcomes: dict[tuple[int, Heard, bool, bool], list[tuple[Step, tuple[int, ...]]]] = {}
+        self._places = range(bounds.agents)
+
+    def name_of(self, other: int, place: int) -> int:
+        """What the agent at `place` calls the one at `other`."""
+        if not self._bounds.reduced:
+            return other + 1
+        return other + 2 if other < place else other + 1
+
+    def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
+        """Whether it makes a difference to the agent at `place` in which order it hears what it heard of the wave."""
+        reached = tuple((self.name_of(wave.air[number][0], place), wave.air[number][1]) for number in sorted(heard))
+        return len(self._outcomes_of(local, reached, lossy=False, answered=False)) > 1
+
+    def outcomes(self, locals_: tuple[int, ...], actions: Sequence[Action], lossy: bool) -> dict[Agents, Wave | None]:
+        """All that may come of it, with one way to each."""
+        key = locals_, tuple(actions), lossy
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = self._of(locals_, actions, lossy)
+        return known
+
+    def _of(self, locals_: tuple[int, ...], actions: Sequence[Action], lossy: bool) -> dict[Agents, Wave | None]:
+        agents, started = list(locals_), [()] * len(locals_)  # type: list[int], list[Started]
+        air: list[tuple[int, int]] = []
+        for action in actions:
+            place = action.place
+            step = self._act(agents[place], action)
+            agents[place] = step.local
+            if action.what in ("death", "reboot"):
+                started[place] = ()
+            started[place] = self._still(started[place], step)
+            air += [(place, message) for message in step.sent]
+        waiting: dict[tuple[Agents, tuple[tuple[int, int], ...]], Wave | None]
+        waiting = {(Agents(tuple(agents), tuple(started)), tuple(air)): None}
+        silent: dict[Agents, Wave | None] = {}
+        rounds = 0
+        while waiting:
+            rounds += 1
+            after: dict[tuple[Agents, tuple[tuple[int, int], ...]], Wave | None] = {}
+            for (there, said), way in waiting.items():
+                if not said or any(map(self._is_flawed, there.locals)):
+                    silent.setdefault(there, way)
+                    continue
+                for heard, answers, orders in self._hear(there, said, lossy, rounds):
+                    if (heard, answers) not in after:
+                        after[heard, answers] = Wave(way, said, orders)
+            waiting = after
+        settled: dict[Agents, Wave | None] = {}
+        for there, way in silent.items():
+            settled.setdefault(Agents(tuple(map(self._settled, there.locals)), there.started), way)
+        return settled
+
+    def _settled(self, local: int) -> int:
+        return local if local == DEAD or self._is_flawed(local) else self._local.settled(local)
+
+    def _is_flawed(self, local: int) -> bool:
+        return local != DEAD and self._local.known[local].flaw is not None
+
+    def _act(self, local: int, action: Action) -> Step:
+        if action.what == "timer":
+            return self._local.end_timer(local, action.number)
+        if action.what == "complete":
+            return self._local.complete(local, action.number)
+        if action.what == "reboot":
+            return self._local.reboot(local)
+        return Step(DEAD, (), ())
+
+    def _hear(
+        self, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, rounds: int
+    ) -> Iterator[tuple[Agents, tuple[tuple[int, int], ...], tuple[tuple[int, ...], ...]]]:
+        choices: list[list[tuple[Step, tuple[int, ...]]]] = []
+        for place in self._places:
+            local = there.locals[place]
+            if local == DEAD:
+                choices.append([(Step(DEAD, (), ()), ())])
+                continue
+            mine = [number for number, (sender, _) in enumerate(said) if sender != place]
+            heard = tuple((self.name_of(said[number][0], place), said[number][1]) for number in mine)
+            choices.append(
+                [
+                    (step, tuple(mine[position] for position in order))
+                    for step, order in self._outcomes_of(local, heard, lossy, rounds >= ANSWERED)
+                ]
+            )
+        for chosen in product(*choices):
+            locals_ = tuple(step.local for step, _ in chosen)
+            started = tuple(
+                self._still(before, step) if step.started or before else ()
+                for before, (step, _) in zip(there.started, chosen, strict=True)
+            )
+            answers = tuple((place, message) for place, (step, _) in enumerate(chosen) for message in step.sent)
+            yield Agents(locals_, started), answers, tuple(order for _, order in chosen)
+
+    def _still(self, before: Started, step: Step) -> Started:
+        """What an agent has started in this instant and still runs."""
+        if not before and not step.started:
+            return ()
+        if step.local == DEAD:
+            return ()
+        running = self._local.known[step.local].running
+        return tuple(sorted(item for item in {**dict(before), **dict(step.started)}.items() if item[0] in running))
+
+    def _outcomes_of(self, local: int, heard: Heard, lossy: bool, answered: bool) -> list[tuple[Step, tuple[int, ...]]]:
+        """What can become of an agent that hears these, each with an order in which it does: positions in `heard`."""
+        key = local, heard, lossy, answered
+        outcomes = self._outcomes.get(key)
+        if outcomes is None:
+            outcomes = list(self._work_out(local, heard, lossy))
+            if self._bounds.reduced:
+                if answered:
+                    settled = {step._replace(local=self._settled(step.local)): way for step, way in reversed(outcomes)}
+                    outcomes = list(settled.items())
+                if lossy:
+                    outcomes = [outcome for outcome in outcomes if not _is_covered(outcome[0], outcomes)]
+            self._outcomes[key] = outcomes
+        return outcomes
+
+    def _work_out(self, local: int, heard: Heard, lossy: bool) -> Iterator[tuple[Step, tuple[int, ...]]]:
+        matter = self._that_matter(local, heard)
+        copies = 2 if self._twice else 1
+        earlier = {  # of the same sender
+            position: [other for other in matter if other < position and heard[other][0] == heard[position][0]]
+            for position in matter
+        }
+        begin = (Step(local, (), ()), tuple(copies if position in matter else 0 for position in range(len(heard))))
+        ways: dict[tuple[Step, tuple[int, ...]], tuple[int, ...]] = {begin: ()}
+        waiting = [begin]
+        while waiting:
+            node = waiting.pop()
+            (at, sent, started), left = node
+            for position in matter:
+                if not left[position]:
+                    continue
+                if not lossy and any(left[other] == copies for other in earlier[position]):
+                    continue  # the one before has not been heard
+                step = self._local.hear(at, *heard[position])
+                still = list(left)
+                still[position] -= 1
+                for other in earlier[position]:
+                    still[other] = 0
+                after = (
+                    Step(step.local, sent + step.sent, self._still(started, step)),
+                    tuple(still),
+                )
+                if after not in ways:
+                    ways[after] = (*ways[node], position)
+                    waiting.append(after)
+        outcomes: dict[Step, tuple[int, ...]] = {}
+        for (step, left), way in ways.items():
+            ends_here = lossy or self._is_flawed(step.local) or all(left[position] < copies for position in matter)
+            if ends_here and len(way) >= len(outcomes.get(step, ())):
+                outcomes[step] = way
+        others = [position for position in range(len(heard)) if position not in matter]
+        for step, way in outcomes.items():
+            yield step, (*way, *others)
+
+    def _that_matter(self, local: int, heard: Heard) -> list[int]:
+        """Positions of what may change the agent or make it answer, whatever of the rest it has heard before."""
+        matter: list[int] = []
+        while True:
+            seen, waiting = {local}, [local]
+            while waiting:
+                at = waiting.pop()
+                for position in matter:
+                    after = self._local.hear(at, *heard[position]).local
+                    if after not in seen:
+                        seen.add(after)
+                        waiting.append(after)
+            more = [
+                position
+                for position in range(len(heard))
+                if position not in matter and any(self._does_something(at, heard[position]) for at in seen)
+            ]
+            if not more:
+                return sorted(matter)
+            matter += more
+
+    def _does_something(self, local: int, heard: tuple[int, int]) -> bool:
+        step = self._local.hear(local, *heard)
+        return step.local != local or bool(step.sent) or bool(step.started)
+
+
+def _is_covered(step: Step, outcomes: Sequence[tuple[Step, tuple[int, ...]]]) -> bool:
+    """Whether another outcome is the same but for saying more: what it says more may be lost by everybody."""
+    return any(
+        other.local == step.local
+        and other.started == step.started
+        and len(other.sent) > len(step.sent)
+        and _is_part(step.sent, other.sent)
+        for other, _ in outcomes
+    )
+
+
+def _is_part(some: tuple[int, ...], of: tuple[int, ...]) -> bool:
+    """Whether `of` has all of `some`, in order."""
+    rest = iter(of)
+    return all(message in rest for message in some)

@@ -1,0 +1,165 @@
+"""Whether the swarm can always come to rest with one chain, and whether it can go round for ever: on the whole graph.
+
+Both are asked of what follows when nothing is lost any more and no new block comes, beside some more votes.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from harness.prove.explore import Graph, quieten
+from harness.prove.instant import Action
+from harness.prove.local import DEAD
+from harness.prove.swarm import AGENTS, BLOCKS
+
+
+@dataclass
+class Liveness:
+    """`forks`: states at rest with several chains. `cycles`: ways round, each as the states on it, the nearest first.
+
+    `astray`: how many states have no way to rest with one chain if there are 0, 1, 2, ... more votes, until it is none,
+    or there was one vote for each agent. `lost` is the nearest of those that are left then.
+    """
+
+    forks: int = 0
+    cycles: list[list[int]] = field(default_factory=list)
+    astray: list[int] = field(default_factory=list)
+    lost: int | None = None
+
+
+def look(graph: Graph) -> Liveness:
+    """Of a graph that is complete."""
+    result = Liveness()
+    reachable = len(graph.states)
+    result.forks = sum(_is_fork(graph, number) for number in range(reachable))
+    result.cycles = list(_cycles(graph, reachable))
+    safe = _attracted(graph, {number for number in range(reachable) if _is_one(graph, number)})
+    votes: dict[int, set[int]] = {}
+    while True:
+        astray = [number for number in range(reachable) if number not in safe]
+        result.astray.append(len(astray))
+        if not astray or len(result.astray) > graph.swarm.bounds.agents:
+            result.lost = astray[0] if astray else None
+            return result
+        forks = [number for number in range(len(graph.states)) if number not in safe and _is_fork(graph, number)]
+        for number in forks:
+            if number not in votes:
+                votes[number] = _vote(graph, number)
+        while len(graph.quiet) < len(graph.states):
+            quieten(graph, len(graph.quiet))
+        safe |= {number for number in range(reachable, len(graph.states)) if _is_one(graph, number)}
+        safe = _attracted(graph, safe)
+        safe = _attracted(graph, safe | {number for number, choices in votes.items() if choices & safe})
+
+
+def _is_one(graph: Graph, number: int) -> bool:
+    state = graph.states[number]
+    return graph.swarm.is_idle(state) and len(graph.swarm.chains(state)) <= 1
+
+
+def _is_fork(graph: Graph, number: int) -> bool:
+    state = graph.states[number]
+    return graph.swarm.is_idle(state) and len(graph.swarm.chains(state)) > 1
+
+
+def _vote(graph: Graph, number: int) -> set[int]:
+    """What follows a state at rest when somebody completes one more block."""
+    state = graph.states[number]
+    return {
+        graph.add(move.state, number, move.actions)
+        for place, local in enumerate(state[AGENTS:])
+        if local != DEAD
+        for move in graph.swarm.moves(state, (Action(place, "complete", state[BLOCKS] + 1),), lossy=False)
+    }
+
+
+def _attracted(graph: Graph, goal: set[int]) -> set[int]:
+    """All states from which, whichever timer is the next to end, some way leads to the goal.
+
+    The durations decide which timer is next, and a zone does not tell: so all that it leaves open have to lead there.
+    """
+    before: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    open_timers: list[set[int]] = []
+    for number, alone in enumerate(graph.quiet):
+        open_timers.append(set(range(len(alone))))
+        for timer, after in enumerate(alone):
+            for state in after:
+                before[state].append((number, timer))
+    any_order = graph.swarm.bounds.timers_any
+    attracted, waiting = set(goal), list(goal)
+    while waiting:
+        for number, timer in before[waiting.pop()]:
+            open_timers[number].discard(timer)
+            if number not in attracted and (any_order or not open_timers[number]):
+                attracted.add(number)
+                waiting.append(number)
+    return attracted
+
+
+def _cycles(graph: Graph, reachable: int) -> Iterator[list[int]]:
+    """A shortest way round in every part of the graph from whose states all others of it can be reached."""
+    for part in _parts(graph, reachable):
+        if len(part) > 1 or part[0] in _after(graph, part[0]):
+            yield _round(graph, min(part), set(part))
+
+
+def _after(graph: Graph, number: int) -> set[int]:
+    return {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
+
+
+def _round(graph: Graph, start: int, part: set[int]) -> list[int]:
+    came_from: dict[int, int] = {}
+    layer = [start]
+    while layer:
+        following = []
+        for number in layer:
+            for after in _after(graph, number):
+                if after == start:
+                    way = [number]
+                    while way[-1] != start:
+                        way.append(came_from[way[-1]])
+                    return way[::-1]
+                if after in part and after not in came_from:
+                    came_from[after] = number
+                    following.append(after)
+        layer = following
+    raise AssertionError("a part has a way round")
+
+
+def _parts(graph: Graph, reachable: int) -> Iterator[list[int]]:
+    """Strongly connected components (Tarjan), without recursion."""
+    index: dict[int, int] = {}
+    low: dict[int, int] = {}
+    stack: list[int] = []
+    on_stack: set[int] = set()
+    for root in range(reachable):
+        if root in index:
+            continue
+        work = [(root, iter(_after(graph, root)))]
+        index[root] = low[root] = len(index)
+        stack.append(root)
+        on_stack.add(root)
+        while work:
+            number, rest = work[-1]
+            for after in rest:
+                if after not in index:
+                    index[after] = low[after] = len(index)
+                    stack.append(after)
+                    on_stack.add(after)
+                    work.append((after, iter(_after(graph, after))))
+                    break
+                if after in on_stack:
+                    low[number] = min(low[number], index[after])
+            else:
+                work.pop()
+                if work:
+                    low[work[-1][0]] = min(low[work[-1][0]], low[number])
+                if low[number] == index[number]:
+                    part = []
+                    while True:
+                        member = stack.pop()
+                        on_stack.remove(member)
+                        part.append(member)
+                        if member == number:
+                            break
+                    yield part

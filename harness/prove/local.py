@@ -1,0 +1,303 @@
+"""Local states by number, and what the real agent makes of each input: computed once, and then looked up.
+
+A local state is all that `ucp.agent.Agent` holds (`snapshot.py`). To compute a step the agent is put into the state,
+given the input, and its state is taken: no line of the protocol is written here. Every state that an agent comes to is
+looked at once, when it gets its number.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from random import Random
+from typing import Any, NamedTuple
+
+from harness.prove.bounds import Bounds
+from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, key_of, put_back, take
+from ucp.agent import Agent
+from ucp.block import next_chain_hash
+from ucp.clock import MICROSECONDS
+from ucp.events import LoggableEvent
+from ucp.messages import Message
+from ucp.quirks import wrong_handlers
+from ucp.settings import Settings
+from ucp.state import AgentState
+from ucp.store import StoredState
+
+INITIAL_DATA = b"proof"
+AT_ONCE_S = 0.05
+"""A timer that is shorter ends before any answer can come (a message takes 2 to 50 ms)."""
+MOST_AT_ONCE = 100
+DEAD = -1
+"""The local state of an agent that is gone."""
+
+Started = tuple[tuple[int, int], ...]
+"""Timers that an agent has started in this instant and that run: (number, duration in microseconds)."""
+
+
+class Step(NamedTuple):
+    """What an input makes of an agent: its state, the messages that it sends, the timers that it has started."""
+
+    local: int
+    sent: tuple[int, ...]
+    started: Started
+
+
+@dataclass(frozen=True, slots=True)
+class Flaw:
+    """Something that must never be: of which characteristic ("2", "3", "4"), or "hang" or "crash", and a sentence."""
+
+    kind: str
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """A local state. `waits` says whether the agent reconciles, `chain` is the number of its chain."""
+
+    agent_id: int
+    snapshot: Snapshot
+    running: tuple[int, ...]
+    idle: bool
+    waits: bool
+    chain: tuple[int, ...]
+    flaw: Flaw | None
+    anonymous: int
+    """The same for states that differ only in who has voted and answered."""
+    names_others: bool
+
+
+class ReductionError(Exception):
+    """The agent does what the argument for a reduction says that it never does."""
+
+
+class LocalStates:
+    """All local states that were come upon, and all steps between them.
+
+    When `bounds.reduced`, every agent is computed as agent 1 among others, and what no handler will read before it is
+    written anew is as at the beginning; docs/proof.md says why that is sound.
+    """
+
+    def __init__(self, bounds: Bounds) -> None:
+        self.bounds = bounds
+        self.known: list[Known] = []
+        self.steps = 0
+        """How many the real agent has computed."""
+        roster = range(1, bounds.agents + 1)
+        settings = bounds.agent_settings()
+        self._agents = {agent_id: self._agent(agent_id, roster, settings) for agent_id in roster}
+        self.timers = [timer.name for timer in self._agents[1].state.timers]
+        self.settings, self._roster = settings, roster
+        self._numbers: dict[tuple[Any, ...], int] = {}
+        self._hashes: dict[bytes, int] = {}
+        self._blocks: dict[bytes, int] = {}
+        """Hashes of completed blocks: who made them, by the agent's number here."""
+        self.messages: list[Message] = []
+        self._message_numbers: dict[Message, int] = {}
+        self._steps: dict[tuple[int, int, int], Step] = {}
+        self._anonymous: dict[tuple[Any, ...], int] = {}
+        self._settled: dict[int, int] = {}
+        self._renamed: dict[tuple[int, tuple[int, ...]], int] = {}
+        self.initial = {agent_id: self._intern(agent_id) for agent_id in roster}
+
+    def _agent(self, agent_id: int, roster: Iterable[int], settings: Settings) -> Agent:
+        handlers = wrong_handlers(self.bounds.quirks, Random(0))
+        return Agent(agent_id, roster, INITIAL_DATA, settings, handlers=handlers, tracing=False)
+
+    # Steps
+
+    def hear(self, local: int, sender: int, message: int) -> Step:
+        """The agent hears a message from another, who is `sender` to it."""
+        key = local, sender, message
+        step = self._steps.get(key)
+        if step is None:
+            agent = self._restored(local)
+            step = self._steps[key] = self._computed(
+                local, agent, lambda: agent.receive_message(sender, 0, self.messages[message], NOW_S), hears=True
+            )
+        return step
+
+    def end_timer(self, local: int, timer: int) -> Step:
+        """A timer of the agent ends."""
+        key = local, -1, timer
+        step = self._steps.get(key)
+        if step is None:
+            agent = self._restored(local)
+            step = self._steps[key] = self._computed(
+                local, agent, lambda: agent.end_timer(agent.state.timers[timer], NOW_S)
+            )
+        return step
+
+    def complete(self, local: int, ordinal: int) -> Step:
+        """The agent completes a block, the `ordinal`th of all."""
+        key = local, -2, ordinal
+        step = self._steps.get(key)
+        if step is None:
+            agent = self._restored(local)
+            event = LoggableEvent(ordinal * MICROSECONDS, 1, bytes(256))
+
+            def logged() -> None:
+                agent.add_event(event, NOW_S)
+                for block_hash in agent.state.completed:
+                    self._blocks.setdefault(block_hash, agent.agent_id)
+
+            step = self._steps[key] = self._computed(local, agent, logged)
+        return step
+
+    def reboot(self, local: int) -> Step:
+        """The agent's computer browns out and goes on from what was on its disk."""
+        key = local, -3, 0
+        step = self._steps.get(key)
+        if step is None:
+            former = self._restored(local)
+            agent = self._agent(former.agent_id, self._roster, self.settings)
+            stored = StoredState.of(former.state)
+            step = self._steps[key] = self._computed(local, agent, lambda: agent.boot(stored, NOW_S))
+        return step
+
+    def _restored(self, local: int) -> Agent:
+        known = self.known[local]
+        agent = self._agents[known.agent_id]
+        put_back(agent, known.snapshot)
+        return agent
+
+    def _computed(self, local: int, agent: Agent, give: Callable[[], None], *, hears: bool = False) -> Step:
+        self.steps += 1
+        crashed = None
+        try:
+            give()
+            for _ in range(MOST_AT_ONCE):
+                soon = [t for t in agent.state.timers if t.deadline is not None and t.deadline <= NOW_S + AT_ONCE_S]
+                if not soon:
+                    break
+                agent.end_timer(min(soon, key=lambda timer: timer.deadline or 0.0), NOW_S)
+            else:
+                crashed = "its timers end at once again and again"
+        except Exception as error:  # whatever a handler raises is what we look for
+            crashed = f"{type(error).__name__}: {error}"
+        started = tuple(
+            (number, round((timer.deadline - NOW_S) * MICROSECONDS))
+            for number, timer in enumerate(agent.state.timers)
+            if timer.deadline is not None and timer.deadline < RUNNING_S
+        )
+        sent = tuple(self._message(message) for _, message in agent.messages_to_send())
+        if self.bounds.reduced:
+            if hears and any(self.timers[timer] == "voting" for timer, _ in started):
+                raise ReductionError("an agent begins a vote because of a message: try again with --whole")
+            self._check_that_nothing_is_lost(self.known[local].snapshot, agent.state)
+            _forget_what_is_dead(agent.state)
+        return Step(self._intern(agent.agent_id, agent, crashed), sent, started)
+
+    def _message(self, message: Message) -> int:
+        number = self._message_numbers.setdefault(message, len(self.messages))
+        if number == len(self.messages):
+            self.messages.append(message)
+        return number
+
+    # States
+
+    def settled(self, local: int) -> int:
+        """The same agent when all answers to what was asked have come, or are lost: who voted matters no more."""
+        if not self.bounds.reduced:
+            return local
+        number = self._settled.get(local)
+        if number is None:
+            agent = self._restored(local)
+            state = agent.state
+            if state.voting_timer.active:
+                state.vote_count = {"yes": int(state.vote_count["yes"] > state.vote_count["no"]), "no": 0}
+                state.voters = set()
+            number = self._settled[local] = self._intern(agent.agent_id, agent)
+        return number
+
+    def renamed(self, local: int, names: tuple[int, ...]) -> int:
+        """The same agent when the others are called otherwise: `names` for those from 2 on."""
+        key = local, names
+        number = self._renamed.get(key)
+        if number is None:
+            agent = self._restored(local)
+            state = agent.state
+            new = dict(zip(range(2, 2 + len(names)), names, strict=True))
+            state.voters = {new[voter] for voter in state.voters}
+            state.reconcile_responders = {new[responder] for responder in state.reconcile_responders}
+            number = self._renamed[key] = self._intern(agent.agent_id, agent)
+        return number
+
+    def _intern(self, agent_id: int, agent: Agent | None = None, crashed: str | None = None) -> int:
+        agent = agent or self._agents[agent_id]
+        snapshot = take(agent)
+        key = (agent_id, crashed, *key_of(snapshot, self._name))
+        number = self._numbers.setdefault(key, len(self.known))
+        if number == len(self.known):
+            state = agent.state
+            self.known.append(
+                Known(
+                    agent_id,
+                    snapshot,
+                    tuple(index for index, timer in enumerate(state.timers) if timer.deadline is not None),
+                    state.idle,
+                    state.reconcile_in_progress,
+                    tuple(self._name(block.block_hash) for block in state.chain),
+                    Flaw("crash", f"a handler ended by {crashed}") if crashed else self._flaw(state),
+                    self._anonymous.setdefault((agent_id, crashed, *key_of(_nameless(snapshot), self._name)), number),
+                    bool(state.voters or state.reconcile_responders),
+                )
+            )
+        return number
+
+    def _name(self, digest: bytes) -> int:
+        return self._hashes.setdefault(digest, len(self._hashes))
+
+    # What is looked at
+
+    def _flaw(self, state: AgentState) -> Flaw | None:
+        aside = [block.block_hash for block in (*state.blocks_to_be_committed, *state.reconcile_stack)]
+        chain = [block.block_hash for block in state.chain]
+        if state.idle and (aside or not {*state.completed} <= {*chain}):
+            return Flaw("2", "an idle agent holds a completed block that is not in its chain")
+        if any(count > 1 for count in Counter([*chain, *aside]).values()):
+            return Flaw("3", "an agent holds a block twice")
+        makers = {block.block_hash: block.agent_id for block in (*state.chain, *state.blocks_to_be_committed)}
+        makers |= {block.block_hash: block.agent_id for block in state.reconcile_stack}
+        if any(self._blocks.get(block_hash) != maker for block_hash, maker in makers.items()):
+            return Flaw("4", "an agent holds a block that the agent that it names never completed")
+        chain_hash = state.chain.inception.chain_hash
+        for block, said in state.chain.with_chain_hashes():
+            chain_hash = next_chain_hash(chain_hash, block.block_hash)
+            if said != chain_hash:
+                return Flaw("4", "a chain hash is not that of the blocks below it")
+        if state.reconcile_in_progress and all(timer.deadline is None for timer in state.reconcile_timers):
+            return Flaw("hang", "an agent reconciles, and no timer of the reconcile runs: it answers nobody for ever")
+        return None
+
+    def _check_that_nothing_is_lost(self, before: Snapshot, state: AgentState) -> None:
+        """Blocks stay: without that the completed ones could not be forgotten (characteristic 2)."""
+        held = {block.block_hash for name in ("blocks_to_be_committed", "reconcile_stack") for block in before[name]}
+        held.update(before["chain"].parts["_block_of_hash"])
+        if not all(state.holds(block_hash) for block_hash in held):
+            raise ReductionError("a block that an agent held is gone: try again with --whole")
+
+
+def _forget_what_is_dead(state: AgentState) -> None:
+    """What every handler writes before it reads it again; and counters of which only the check above makes use."""
+    state.completed.clear()
+    state.newest_block_timestamp_us = -1
+    if not state.voting_timer.active:
+        state.vote_count = {"yes": 0, "no": 0}
+        state.voters = set()
+        state.candidate_block = None
+        state.top_chain_hash_at_initiation = b""
+    if not state.phase_one_timer.active:
+        state.reconcile_vote_count = {"yes": 0, "no": 0}
+        if not state.phase_two_timer.active:
+            state.reconcile_responders = set()
+    if not state.phase_two_timer.active:
+        state.reconcile_response_dictionary = {}
+    if not state.phase_three_timer.active:
+        state.majority_response_block_hash = None
+
+
+def _nameless(snapshot: Snapshot) -> Snapshot:
+    """With how many have voted and answered in the place of who."""
+    return {
+        name: len(value) if name in ("voters", "reconcile_responders") else value for name, value in snapshot.items()
+    }

@@ -1,0 +1,69 @@
+"""What was proven, for people; nothing "holds" of which not everything was looked at."""
+
+from collections.abc import Iterator
+
+from harness.prove.prove import CLAIMS, Proof
+
+WHY = {
+    "flaw": "it ends where the first flaw is",
+    "memory": "the bound of --memory was reached",
+    "time": "the bound of --for was reached",
+    "interrupted": "it was interrupted",
+}
+
+
+def in_words(proof: Proof) -> Iterator[str]:
+    graph = proof.graph
+    ended = "complete" if proof.complete else f"not complete: {WHY[graph.ended]}"
+    yield f"{proof.bounds.in_words()}: {ended}"
+    left = "" if proof.complete else f", of which {graph.looked_at:,} were looked at"
+    yield (
+        f"  {graph.reached:,} states{left}, {graph.transitions:,} transitions, {len(graph.swarm.local.known):,} "
+        f"local states, {len(graph.swarm.zones):,} zones, up to {graph.depth} instants, in {graph.seconds:.1f} s"
+    )
+    for kind, claim in CLAIMS.items():
+        yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
+    yield from _of_the_whole(proof)
+    example = proof.example
+    if example is not None:
+        yield f"  a shortest way there, {example.instants} instants: {example.replay}"
+        for key, judgement in example.judged.items():
+            yield f"    played: {key} {judgement.verdict}, {judgement.reason}"
+        if not example.judged:
+            yield "    played: the simulation goes another way in the end, and nothing is bad about it"
+
+
+def _name(kind: str) -> str:
+    return f"characteristic {kind}" if kind.isdecimal() else kind
+
+
+def _mark(proof: Proof, kind: str) -> str:
+    flaw = proof.graph.flaw
+    if flaw is not None and flaw.kind == kind:
+        return "✘ violated,"
+    return "✔ holds," if proof.complete else "- not decided,"
+
+
+def _of_the_whole(proof: Proof) -> Iterator[str]:
+    live = proof.liveness
+    if live is None:
+        yield "- not decided, one chain: from every state some way without losses leads to rest with one chain"
+        yield "- not decided, livelock: the swarm cannot go round for ever"
+        return
+    votes = len(live.astray) - 1
+    after = (
+        "without another vote" if not votes else "after one more vote" if votes == 1 else f"after {votes} more votes"
+    )
+    if live.lost is None:
+        yield f"✔ holds, one chain: from every state some way without losses leads to rest with one chain, {after}"
+    else:
+        states = f"{live.astray[-1]:,} states"
+        yield f"✘ not shown, one chain: from {states} no way without losses leads to rest with one chain, even {after}"
+    if votes:
+        counts = ", ".join(f"{count:,} with {number}" for number, count in enumerate(live.astray[:-1]))
+        yield f"    states that cannot yet, by how many more votes there are: {counts}"
+    yield f"    {live.forks:,} states are at rest with several chains, and stay so until somebody votes"
+    if live.cycles:
+        yield f"✘ violated, livelock: there are {len(live.cycles)} ways to go round for ever, though nothing is lost"
+    else:
+        yield "✔ holds, livelock: the swarm cannot go round for ever if nothing is lost and no new block comes"

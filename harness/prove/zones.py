@@ -1,0 +1,91 @@
+"""How long the timers that run have yet to run, compared with each other: difference bounds, as small numbers.
+
+A zone is a set of possible remaining times of n timers: all that satisfy x_i - x_j <= m[i][j], with x_0 = 0. The matrix
+is closed (no bound can be tightened), so equal sets have equal matrices. A zone is kept as it is when any time may
+have passed: with a point of it all earlier ones are in it, down to where the first timer ends. Bounds are whole
+microseconds between minus and plus the longest duration, so there are finitely many.
+"""
+
+from collections.abc import Sequence
+
+Matrix = tuple[tuple[int, ...], ...]
+NOTHING_RUNS = 0
+
+
+class Zones:
+    """Zones by number."""
+
+    def __init__(self) -> None:
+        self._matrices: list[Matrix] = []
+        self._numbers: dict[Matrix, int] = {}
+        self._after: dict[tuple[int, tuple[int, ...], tuple[int, ...]], int | None] = {}
+        self._permuted: dict[tuple[int, tuple[int, ...]], int] = {}
+        self._intern(((0,),))
+
+    def __len__(self) -> int:
+        return len(self._matrices)
+
+    def matrix(self, zone: int) -> Matrix:
+        return self._matrices[zone]
+
+    def firsts(self, zone: int) -> list[int]:
+        """The timers, from 1, that may be the next to end."""
+        least = self._matrices[zone][0]
+        return [timer for timer in range(1, len(least)) if not least[timer]]
+
+    def bounds(self, zone: int, timer: int) -> tuple[int, ...]:
+        """Tells timers apart, whatever their places."""
+        matrix = self._matrices[zone]
+        return (matrix[timer][0], matrix[0][timer], *sorted(matrix[timer]), *sorted(row[timer] for row in matrix))
+
+    def after(self, zone: int, ended: tuple[int, ...], running: tuple[int, ...]) -> int | None:
+        """The zone when all of `ended` have ended in one instant; None if they cannot.
+
+        `running` says of each timer that then runs which it was, or, if it has just been started, minus its duration
+        in microseconds less one.
+        """
+        key = zone, ended, running
+        if key not in self._after:
+            self._after[key] = self._work_out(zone, ended, running)
+        return self._after[key]
+
+    def permuted(self, zone: int, places: tuple[int, ...]) -> int:
+        """The same with its timers in another order: `places` names for each the place that it had, from 1."""
+        key = zone, places
+        if key not in self._permuted:
+            matrix, order = self._matrices[zone], (0, *places)
+            self._permuted[key] = self._intern(tuple(tuple(matrix[i][j] for j in order) for i in order))
+        return self._permuted[key]
+
+    def _work_out(self, zone: int, ended: Sequence[int], running: Sequence[int]) -> int | None:
+        matrix = [list(row) for row in self._matrices[zone]]
+        size = range(len(matrix))
+        for timer in ended:
+            if matrix[0][timer] < 0:
+                return None
+            matrix[timer][0] = 0
+            for i in size:  # a path over the new bound may be shorter
+                for j in size:
+                    over = matrix[i][timer] + matrix[0][j]
+                    if over < matrix[i][j]:
+                        matrix[i][j] = over
+            if any(matrix[i][i] < 0 for i in size):
+                return None
+        places = [0, *running]
+
+        def bound(left: int, right: int) -> int:
+            """Of x_left - x_right; what was just started has its whole duration to run."""
+            left_s, left_place = (0, left) if left >= 0 else (-left - 1, 0)
+            right_s, right_place = (0, right) if right >= 0 else (-right - 1, 0)
+            return left_s - right_s + matrix[left_place][right_place]
+
+        after = [[bound(left, right) for right in places] for left in places]
+        for timer in range(1, len(places)):
+            after[0][timer] = min(0, *(after[other][timer] for other in range(1, len(places))))
+        return self._intern(tuple(map(tuple, after)))
+
+    def _intern(self, matrix: Matrix) -> int:
+        number = self._numbers.setdefault(matrix, len(self._matrices))
+        if number == len(self._matrices):
+            self._matrices.append(matrix)
+        return number

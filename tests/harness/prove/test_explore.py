@@ -1,0 +1,132 @@
+"""All states: whole and reduced, and whatever agents do by chance is among them."""
+
+from collections.abc import Iterator, Sequence
+from random import Random
+from typing import Any
+
+import pytest
+
+from harness.prove import Bounds
+from harness.prove.explore import Graph, explore
+from harness.prove.local import DEAD
+from harness.prove.snapshot import key_of, put_back, take
+from harness.prove.swarm import AGENTS, Swarm
+from ucp.agent import Agent
+from ucp.clock import MICROSECONDS
+from ucp.events import LoggableEvent
+from ucp.settings import Settings
+
+Seen = tuple[tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], bool, tuple[str, ...]], ...]
+
+
+def explored(*arguments: Any, **options: Any) -> Graph:
+    graph = explore(Swarm(Bounds(*arguments, **options)), most_bytes=8e9, most_s=60)
+    assert graph.ended == "complete"
+    return graph
+
+
+def seen_of(agents: Sequence[Agent]) -> Seen:
+    """What one sees of agents, whoever is who: which blocks are where, and which timers run."""
+    return tuple(
+        sorted(
+            (
+                tuple(block.timestamp_us // MICROSECONDS for block in agent.state.chain),
+                tuple(block.timestamp_us // MICROSECONDS for block in agent.state.blocks_to_be_committed),
+                tuple(block.timestamp_us // MICROSECONDS for block in agent.state.reconcile_stack),
+                agent.state.reconcile_in_progress,
+                tuple(timer.name for timer in agent.state.timers if timer.deadline is not None),
+            )
+            for agent in agents
+        )
+    )
+
+
+def all_seen(graph: Graph) -> set[Seen]:
+    local = graph.swarm.local
+    seen = set()
+    for state in graph.states:
+        agents = []
+        for number in state[AGENTS:]:
+            if number != DEAD:
+                agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
+                put_back(agent, local.known[number].snapshot)
+                agents.append(agent)
+        seen.add(seen_of(agents))
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("agents", "blocks", "network", "faults"),
+    [(2, 3, "lossless", ()), (2, 2, "lossy", ("reboot", "duplicate")), (3, 2, "lossless", ("death",))],
+)
+def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, faults: tuple[str, ...]) -> None:
+    reduced = explored(agents, blocks, network, faults)
+    whole = explored(agents, blocks, network, faults, reduced=False)
+    assert len(reduced.states) < len(whole.states)
+    assert all_seen(reduced) == all_seen(whole)
+
+
+@pytest.mark.parametrize(("agents", "blocks", "loss"), [(2, 3, 0.4), (3, 2, 0.4), (3, 2, 0.0)])
+def test_whatever_agents_do_by_chance_is_among_it(agents: int, blocks: int, loss: float) -> None:
+    seen = all_seen(explored(agents, blocks, "lossy" if loss else "lossless"))
+    for seed in range(60):
+        for there in by_chance(agents, blocks, loss, Random(seed)):
+            assert there in seen
+
+
+def by_chance(count: int, blocks: int, loss: float, lots: Random) -> Iterator[Seen]:
+    """What is seen whenever nothing is on the air: messages take no time, blocks come at any time."""
+    settings = Settings(max_block_bytes=267)
+    agents = [Agent(agent_id, range(1, count + 1), b"proof", settings) for agent_id in range(1, count + 1)]
+    completed = sorted(lots.uniform(0, 40) if lots.random() < 0.7 else 5.0 * lots.randint(0, 6) for _ in range(blocks))
+    ordinal = 0
+    while True:
+        soonest = min(
+            ((at, agent) for agent in agents if (at := agent.next_timer()) is not None), default=None, key=first
+        )
+        if ordinal < blocks and (soonest is None or completed[ordinal] <= soonest[0]):
+            now = completed[ordinal]
+            ordinal += 1
+            acted = lots.choice(agents)
+            acted.add_event(LoggableEvent(ordinal * MICROSECONDS, 1, bytes(256)), now)
+        elif soonest is not None and soonest[0] < 300:
+            now, acted = soonest
+            timer = min((timer for timer in acted.state.timers if timer.deadline is not None), key=lambda t: t.deadline)
+            acted.end_timer(timer, now)
+        else:
+            return
+        deliver(agents, loss, now, lots)
+        yield seen_of(agents)
+
+
+def deliver(agents: Sequence[Agent], loss: float, now: float, lots: Random) -> None:
+    while said := [(agent, sent) for agent in agents for sent in agent.messages_to_send()]:
+        for receiver in agents:
+            heard = [(sender, sent) for sender, sent in said if sender is not receiver and lots.random() >= loss]
+            for sender, (sequence, message) in heard:
+                receiver.receive_message(sender.agent_id, sequence, message, now)
+
+
+def first(pair: tuple[float, Agent]) -> float:
+    return pair[0]
+
+
+def test_a_snapshot_is_the_whole_state() -> None:
+    agents = [Agent(agent_id, (1, 2), b"proof", Settings(max_block_bytes=267)) for agent_id in (1, 2)]
+    names: dict[bytes, int] = {}
+    keys = []
+    for number in (1, 2, 3):
+        agents[0].add_event(LoggableEvent(number, 1, bytes(256)), float(number))
+        keys.append(key_of(take(agents[0]), lambda digest: names.setdefault(digest, len(names))))
+    assert len(set(keys)) == 3
+    snapshot = take(agents[0])
+    put_back(agents[0], snapshot)
+    assert key_of(take(agents[0]), names.__getitem__) == keys[-1]
+    assert agents[0].state.voting_timer.active
+
+
+def test_what_nobody_knows_how_to_copy_is_refused() -> None:
+    agent = Agent(1, (1, 2), b"proof")
+    vars(agent.state)["new"] = object()
+    with pytest.raises(TypeError, match="object"):
+        take(agent)

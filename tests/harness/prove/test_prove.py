@@ -1,0 +1,62 @@
+"""What is found, that the simulation plays it again, and what the command says."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from harness.prove import INCOMPLETE, Bounds, BoundsError, Limits, in_words, prove
+from tests.harness.command import harness, sentences
+
+
+def test_the_livelock_in_step_is_found_without_being_told(tmp_path: Path) -> None:
+    proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "in_step.yaml")
+    assert proof.graph.flaw is None
+    assert proof.liveness is not None
+    assert proof.liveness.lost is None
+    assert proof.example is not None
+    assert proof.example.judged["liveness"].verdict == "never finishes"
+    assert "fates" not in proof.example.path.read_text()
+    assert proof.exit_status == 1
+
+
+def test_fewer_blocks_hold(tmp_path: Path) -> None:
+    proof = prove(Bounds(2, 2, "lossy"), out=tmp_path / "none.yaml")
+    assert proof.exit_status == 0
+    assert proof.example is None
+    assert not [*tmp_path.iterdir()]
+    assert not [line for line in in_words(proof) if line.startswith(("✘", "-"))]
+
+
+@pytest.mark.parametrize(
+    ("quirk", "kind", "key"),
+    [("forget_stack", "2", "2"), ("commit_others_twice", "3", "3"), ("leave_flag_set", "hang", "liveness")],
+)
+def test_a_wrong_agent_is_found_and_its_scenario_shows_it(tmp_path: Path, quirk: str, kind: str, key: str) -> None:
+    bounds = Bounds(2, 2, "lossy", quirks={quirk: True}, reduced=False)
+    proof = prove(bounds, out=tmp_path / "wrong.yaml")
+    assert proof.graph.flaw is not None
+    assert proof.graph.flaw.kind == kind
+    assert proof.example is not None
+    assert key in proof.example.judged
+
+
+def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:
+    proof = prove(Bounds(3, 3, "lossy"), Limits(most_s=0.0), tmp_path / "none.yaml")
+    assert proof.exit_status == INCOMPLETE
+    assert not any("✔" in line for line in in_words(proof))
+
+
+@pytest.mark.parametrize("wrong", [{"agents": 0}, {"settings": {"a": 1}}, {"quirks": {"a": True}}, {"faults": ("a",)}])
+def test_impossible_bounds_are_one_sentence(wrong: dict[str, object]) -> None:
+    with pytest.raises(BoundsError):
+        Bounds(**wrong)  # type: ignore[arg-type]
+
+
+def test_the_command(tmp_path: Path) -> None:
+    held = harness("prove", "--blocks", 1, "--json", cwd=tmp_path)
+    assert held.returncode == 0
+    assert json.loads(held.stdout)["complete"] is True
+    wrong = harness("prove", "--settings", "vote_timeout_s=-1", cwd=tmp_path)
+    assert wrong.returncode == 2
+    assert sentences(wrong.stderr) == ["vote_timeout_s must be more than 0 seconds, not -1"]
