@@ -6,16 +6,14 @@ The checker is that of any other run; the evidence comes straight from the agent
 from collections.abc import Coroutine, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 from harness import checker
-from harness.archive.exports import SUFFIX, Export, ExportMaker, export_of
+from harness.archive.exports import Export, ExportMaker
 from harness.archive.record import JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
 from harness.checker.evidence import InjectedDatagram, RogueTraffic
-from harness.errors import ExportError
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
@@ -151,21 +149,12 @@ class InMemory:
                 "agents": simulation.played.agents,
             }
         )
-        errors: list[str] = []
-        exports = self._exports(simulation, errors)
-        return Evidence(exports, self._traces, record, errors, self._kept, self._injected)
+        return Evidence(self._exports(simulation), self._traces, record, [], self._kept, self._injected)
 
-    def _exports(self, simulation: Simulation, errors: list[str] | None = None) -> dict[int, Export]:
-        """Those that can be used; of each of the others `errors` gets a sentence."""
-        exports = {}
-        for life in simulation.exporting():
-            agent_id = life.agent.agent_id
-            if life.state is not None:
-                exports[agent_id] = self._maker.export(life.state, simulation.timestamp_us(life))
-                continue
-            try:
-                exports[agent_id] = export_of(Path(f"{agent_id}{SUFFIX}"), simulation.export_of(life))
-            except ExportError as error:
-                if errors is not None:
-                    errors.append(str(error))
-        return exports
+    def _exports(self, simulation: Simulation) -> dict[int, Export]:
+        return {
+            life.agent.agent_id: Export.model_validate(simulation.export_of(life))
+            if life.state is None
+            else self._maker.export(life.state, simulation.timestamp_us(life))
+            for life in simulation.exporting()
+        }

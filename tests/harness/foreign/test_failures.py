@@ -69,6 +69,16 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
             "crashed",
             "gave no `answer` to the command export",
         ),
+        (
+            EXPORT + "if given.get('command') == 'export': said['answer']['chain'] = [1]",
+            "crashed",
+            "answered to the command export without a proper `chain.0`",
+        ),
+        (
+            EXPORT + "if given.get('command') == 'export': said['answer']['agent_id'] = 7",
+            "crashed",
+            "answered to the command export with that of agent 7",
+        ),
         ("if given.get('command') == 'export': said['sent'] = ['AA==']", "crashed", "did more than answer when it was"),
         (EVENT + "said = {'error': 'no such event', 'unsupported': True}", "not supported", "no such event"),
     ],

@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from harness.archive.exports import Export
 from harness.play.control import Status
 from harness.play.last_words import last_words, of_a_shell
 from harness.play.simulation.agents import Outgoing, Stored
@@ -165,8 +166,9 @@ class ForeignAgent:
             try:
                 self._status = Status.model_validate(told)
             except ValidationError as error:
-                where = ".".join(str(part) for part in error.errors()[0]["loc"])
-                raise self._failure("crashed", f"answered to the command status without a proper `{where}`") from None
+                raise self._failure(
+                    "crashed", f"answered to the command status without a proper {_where(error)}"
+                ) from None
         return self._status
 
     def known_status(self) -> Status | None:
@@ -177,14 +179,22 @@ class ForeignAgent:
             return self._completed
         if self.failed is not None:
             return []
-        export = self._export if self._export is not None else self._ask("export", self._now)
-        try:
-            return [bytes.fromhex(block_hash) for block_hash in export["completed"]]
-        except (KeyError, TypeError, ValueError):
-            raise self._failure("crashed", "answered to the command export without a proper `completed`") from None
+        export = self._export if self._export is not None else self._ask_for_export(self._now)
+        return [bytes.fromhex(block_hash) for block_hash in export["completed"]]
 
     def export(self, now: float, exported_at_us: int) -> dict[str, Any]:
-        return self._export if self._export is not None else self._ask("export", now)
+        return self._export if self._export is not None else self._ask_for_export(now)
+
+    def _ask_for_export(self, now: float) -> dict[str, Any]:
+        """Its export, which is one."""
+        export = self._ask("export", now)
+        try:
+            whose = Export.model_validate(export).agent_id
+        except ValidationError as error:
+            raise self._failure("crashed", f"answered to the command export without a proper {_where(error)}") from None
+        if whose != self.agent_id:
+            raise self._failure("crashed", f"answered to the command export with that of agent {whose}")
+        return export
 
     def stored(self, now: float) -> Stored:
         told = self._ask("store", now)
@@ -195,7 +205,7 @@ class ForeignAgent:
     def leave(self, now: float) -> None:
         if self._export is None and self.failed is None:
             self.status()
-            self._export = self._ask("export", now)
+            self._export = self._ask_for_export(now)
 
     # Lines
 
@@ -301,3 +311,8 @@ class ForeignAgent:
 def _changes(entries: list[Entry]) -> Iterator[tuple[str, str]]:
     """Operation and block hash."""
     return (change for entry in entries if isinstance(entry, HandlerRun) for change in entry.changes)
+
+
+def _where(error: ValidationError) -> str:
+    """The first key that is wrong."""
+    return f"`{'.'.join(str(part) for part in error.errors()[0]['loc'])}`"
