@@ -32,11 +32,12 @@ def watching(console: Console) -> Iterator[Watcher]:
         nonlocal last
         if time.monotonic() - last >= every_s:
             last = time.monotonic()
+            so_far = f"{words} after {runs} {'run' if runs == 1 else 'runs'}"
             if console.is_terminal:
-                console.file.write(f"{CLEAR_LINE}{words} after {runs} runs"[: console.width + len(CLEAR_LINE)])
+                console.file.write(f"{CLEAR_LINE}{so_far}"[: console.width + len(CLEAR_LINE)])
                 console.file.flush()
             else:
-                console.print(f"{words} after {runs} runs", highlight=False, soft_wrap=True)
+                console.print(so_far, highlight=False, soft_wrap=True)
 
     try:
         yield Watcher(on_violation, on_step, shown=True)

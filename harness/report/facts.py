@@ -40,7 +40,7 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
         if not in_virtual_time(record.backend):
             parts.append(f"speedup {words.value(scenario.speedup)}")
     played = {"seed": record.seed, "backend": record.backend, "engine": record.engine}
-    parts += [f"{key} {words.value(value)}" for key, value in played.items() if value is not None]
+    parts += [f"{key} {value}" for key, value in played.items() if value is not None]  # to be typed again, so no groups
     parts += [program.in_words for program in programs(record)]
     if record.wall_s is not None:
         parts.append(f"{words.duration(record.wall_s)} wall time")

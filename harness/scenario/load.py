@@ -2,6 +2,7 @@
 
 import stat
 from collections.abc import Hashable, Iterator
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
 
@@ -107,13 +108,18 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     problem = max(problems, key=lambda candidate: (len(candidate["loc"]), candidate["type"] == "extra_forbidden"))
     key = ".".join(shown_key(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
-        return f"`{key}` is unknown: there are {', '.join(_siblings(model, problem['loc']))}"
+        there_are = _siblings(model, problem["loc"])
+        nearest = get_close_matches(str(problem["loc"][-1]), there_are, n=1)
+        meant = f"; did you mean `{nearest[0]}`?" if nearest else ""
+        return f"`{key}` is unknown: there are {', '.join(there_are)}{meant}"
     if problem["type"] == "missing":
         return f"`{key}` is missing"
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").removeprefix("String ")
     if not key:
         return str(message)
     value = shown(problem["input"])
+    if problem["type"] == "list_type" and isinstance(problem["input"], int | float | str):
+        message += f", as [{value}]"
     return f"`{key}` is {value}: it {message}" if message.startswith("should") else f"`{key}` is {value}: {message}"
 
 

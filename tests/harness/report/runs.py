@@ -79,7 +79,7 @@ def result_of(agent_ids: Sequence[int]) -> dict[str, Any]:
                 {"at_s": 900, "loss": 0.5},
             ],
         },
-        "seed": 7,
+        "seed": 1878470074,
         "backend": "process",
         "engine": "nftables",
         "versions": {"ucp-harness": "0.1.0", "python": "3.11.2", "kernel": "6.18"},

@@ -20,7 +20,7 @@ def lines_of(tmp_path: Path, result: dict[str, Any] | None = None) -> list[str]:
 def test_it_says_how_the_run_went_in_little_more_than_a_screen(tmp_path: Path) -> None:
     lines = lines_of(tmp_path)
     assert lines[:3] == ["## 15 % loss", "", "**none violated, 4 of 6 hold**"]
-    assert "seed 7 \u00b7 backend process \u00b7 engine nftables" in lines[4]
+    assert "seed 1878470074 \u00b7 backend process \u00b7 engine nftables" in lines[4]
     assert "| 1 | distributed | \u2713 holds | Looked at every export and every trace. |" in lines
     assert "blocks in the mutual chain **39**" in "\n".join(lines)
     assert "- at 300 s vehicle 3 was lost (crash), and with it 1 of 12 completed blocks" in lines

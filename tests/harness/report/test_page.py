@@ -70,7 +70,7 @@ def test_the_page_says_how_the_run_went_in_its_order(tmp_path: Path) -> None:
     assert at == sorted(at)
     for said in (
         "none violated, 4 of 6 hold",
-        "completed 3 agents 1200 s mission 15 % loss speedup 20 seed 7 backend process engine nftables",
+        "completed 3 agents 1200 s mission 15 % loss speedup 20 seed 1878470074 backend process engine nftables",
         "61.2 s wall time started 2026-11-21 10:00:00 UTC",
         "1. distributed",
         "not applicable 6. one uniform chain",
