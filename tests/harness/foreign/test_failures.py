@@ -23,7 +23,7 @@ EVENT = "if 'event_id' in given:\n    "
 @pytest.fixture(autouse=True)
 def narrow_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(program, "MAX_ANSWER_BYTES", 1 << 20)
-    monkeypatch.setattr(agent, "MAX_AT_ONCE", 50)
+    monkeypatch.setattr(agent, "MAX_TIMERS_PER_S", 50)
 
 
 def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
@@ -50,6 +50,7 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
         (EVENT + "said['timer'] = float('nan')", "crashed", "with what is not JSON (expected value"),
         (EVENT + "said['timer'] = 10 ** 400", "crashed", "not a number of mission seconds, or null, as `timer`"),
         (EVENT + "said['timer'] = '1'", "crashed", "with the timer '1', not a number of mission seconds"),
+        ("said['timer'] = given['t'] + 1e-9 * ('timer' in given or not number)", "hung", "a timer that ends again and"),
         ("said['timer'] = 1", "hung", "has a timer that ends again and again at 1 s"),
         (EVENT + "said['sent'] = ['?']", "crashed", "with a datagram that is not base64: '?'"),
         (EVENT + "said['sent'] = ['AA=='] * 2000", "crashed", "with 2000 datagrams at once"),

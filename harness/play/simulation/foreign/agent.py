@@ -30,14 +30,27 @@ from ucp.messages import Datagram, Message
 from ucp.settings import Settings
 from ucp.trace import Entry, HandlerRun, Recorded, in_base64
 
-MAX_AT_ONCE = 1000
-"""An agent whose timers end more often in one instant hangs."""
+MAX_TIMERS_PER_S = 10_000
+"""An agent whose timers end more often in a mission second, or in one instant, hangs."""
 MAX_SENT_PER_S = 5000
 """Datagrams in a mission second: more are a storm, which feeds itself where others answer."""
 ROUNDED_S = 2e-6
 """The times of a trace have six digits after the point."""
 NO_VIRTUAL_TIME = (2, 127)
 """Exit statuses of agents that take `--virtual` for a mission file that is wrong, or say that they lack it."""
+
+
+class _PerSecond:
+    """How many of something there were in this mission second."""
+
+    def __init__(self) -> None:
+        self._second = self._count = 0
+
+    def add(self, count: int, now: float) -> int:
+        """How many there are by now, with these."""
+        self._count = count + (self._count if self._second == int(now) else 0)
+        self._second = int(now)
+        return self._count
 
 
 @dataclass
@@ -88,9 +101,7 @@ class ForeignAgent:
         self._tracing = tracing
         self._now = now
         self._timer: float | None = None
-        self._at_once = 0
-        self._sent_in = (0, 0)
-        """A mission second, and how many datagrams it sent in that."""
+        self._timers_ended, self._datagrams_sent = _PerSecond(), _PerSecond()
         self._sent: list[tuple[bytes, Recorded]] = []
         self._trace: list[Entry] = []
         self._completed: list[bytes] | None = [] if tracing else None
@@ -125,9 +136,8 @@ class ForeignAgent:
         self._give(f'{{"t":{self._at(now)},{event_of}}}', "an event", now)
 
     def handle_timer(self, now: float) -> None:
-        self._at_once = self._at_once + 1 if now <= self._now else 0
-        if self._at_once > MAX_AT_ONCE:
-            raise self._failure("hung", f"has a timer that ends again and again at {now:g} s, and never stops it")
+        if self._timers_ended.add(1, now) > MAX_TIMERS_PER_S:
+            raise self._failure("hung", f"has a timer that ends again and again at {now:g} s")
         self._give(f'{{"t":{self._at(now)},"timer":true}}', "the end of its timer", now)
 
     def begin_reconcile(self, now: float) -> None:
@@ -234,7 +244,8 @@ class ForeignAgent:
     def _give(self, line: str, what: str, now: float) -> Answer:
         """An input, of which may come whatever it likes; nothing does of one over which it fails."""
         answer = self._exchange(line, what, now)
-        self._count_sent(len(answer.sent), now)
+        if self._datagrams_sent.add(len(answer.sent), now) > MAX_SENT_PER_S:
+            raise self._failure("crashed", f"sent more than {MAX_SENT_PER_S} datagrams within mission second {now:.0f}")
         completed = self._check(answer.trace)
         self._status = None
         self._timer = answer.timer
@@ -279,13 +290,6 @@ class ForeignAgent:
             return [bytes.fromhex(block) for operation, block in _changes(entries) if operation == "complete"]
         except ValueError:
             raise self._failure("crashed", "completed a block whose hash in its trace is none") from None
-
-    def _count_sent(self, count: int, now: float) -> None:
-        second, before = self._sent_in
-        count += before if second == int(now) else 0
-        self._sent_in = int(now), count
-        if count > MAX_SENT_PER_S:
-            raise self._failure("crashed", f"sent more than {MAX_SENT_PER_S} datagrams within mission second {now:.0f}")
 
     def _failure(self, outcome: Outcome, detail: str) -> AgentFailedError:
         self.failed = AgentFailedError(self.agent_id, outcome, f"{detail}{self._program.where_it_logs()}")
