@@ -27,7 +27,7 @@ from harness.stories.sentences import Course
 
 MAX_BYTES = 1024 * 1024
 MAX_LINES = 20_000
-_SENTENCE = re.compile(r"(\d{1,7}) s: (.+?)\s*")
+_SENTENCE = re.compile(r"(\d{1,7}) s: +(\S.*)")
 _ENTRY = re.compile(r"(`?)(timeline|events\.script)\.(\d+)(?:\.|: )")
 INDENT = "    "
 DELAY_S = 0.02
@@ -120,7 +120,7 @@ def _parsed(path: Path, text: str) -> Story:
         sentence = _SENTENCE.fullmatch(line)
         if sentence is None:
             raise ScenarioError(f"line {number}: {line[:80]!r} is no sentence: those begin with their second, `12 s: `")
-        at_s, words = int(sentence[1]), sentence[2]
+        at_s, words = int(sentence[1]), sentence[2].rstrip()
         if told and at_s < told[-1][1]:
             raise ScenarioError(f"line {number}: {at_s} s is before {told[-1][1]} s, which was told already")
         if course.ends_at_s is not None:
