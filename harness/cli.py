@@ -4,6 +4,7 @@ Exit status 0: ran, and no characteristic is violated. 1: at least one is violat
 was wrong. 3: this machine cannot do it. 4: `prove` could not look at everything. 130: interrupted.
 """
 
+import errno
 import os
 import sys
 from importlib import import_module
@@ -14,7 +15,10 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from harness.errors import HarnessError, MachineError
+from harness.errors import WRONG_REQUEST, HarnessError, MachineError
+
+MAX_NAME = 200
+"""More of a file's name is not shown."""
 
 COMMANDS = {
     "run": (
@@ -167,6 +171,8 @@ def main() -> NoReturn:
     except HarnessError as error:
         _end(*error.details, str(error), exit_status=error.exit_status)
     except OSError as error:
+        if error.errno in (errno.EACCES, errno.ENAMETOOLONG) and error.filename is not None:
+            _end(f"{str(error.filename)[:MAX_NAME]}: cannot be looked at: {error.strerror}", exit_status=WRONG_REQUEST)
         if error.filename is not None:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere

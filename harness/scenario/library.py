@@ -15,8 +15,10 @@ def names() -> list[str]:
 
 def find(path: Path) -> Path:
     """The file that comes along by this name, if it is such a name and no file; else what was given."""
-    named = FOLDER / f"{path}.yaml"
-    return named if len(path.parts) == 1 and not path.exists() and named.is_file() else path
+    named = f"{path}.yaml"
+    if len(path.parts) != 1 or not FOLDER.is_dir() or named not in (scenario.name for scenario in FOLDER.iterdir()):
+        return path
+    return path if path.exists() else FOLDER / named
 
 
 def opening(name: str) -> str:

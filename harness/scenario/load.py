@@ -88,7 +88,7 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
         names = "`ucp-harness scenarios` lists those that come along"
         raise ScenarioError(f"{path}: there is no such file or {what}; {names}") from None
     except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ScenarioError(f"{str(path)[:MAX_PROBLEM]}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ScenarioError(f"{path}: not YAML: it is not UTF-8 text") from None
     except ValueError:  # NUL

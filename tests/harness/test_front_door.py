@@ -91,3 +91,11 @@ def test_a_mission_beyond_reason_is_refused(tmp_path: Path) -> None:
     refused = harness("run", write_scenario(tmp_path, duration_s=10**9))
     assert refused.returncode == 2
     assert "`duration_s` is 1000000000: it should be less than or equal to 2678400" in refused.stderr
+
+
+@pytest.mark.parametrize("command", ["check", "run", "replay"])
+def test_a_file_that_cannot_even_be_looked_at_is_one_sentence(command: str) -> None:
+    ended = harness(command, "x" * 5000)
+    assert ended.returncode == 2
+    (sentence,) = sentences(ended.stderr)
+    assert sentence.startswith("xxx") and sentence.endswith("File name too long")
