@@ -24,6 +24,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <sys/signalfd.h>
 #include <sys/stat.h>
 #include <sys/un.h>
 #include <time.h>
@@ -1466,8 +1467,14 @@ static double next_deadline(const Agent *a) {           /* infinity if no timer 
     return first;
 }
 
+static void take_reconcile(Agent *a, double now) {
+    begin_input(a, now);
+    run_all(a, RECONCILE_BEGIN, BY_OPERATOR, 0, NULL);
+}
+
 /* A command that runs no handler leaves a line of its own. */
-static void note_command(Agent *a, Json *j, uint32_t request, const char *command, const char *without) {
+static void note_command(Agent *a, double now, Json *j, uint32_t request, const char *command, const char *without) {
+    begin_input(a, now);
     if (!a->tracing) return;
     put_format(&a->lines, "{\"t\":%s,\"command\":\"%s\",\"request\":", a->t, command);
     put_object(&a->lines, j, request, without);
@@ -1745,10 +1752,6 @@ typedef struct {
     Buf bytes;
 } Station;
 
-static volatile sig_atomic_t told_to_end;
-
-static void on_signal(int number) { told_to_end = number; }
-
 static double seconds(clockid_t clock) {
     struct timespec time;
     clock_gettime(clock, &time);
@@ -1879,6 +1882,15 @@ static void settle(Station *s) {
     a->out.len = 0;
 }
 
+static uint64_t draw(Station *s) {                      /* SplitMix64 */
+    uint64_t z = s->random += 0x9e3779b97f4a7c15u;
+    z = (z ^ z >> 30) * 0xbf58476d1ce4e5b9u;
+    z = (z ^ z >> 27) * 0x94d049bb133111ebu;
+    return z ^ z >> 31;
+}
+
+static double draw_part(Station *s) { return (double)(draw(s) >> 11) * 0x1p-53; }      /* of 0..1 */
+
 static void begin_mission(Station *s, uint64_t epoch_us) {
     Agent *a = s->a;
     a->m.epoch_us = epoch_us;
@@ -1891,28 +1903,16 @@ static void begin_mission(Station *s, uint64_t epoch_us) {
     if (a->boots)
         boot(a, a->now);
     settle(s);
-    s->next_second = INFINITY;
-    if (a->m.random_events) {                           /* the phase of Algorithm 21 */
-        s->random = a->m.seed;
-        s->next_second = a->now;
-    }
+    s->random = a->m.seed;
+    s->next_second = a->m.random_events ? a->now + draw_part(s) : INFINITY;
 }
 
 /* --- Events: Algorithm 21 ---------------------------------------------------------------------------------------- */
 
-static uint64_t draw(Station *s) {                      /* SplitMix64 */
-    uint64_t z = s->random += 0x9e3779b97f4a7c15u;
-    z = (z ^ z >> 30) * 0xbf58476d1ce4e5b9u;
-    z = (z ^ z >> 27) * 0x94d049bb133111ebu;
-    return z ^ z >> 31;
-}
-
-static double draw_part(Station *s) { return (double)(draw(s) >> 11) * 0x1p-53; }      /* of 0..1 */
-
 static void random_events(Station *s, double now) {     /* the seconds that have come since it was here last */
     Agent *a = s->a;
     if (now - s->next_second > 1000)                    /* it was stopped for long: nothing happened meanwhile */
-        s->next_second = now;
+        s->next_second = now + draw_part(s);
     while (s->next_second <= now) {
         s->next_second += 1;
         if (draw_part(s) >= 1 / fmax(1, a->m.mean_s)) continue;
@@ -1954,65 +1954,51 @@ static bool export_chain(Station *s) {
 }
 
 static void answer(Station *s, uint32_t request, Buf *b) {
-    static const char ok[] = "{\"ok\":true}";
     Agent *a = s->a;
     Json *j = &s->json;
     uint32_t command = member(j, request, "command");
+    bool stop = says(j, command, "stop_events"), export = says(j, command, "export");
+    const char *error = NULL;
+    uint64_t value;
     if (says(j, command, "status")) {
         put_status(b, a, a->started ? mission_now(s) : 0, s->trace_problem);
-    } else if (says(j, command, "start")) {
-        uint64_t epoch;
-        if (a->started)
-            put_error(b, false, "The mission has begun.");
-        else if (!json_uint(j, member(j, request, "epoch_us"), 0, INT64_MAX, &epoch))
-            put_error(b, false, "epoch_us is no whole number of microseconds.");
-        else
-            begin_mission(s, epoch), put_text(b, ok);
+        return;
+    }
+    if (says(j, command, "start")) {
+        error = a->started ? "The mission has begun."
+              : !json_uint(j, member(j, request, "epoch_us"), 0, INT64_MAX, &value) ? "epoch_us is no time." : NULL;
+        if (error == NULL)
+            begin_mission(s, value);
     } else if (says(j, command, "log")) {
-        uint64_t id;
-        s->bytes.len = 0;
-        if (!a->started)
-            put_error(b, false, "The mission has not begun.");
-        else if (!json_uint(j, member(j, request, "event_id"), 1, 254, &id)
-                 || !json_bytes(j, member(j, request, "data"), &s->bytes))
-            put_error(b, false, "This is no event.");
-        else if (!event_fits(a, s->bytes.len))
-            put_error(b, false, "The event is too large.");
-        else {
-            double now = mission_now(s);
-            take_event(a, now, (uint8_t)id, timestamp_at(a, now), s->bytes.data, s->bytes.len);
-            settle(s);
-            put_text(b, ok);
-        }
+        Buf data = {0};
+        error = !a->started ? "The mission has not begun."
+              : !json_uint(j, member(j, request, "event_id"), 1, 254, &value)
+                || !json_bytes(j, member(j, request, "data"), &data) ? "This is no event."
+              : !event_fits(a, data.len) ? "The event is too large." : NULL;
+        double now = mission_now(s);
+        if (error == NULL)
+            take_event(a, now, (uint8_t)value, timestamp_at(a, now), data.data, data.len);
+        free(data.data);
     } else if (says(j, command, "reconcile")) {
-        if (!a->started) {
-            put_error(b, false, "The mission has not begun.");
-            return;
-        }
-        begin_input(a, mission_now(s));
-        run_all(a, RECONCILE_BEGIN, BY_OPERATOR, 0, NULL);
-        settle(s);
-        put_text(b, ok);
-    } else if (says(j, command, "stop_events") || says(j, command, "export")) {
-        bool stop = says(j, command, "stop_events");
-        if (stop)
-            a->no_events = true;
-        else if (!export_chain(s)) {
-            put_error(b, false, "The export could not be written.");
-            return;
-        }
-        if (a->started) {
-            begin_input(a, mission_now(s));
-            note_command(a, j, request, stop ? "stop_events" : "export", NULL);
-            settle(s);
-        }
-        if (stop)
-            put_text(b, ok);
-        else
-            put_format(b, "{\"ok\":true,\"path\":\"%s\"}", s->export_name);
+        error = a->started ? NULL : "The mission has not begun.";
+        if (error == NULL)
+            take_reconcile(a, mission_now(s));
+    } else if (stop || export) {
+        a->no_events = a->no_events || stop;
+        error = export && !export_chain(s) ? "The export could not be written." : NULL;
+        if (error == NULL && a->started)
+            note_command(a, mission_now(s), j, request, stop ? "stop_events" : "export", NULL);
     } else {
         put_error(b, true, "This agent does not have the command.");
+        return;
     }
+    settle(s);
+    if (error != NULL)
+        put_error(b, false, error);
+    else if (export)
+        put_format(b, "{\"ok\":true,\"path\":\"%s\"}", s->export_name);
+    else
+        put_text(b, "{\"ok\":true}");
 }
 
 static void client_close(Station *s, int i) {
@@ -2022,26 +2008,19 @@ static void client_close(Station *s, int i) {
     s->client[i] = s->client[--s->clients];
 }
 
-/* Take the requests that are there, give the answers that go; false: the connection is over. A client that does not
-   take its answers is not read from meanwhile. */
+/* Take requests that are there, give the answers that go; false: the connection is over. A client that does not take
+   its answers is not read from meanwhile; one that never stops asking waits for others now and then. */
 static bool client_serve(Station *s, Client *c) {
+    if (!c->ended && c->in.len <= MAX_REQUEST) {
+        ssize_t n = recv(c->fd, buf_room(&c->in, MAX_REQUEST), MAX_REQUEST, 0);
+        if (n < 0 && errno != EAGAIN && errno != EWOULDBLOCK) return false;
+        c->ended = n == 0;                              /* half a line at the end is no request */
+        c->in.len += n > 0 ? (size_t)n : 0;
+    }
     for (;;) {
-        bool idle = true;
-        if (!c->ended && c->in.len <= MAX_REQUEST) {
-            ssize_t n = recv(c->fd, buf_room(&c->in, MAX_REQUEST), MAX_REQUEST, 0);
-            if (n == 0)
-                c->ended = true;                        /* half a line at the end is no request */
-            else if (n < 0 && errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR)
-                return false;
-            if (n > 0) {
-                c->in.len += (size_t)n;
-                idle = false;
-            }
-        }
         size_t at = 0;
-        const char *line = (const char *)c->in.data, *end;
-        while (c->out.len - c->given < (1 << 20) && at < c->in.len
-               && (end = memchr(line + at, '\n', c->in.len - at)) != NULL) {
+        const char *line = (const char *)c->in.data, *end = NULL;
+        while (c->out.len < (1 << 20) && at < c->in.len && (end = memchr(line + at, '\n', c->in.len - at)) != NULL) {
             size_t n = (size_t)(end - line) - at;
             if (n > MAX_REQUEST) return false;
             c->in.data[at + n] = '\0';
@@ -2051,21 +2030,18 @@ static bool client_serve(Station *s, Client *c) {
                 put_error(&c->out, false, "not JSON");
             put_byte(&c->out, '\n');
             at += n + 1;
-            idle = false;
+            tick(s);
         }
         if (at > 0)
             buf_drop(&c->in, at);
         while (c->given < c->out.len) {
             ssize_t n = send(c->fd, c->out.data + c->given, c->out.len - c->given, MSG_NOSIGNAL);
-            if (n < 0 && (errno == EAGAIN || errno == EWOULDBLOCK || errno == EINTR)) return true;
-            if (n < 0) return false;
+            if (n < 0) return errno == EAGAIN || errno == EWOULDBLOCK;
             c->given += (size_t)n;
         }
         c->given = c->out.len = 0;
-        if (c->in.len > MAX_REQUEST && memchr(c->in.data, '\n', c->in.len) == NULL)
-            return false;                               /* too long a request */
-        if (idle) return !c->ended;
-        tick(s);
+        if (at == 0)                                    /* no whole line is left, but maybe too long a beginning */
+            return !c->ended && c->in.len <= MAX_REQUEST;
     }
 }
 
@@ -2114,24 +2090,23 @@ static struct timespec time_to_wait(const Station *s) {   /* until the next time
     return (struct timespec){(time_t)wait + ns / 1000000000, ns % 1000000000};
 }
 
-static void station_run(Station *s, const sigset_t *unblocked) {   /* until SIGTERM or SIGINT */
-    struct pollfd polled[2 + MAX_CLIENTS];
-    while (!told_to_end) {
+static void station_run(Station *s, int signals) {      /* until SIGTERM or SIGINT */
+    struct pollfd polled[3 + MAX_CLIENTS] = {{signals, POLLIN, 0}, {s->udp, POLLIN, 0}};
+    for (;;) {
         tick(s);
         int clients = s->clients;
-        polled[0] = (struct pollfd){s->udp, POLLIN, 0};
-        polled[1] = (struct pollfd){s->clients < MAX_CLIENTS ? s->listener : -1, POLLIN, 0};
+        polled[2] = (struct pollfd){s->clients < MAX_CLIENTS ? s->listener : -1, POLLIN, 0};
         for (int i = 0; i < clients; i++)
-            polled[2 + i] = (struct pollfd){s->client[i].fd, s->client[i].out.len > 0 ? POLLOUT : POLLIN, 0};
+            polled[3 + i] = (struct pollfd){s->client[i].fd, s->client[i].out.len > 0 ? POLLOUT : POLLIN, 0};
         struct timespec wait = time_to_wait(s);
-        if (ppoll(polled, 2 + (nfds_t)clients, &wait, unblocked) < 0)
-            continue;                                   /* a signal, and told_to_end says so */
-        if (polled[0].revents != 0)
+        if (ppoll(polled, 3 + (nfds_t)clients, &wait, NULL) < 0) continue;
+        if (polled[0].revents != 0) return;
+        if (polled[1].revents != 0)
             udp_receive(s);
         for (int i = clients - 1; i >= 0; i--)          /* closing one moves the last one, which has been served */
-            if (polled[2 + i].revents != 0 && !client_serve(s, &s->client[i]))
+            if (polled[3 + i].revents != 0 && !client_serve(s, &s->client[i]))
                 client_close(s, i);
-        int fd = polled[1].revents != 0 ? accept4(s->listener, NULL, NULL, SOCK_NONBLOCK | SOCK_CLOEXEC) : -1;
+        int fd = polled[2].revents != 0 ? accept4(s->listener, NULL, NULL, SOCK_NONBLOCK | SOCK_CLOEXEC) : -1;
         if (fd >= 0)
             s->client[s->clients++] = (Client){.fd = fd};
     }
@@ -2142,18 +2117,14 @@ static int play_over_udp(Agent *a, const char *mission_file) {
     Station *s = &station;
     Fault fault;
     char trace_name[32];
-    sigset_t blocked, unblocked;
-    struct sigaction action = {.sa_handler = on_signal};
-    sigaction(SIGTERM, &action, NULL);
-    sigaction(SIGINT, &action, NULL);
+    sigset_t ends;
+    sigemptyset(&ends);
+    sigaddset(&ends, SIGTERM);
+    sigaddset(&ends, SIGINT);
+    sigprocmask(SIG_BLOCK, &ends, NULL);                /* they interrupt nothing: the loop looks for them */
+    int signals = signalfd(-1, &ends, SFD_CLOEXEC);
     signal(SIGPIPE, SIG_IGN);
     signal(SIGXFSZ, SIG_IGN);
-    sigemptyset(&blocked);
-    sigaddset(&blocked, SIGTERM);
-    sigaddset(&blocked, SIGINT);
-    sigprocmask(SIG_BLOCK, &blocked, &unblocked);
-    sigdelset(&unblocked, SIGTERM);
-    sigdelset(&unblocked, SIGINT);
 
     s->a = a;
     if (!read_file(mission_file, MAX_MISSION, &s->bytes)) {
@@ -2182,7 +2153,7 @@ static int play_over_udp(Agent *a, const char *mission_file) {
     }
     if (a->m.has_epoch)
         begin_mission(s, a->m.epoch_us);
-    station_run(s, &unblocked);
+    station_run(s, signals);
     bool exported = export_chain(s);
     unlink(s->control_name);
     while (s->clients > 0)
@@ -2286,11 +2257,10 @@ static bool virtual_mission(Virtual *v, double t, uint32_t mission) {
     return true;
 }
 
-/* Returns false for a command that is answered before it is a command: none. Puts the answer behind the output. */
 static void virtual_command(Virtual *v, double t, uint32_t command, Buf *b) {
     Agent *a = v->a;
     Json *j = &v->json;
-    begin_input(a, t);
+    a->now = t;
     if (says(j, command, "status")) {
         put_status(b, a, t, NULL);
     } else if (says(j, command, "store")) {
@@ -2298,14 +2268,14 @@ static void virtual_command(Virtual *v, double t, uint32_t command, Buf *b) {
         put_store(b, a);
         put_byte(b, '}');
     } else if (says(j, command, "export")) {
-        note_command(a, j, ROOT, "export", "t");
+        note_command(a, t, j, ROOT, "export", "t");
         put_export(b, a, timestamp_at(a, t));
     } else if (says(j, command, "stop_events")) {
         a->no_events = true;
-        note_command(a, j, ROOT, "stop_events", "t");
+        note_command(a, t, j, ROOT, "stop_events", "t");
         put_text(b, "{\"ok\":true}");
     } else if (says(j, command, "reconcile")) {
-        run_all(a, RECONCILE_BEGIN, BY_OPERATOR, 0, NULL);
+        take_reconcile(a, t);
         put_text(b, "{\"ok\":true}");
     } else {
         put_error(b, true, "This agent does not have the command.");
