@@ -38,6 +38,7 @@ def conformance_command(
         Path | None,
         typer.Option(metavar="DIR", help="Where failures are put, with vector and capture; must be new."),
     ] = None,
+    virtual: Annotated[bool, typer.Option("--virtual", help="In virtual time: COMMAND --virtual, in seconds.")] = False,
     write: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Only write the generated vectors, as JSON lines; must be new.")
     ] = None,
@@ -54,7 +55,8 @@ def conformance_command(
     console = Console(stderr=as_json, highlight=False)
     place = keep or Path("conformance-failures")
     with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
-        results = conform(Asked(tuple(located(command, "the agent")), only, _fresh(place)), Path(scratch), told)
+        asked = Asked(tuple(located(command, "the agent")), only, _fresh(place), virtual)
+        results = conform(asked, Path(scratch), told)
     if junit is not None:
         write_new(junit, [to_junit(results)])
     if as_json:

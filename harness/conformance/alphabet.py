@@ -26,8 +26,6 @@ from ucp.reconcile import IS_TOP_OF_CHAIN
 
 UNKNOWN = bytes.fromhex("de" * 32)
 """A hash of nothing."""
-MOST_WAITING = 2
-"""Blocks in the deque."""
 
 Tally = Literal["voting", "phase one", "phase two", "timer"]
 
@@ -48,7 +46,7 @@ class Input:
 
 
 INPUTS: dict[str, Input] = {}
-TIMER = "the next timer ends"
+TIMER, LOG = "the next timer ends", "an event fills a block"
 
 
 def _input(
@@ -90,12 +88,17 @@ def _again(responders: Callable[[Model], set[int]]) -> Callable[[Model], int | N
 
 
 def _voters(model: Model) -> set[int]:
-    return model.state.voters if model.state.voting_timer.active else set()
-
-
-def _responders(model: Model) -> set[int]:
+    """Of the vote that matters now."""
     state = model.state
-    return state.reconcile_responders if state.phase_one_timer.active or state.phase_two_timer.active else set()
+    return state.voters if state.voting_timer.active and not state.reconcile_in_progress else set()
+
+
+def _of_phase_1(model: Model) -> set[int]:
+    return model.state.reconcile_responders if model.state.phase_one_timer.active else set()
+
+
+def _of_phase_2(model: Model) -> set[int]:
+    return model.state.reconcile_responders if model.state.phase_two_timer.active else set()
 
 
 # Of what
@@ -137,9 +140,9 @@ def _chain_of_vote(model: Model) -> bytes | None:
     return state.top_chain_hash_at_initiation if state.settings.vote_names_chain else None
 
 
-@_input("an event fills a block")
+@_input(LOG)
 def _log(model: Model) -> Action | None:
-    return model.event() if len(model.state.blocks_to_be_committed) < MOST_WAITING else None
+    return model.event()
 
 
 @_input(TIMER, "timer")
@@ -306,7 +309,7 @@ _message(
     lambda model: ChainContainQuery(popped) if (popped := _popped(model)) else None,
 )
 for _contained, _word in ((True, "yes"), (False, "no")):
-    for _who, _sender in (("", _nobody_yet(_responders)), (" of who has answered", _again(_responders))):
+    for _who, _sender in (("", _nobody_yet(_of_phase_1)), (" of who has answered", _again(_of_phase_1))):
         _message(
             f"Chain Contain Response {_word}{_who}",
             lambda model, contained=_contained: ChainContainResponse(_top(model), contained),  # type: ignore[misc]
@@ -317,7 +320,7 @@ for _contained, _word in ((True, "yes"), (False, "no")):
     _message(
         f"Chain Contain Response {_word} about an unknown chain",
         lambda model, contained=_contained: ChainContainResponse(UNKNOWN, contained),  # type: ignore[misc]
-        _nobody_yet(_responders),
+        _nobody_yet(_of_phase_1),
         "phase one",
         f"Chain Contain Response {_word}",
     )
@@ -326,7 +329,7 @@ for _contained, _word in ((True, "yes"), (False, "no")):
         lambda model, contained=_contained: (  # type: ignore[misc]
             ChainContainResponse(popped, contained) if (popped := _popped(model)) else None
         ),
-        _nobody_yet(_responders),
+        _nobody_yet(_of_phase_1),
         "phase one",
         f"Chain Contain Response {_word}",
     )
@@ -395,7 +398,7 @@ for _name, _says in {
     "the top block itself": _next(_top_block),
     "a block of the agent's deque": _next(_waiting),
 }.items():
-    _message(f"Next in Sequence Response: {_name}", _says, _nobody_yet(_responders), "phase two")
+    _message(f"Next in Sequence Response: {_name}", _says, _nobody_yet(_of_phase_2), "phase two")
 _COUNTED = {
     "Is Top Of Chain": "Next in Sequence Response: Is Top Of Chain, old",
     "an old new block": "Next in Sequence Response: an old new block",
@@ -409,7 +412,7 @@ for _name, _says in {
     _message(
         f"Next in Sequence Response of who has answered: {_name}",
         _says,
-        _again(_responders),
+        _again(_of_phase_2),
         "phase two",
         _COUNTED[_name],
     )
@@ -418,14 +421,14 @@ _message(
     lambda model: NextInSequenceResponse(
         UNKNOWN, (block := model.new_block(PEERS[1], young=False)).block_hash, block.timestamp_us
     ),
-    _nobody_yet(_responders),
+    _nobody_yet(_of_phase_2),
     "phase two",
     "Next in Sequence Response: an old new block",
 )
 _message(
     "Next in Sequence Response about the chain with the popped block",
     lambda model: NextInSequenceResponse(popped, None, OLD_US) if (popped := _popped(model)) else None,
-    _nobody_yet(_responders),
+    _nobody_yet(_of_phase_2),
     "phase two",
     "Next in Sequence Response: Is Top Of Chain, old",
 )

@@ -56,14 +56,19 @@ class Evidence:
         hidden, runs = failure.seen.hidden, failure.seen.outcome.runs
         if hidden is not None:
             return Blamed(hidden.handler, hidden.branch)
-        early = next((words for words in failure.seen.wrong if "before its timer" in words), None)
-        if early is not None:
-            timer = early.split("before its timer ")[1].removesuffix(" ends")
-            return Blamed(STARTS[timer], "")
+        if failure.seen.mistimed in STARTS:
+            return self._starter(failure)
         if failure.of_an_earlier_round and runs[0].handler in ENDS:
             return Blamed(ENDS[runs[0].handler], "")
         run = self._suspect(runs, failure)
         return Blamed(run.handler, run.branch)
+
+    @staticmethod
+    def _starter(failure: Failure) -> Blamed:
+        """Who starts the timer that is not as it should be; if that ran now, in the branch that it took."""
+        handler = STARTS[str(failure.seen.mistimed)]
+        branch = next((run.branch for run in failure.seen.outcome.runs if run.handler == handler), "")
+        return Blamed(handler, branch)
 
     def _suspect(self, runs: Sequence[Run], failure: Failure) -> Run:
         """Who should have sent what is missing, or sends what is too much; of these, whose branch passes least."""

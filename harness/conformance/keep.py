@@ -12,8 +12,8 @@ from pathlib import Path
 from harness.conformance.air import AGENTS, PEERS_ON
 from harness.conformance.lines import Writer
 from harness.conformance.results import Case
+from harness.conformance.seen import Exchange
 from harness.conformance.states import VARIANTS
-from harness.conformance.subject import Exchange
 from harness.conformance.table import lines_of
 from harness.errors import MachineError
 from netem.capture import begin_file

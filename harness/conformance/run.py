@@ -7,13 +7,16 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from harness.conformance import over_udp, virtual
 from harness.conformance.air import Air
 from harness.conformance.blame import Evidence
 from harness.conformance.keep import keep
 from harness.conformance.results import Case, Results, Row
-from harness.conformance.suite import FAILURES_OF_A_KIND, SIDE_BY_SIDE, Failure, Suite, Tally
+from harness.conformance.suite import ALONE_AT_ONCE, FAILURES_OF_A_KIND, SIDE_BY_SIDE, Failure, Suite, Tally
 from harness.conformance.vectors import Vectors, generate
 
+IN_VIRTUAL_TIME = 2
+"""Processes of the agent there."""
 LIMIT_S = 100.0
 """Of the tours, in wall time; what has not been seen by then is not tried."""
 
@@ -25,6 +28,7 @@ class Asked:
     command: tuple[str, ...]
     only: str | None
     keep: Path | None
+    virtual: bool = False
     limit_s: float = LIMIT_S
 
 
@@ -45,12 +49,25 @@ def conform(asked: Asked, place: Path, told: Callable[[int, int], None]) -> Resu
 async def _run(
     asked: Asked, place: Path, generated: Sequence[Vectors], told: Callable[[int], None], results: Results
 ) -> None:
-    async with Air(place, asked.command, SIDE_BY_SIDE) as air:
-        suite = Suite(air, generated, told)
+    until = time.monotonic() + asked.limit_s
+    if asked.virtual:
+        start, programs = virtual.starting(asked.command, place / "errors.log")
         try:
-            await suite.run(time.monotonic() + asked.limit_s)
+            await _play(Suite(start, generated, told, side_by_side=IN_VIRTUAL_TIME), until, asked, results)
         finally:
-            _conclude(suite.tallies, asked, results)
+            for program in programs:
+                await program.close()
+        return
+    async with Air(place, asked.command, SIDE_BY_SIDE + ALONE_AT_ONCE) as air:
+        start = over_udp.starting(air)
+        await _play(Suite(start, generated, told, side_by_side=SIDE_BY_SIDE), until, asked, results)
+
+
+async def _play(suite: Suite, until: float, asked: Asked, results: Results) -> None:
+    try:
+        await suite.run(until)
+    finally:
+        _conclude(suite.tallies, asked, results)
 
 
 def _conclude(tallies: Sequence[Tally], asked: Asked, results: Results) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from harness.conformance.alphabet import INPUTS, TIMER, Input
+from harness.conformance.alphabet import INPUTS, LOG, TIMER, Input
 from harness.conformance.model import AGENT, OLD_US, YOUNG_US, Model, Outcome
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.reconcile import IS_TOP_OF_CHAIN
@@ -18,7 +18,7 @@ from ucp.settings import Settings
 
 STEP_S = 0.125
 """Mission seconds between two inputs that are not timers, in virtual time."""
-MOST_CHAIN, MOST_STACK = 2, 2
+MOST_CHAIN, MOST_STACK, MOST_WAITING = 2, 2, 2
 MOST_STATES = 4000
 """So that a mistake in here ends."""
 
@@ -273,7 +273,11 @@ depends on nothing else."""
 
 
 def _too_much(model: Model, before: State, given: Input) -> bool:
-    """What would only make more of the same."""
+    """What would only make more of the same, or is not told apart by the state."""
+    if given.name == LOG:
+        return len(model.state.blocks_to_be_committed) >= MOST_WAITING
+    if before.doing != "voting" and "waits behind" in given.name:
+        return True
     if given.tally != "phase two" or before.doing != "phase two" or "of who has answered" in given.name:
         return False
     answers = sum(count for count, _ in model.state.reconcile_response_dictionary.values())

@@ -1,18 +1,18 @@
 """All generated vectors, by agents side by side; then what is suspected, alone."""
 
 import asyncio
-import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from harness.conformance.air import AgentEndedError, Air, NoAgentError, UnsupportedError
+from harness.conformance.air import AgentEndedError, NoAgentError, UnsupportedError
 from harness.conformance.alphabet import INPUTS
 from harness.conformance.model import Model, Run
+from harness.conformance.seen import Exchange, Seen
 from harness.conformance.states import COUNTING, Pair, Variant, advance, in_short, walk
-from harness.conformance.subject import ALONE, BESIDE_OTHERS, Exchange, OverUdp, Pace, Seen
+from harness.conformance.subject import Start
 from harness.conformance.tours import Map, Suspicion, Tour
 from harness.conformance.vectors import Vectors
 
@@ -59,8 +59,11 @@ class Tally:
 class Suite:
     """`told` is called with how many vectors have been seen, whenever that changes."""
 
-    def __init__(self, air: Air, generated: Sequence[Vectors], told: Callable[[int], None]) -> None:
-        self._air = air
+    def __init__(
+        self, start: Start, generated: Sequence[Vectors], told: Callable[[int], None], *, side_by_side: int
+    ) -> None:
+        self._start = start
+        self._side_by_side = side_by_side
         self._told = told
         self.tallies = [Tally(vectors) for vectors in generated if vectors.wanted]
         self._maps = [
@@ -75,23 +78,19 @@ class Suite:
 
         Raises NoAgentError if the agent never starts.
         """
-        workers = min(SIDE_BY_SIDE, 1 + sum(atlas.left for atlas in self._maps) // 10)
+        workers = min(self._side_by_side, 1 + sum(atlas.left for atlas in self._maps) // 10)
         await _together([self._work(until) for _ in range(workers)])
         once_more = [(tally, suspicion) for tally in self.tallies for suspicion in self._worth(tally)]
         waiting = iter(once_more[:MOST_SUSPICIONS])
         await _together([self._try_again(waiting) for _ in range(ALONE_AT_ONCE)])
 
     async def _work(self, until: float) -> None:
-        port = self._air.take_port()
-        try:
-            while time.monotonic() < until and (number := self._most_left()) is not None:
-                self._at_work[number] += 1
-                try:
-                    await self._tour(number, port, until)
-                finally:
-                    self._at_work[number] -= 1
-        finally:
-            self._air.give_back(port)
+        while time.monotonic() < until and (number := self._most_left()) is not None:
+            self._at_work[number] += 1
+            try:
+                await self._tour(number, until)
+            finally:
+                self._at_work[number] -= 1
 
     def _most_left(self) -> int | None:
         """The variant in which an agent finds most that is yet to be seen."""
@@ -102,7 +101,7 @@ class Suite:
         ]
         return max(shares, default=(0, None))[1]
 
-    async def _tour(self, number: int, port: int, until: float) -> None:
+    async def _tour(self, number: int, until: float) -> None:
         tally, atlas = self.tallies[number], self._maps[number]
         if atlas.way_from(atlas.start) is None:
             if not self._at_work[number] > 1:
@@ -110,7 +109,7 @@ class Suite:
             await asyncio.sleep(0.1)
             return
         try:
-            subject = await OverUdp.start(self._air, port, tally.vectors.variant, BESIDE_OTHERS)
+            subject = await self._start(tally.vectors.variant, False)
         except UnsupportedError as error:
             tally.unsupported = str(error)
             atlas.give_up()
@@ -132,7 +131,6 @@ class Suite:
                 self._suspect(number, suspicion)
         finally:
             await subject.close()
-            shutil.rmtree(subject.process.directory, ignore_errors=True)
 
     def _suspect(self, number: int, suspicion: Suspicion) -> None:
         tally, atlas = self.tallies[number], self._maps[number]
@@ -194,25 +192,20 @@ class Suite:
                 return None
         return failure
 
-    async def play(self, variant: Variant, way: Sequence[str], pace: Pace = ALONE) -> Failure | None:
+    async def play(self, variant: Variant, way: Sequence[str]) -> Failure | None:
         """An agent is given all these inputs: where it was wrong first, if it was not the machine that was late."""
-        port = self._air.take_port()
         try:
-            subject = await OverUdp.start(self._air, port, variant, pace)
-            try:
-                for number, name in enumerate(way, 1):
-                    seen = await subject.step(INPUTS[name])
-                    if seen is not None and seen.wrong:
-                        return (
-                            None if seen.late else Failure(variant.name, tuple(way[:number]), seen, subject.exchanges())
-                        )
-            finally:
-                await subject.close()
-                shutil.rmtree(subject.process.directory, ignore_errors=True)
+            subject = await self._start(variant, True)
         except (AgentEndedError, UnsupportedError):
             return None
+        try:
+            for number, name in enumerate(way, 1):
+                seen = await subject.step(INPUTS[name])
+                if seen is not None and seen.wrong:
+                    failure = Failure(variant.name, tuple(way[:number]), seen, subject.exchanges())
+                    return None if seen.late else failure
         finally:
-            self._air.give_back(port)
+            await subject.close()
         return None
 
 

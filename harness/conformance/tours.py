@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 from harness.conformance.alphabet import INPUTS, TIMER
 from harness.conformance.model import Model
+from harness.conformance.seen import Seen
 from harness.conformance.states import Pair, State, Step, Variant, pair_of, state_of
-from harness.conformance.subject import Seen, Subject
+from harness.conformance.subject import Subject
 
 TIMER_COSTS = 10.0
 """Mission seconds, about."""

@@ -1,0 +1,232 @@
+"""An agent over UDP beside the reference: both are given an input, and then compared.
+
+What is seen of it: what it broadcasts, and what it says of itself (`status`), once it says that it has handled the
+input. So nobody waits where nothing must come, but for an agent that counts its handler runs otherwise.
+"""
+
+import base64
+import binascii
+import dataclasses
+import math
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from harness.conformance.air import AgentEndedError, Air, Ear, Process
+from harness.conformance.alphabet import Input
+from harness.conformance.model import AGENT, EVENT_ID, Action, Command, Datagram, Expire, Log, Model, Outcome
+from harness.conformance.seen import COMPARED, Exchange, Seen, compare
+from harness.conformance.states import Variant, ends_next, state_of
+from harness.conformance.subject import Start, Subject
+from harness.conformance.words import Names, told_datagram
+from harness.play.control import AgentRefusedError
+from ucp.clock import MICROSECONDS
+from ucp.events import MalformedEventsError, decode_events
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How time is scaled, and what is still in time, in wall seconds."""
+
+    speedup: float
+    margin_s: float
+    """No input is given so near to the end of a timer."""
+    early_s: float
+    """A timer may end so much earlier than it should."""
+    patience_s: float
+    """So long after it should have come a message is late."""
+    calm_s: float
+    """So long nothing must have happened, if the agent does not say that it has handled its input."""
+
+
+BESIDE_OTHERS = Pace(speedup=24.0, margin_s=0.08, early_s=0.15, patience_s=0.5, calm_s=0.08)
+ALONE = Pace(speedup=8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3)
+
+
+class OverUdp(Subject):
+    """An agent as a process, from its start on."""
+
+    def __init__(self, variant: Variant, pace: Pace, process: Process, ear: Ear, closed: Callable[[], None]) -> None:
+        super().__init__(variant)
+        self.process = process
+        self.ear = ear
+        self._pace = pace
+        self._closed = closed
+        self._epoch = 0.0
+
+    @classmethod
+    async def start(cls, air: Air, variant: Variant, pace: Pace) -> "OverUdp":
+        """Raises NoAgentError, UnsupportedError, AgentEndedError."""
+        port = air.take_port()
+        try:
+            process = await Process.start(air, air.new_directory(), air.mission(variant, port, pace.speedup), AGENT)
+        except BaseException:
+            air.give_back(port)
+            raise
+        subject = cls(variant, pace, process, Ear(air, port), lambda: air.give_back(port))
+        try:
+            await process.ready()
+            await subject._begin()
+        except BaseException:
+            await subject.close()
+            raise
+        return subject
+
+    async def _begin(self) -> None:
+        self._epoch = time.time()
+        epoch_us = round(self._epoch * MICROSECONDS)
+        await self.process.ask("start", epoch_us=epoch_us)
+
+    async def close(self) -> None:
+        self.ear.close()
+        await self.process.kill()
+        shutil.rmtree(self.process.directory, ignore_errors=True)
+        self._closed()
+
+    def exchanges(self) -> tuple[Exchange, ...]:
+        """All that has crossed the air."""
+        names = Names(self.model)
+        return tuple(
+            Exchange(round((at_s - self._epoch) * self._pace.speedup, 3), by_agent, data, told_datagram(data, names))
+            for at_s, by_agent, data in self.ear.record
+        )
+
+    def now(self) -> float:
+        """In mission seconds."""
+        return (time.time() - self._epoch) * self._pace.speedup
+
+    def _wall(self, mission_s: float) -> float:
+        """Seconds since the Unix epoch at a mission second."""
+        return self._epoch + mission_s / self._pace.speedup
+
+    @property
+    def hurried(self) -> bool:
+        deadline = self.model.agent.next_timer()
+        return deadline is not None and self._wall(deadline) - time.time() < self._pace.margin_s
+
+    async def _step(self, given: Input) -> Seen | None:
+        model = self.model
+        before, deadline, expired = state_of(model), model.agent.next_timer(), ends_next(model)
+        action = given.make(model)
+        if action is None:
+            return None
+        wrong = [f"it sent {told_datagram(data, Names(model))} unasked" for _, data in self.ear.take()]
+        began, ends = self.now(), self._wall(deadline or 0.0) if isinstance(action, Expire) else 0.0
+        waiting: list[Any] = []
+        status: dict[str, Any] = {}
+        mistimed = None
+        try:
+            if isinstance(action, Expire):
+                early = await self._wait_for_timer(ends, str(expired))
+                if early is not None:
+                    wrong, mistimed = [*wrong, early], expired
+                began = max(deadline or 0.0, self._first_heard())
+            else:
+                waiting = await self._give(action)
+        except (AgentEndedError, AgentRefusedError) as error:
+            wrong.append(str(error))
+        if isinstance(action, Log):
+            outcome, made = log_as(model, action, began, waiting)
+            wrong += made
+        else:
+            outcome = model.feed(action, began)
+        gave_up = False
+        try:
+            status, gave_up = await self._settle(len(outcome.sent), max(time.time(), ends))
+        except (AgentEndedError, AgentRefusedError) as error:
+            wrong.append(str(error))
+        seen = compare(model, given, before, outcome, [data for _, data in self.ear.take()], status, wrong)
+        following = model.agent.next_timer()
+        late = not gave_up and following is not None and self._wall(following) - time.time() < self._pace.early_s
+        return dataclasses.replace(seen, late=late, mistimed=mistimed)
+
+    async def _wait_for_timer(self, until: float, name: str) -> str | None:
+        """Until the timer's end, or until anything is heard: what is wrong about that."""
+        while time.time() < until and not self.ear.heard:
+            await self.ear.arrival(until)
+        early_s = until - self.ear.heard[0][0] if self.ear.heard else 0.0
+        if early_s > self._pace.early_s:
+            early = f"{early_s * self._pace.speedup:.1f} mission seconds"
+            return f"it sent something {early} before its timer {name} ends"
+        return None
+
+    def _first_heard(self) -> float:
+        """In mission seconds."""
+        return (self.ear.heard[0][0] - self._epoch) * self._pace.speedup if self.ear.heard else 0.0
+
+    async def _give(self, action: Action) -> list[Any]:
+        """Of an event, the blocks of the agent's export that it now holds."""
+        match action:
+            case Datagram():
+                self.ear.say(action.data)
+            case Command():
+                await self.process.ask(action.name)
+            case Log():
+                data = base64.b64encode(action.data).decode("ascii")
+                await self.process.ask("log", event_id=EVENT_ID, data=data)
+                export = await self.process.export()
+                waiting = export.get("blocks_to_be_committed")
+                return waiting if isinstance(waiting, list) else []
+        return []
+
+    async def _settle(self, messages: int, since: float) -> tuple[dict[str, Any], bool]:
+        """The status once the agent has handled the input and sent as much as it should, or when that is too late.
+
+        And whether it was too late. Of an agent that counts its handler runs otherwise all else must be as it should
+        for a while.
+        """
+        give_up, calm_since = since + self._pace.patience_s, math.inf
+        should = self.model.status()
+        while True:
+            self.ear.drain()
+            over = time.time() >= give_up
+            if len(self.ear.heard) < messages and not over:
+                await self.ear.arrival(give_up)
+                continue
+            status = await self.process.ask("status")
+            self.ear.drain()
+            handled = status.get("handled")
+            if isinstance(handled, int) and handled >= should["handled"]:
+                return status, False
+            calm = all(status.get(key, should[key]) == should[key] for key in COMPARED)
+            calm_since = min(calm_since, time.time()) if calm else math.inf
+            if over or time.time() - calm_since > self._pace.calm_s:
+                return status, over
+            await self.ear.arrival(min(give_up, time.time() + 0.004))
+
+
+def log_as(model: Model, action: Log, now: float, waiting: list[Any]) -> tuple[Outcome, list[str]]:
+    """Have the reference make the block that the agent has made; and what is wrong about that.
+
+    `waiting` is the deque of the agent's export.
+    """
+    otherwise_us = model.state.newest_block_timestamp_us + 1
+    held = len(model.state.blocks_to_be_committed)
+    if len(waiting) != held + 1:
+        wrong = f"the event did not fill a block: {len(waiting)} blocks in the deque of its export, not {held + 1}"
+        return model.feed(action, now, otherwise_us), [wrong]
+    made = waiting[-1]
+    try:
+        events = decode_events(base64.b64decode(made["event_data"], validate=True))
+        timestamp_us, block_hash = made["timestamp_us"], made["block_hash"]
+    except (MalformedEventsError, binascii.Error, KeyError, TypeError, ValueError):
+        return model.feed(action, now, otherwise_us), ["the block in its export is not well-formed"]
+    if [event.data for event in events] != [action.data] or events[0].event_id != EVENT_ID:
+        return model.feed(action, now, otherwise_us), ["the block does not hold the event that was logged"]
+    outcome = model.feed(action, now, events[0].timestamp_us)
+    if model.state.newest_block_timestamp_us != timestamp_us:
+        return outcome, ["the block's timestamp is not that of its newest event"]
+    if model.state.blocks_to_be_committed[-1].block_hash.hex() != block_hash:
+        return outcome, ["the block's hash in the export is not that of the block"]
+    return outcome, []
+
+
+def starting(air: Air) -> Start:
+    """Agents on this air."""
+
+    async def start(variant: Variant, alone: bool) -> Subject:
+        return await OverUdp.start(air, variant, ALONE if alone else BESIDE_OTHERS)
+
+    return start

@@ -1,0 +1,95 @@
+"""What is seen of an agent at one step, and whether it is what should have come."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from harness.conformance.alphabet import Input
+from harness.conformance.model import AGENT, Model, Outcome, Run
+from harness.conformance.states import Pair, State, pair_of
+from harness.conformance.words import Names, told, told_datagram
+from ucp.messages import MalformedDatagramError, Message, decode
+
+COMPARED = ("idle", "reconcile_in_progress", "chain", "deque", "stack", "completed", "reconciles", "top_chain_hash")
+"""Keys of the status; what is not there is not compared."""
+SHOWN = 12
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """A datagram that crossed the air: mission second, whether the agent sent it, what, and what that says."""
+
+    t: float
+    sent: bool
+    data: bytes
+    text: str
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One step: what came of an input, beside what should have."""
+
+    pair: Pair
+    outcome: Outcome
+    given: str
+    expected: tuple[str, ...]
+    came: tuple[str, ...]
+    wrong: tuple[str, ...]
+    """In sentences; none if all is as it should be."""
+    before: State
+    late: bool = False
+    """The machine was so late that nothing can be said."""
+    unexpected: tuple[str, ...] = ()
+    """Names of messages that should not have come."""
+    missing: tuple[str, ...] = ()
+    mistimed: str | None = None
+    """The timer that ended, or would end, at another time than it should."""
+    hidden: Run | None = None
+    """What should have changed nothing, just before."""
+
+
+def compare(
+    model: Model,
+    given: Input,
+    before: State,
+    outcome: Outcome,
+    datagrams: Iterable[bytes],
+    status: Mapping[str, Any],
+    wrong: Iterable[str],
+) -> Seen:
+    """What the agent sent for an input that the reference has been given, and its status after it.
+
+    `wrong` is what is known to be wrong already.
+    """
+    sentences, names, came = list(wrong), Names(model), list[Message]()
+    for data in datagrams:
+        try:
+            sender, _, message = decode(data)
+        except MalformedDatagramError:
+            sentences.append(f"it sent {told_datagram(data, names)}")
+            continue
+        if sender != AGENT:
+            sentences.append(f"it sent a message as agent {sender}")
+        came.append(message)
+    missing = [message for message in outcome.sent if message not in came]
+    unexpected = [message for message in came if message not in outcome.sent]
+    if came != outcome.sent:
+        sentences += [f"it did not send {told(message, names)}" for message in missing]
+        sentences += [f"it sent {told(message, names)}" for message in unexpected[:SHOWN]]
+        if not missing and not unexpected:
+            sentences.append("it sent its messages in another order, or one of them more than once")
+    should = model.status()
+    for key in COMPARED:
+        if key in status and status[key] != should[key]:
+            sentences.append(f"its status says {key} {status[key]!r}, not {should[key]!r}")
+    return Seen(
+        pair_of(before, given),
+        outcome,
+        given.name,
+        tuple(told(message, names) for message in outcome.sent),
+        tuple(told(message, names) for message in came[:SHOWN]),
+        tuple(sentences),
+        before,
+        unexpected=tuple(message.NAME for message in unexpected),
+        missing=tuple(message.NAME for message in missing),
+    )

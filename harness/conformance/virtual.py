@@ -1,0 +1,164 @@
+"""An agent in virtual time beside the reference: `COMMAND --virtual`, which reads inputs and writes answers as lines.
+
+Nobody waits for a timer, and the instant at which the next one ends is compared as well. One process lives many lives.
+"""
+
+import asyncio
+import base64
+import json
+import math
+from asyncio.subprocess import PIPE, Process
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from harness.conformance.air import ANSWER_LIMIT_S, AgentEndedError, NoAgentError, UnsupportedError, last_line
+from harness.conformance.alphabet import Input
+from harness.conformance.lines import given_line, virtual_mission
+from harness.conformance.model import Expire
+from harness.conformance.seen import Exchange, Seen, compare
+from harness.conformance.states import STEP_S, Variant, ends_next, state_of
+from harness.conformance.subject import Start, Subject
+from harness.conformance.words import Names, told_datagram
+from ucp.clock import MICROSECONDS
+
+ANSWER_BYTES = 4 * 1024 * 1024
+NO_AGENT = "the agent does not answer in virtual time"
+
+
+class Program:
+    """A process of the agent."""
+
+    def __init__(self, process: Process, errors: Path) -> None:
+        self._process = process
+        self._errors = errors
+        self.broken = False
+
+    @classmethod
+    async def start(cls, command: Sequence[str], errors: Path) -> "Program":
+        try:
+            with errors.open("ab") as file:
+                process = await asyncio.create_subprocess_exec(
+                    *command, "--virtual", stdin=PIPE, stdout=PIPE, stderr=file, limit=ANSWER_BYTES
+                )
+        except OSError as error:
+            raise NoAgentError(f"the agent could not be started: {error.strerror}") from None
+        return cls(process, errors)
+
+    async def ask(self, line: dict[str, Any]) -> dict[str, Any]:
+        """Its answer. Raises AgentEndedError, UnsupportedError."""
+        assert self._process.stdin is not None and self._process.stdout is not None, "they are pipes"
+        try:
+            async with asyncio.timeout(ANSWER_LIMIT_S):
+                self._process.stdin.write(json.dumps(line).encode("ascii") + b"\n")
+                await self._process.stdin.drain()
+                text = await self._process.stdout.readline()
+                answer = json.loads(text) if text else None
+        except (TimeoutError, OSError, ValueError, RecursionError) as error:
+            self.broken = True
+            raise AgentEndedError(f"no answer that can be read: {error or 'it is silent'}") from None
+        if answer is None:
+            self.broken = True
+            await self._process.wait()
+            raise AgentEndedError(f"it ended with status {self._process.returncode}: {last_line(self._errors)}")
+        if not isinstance(answer, dict):
+            self.broken = True
+            raise AgentEndedError("its answer is not a JSON object")
+        if "error" in answer:
+            if answer.get("unsupported") is True:
+                raise UnsupportedError(str(answer["error"]))
+            raise AgentEndedError(f"it answers with an error: {answer['error']}")
+        return answer
+
+    async def close(self) -> None:
+        if self._process.returncode is None:
+            self._process.kill()
+        await self._process.wait()
+
+
+class InVirtualTime(Subject):
+    """One life in a process, which is given back at its end."""
+
+    def __init__(self, variant: Variant, program: Program, idle: list[Program]) -> None:
+        super().__init__(variant)
+        self._program = program
+        self._idle = idle
+        self._now = 0.0
+        self._record: list[Exchange] = []
+        self._failed = False
+
+    @classmethod
+    async def start(cls, variant: Variant, program: Program, idle: list[Program]) -> "InVirtualTime":
+        subject = cls(variant, program, idle)
+        try:
+            await program.ask({"t": 0.0, "mission": virtual_mission(variant), "trace": False})
+        except BaseException:
+            await subject.close()
+            raise
+        return subject
+
+    @property
+    def hurried(self) -> bool:
+        deadline = self.model.agent.next_timer()
+        return deadline is not None and deadline - self._now <= STEP_S
+
+    def exchanges(self) -> tuple[Exchange, ...]:
+        return tuple(self._record)
+
+    async def close(self) -> None:
+        if self._program.broken:
+            await self._program.close()
+        else:
+            self._idle.append(self._program)
+
+    async def _step(self, given: Input) -> Seen | None:
+        model = self.model
+        before, deadline = state_of(model), model.agent.next_timer()
+        action = given.make(model)
+        if action is None:
+            return None
+        self._now = deadline if isinstance(action, Expire) and deadline is not None else self._now + STEP_S
+        timestamp_us = round(self._now * MICROSECONDS)
+        outcome = model.feed(action, self._now, timestamp_us)
+        line = given_line(action, self._now, timestamp_us)
+        wrong, sent, mistimed, status = [], list[bytes](), None, dict[str, Any]()
+        names = Names(model)
+        try:
+            answer = await self._program.ask(line)
+            sent = [base64.b64decode(text, validate=True) for text in answer["sent"]]
+            mistimed = self._mistimed(answer.get("timer"))
+            if mistimed is not None:
+                ends, should = answer.get("timer"), model.agent.next_timer()
+                wrong.append(f"it says that its next timer ends at {ends} s, not at {should} s")
+            told = (await self._program.ask({"t": self._now, "command": "status"})).get("answer")
+            status = told if isinstance(told, dict) else {}
+        except (AgentEndedError, UnsupportedError) as error:
+            wrong.append(str(error))
+        except (KeyError, TypeError, ValueError):
+            wrong.append("its answer has no list of datagrams in base64 as `sent`")
+        if "datagram" in line:
+            data = base64.b64decode(line["datagram"])
+            self._record.append(Exchange(self._now, False, data, told_datagram(data, names)))
+        self._record += [Exchange(self._now, True, data, told_datagram(data, names)) for data in sent]
+        seen = compare(model, given, before, outcome, sent, status, wrong)
+        return replace(seen, mistimed=mistimed)
+
+    def _mistimed(self, ends: Any) -> str | None:
+        """The timer that ends next, if the agent says another instant."""
+        should = self.model.agent.next_timer()
+        if should is None and ends is None:
+            return None
+        right = isinstance(ends, int | float) and should is not None and math.isclose(ends, should, rel_tol=1e-9)
+        return None if right else (ends_next(self.model) or "none")
+
+
+def starting(command: Sequence[str], errors: Path) -> tuple[Start, list[Program]]:
+    """Agents in virtual time; and the processes of which they are made, to be closed at the end."""
+    idle: list[Program] = []
+
+    async def start(variant: Variant, alone: bool) -> Subject:
+        program = idle.pop() if idle else await Program.start(command, errors)
+        return await InVirtualTime.start(variant, program, idle)
+
+    return start, idle
