@@ -150,16 +150,18 @@ def test_a_project_with_a_package_of_the_same_name_keeps_its_tests(pytester: pyt
     package = pytester.mkpydir(ours)
     (package / "theirs.py").write_text("ANSWER = 42")
     pytester.makepyfile(f"""
+    import pytest
     from {ours}.theirs import ANSWER
 
     def test_theirs():
         assert ANSWER == 42
 
+    @pytest.mark.swarm(agents=3)
     def test_story(swarm):
         swarm.run_for(10)
     """)
     pytester.makeconftest("")
     for command in ([sys.executable, "-m", "pytest"], [Path(sys.executable).with_name("pytest")]):
-        result = pytester.run(*command)
+        result = pytester.run(*command, "--strict-markers")
         result.assert_outcomes(passed=1, errors=1)
         result.stdout.fnmatch_lines([f"*ucp-harness is not there: *{ours} has the name of one of its packages; *"])

@@ -29,12 +29,17 @@ def others() -> list[Path]:
 
 if hidden := others():
     WHY = (
-        f"ucp-harness is not there: {', '.join(map(str, hidden))} has the name of one of its packages; "
-        "rename the folder, or keep tests of swarms in a directory without it"
+        f"ucp-harness is not there: {' and '.join(map(str, hidden))} "
+        f"{'has the name of one' if len(hidden) == 1 else 'have names'} of its packages; "
+        f"rename {'the folder' if len(hidden) == 1 else 'them'}, or call pytest in a directory without"
     )
 
     def pytest_report_header() -> str:
         return WHY
+
+    def pytest_configure(config: pytest.Config) -> None:
+        for marker in ("swarm", "scenario"):
+            config.addinivalue_line("markers", f"{marker}: {WHY}")
 
     @pytest.fixture
     def swarm() -> NoReturn:
