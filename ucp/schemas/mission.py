@@ -11,7 +11,8 @@ from ucp.settings import MAX_TIMER_S, Phase1Tie, Phase2Tie, Settings
 from ucp.telemetry import EVENT_KINDS
 
 ABOVE_0: Schema = {"type": "number", "exclusiveMinimum": 0}
-IPV4: Schema = {"type": "string", "format": "ipv4", "pattern": r"^[0-9]{1,3}(\.[0-9]{1,3}){3}$"}
+OCTET = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
+IPV4: Schema = {"type": "string", "format": "ipv4", "pattern": rf"^{OCTET}(\.{OCTET}){{3}}$"}
 PORT: Schema = {"type": "integer", "minimum": 1, "maximum": 65535}
 BYTES: Schema = {"type": "integer", "minimum": 1, "maximum": MAX_EVENT_DATA_BYTES}
 
@@ -43,7 +44,7 @@ def events() -> Schema:
         "mean_s": ABOVE_0 | {"maximum": MAX_MEAN_S},
         "position_interval_s": ABOVE_0,
         "log": listed({"enum": list(EVENT_KINDS)}),
-        "vehicle_host": {"type": "string"},
+        "vehicle_host": {"type": "string", "minLength": 1},
         "vehicle_port": PORT,
     }
     return record({"source": {"enum": ["random", "mavlink", "none"]}, **of_telemetry}, optional=tuple(of_telemetry))
