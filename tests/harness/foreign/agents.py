@@ -26,12 +26,14 @@ for number, line in enumerate(sys.stdin):
 """An agent that does nothing but answer; CODE may have it go wrong."""
 
 EXPORT = """
-me = given['mission']['agent_id'] if 'mission' in given else me
+if 'mission' in given:
+    mission = given['mission']
 if given.get('command') == 'export':
     said['answer'] = {
-        'schema': 'ucp-chain-export/1', 'agent_id': me, 'exported_at_us': 0, 'chain': [], 'completed': [], 'idle': True,
-        'inception': {'block_data': '', 'block_hash': '00' * 32, 'chain_hash': '00' * 32}, 'reconcile_stack': [],
-        'blocks_to_be_committed': [], 'current_block': {'event_data': ''}, 'reconcile_in_progress': False}
+        'schema': 'ucp-chain-export/1', 'agent_id': mission['agent_id'], 'exported_at_us': 0,
+        'inception': {'block_data': mission['initial_data'], 'block_hash': '00' * 32, 'chain_hash': '00' * 32},
+        'chain': [], 'blocks_to_be_committed': [], 'reconcile_stack': [], 'current_block': {'event_data': ''},
+        'completed': [], 'reconcile_in_progress': False, 'idle': True}
 """
 """Code with which it has an export, of nothing."""
 

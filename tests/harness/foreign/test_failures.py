@@ -80,6 +80,11 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
             "crashed",
             "answered to the command export with that of agent 7",
         ),
+        (
+            EXPORT + "if given.get('command') == 'export': said['answer']['inception']['block_data'] = 'AA=='",
+            "crashed",
+            "answered to the command export with the chain of another mission",
+        ),
         ("if given.get('command') == 'export': said['sent'] = ['AA==']", "crashed", "did more than answer when it was"),
         (EVENT + "said = {'error': 'no such event', 'unsupported': True}", "not supported", "no such event"),
     ],

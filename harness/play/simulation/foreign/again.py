@@ -15,7 +15,9 @@ from harness.play.simulation.foreign.agent import LifeRecord
 from harness.play.simulation.foreign.answer import shown
 from harness.play.simulation.foreign.program import NoAnswerError, Program
 
-OF_ITSELF = "it reads a clock, draws random numbers, or has something else of its own that is not among its inputs"
+OF_ITSELF = (
+    "it reads a clock, draws random numbers, or has something else of its own, such as the order of a hash table"
+)
 OF_BEFORE = "it keeps something from an earlier life that it played in the same process"
 
 

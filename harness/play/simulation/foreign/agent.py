@@ -199,11 +199,13 @@ class ForeignAgent:
         """Its export, which is one."""
         export = self._ask("export", now)
         try:
-            whose = Export.model_validate(export).agent_id
+            read = Export.model_validate(export)
         except ValidationError as error:
             raise self._failure("crashed", f"answered to the command export without a proper {_where(error)}") from None
-        if whose != self.agent_id:
-            raise self._failure("crashed", f"answered to the command export with that of agent {whose}")
+        if read.agent_id != self.agent_id:
+            raise self._failure("crashed", f"answered to the command export with that of agent {read.agent_id}")
+        if read.inception.block_data != in_base64(self.initial_data):
+            raise self._failure("crashed", "answered to the command export with the chain of another mission")
         return export
 
     def stored(self, now: float) -> Stored:
