@@ -847,18 +847,21 @@ static void put_change(Buf *b, enum change what, const uint8_t *hash) {
     put_text(b, "\"]");
 }
 
+static void put_journal(Buf *b, enum change what, const Block *block) {         /* as the store has it, section 9 */
+    put_byte(b, (uint8_t)what);
+    if (what == COMPLETE || what == STACK_TAKE) {
+        put(b, block->hash.b, 32);
+    } else if (what == CHAIN_PUSH || what == DEQUE_PUSH || what == STACK_PUSH) {
+        put_be(b, block->size, 2);
+        put(b, block->data, block->size);
+    }
+}
+
 static void change(Agent *a, enum change what, const Block *block) {   /* record it: for the trace, for the store */
     if (a->tracing)
         put_change(&a->changes, what, block->hash.b);
-    if (a->keeping) {
-        put_byte(&a->journal, (uint8_t)what);
-        if (what == COMPLETE || what == STACK_TAKE) {
-            put(&a->journal, block->hash.b, 32);
-        } else if (what == CHAIN_PUSH || what == DEQUE_PUSH || what == STACK_PUSH) {
-            put_be(&a->journal, block->size, 2);
-            put(&a->journal, block->data, block->size);
-        }
-    }
+    if (a->keeping)
+        put_journal(&a->journal, what, block);
 }
 
 static void complete(Agent *a, Block *block) {
@@ -2175,65 +2178,33 @@ static bool virtual_error(Virtual *v, const char *error, bool unsupported) {
     return false;
 }
 
-/* The store's value: what is found after a brown-out, as blocks in base64 and hashes in hex. */
+/* The store's value is the file that would be left, in base64, with all that is there in place of how it came. */
 static void put_store(Buf *b, const Agent *a) {
     const List *lists[] = {&a->chain, &a->deque, &a->stack};
-    const char *const names[] = {"chain", "deque", "stack"};
-    put_format(b, "{\"agent_id\":%u,\"inception\":\"", a->m.agent_id);
-    put_hex(b, a->bh0.b, 32);
+    const enum change changes[] = {CHAIN_PUSH, DEQUE_PUSH, STACK_PUSH};
+    Buf file = {0};
+    put_store_header(&file, a);
+    for (size_t i = 0; i < completed_len(a); i++) {
+        put_byte(&file, COMPLETE);
+        put(&file, a->completed.data + 32 * i, 32);
+    }
+    for (int k = 0; k < 3; k++)
+        for (size_t i = 0; i < lists[k]->len; i++)
+            put_journal(&file, changes[k], lists[k]->at[i]);
     put_byte(b, '"');
-    put_hashes(b, a);
-    for (int k = 0; k < 3; k++) {
-        put_format(b, ",\"%s\":[", names[k]);
-        for (size_t i = 0; i < lists[k]->len; i++) {
-            put_text(b, i > 0 ? ",\"" : "\"");
-            put_base64(b, lists[k]->at[i]->data, lists[k]->at[i]->size);
-            put_byte(b, '"');
-        }
-        put_byte(b, ']');
-    }
-    put_byte(b, '}');
+    put_base64(b, file.data, file.len);
+    put_byte(b, '"');
+    free(file.data);
 }
 
-static bool json_hash(Json *j, uint32_t i, Hash *hash) {
-    size_t n;
-    if (kind(j, i) != '"') return false;
-    const char *text = json_text(j, i, &n);
-    if (n != 64) return false;
-    for (size_t k = 0; k < 64; k++)
-        if (hex_digit(text[k]) < 0) return false;
-    for (size_t k = 0; k < 32; k++)
-        hash->b[k] = (uint8_t)(hex_digit(text[2 * k]) << 4 | hex_digit(text[2 * k + 1]));
-    return true;
-}
-
-static bool virtual_store(Virtual *v, uint32_t value) {   /* into an agent that is new */
-    static const char *const names[] = {"chain", "deque", "stack"};
-    Agent *a = v->a;
-    Json *j = &v->json;
-    Hash hash;
-    uint64_t id;
-    uint32_t list = member(j, value, "completed");
-    if (!json_uint(j, member(j, value, "agent_id"), a->m.agent_id, a->m.agent_id, &id) || kind(j, list) != '['
-        || !json_hash(j, member(j, value, "inception"), &hash) || !same(&hash, &a->bh0))
-        return false;
-    for (uint32_t i = list + 1; i < j->node[list].end; i = j->node[i].end) {
-        if (!json_hash(j, i, &hash)) return false;
-        put(&a->completed, hash.b, 32);
-    }
-    for (int k = 0; k < 3; k++) {
-        if (kind(j, list = member(j, value, names[k])) != '[') return false;
-        for (uint32_t i = list + 1; i < j->node[list].end; i = j->node[i].end) {
-            if (!json_bytes(j, i, &v->bytes) || !block_well_formed(v->bytes.data, v->bytes.len)) return false;
-            Block *block = block_new(v->bytes.data, v->bytes.len);
-            if (k == 0)
-                chain_push(a, block);
-            else
-                list_push(k == 1 ? &a->deque : &a->stack, block);
-        }
-    }
-    a->boots = true;
-    return true;
+static bool virtual_store(Virtual *v, uint32_t value) { /* into an agent that is new */
+    Buf header = {0}, *file = &v->bytes;
+    put_store_header(&header, v->a);
+    v->a->boots = json_bytes(&v->json, value, file) && file->len >= header.len
+               && memcmp(file->data, header.data, header.len) == 0
+               && store_replay(v->a, file->data + header.len, file->data + file->len);
+    free(header.data);
+    return v->a->boots;
 }
 
 static bool virtual_mission(Virtual *v, double t, uint32_t mission) {
