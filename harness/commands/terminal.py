@@ -48,7 +48,7 @@ def show_result(console: Console, result: checker.Result) -> None:
 
 def show_programs(console: Console, record: RunRecord) -> None:
     if ran := programs.programs(record):
-        console.print(programs.in_sentence(ran), highlight=False, soft_wrap=True, style="dim")
+        console.print(Text(programs.in_sentence(ran), style="dim"), soft_wrap=True)
 
 
 def show_survival(console: Console, survived: Survival) -> None:

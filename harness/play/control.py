@@ -19,7 +19,9 @@ VERSION_CHARACTERS = 80
 
 def _first_words(version: Any) -> str | None:
     """What an agent says of its version as a line for people; None if it is no text."""
-    return " ".join(version.split())[:VERSION_CHARACTERS] or None if isinstance(version, str) else None
+    if not isinstance(version, str):
+        return None
+    return " ".join("".join(filter(str.isprintable, word)) for word in version.split())[:VERSION_CHARACTERS] or None
 
 
 class Status(BaseModel):

@@ -295,6 +295,10 @@ sys.exit(ucp.node.main(sys.argv[1:], Mine))
             {3: ["{notes}"]},
             "`agent_command` of agent 3: {notes} is a file that may not be executed: chmod +x, or name ",
         ),
+        (
+            {3: ["{script}"]},
+            "`agent_command` of agent 3: the first line of {script} names /no/such, and ",
+        ),
         ({3: ["/usr"]}, "`agent_command` of agent 3: /usr is no program: give a path, or a name on PATH"),
     ],
 )
@@ -303,11 +307,22 @@ def test_an_agent_command_that_is_no_program_is_one_sentence_before_anything_sta
 ) -> None:
     notes = tmp_path / "notes.txt"
     notes.touch()
-    asked = json.loads(json.dumps(command).replace("{notes}", str(notes)))
+    script = executable(tmp_path / "script", "#!/no/such interpreter\n")
+    asked = json.loads(json.dumps(command).replace("{notes}", str(notes)).replace("{script}", str(script)))
     done = harness("run", write_scenario(tmp_path, agent_command=asked), "--out", tmp_path / "run")
     assert done.returncode == 2
-    assert sentences(done.stderr)[0].startswith(sentence.replace("{notes}", str(notes)))
+    assert sentences(done.stderr)[0].startswith(sentence.format(notes=notes, script=script))
     assert not (tmp_path / "run").exists()
+
+
+def test_a_file_that_is_no_program_after_all_is_the_scenarios_mistake(tmp_path: Path) -> None:
+    agent = executable(tmp_path / "my-agent", "no program\n")
+    done = harness(
+        "run", write_scenario(tmp_path, agent_command={3: [str(agent), "[/bold]"]}), "--out", tmp_path / "run"
+    )
+    assert done.returncode == 2
+    assert "`agent_command` of agent 3: The agent could not be started: [Errno 8] Exec format error" in done.stderr
+    assert "agent 3 ran" in done.stdout and "[/bold]" in done.stdout
 
 
 def test_an_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> None:

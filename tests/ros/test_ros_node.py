@@ -12,7 +12,7 @@ from tests.machine import do_without
 from tests.pages import REPOSITORY, play
 from ucp.messages import PORT
 
-pytestmark = pytest.mark.lab
+pytestmark = [pytest.mark.lab, pytest.mark.ros]
 
 
 @pytest.fixture(scope="module")

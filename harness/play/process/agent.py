@@ -20,13 +20,14 @@ from pydantic import ValidationError
 
 from harness.archive.directory import RunDirectory
 from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
-from harness.errors import VIOLATED, HarnessError, MachineError, UnsupportedError
+from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError, UnsupportedError
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, AgentUnsupportedError, Status
 from harness.play.last_words import UNSUPPORTED, last_words, last_words_in, of_a_shell
 from harness.play.process.lab import MissionLab, Program
 from harness.play.process.mission_file import mission_file
 from harness.play.program import located
 from harness.scenario import Scenario
+from netem.errors import SpawnError
 from ucp.trace import HandlerRun
 
 START_LIMIT_S = 30.0
@@ -136,7 +137,7 @@ class AgentProcess:
         """Start the program and wait until it answers; with `epoch_us` it joins the mission that began then.
 
         With `keeps_disk` it stores what it holds, to be rebooted with it.
-        Raises AgentFailedError, AgentRefusedError, UnsupportedError.
+        Raises AgentFailedError, AgentRefusedError, UnsupportedError; ScenarioError for a program that is none.
         """
         life = self._begin_life()
         mission = mission_file(
@@ -154,15 +155,20 @@ class AgentProcess:
         path = self._rundir.write_mission(life.directory, self.agent_id, mission)
         output = self._log
         self._control = AgentControl(self._control_path)
-        self._process = await lab.spawn(
-            self.agent_id,
-            [*self._command, path.name],
-            cwd=life.directory,
-            env=dict(os.environ),
-            stdout=output,
-            stderr=output,
-            role="agent",
-        )
+        try:
+            self._process = await lab.spawn(
+                self.agent_id,
+                [*self._command, path.name],
+                cwd=life.directory,
+                env=dict(os.environ),
+                stdout=output,
+                stderr=output,
+                role="agent",
+            )
+        except SpawnError as error:
+            if scenario.command_of(self.agent_id) is None:
+                raise
+            raise ScenarioError(f"`agent_command` of agent {self.agent_id}: {error}") from None
         await self._wait_until_it_answers(self._process)
         self.outcome = "running"
 
