@@ -37,4 +37,5 @@ def _interpreter(program: Path) -> Path | None:
 def _why_none(program: str) -> str:
     if Path(program).name != program and Path(program).is_file():
         return f"{program} is a file that may not be executed: chmod +x, or name its interpreter before it"
-    return f"{program} is no program: give a path, or a name on PATH"
+    from_here = "" if Path(program).name == program or Path(program).is_absolute() else f" from {Path.cwd()}"
+    return f"{program} is no program: give a path{from_here}, or a name on PATH"

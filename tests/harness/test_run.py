@@ -289,8 +289,11 @@ sys.exit(ucp.node.main(sys.argv[1:], Mine))
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        (["./nowhere"], "`agent_command`: ./nowhere is no program: give a path, or a name on PATH"),
-        ({3: ["./nowhere"]}, "`agent_command` of agent 3: ./nowhere is no program: give a path, or a name on PATH"),
+        (["./nowhere"], "`agent_command`: ./nowhere is no program: give a path from {here}, or a name on PATH"),
+        (
+            {3: ["./nowhere"]},
+            "`agent_command` of agent 3: ./nowhere is no program: give a path from {here}, or a name on PATH",
+        ),
         (
             {3: ["{notes}"]},
             "`agent_command` of agent 3: {notes} is a file that may not be executed: chmod +x, or name ",
@@ -311,7 +314,7 @@ def test_an_agent_command_that_is_no_program_is_one_sentence_before_anything_sta
     asked = json.loads(json.dumps(command).replace("{notes}", str(notes)).replace("{script}", str(script)))
     done = harness("run", write_scenario(tmp_path, agent_command=asked), "--out", tmp_path / "run")
     assert done.returncode == 2
-    assert sentences(done.stderr)[0].startswith(sentence.format(notes=notes, script=script))
+    assert sentences(done.stderr)[0].startswith(sentence.format(notes=notes, script=script, here=Path.cwd()))
     assert not (tmp_path / "run").exists()
 
 
