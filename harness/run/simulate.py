@@ -66,7 +66,7 @@ def simulate_in_memory(
     if (records := simulation.records()) and (again or result.bad):
         from harness.play.simulation.foreign.again import Again
 
-        with closing(Again()) as second:
+        with closing(Again(patient=again)) as second:
             for record in records:
                 second.compare(record)
     return Simulated(simulation.played, evidence, result)

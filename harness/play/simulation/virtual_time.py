@@ -103,7 +103,7 @@ async def _compare_again(simulation: Simulation, breathe: Callable[[Simulation],
     from harness.play.simulation.foreign.again import Again, NotTheSameError
 
     simulation.enter("the same again")
-    with closing(Again()) as again:
+    with closing(Again(patient=True)) as again:
         try:
             for record in simulation.records():
                 await breathe(simulation)

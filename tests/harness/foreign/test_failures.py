@@ -149,7 +149,7 @@ def test_an_agent_that_does_not_end_by_itself_is_ended(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("code", "why"),
     [
-        ("import time; said['now'] = time.time_ns()", "it reads a clock, draws random numbers"),
+        ("import time; said['now'] = int(time.time())", "it reads a clock, draws random numbers"),
         ("import os; said['pid'] = os.getpid()", "it reads a clock, draws random numbers"),
         ("given.setdefault('seen', globals().setdefault('seen', number)); said['n'] = number", "from an earlier life"),
     ],

@@ -5,6 +5,7 @@ Then no seed would mean anything, so it is found out, and named.
 """
 
 import json
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import zip_longest
@@ -32,10 +33,15 @@ class NotTheSameError(HarnessError):
 
 
 class Again:
-    """Gives lives their inputs again, one after another in one process of each make. Close it."""
+    """Gives lives their inputs again, one after another in one process of each make. Close it.
 
-    def __init__(self) -> None:
+    If `patient`, not within the second in which they were played: clocks may be looked at in whole seconds.
+    """
+
+    def __init__(self, *, patient: bool) -> None:
         self._programs: dict[tuple[str, ...], Program] = {}
+        if patient:
+            time.sleep(1 - time.time() % 1)
 
     def compare(self, record: LifeRecord) -> None:
         """The first life of each make is given its inputs twice, so that a process plays more than one.
