@@ -19,6 +19,7 @@ from harness.matrix.table import (
 )
 from harness.present import words
 from harness.present.markdown import escaped, row
+from harness.report.programs import asked_for, in_sentence
 
 
 def to_markdown(record: MatrixRecord) -> str:
@@ -26,6 +27,8 @@ def to_markdown(record: MatrixRecord) -> str:
     lines += [explanation(record) + unjudged(record), ""]
     if findings := [*troubles_of_all(record), *unsupported_of_all(record), *improvements(record)]:
         lines += [*(f"- {escaped(sentence)}" for sentence in findings), ""]
+    if ran := in_sentence(asked_for(record.matrix.scenario_at(record.matrix.points[-1]))):
+        lines += [escaped(ran), ""]
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     lines += [f"<sub>Begun {words.started(record.started_at)}; {versions}</sub>"]
     return "\n".join(lines) + "\n"

@@ -1,12 +1,14 @@
 """Who ran what, where not all agents were the harness's own."""
 
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
-from harness.archive.record import RunRecord
+from harness.archive.record import AgentRecord, RunRecord
 from harness.report.chain_tree import ranges
+from harness.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -33,14 +35,19 @@ class Program:
 
 def programs(record: RunRecord) -> list[Program]:
     """In the order of their first agents; none where all agents are the harness's own, or nothing is known of them."""
-    if record.scenario is None or not record.scenario.foreign:
+    return [] if record.scenario is None else asked_for(record.scenario, record.agents)
+
+
+def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[Program]:
+    """The same of a scenario; `agents` is what is on record of them."""
+    if not scenario.foreign:
         return []
     alike: dict[tuple[tuple[str, ...] | None, str | None], list[int]] = {}
-    for agent_id in record.scenario.roster:
-        command, agent = record.scenario.command_of(agent_id), record.agents.get(str(agent_id))
+    for agent_id in scenario.roster:
+        command, agent = scenario.command_of(agent_id), agents.get(str(agent_id))
         ran = tuple(command) if command else None, agent.version if agent else None
         alike.setdefault(ran, []).append(agent_id)
-    return [Program(tuple(agents), command, version) for (command, version), agents in alike.items()]
+    return [Program(tuple(alike_agents), command, version) for (command, version), alike_agents in alike.items()]
 
 
 def in_sentence(ran: Iterable[Program]) -> str:

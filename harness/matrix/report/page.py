@@ -15,6 +15,7 @@ from harness.matrix.summary import verdict
 from harness.matrix.table import explanation, improvements, name_of, troubles, unjudged
 from harness.present import svg, words
 from harness.report import html
+from harness.report.programs import asked_for
 from harness.scenario.verdicts import JUDGED
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
@@ -76,5 +77,6 @@ def _summary(record: MatrixRecord) -> list[str]:
         f"{len(matrix.loss)} loss rates" if len(matrix.loss) > 1 else f"{words.percent(matrix.loss[0])} loss",
         f"{len(matrix.seed_list)} seeds" if len(matrix.seed_list) > 1 else f"seed {matrix.seed_list[0]}",
         f"backend {', '.join(matrix.backend)}",
+        *(program.in_words for program in asked_for(matrix.scenario_at(matrix.points[-1]))),
         f"begun {words.started(record.started_at)}",
     ]

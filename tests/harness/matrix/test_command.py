@@ -147,7 +147,8 @@ def test_what_an_agent_does_not_support_is_neither_failed_nor_violated(tmp_path:
     assert "mine has no telemetry" in " ".join(done.stdout.split())
     assert (record.failed, record.cells[0].violated, record.cells[0].unsupported) == ([], {}, 1)
     assert "<skipped message=" in (tmp_path / "out" / "junit.xml").read_text()
-    assert "1 not supported" in (tmp_path / "out" / "report.html").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "1 not supported" in page and f"agent 1 ran {agent}" in page
 
 
 def test_what_a_backend_cannot_play_is_refused_before_anything_is_played(tmp_path: Path) -> None:
