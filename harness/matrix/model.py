@@ -158,6 +158,10 @@ def load_matrix(path: Path, backend: BackendName | None = None) -> Matrix:
     Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed.
     """
     document = read_yaml(path, "matrix")
+    if "scenario" not in document and document.keys() & (Scenario.model_fields.keys() - Matrix.model_fields.keys()):
+        raise ScenarioError(
+            f"{path}: this is a scenario; a matrix names one, `scenario: {path.name}`, and `loss`, a list"
+        )
     if backend is not None:
         document["backend"] = backend
     if isinstance(document.get("scenario"), str):

@@ -24,6 +24,8 @@ MAX_SCENARIO_BYTES = 8 * 1024 * 1024
 def load_scenario(path: Path) -> Scenario:
     """Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed."""
     document = read_yaml(path, "scenario")
+    if "scenario" in document:
+        raise ScenarioError(f"{path}: this is a matrix, which `ucp-harness matrix {path}` plays")
     try:
         return parse(document)
     except ScenarioError as error:

@@ -34,6 +34,7 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
     ("text", "sentence"),
     [
         ("name: x\nspeedpu: 3", "`speedpu` is unknown: there are name, about, agents"),
+        ("name: x\nscenario: {name: y}", "this is a matrix, which `ucp-harness matrix "),
         ("name: x\nspeedpu: 3", "; did you mean `speedup`?"),
         ("name: x\ntimeline: [{at_s: 1, kill: 2}]", "`timeline.0.kill` is 2: it should be a valid list, as [2]"),
         (

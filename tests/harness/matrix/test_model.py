@@ -121,6 +121,7 @@ def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
         ({"delay": [0.1]}, "`delay` is unknown: there are name, about, scenario, loss, seeds, agents, backend, keep"),
         ({"scenario": "nowhere.yaml"}, "nowhere.yaml: there is no such file or scenario"),
         ({"name": None}, "is missing"),
+        ({"scenario": None, "timeline": []}, "this is a scenario; a matrix names one, `scenario: "),
     ],
 )
 def test_a_mistake_is_told_with_its_key_value_and_what_is_allowed(
