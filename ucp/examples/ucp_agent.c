@@ -1761,10 +1761,11 @@ static double seconds(clockid_t clock) {
     return (double)time.tv_sec + (double)time.tv_nsec / 1e9;
 }
 
-static double mission_now(const Station *s) {           /* never goes back */
-    double now = (s->wall0 - (double)s->a->m.epoch_us / 1e6 + seconds(CLOCK_MONOTONIC) - s->mono0) * s->a->m.speedup;
-    return now > s->a->now ? fmin(now, 1e15) : s->a->now;
+static double since_epoch(const Station *s) {           /* mission seconds, below 0 before the mission's epoch */
+    return (s->wall0 - (double)s->a->m.epoch_us / 1e6 + seconds(CLOCK_MONOTONIC) - s->mono0) * s->a->m.speedup;
 }
+
+static double mission_now(const Station *s) { return fmax(s->a->now, since_epoch(s)); }        /* never goes back */
 
 /* --- Trace ------------------------------------------------------------------------------------------------------- */
 
@@ -2087,7 +2088,7 @@ static struct timespec time_to_wait(const Station *s) {   /* until the next time
     double wait = 60;
     if (s->a->started) {
         double at = fmin(next_deadline(s->a), s->next_second);
-        wait = fmax(0, fmin(wait, (at - mission_now(s)) / s->a->m.speedup));
+        wait = fmax(0, fmin(wait, (at - since_epoch(s)) / s->a->m.speedup));
     }
     long ns = (long)((wait - floor(wait)) * 1e9) + 1000;
     return (struct timespec){(time_t)wait + ns / 1000000000, ns % 1000000000};
