@@ -176,11 +176,15 @@ class Agent:
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
         """Log an event. Raises ValueError if it is larger than the mission's largest event."""
+        self.check_size(event)
+        came = Recorded(None, event) if self._tracing else None
+        self._handle(now, {"event": event.event_id}, came, self._on_local_event["Build Data Block"], event)
+
+    def check_size(self, event: LoggableEvent) -> None:
+        """Raises ValueError if the event is larger than the mission's largest."""
         largest = self.state.settings.max_event_bytes
         if event.encoded_bytes > largest:
             raise ValueError(f"an event of {event.encoded_bytes} bytes is more than max_event_bytes {largest}")
-        came = Recorded(None, event) if self._tracing else None
-        self._handle(now, {"event": event.event_id}, came, self._on_local_event["Build Data Block"], event)
 
     def next_timer(self) -> float | None:
         """When `handle_timer` has something to do next, in mission seconds; None if no timer runs."""

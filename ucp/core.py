@@ -71,8 +71,9 @@ class Core(AgentState):
             self.push_onto_deque(block)
         for block in stack:
             self.push_onto_stack(block)
+        own = set(self.completed)  # whatever others may have sent in its name
         for block in (*self.chain, *self.blocks_to_be_committed, *self.reconcile_stack):
-            if block.agent_id == self.agent_id:
+            if block.block_hash in own:
                 self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
 
     def complete(self, block: Block) -> None:

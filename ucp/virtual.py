@@ -20,7 +20,7 @@ from ucp.block import Block
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.export import export_chain
-from ucp.mission import MAX_MISSION_BYTES, MissionError, UnsupportedMissionError, parse_mission
+from ucp.mission import MAX_MISSION_BYTES, MissionError, UnsupportedMissionError, is_epoch, parse_mission
 from ucp.request import check_request
 from ucp.status import status_of
 from ucp.store import StoredState, block_on_disk
@@ -136,14 +136,15 @@ class VirtualAgent:
 
     def _log(self, given: dict[str, Any], now: float) -> None:
         event_id, timestamp_us = given["event_id"], given.get("timestamp_us")
-        if type(event_id) is not int or type(timestamp_us) is not int or not 0 <= timestamp_us < 2**64:
-            raise InputError("an event needs `event_id` and `timestamp_us`, whole numbers")
-        if not self._generating:
-            return
+        if type(event_id) is not int or type(timestamp_us) is not int or not is_epoch(timestamp_us):
+            raise InputError("an event needs `event_id` and `timestamp_us`, whole numbers, of at most 2^63-1")
         try:
-            self._agent.add_event(LoggableEvent(timestamp_us, event_id, _decoded(given, "data")), now)
+            event = LoggableEvent(timestamp_us, event_id, _decoded(given, "data"))
+            self._agent.check_size(event)
         except ValueError as error:
             raise InputError(f"the event cannot be logged: {error}") from None
+        if self._generating:
+            self._agent.add_event(event, now)
 
     # Commands, as those of the control socket
 

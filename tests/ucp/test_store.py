@@ -10,9 +10,10 @@ import pytest
 
 from tests.ucp.air import INITIAL_DATA, Air, assert_characteristics_2_to_4, uniform_latency
 from ucp.agent import Agent
-from ucp.block import Block
+from ucp.block import Block, next_chain_hash
 from ucp.core import Core
 from ucp.events import LoggableEvent
+from ucp.messages import CommitBlock
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import Store, StoredState, StoreError
@@ -193,3 +194,15 @@ def test_a_full_disk_ends_the_store_and_leaves_what_was_written(
     assert path.read_bytes() == before
     assert not list(tmp_path.glob(".*"))
     assert found(path) == StoredState.of(state)
+
+
+def test_what_others_send_in_an_agent_s_name_does_not_make_its_blocks_later() -> None:
+    agent = Agent(1, [1, 2], b"")
+    false = Block(1, 2**64 - 1, b"not mine")
+    commit = CommitBlock(false, next_chain_hash(agent.state.chain.top_chain_hash, false.block_hash))
+    agent.receive_message(2, 0, commit, 0.0)
+    reborn = Agent(1, [1, 2], b"")
+    reborn.boot(StoredState.of(agent.state), 1.0)
+    for _ in range(3):
+        reborn.add_event(LoggableEvent(5, 1, bytes(256)), 2.0)
+    assert [block.timestamp_us for block in reborn.state.blocks_to_be_committed] == [5]

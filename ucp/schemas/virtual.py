@@ -1,7 +1,10 @@
 """Lines of virtual time: each is an input and the output that answers it."""
 
+from ucp.mission import LATEST_EPOCH_US
 from ucp.schemas import chain_export, control, mission, trace
 from ucp.schemas.parts import BASE64, EVENT_ID, FLAG, SECONDS, TIMESTAMP, Schema, listed, record
+
+EVENT_TIMESTAMP: Schema = TIMESTAMP | {"maximum": LATEST_EPOCH_US}
 
 COMMANDS = ("status", "stop_events", "reconcile", "export", "quirk")
 """Those of the control socket; besides there is `store`."""
@@ -28,7 +31,7 @@ def inputs() -> Schema:
         "oneOf": [
             life,
             record({"t": SECONDS, "datagram": BASE64}),
-            record({"t": SECONDS, "event_id": EVENT_ID, "data": BASE64, "timestamp_us": TIMESTAMP}),
+            record({"t": SECONDS, "event_id": EVENT_ID, "data": BASE64, "timestamp_us": EVENT_TIMESTAMP}),
             record({"t": SECONDS, "timer": {"const": True}}),
             *(record({"t": SECONDS, "command": {"const": name}, **keys[name]}) for name in commands),
         ]
