@@ -65,23 +65,37 @@ class Scenario(Model):
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
     about: Annotated[str, Field(max_length=2000)] = ""
+    """What the run shows, for its report."""
     agents: int | list[int] = 5
+    """How many, or their IDs."""
     duration_s: Annotated[Seconds, Field(le=MAX_DURATION_S)] = 1200.0
+    """For so long events are logged; then the agents finish what they are about."""
     speedup: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    """Mission seconds per second, of processes and containers."""
     network: NetworkModel = NetworkModel()
+    """Conditions from the start on, until the timeline changes them."""
     timeline: Annotated[list[TimelineEntry], Field(max_length=10_000)] = []
+    """What happens when, to the network and to agents."""
     schedule: Annotated[list[Schedule], Field(max_length=100)] = []
+    """What happens to the network again and again."""
     events: Events = Events()
+    """What the agents log."""
     vehicles: Vehicles = Vehicles()
+    """What carries the agents."""
     flight: Annotated[list[Flight], Field(max_length=MAX_AGENTS)] = []
+    """Where vehicles fly; those that no plan names take off and stay."""
     agent_command: AgentCommand = None
     """Any program that follows ucp/CONTRACT.md, with its arguments: for all agents, or by agent for some."""
     docker: Docker = Docker()
+    """What containers are made from, and may use."""
     settings: Settings = Settings()
+    """The agents' timers, and how they read what the thesis leaves open."""
     quirks: AskedQuirks = {}
     """Mistakes that all agents make, or those that are named (`ucp.quirks`)."""
     clocks: dict[VehicleKey, Clock] = {}
+    """What agents' own clocks show, by agent, in virtual time."""
     fates: Annotated[list[Fate], Field(max_length=100_000)] = []
+    """What becomes of single messages, in virtual time."""
     datagrams: Annotated[list[ScriptedDatagram], Field(max_length=100_000)] = []
     """What is on the air beside what agents send."""
     lateness: dict[VehicleKey, Lateness] = {}
@@ -90,7 +104,9 @@ class Scenario(Model):
     initial_data: Annotated[Data, Field(max_length=MAX_INITIAL_DATA)] | None = None
     """BD_0, in base64. Without it each run has its own: in virtual time made of `name` and seed."""
     settle: Settle = Settle()
+    """How long agents may finish after the mission."""
     final_reconcile: bool = False
+    """At the end clear all conditions, and let one agent after another reconcile."""
     capture: bool = False
     """Keep every frame that a vehicle sent, and every one that reached it, in capture/<ID>.pcapng."""
     expect: Expect | None = None
