@@ -100,7 +100,9 @@ class Program:
     def answer(self) -> bytes:
         """The next line that it says, with its end. Raises NoAnswerError."""
         limit_s = ANSWER_LIMIT_S if self._answered else START_LIMIT_S
-        if not self._said and self._readable.poll(limit_s * 1000):
+        if not self._said:
+            if not self._readable.poll(limit_s * 1000):
+                raise _hung(limit_s)
             self._said = os.read(self._out, CHUNK_BYTES)
             if not self._said:
                 raise self._ended()
@@ -120,7 +122,7 @@ class Program:
                 raise NoAnswerError("crashed", f"answers with a line of more than {MAX_ANSWER_BYTES >> 20} MiB")
             left_s = deadline - time.monotonic()
             if left_s <= 0 or not self._readable.poll(left_s * 1000):
-                raise NoAnswerError("hung", f"did not answer within {limit_s:g} s (with a whole line, flushed)")
+                raise _hung(limit_s)
             pieces.append(os.read(self._out, CHUNK_BYTES))
             length += len(pieces[-1])
             if not pieces[-1]:
@@ -208,6 +210,10 @@ class Program:
         assert self._process.stdout is not None
         self._process.stdout.close()
         self._errors.close()
+
+
+def _hung(limit_s: float) -> NoAnswerError:
+    return NoAnswerError("hung", f"did not answer within {limit_s:g} s (with a whole line, flushed)")
 
 
 def _passing_file() -> IO[bytes]:
