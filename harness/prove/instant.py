@@ -8,7 +8,7 @@ For each agent the outcomes of all orders, and of all losses, are worked out onc
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import product
+from itertools import chain, product
 from typing import NamedTuple
 
 from harness.prove.bounds import Bounds
@@ -48,6 +48,10 @@ class Wave(NamedTuple):
     heard: tuple[tuple[int, ...], ...]
 
 
+_Choice = tuple[int, Started, tuple[tuple[int, int], ...], tuple[int, ...]]
+"""Of one agent: its local state, what it has started, what it says, and what it has heard, in order."""
+
+
 class Instants:
     """What instants make of agents."""
 
@@ -57,6 +61,7 @@ class Instants:
         self._twice = "duplicate" in bounds.faults
         self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], dict[Agents, Wave | None]] = {}
         self._outcomes: dict[tuple[int, Heard, bool, bool], list[tuple[Step, tuple[int, ...]]]] = {}
+        self._choices_of: dict[tuple[int, int, Started, tuple[tuple[int, int], ...], bool, bool], list[_Choice]] = {}
         self._places = range(bounds.agents)
 
     def name_of(self, other: int, place: int) -> int:
@@ -127,28 +132,34 @@ class Instants:
     def _hear(
         self, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, rounds: int
     ) -> Iterator[tuple[Agents, tuple[tuple[int, int], ...], tuple[tuple[int, ...], ...]]]:
-        choices: list[list[tuple[Step, tuple[int, ...]]]] = []
-        for place in self._places:
-            local = there.locals[place]
-            if local == DEAD:
-                choices.append([(Step(DEAD, (), ()), ())])
-                continue
+        answered = rounds >= ANSWERED
+        choices = [self._choices(place, there, said, lossy, answered) for place in self._places]
+        for chosen in product(*choices):
+            locals_, started, answers, orders = zip(*chosen, strict=True)
+            yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders
+
+    def _choices(
+        self, place: int, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, answered: bool
+    ) -> list[_Choice]:
+        """What may become of the agent at `place`."""
+        local, before = there.locals[place], there.started[place]
+        if local == DEAD:
+            return [(DEAD, (), (), ())]
+        key = place, local, before, said, lossy, answered
+        choices = self._choices_of.get(key)
+        if choices is None:
             mine = [number for number, (sender, _) in enumerate(said) if sender != place]
             heard = tuple((self.name_of(said[number][0], place), said[number][1]) for number in mine)
-            choices.append(
-                [
-                    (step, tuple(mine[position] for position in order))
-                    for step, order in self._outcomes_of(local, heard, lossy, rounds >= ANSWERED)
-                ]
-            )
-        for chosen in product(*choices):
-            locals_ = tuple(step.local for step, _ in chosen)
-            started = tuple(
-                self._still(before, step) if step.started or before else ()
-                for before, (step, _) in zip(there.started, chosen, strict=True)
-            )
-            answers = tuple((place, message) for place, (step, _) in enumerate(chosen) for message in step.sent)
-            yield Agents(locals_, started), answers, tuple(order for _, order in chosen)
+            choices = self._choices_of[key] = [
+                (
+                    step.local,
+                    self._still(before, step),
+                    tuple((place, message) for message in step.sent),
+                    tuple(mine[position] for position in order),
+                )
+                for step, order in self._outcomes_of(local, heard, lossy, answered)
+            ]
+        return choices
 
     def _still(self, before: Started, step: Step) -> Started:
         """What an agent has started in this instant and still runs."""

@@ -12,7 +12,7 @@ from random import Random
 from typing import Any, NamedTuple
 
 from harness.prove.bounds import Bounds
-from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, key_of, put_back, take
+from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, is_as, key_of, put_back, take
 from ucp.agent import Agent
 from ucp.block import next_chain_hash
 from ucp.clock import MICROSECONDS
@@ -82,6 +82,8 @@ class LocalStates:
         self.known: list[Known] = []
         self.steps = 0
         """How many the real agent has computed."""
+        self._loaded: dict[int, int] = {}
+        """In which local state each of the real agents is."""
         roster = range(1, bounds.agents + 1)
         settings = bounds.agent_settings()
         self._agents = {agent_id: self._agent(agent_id, roster, settings) for agent_id in roster}
@@ -157,7 +159,9 @@ class LocalStates:
     def _restored(self, local: int) -> Agent:
         known = self.known[local]
         agent = self._agents[known.agent_id]
-        put_back(agent, known.snapshot)
+        if self._loaded.get(known.agent_id) != local:
+            put_back(agent, known.snapshot)
+            self._loaded[known.agent_id] = local
         return agent
 
     def _computed(self, local: int, agent: Agent, give: Callable[[], None], *, hears: bool = False) -> Step:
@@ -174,12 +178,16 @@ class LocalStates:
                 crashed = "its timers end at once again and again"
         except Exception as error:  # whatever a handler raises is what we look for
             crashed = f"{type(error).__name__}: {error}"
+        sent = tuple(self._message(message) for _, message in agent.messages_to_send())
+        before = self.known[local]
+        if crashed is None and agent is self._agents[before.agent_id] and is_as(agent, before.snapshot):
+            return Step(local, sent, ())
+        self._loaded.pop(agent.agent_id, None)
         started = tuple(
             (number, round((timer.deadline - NOW_S) * MICROSECONDS))
             for number, timer in enumerate(agent.state.timers)
             if timer.deadline is not None and timer.deadline < RUNNING_S
         )
-        sent = tuple(self._message(message) for _, message in agent.messages_to_send())
         if self.bounds.reduced:
             if hears and any(self.timers[timer] == "voting" for timer, _ in started):
                 raise ReductionError("an agent begins a vote because of a message: try again with --whole")
@@ -203,6 +211,7 @@ class LocalStates:
         if number is None:
             agent = self._restored(local)
             state = agent.state
+            self._loaded.pop(agent.agent_id, None)
             if state.voting_timer.active:
                 state.vote_count = {"yes": int(state.vote_count["yes"] > state.vote_count["no"]), "no": 0}
                 state.voters = set()
@@ -216,6 +225,7 @@ class LocalStates:
         if number is None:
             agent = self._restored(local)
             state = agent.state
+            self._loaded.pop(agent.agent_id, None)
             new = dict(zip(range(2, 2 + len(names)), names, strict=True))
             state.voters = {new[voter] for voter in state.voters}
             state.reconcile_responders = {new[responder] for responder in state.reconcile_responders}

@@ -49,6 +49,18 @@ def put_back(agent: Agent, snapshot: Snapshot) -> None:
             state[name] = _copied(value)
 
 
+def is_as(agent: Agent, snapshot: Snapshot) -> bool:
+    """Whether the agent, which was in the state of the snapshot, still is."""
+    state = vars(agent.state)
+    for name, value in snapshot.items():
+        if isinstance(value, _TimerState | _ChainState):
+            if not value.is_of(state[name]):
+                return False
+        elif state[name] != value:
+            return False
+    return state.keys() - LEFT_OUT == snapshot.keys()
+
+
 def key_of(snapshot: Snapshot, name_of: NameOf) -> tuple[Any, ...]:
     """Equal for equal states, and only for these."""
     return tuple(_keyed(value, name_of) for value in snapshot.values())
@@ -60,6 +72,10 @@ class _TimerState:
     def __init__(self, timer: Timer) -> None:
         self.running = timer.deadline is not None
         self.paused = timer.active and not self.running
+
+    def is_of(self, timer: Timer) -> bool:
+        """A timer that was started anew is not what it was."""
+        return (timer.deadline == RUNNING_S) == self.running and timer.active == (self.running or self.paused)
 
     def put_back(self, timer: Timer) -> None:
         timer.stop()
@@ -76,6 +92,10 @@ class _ChainState:
         self.kind = type(chain)
         self.parts = {name: _copied(value) for name, value in vars(chain).items() if name != "inception"}
 
+    def is_of(self, chain: Chain) -> bool:
+        now = vars(chain)
+        return type(chain) is self.kind and all(now[name] == value for name, value in self.parts.items())
+
     def put_back(self, chain: Chain) -> None:
         chain.__class__ = self.kind
         for name, value in self.parts.items():
@@ -84,36 +104,49 @@ class _ChainState:
 
 def _copied(value: Any) -> Any:
     """A copy that shares nothing that changes."""
-    if value is None or isinstance(value, int | bytes | str | float | Block | _TimerState | _ChainState):
-        return value
-    if isinstance(value, Timer):
-        return _TimerState(value)
-    if isinstance(value, Chain):
-        return _ChainState(value)
-    if isinstance(value, Counter | set | bytearray):
-        return value.copy()
-    if isinstance(value, dict):
-        return {key: _copied(item) for key, item in value.items()}
-    if isinstance(value, list | deque | tuple):
-        return type(value)(map(_copied, value))
-    raise TypeError(f"an agent's state has a {type(value).__name__}, and nobody has said how it is copied")
+    copy = _COPIED.get(type(value))
+    if copy is None:
+        copy = next((way for kind, way in _COPIED.items() if isinstance(value, kind)), None)
+    if copy is None:
+        raise TypeError(f"an agent's state has a {type(value).__name__}, and nobody has said how it is copied")
+    return copy(value)
+
+
+def _itself(value: Any) -> Any:
+    return value
+
+
+def _each(value: Any) -> Any:
+    return type(value)(map(_copied, value))
+
+
+_COPIED: dict[type, Callable[[Any], Any]] = {
+    **dict.fromkeys((type(None), bool, int, bytes, str, float, Block, _TimerState, _ChainState), _itself),
+    **dict.fromkeys((set, bytearray, Counter), lambda value: value.copy()),
+    **dict.fromkeys((list, deque, tuple), _each),
+    dict: lambda value: {key: _copied(item) for key, item in value.items()},
+    Timer: _TimerState,
+    Chain: _ChainState,
+}
 
 
 def _keyed(value: Any, name_of: NameOf) -> Any:
-    if isinstance(value, bytes):
-        return name_of(value)
-    if isinstance(value, Block):
-        return name_of(value.block_hash)
-    if isinstance(value, _TimerState):
-        return value.running, value.paused
-    if isinstance(value, _ChainState):
-        return value.kind.__name__, *(_keyed(part, name_of) for part in value.parts.values())
-    if isinstance(value, dict):
-        return frozenset((_keyed(key, name_of), _keyed(item, name_of)) for key, item in value.items())
-    if isinstance(value, set):
-        return frozenset(_keyed(item, name_of) for item in value)
-    if isinstance(value, bytearray):
-        return bytes(value)
-    if isinstance(value, list | deque | tuple):
-        return tuple(_keyed(item, name_of) for item in value)
-    return value
+    key = _KEYED.get(type(value))
+    return value if key is None else key(value, name_of)
+
+
+_KEYED: dict[type, Callable[[Any, NameOf], Any]] = {
+    bytes: lambda value, name_of: name_of(value),
+    Block: lambda value, name_of: name_of(value.block_hash),
+    _TimerState: lambda value, name_of: (value.running, value.paused),
+    _ChainState: lambda value, name_of: (
+        value.kind.__name__,
+        *[_keyed(part, name_of) for part in value.parts.values()],
+    ),
+    dict: lambda value, name_of: frozenset(
+        [(_keyed(key, name_of), _keyed(item, name_of)) for key, item in value.items()]
+    ),
+    set: lambda value, name_of: frozenset([_keyed(item, name_of) for item in value]),
+    bytearray: lambda value, name_of: bytes(value),
+    **dict.fromkeys((list, deque, tuple), lambda value, name_of: tuple([_keyed(item, name_of) for item in value])),
+}
