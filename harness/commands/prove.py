@@ -20,7 +20,9 @@ GIGABYTE = 1e9
 def prove_command(
     agents: Annotated[int, typer.Option(help="How many agents there are.")] = 2,
     blocks: Annotated[int, typer.Option(help="How many blocks they complete in all, anybody at any moment.")] = 3,
-    network: Annotated[str, typer.Option(help="lossless, or lossy: anybody may lose any message.")] = "lossy",
+    network: Annotated[
+        str, typer.Option(help="lossless; lossy: anybody may lose any message; any: late, twice, in any order.")
+    ] = "lossy",
     faults: Annotated[
         str, typer.Option(help="Of reboot, death (each once, at any moment) and duplicate, with commas between.")
     ] = "",
@@ -66,7 +68,7 @@ def prove_command(
         console = Console()
         for line in prove.in_words(proof):
             console.print(line, highlight=False, soft_wrap=True, markup=False)
-    if proof.graph.ended == "interrupted":
+    if proof.ended == "interrupted":
         complain("interrupted")
     raise typer.Exit(proof.exit_status)
 

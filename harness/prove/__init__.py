@@ -15,7 +15,7 @@ words.py      what came out, for people
 """
 
 from harness.prove.bounds import Bounds, BoundsError, Network
-from harness.prove.explore import Progress
+from harness.prove.progress import Progress
 from harness.prove.prove import INCOMPLETE, Limits, Proof, prove
 from harness.prove.words import in_words
 

@@ -3,34 +3,19 @@
 Of each state it is also kept where it goes on losing nothing and with no new block (`quiet`), for `liveness.py`.
 """
 
-import resource
-import sys
 import time
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Literal
 
 from harness.prove.instant import Action
 from harness.prove.local import Flaw
+from harness.prove.progress import Ended, Progress, memory_bytes
 from harness.prove.swarm import State, Swarm
 
 LOOK_EVERY = 200
 """States between two looks at memory, clock and whoever watches."""
 NO_PARENT = -1
-
-Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far it is: states known, of these looked at, ways between them, how many instants from the beginning."""
-
-    states: int
-    looked_at: int
-    transitions: int
-    depth: int
-    seconds: float
 
 
 @dataclass
@@ -76,12 +61,6 @@ class Graph:
         while (parent := self.parents[path[-1]]) != NO_PARENT:
             path.append(parent)
         return path[::-1]
-
-
-def memory_bytes() -> int:
-    """What this process has ever taken."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
 
 
 def explore(

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from harness.prove.bounds import Bounds
 from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, is_as, key_of, put_back, take
 from ucp.agent import Agent
-from ucp.block import next_chain_hash
+from ucp.block import Block, next_chain_hash
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.messages import Message
@@ -73,8 +73,8 @@ class ReductionError(Exception):
 class LocalStates:
     """All local states that were come upon, and all steps between them.
 
-    When `bounds.reduced`, every agent is computed as agent 1 among others, and what no handler will read before it is
-    written anew is as at the beginning; docs/proof.md says why that is sound.
+    When `bounds.reduced`, what no handler will read before it is written anew is as at the beginning; docs/proof.md
+    says why that is sound.
     """
 
     def __init__(self, bounds: Bounds) -> None:
@@ -89,10 +89,21 @@ class LocalStates:
         self._agents = {agent_id: self._agent(agent_id, roster, settings) for agent_id in roster}
         self.timers = [timer.name for timer in self._agents[1].state.timers]
         self.settings, self._roster = settings, roster
+        durations = (
+            settings.vote_timeout_s,
+            settings.phase1_timeout_s,
+            settings.phase2_timeout_s,
+            settings.phase3_timeout_s,
+            settings.finalize_gap_s,
+        )
+        self.durations_us = [round(duration * MICROSECONDS) for duration in durations]
+        """By timer."""
         self._numbers: dict[tuple[Any, ...], int] = {}
         self._hashes: dict[bytes, int] = {}
         self._blocks: dict[bytes, int] = {}
         """Hashes of completed blocks: who made them, by the agent's number here."""
+        self._ordinals: dict[bytes, frozenset[int]] = {}
+        """Hashes of blocks and chains: which blocks they are of."""
         self.messages: list[Message] = []
         self._message_numbers: dict[Message, int] = {}
         self._steps: dict[tuple[int, int, int], Step] = {}
@@ -139,6 +150,9 @@ class LocalStates:
 
             def logged() -> None:
                 agent.add_event(event, NOW_S)
+                for block in agent.state.blocks_to_be_committed:
+                    if block.timestamp_us == event.timestamp_us:
+                        self._ordinals[block.block_hash] = frozenset((ordinal,))
                 for block_hash in agent.state.completed:
                     self._blocks.setdefault(block_hash, agent.agent_id)
 
@@ -201,6 +215,12 @@ class LocalStates:
             self.messages.append(message)
         return number
 
+    def blocks_named(self, message: int) -> frozenset[int]:
+        """Ordinals of the blocks that a message names, by themselves or as those of a chain."""
+        fields = (getattr(self.messages[message], name) for name in self.messages[message].__slots__)
+        hashes = [field.block_hash if isinstance(field, Block) else field for field in fields]
+        return frozenset().union(*(self._ordinals.get(digest, ()) for digest in hashes if isinstance(digest, bytes)))
+
     # States
 
     def settled(self, local: int) -> int:
@@ -239,6 +259,9 @@ class LocalStates:
         number = self._numbers.setdefault(key, len(self.known))
         if number == len(self.known):
             state = agent.state
+            below: frozenset[int] = frozenset()
+            for block, chain_hash in state.chain.with_chain_hashes():
+                below = self._ordinals[chain_hash] = below | self._ordinals.get(block.block_hash, frozenset())
             self.known.append(
                 Known(
                     agent_id,

@@ -1,7 +1,8 @@
 """From bounds to what holds within them: explore, look at the whole, and write what was found as scenarios."""
 
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ from harness.errors import INTERRUPTED, VIOLATED, HarnessError
 from harness.explore.search import simulated
 from harness.explore.write import claim, evidence_lines, write
 from harness.prove import liveness
+from harness.prove.alone import collect
 from harness.prove.bounds import Bounds
-from harness.prove.explore import Graph, Progress, explore
+from harness.prove.explore import Graph, explore
 from harness.prove.liveness import Liveness
-from harness.prove.local import ReductionError
+from harness.prove.local import Flaw, ReductionError
+from harness.prove.progress import Ended, Figures, Progress
 from harness.prove.script import Script
 from harness.prove.swarm import Swarm
 from harness.scenario.load import parse
@@ -63,53 +66,49 @@ class Example:
 
 @dataclass
 class Proof:
-    """What came out. `liveness` is None if not all states are known, or one of them has a flaw."""
+    """What came out. `liveness` is None if it was not looked at: not all states are known, or the network is `any`.
 
-    graph: Graph
+    `way` is what an agent did that has a flaw in the network `any`, where nothing shows that all of it fits together.
+    """
+
+    bounds: Bounds
+    figures: Figures
+    ended: Ended
+    flaw: Flaw | None
     liveness: Liveness | None = None
     example: Example | None = None
-
-    @property
-    def bounds(self) -> Bounds:
-        return self.graph.swarm.bounds
+    way: list[str] = field(default_factory=list)
 
     @property
     def complete(self) -> bool:
-        return self.graph.ended == "complete"
+        return self.ended == "complete"
 
     @property
     def exit_status(self) -> int:
         live = self.liveness
-        if self.graph.flaw or (live is not None and (live.cycles or live.lost is not None)):
+        if self.flaw or (live is not None and (live.cycles or live.lost is not None)):
             return VIOLATED
-        if self.graph.ended == "interrupted":
+        if self.ended == "interrupted":
             return INTERRUPTED
         return 0 if self.complete else INCOMPLETE
 
     def to_json(self) -> dict[str, Any]:
-        graph, bounds, live = self.graph, self.bounds, self.liveness
-        flaw = graph.flaw
+        bounds, live, flaw = self.bounds, self.liveness, self.flaw
         return {
             "schema": "ucp-proof/1",
             "agents": bounds.agents,
             "blocks": bounds.blocks,
             "network": bounds.network,
             "faults": list(bounds.faults),
-            "timers": "any" if bounds.timers_any else "by duration",
+            "timers": "any" if bounds.timers_any else "duration",
             "settings": dict(bounds.settings),
             "quirks": dict(bounds.quirks),
             "reduced": bounds.reduced,
             "complete": self.complete,
-            "ended": graph.ended,
-            "states": graph.reached,
-            "looked_at": graph.looked_at,
-            "transitions": graph.transitions,
-            "local_states": len(graph.swarm.local.known),
-            "steps_of_the_agent": graph.swarm.local.steps,
-            "zones": len(graph.swarm.zones),
-            "depth": graph.depth,
-            "seconds": round(graph.seconds, 3),
-            "flaw": None if flaw is None else {"kind": flaw.kind, "sentence": flaw.sentence},
+            "ended": self.ended,
+            **asdict(self.figures),
+            "flaw": None if flaw is None else asdict(flaw),
+            "way": self.way,
             "forks_at_rest": None if live is None else live.forks,
             "without_a_way_to_one_chain": None if live is None else live.astray,
             "livelocks": None if live is None else len(live.cycles),
@@ -128,22 +127,57 @@ def prove(
 
     Raises HarnessError if nothing can be written, or if the agent does what a reduction must not meet.
     """
-    name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
-    path = claim(out or default_path(name).with_suffix(".yaml"), name)
     try:
-        graph = explore(Swarm(bounds), most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
-        proof = Proof(graph)
-        if proof.complete:
-            proof.liveness = liveness.look(graph)
+        if bounds.network == "any":
+            return _alone(bounds, limits, watch)
+        return _together(bounds, limits, out, watch)
     except ReductionError as error:
         raise HarnessError(f"{error}") from None
-    proof.example = _example(proof, path, name)
+
+
+def _alone(bounds: Bounds, limits: Limits, watch: Callable[[Progress], None]) -> Proof:
+    began_s = time.process_time()
+    found = collect(bounds, most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
+    figures = Figures(
+        found.states,
+        found.looked_at,
+        found.transitions,
+        found.local_states,
+        found.steps,
+        found.zones,
+        None,
+        round(found.seconds, 3),
+        round(time.process_time() - began_s, 3),
+    )
+    return Proof(bounds, figures, found.ended, found.flaw, way=found.way)
+
+
+def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:
+    name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
+    path = claim(out or default_path(name).with_suffix(".yaml"), name)
+    began_s = time.process_time()
+    swarm = Swarm(bounds)
+    graph = explore(swarm, most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
+    figures = Figures(
+        graph.reached,
+        graph.looked_at,
+        graph.transitions,
+        len(swarm.local.known),
+        swarm.local.steps,
+        len(swarm.zones),
+        graph.depth,
+        round(graph.seconds, 3),
+        round(time.process_time() - began_s, 3),
+    )
+    proof = Proof(bounds, figures, graph.ended, graph.flaw)
+    if proof.complete:
+        proof.liveness = liveness.look(graph)
+    proof.example = _example(graph, proof.liveness, path, name)
     return proof
 
 
-def _ways(proof: Proof) -> Iterator[tuple[list[int], str, str]]:
+def _ways(graph: Graph, live: Liveness | None) -> Iterator[tuple[list[int], str, str]]:
     """Ways to what was found, the shortest first, each with a sentence and the key of what is bad when it is played."""
-    graph, live = proof.graph, proof.liveness
     if graph.flawed is not None and graph.flaw is not None:
         kind = graph.flaw.kind
         yield graph.path(graph.flawed), graph.flaw.sentence, kind if kind.isdecimal() else "liveness"
@@ -155,11 +189,11 @@ def _ways(proof: Proof) -> Iterator[tuple[list[int], str, str]]:
         yield graph.path(live.lost), "no way was found from here to rest with one chain", "6"
 
 
-def _example(proof: Proof, path: Path, name: str) -> Example | None:
+def _example(graph: Graph, live: Liveness | None, path: Path, name: str) -> Example | None:
     """The first that the simulation plays as it is meant, or the first of all; written to `path`."""
     first = None
-    for way, sentence, key in islice(_ways(proof), MOST_PLAYED):
-        document = Script(proof.graph, way).document(name)
+    for way, sentence, key in islice(_ways(graph, live), MOST_PLAYED):
+        document = Script(graph, way).document(name)
         result = simulated(parse(document), SEED)
         played = document, len(way) - 1, sentence, {bad: result.judgements[bad] for bad in result.bad}
         first = first or played
@@ -172,7 +206,7 @@ def _example(proof: Proof, path: Path, name: str) -> Example | None:
     document, instants, sentence, judged = played
     comment = [
         f"{sentence.capitalize()}: {instants} instants after the beginning.",
-        f"A shortest way within {proof.bounds.in_words()}.",
+        f"A shortest way within {graph.swarm.bounds.in_words()}.",
         *evidence_lines(judged),
         f"  ucp-harness run {path} --backend sim --seed {SEED}",
     ]

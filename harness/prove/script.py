@@ -116,7 +116,7 @@ class Script:
                     before = running.get((old, timer))
                     started = dict(move.started[old]).get(timer)
                     if before is None or started is not None:
-                        us = self._swarm.durations_us[timer] if started is None else started
+                        us = self._swarm.local.durations_us[timer] if started is None else started
                         before = instant, us / 1e6
                     after[new, timer] = before
             running = after
@@ -174,7 +174,7 @@ class Script:
         started = dict(step.started)
         for timer in running:
             if timer in started or timer not in agent.timers:
-                us = started.get(timer, self._swarm.durations_us[timer])
+                us = started.get(timer, self._swarm.local.durations_us[timer])
                 agent.timers[timer] = agent.started, now + us / 1e6
                 agent.started += 1
         flights = []

@@ -13,7 +13,6 @@ from harness.prove.bounds import FAULTS, Bounds
 from harness.prove.instant import Action, Agents, Instants, Wave
 from harness.prove.local import DEAD, Flaw, LocalStates, Started
 from harness.prove.zones import NOTHING_RUNS, Zones
-from ucp.clock import MICROSECONDS
 
 State = tuple[int, ...]
 """Blocks completed, faults left (a bit for each), zone, then the agents."""
@@ -44,15 +43,6 @@ class Swarm:
         self.zones = Zones()
         self._instants = Instants(self.local, bounds)
         self._in_order: dict[tuple[tuple[int, ...], int], tuple[tuple[int, ...], int, Places]] = {}
-        settings = self.local.settings
-        durations = (
-            settings.vote_timeout_s,
-            settings.phase1_timeout_s,
-            settings.phase2_timeout_s,
-            settings.phase3_timeout_s,
-            settings.finalize_gap_s,
-        )
-        self.durations_us = [round(duration * MICROSECONDS) for duration in durations]
         own = [1] * bounds.agents if bounds.reduced else range(1, bounds.agents + 1)
         faults = sum(1 << FAULTS.index(name) for name in bounds.faults if name != "duplicate")
         self.initial: State = (0, faults, NOTHING_RUNS, *(self.local.initial[agent_id] for agent_id in own))
@@ -126,7 +116,7 @@ class Swarm:
                 if timer in started:
                     running.append(-started[timer] - 1)
                 else:
-                    running.append(at.get((place, timer)) or -self.durations_us[timer] - 1)
+                    running.append(at.get((place, timer)) or -self.local.durations_us[timer] - 1)
         after = self.zones.after(zone, ended, tuple(running))
         assert after is not None, "these timers can end at once"
         return after

@@ -13,17 +13,20 @@ WHY = {
 
 
 def in_words(proof: Proof) -> Iterator[str]:
-    graph = proof.graph
-    ended = "complete" if proof.complete else f"not complete: {WHY[graph.ended]}"
+    figures = proof.figures
+    ended = "complete" if proof.complete else f"not complete: {WHY[proof.ended]}"
     yield f"{proof.bounds.in_words()}: {ended}"
-    left = "" if proof.complete else f", of which {graph.looked_at:,} were looked at"
+    left = "" if proof.complete else f", of which {figures.looked_at:,} were looked at"
+    instants = "of agents by themselves" if figures.depth is None else f"up to {figures.depth} instants"
     yield (
-        f"  {graph.reached:,} states{left}, {graph.transitions:,} transitions, {len(graph.swarm.local.known):,} "
-        f"local states, {len(graph.swarm.zones):,} zones, up to {graph.depth} instants, in {graph.seconds:.1f} s"
+        f"  {figures.states:,} states{left}, {figures.transitions:,} transitions, {figures.local_states:,} "
+        f"local states, {figures.zones:,} zones, {instants}, in {figures.seconds:.1f} s"
     )
     for kind, claim in CLAIMS.items():
         yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
     yield from _of_the_whole(proof)
+    if proof.way:
+        yield f"  an agent may, if all that it hears can be sent in one run: {'; '.join(proof.way)}"
     example = proof.example
     if example is not None:
         yield f"  a shortest way there, {example.instants} instants: {example.replay}"
@@ -38,14 +41,16 @@ def _name(kind: str) -> str:
 
 
 def _mark(proof: Proof, kind: str) -> str:
-    flaw = proof.graph.flaw
-    if flaw is not None and flaw.kind == kind:
-        return "✘ violated,"
+    if proof.flaw is not None and proof.flaw.kind == kind:
+        return "✘ not shown," if proof.bounds.network == "any" else "✘ violated,"
     return "✔ holds," if proof.complete else "- not decided,"
 
 
 def _of_the_whole(proof: Proof) -> Iterator[str]:
     live = proof.liveness
+    if proof.bounds.network == "any":
+        yield "- not looked at, one chain, livelock: they are about all agents together; see the network lossy"
+        return
     if live is None:
         yield "- not decided, one chain: from every state some way without losses leads to rest with one chain"
         yield "- not decided, livelock: the swarm cannot go round for ever"

@@ -11,7 +11,7 @@ from tests.harness.command import harness, sentences
 
 def test_the_livelock_in_step_is_found_without_being_told(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "in_step.yaml")
-    assert proof.graph.flaw is None
+    assert proof.flaw is None
     assert proof.liveness is not None
     assert proof.liveness.lost is None
     assert proof.example is not None
@@ -35,8 +35,8 @@ def test_fewer_blocks_hold(tmp_path: Path) -> None:
 def test_a_wrong_agent_is_found_and_its_scenario_shows_it(tmp_path: Path, quirk: str, kind: str, key: str) -> None:
     bounds = Bounds(2, 2, "lossy", quirks={quirk: True}, reduced=False)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
-    assert proof.graph.flaw is not None
-    assert proof.graph.flaw.kind == kind
+    assert proof.flaw is not None
+    assert proof.flaw.kind == kind
     assert proof.example is not None
     assert key in proof.example.judged
 
@@ -60,3 +60,13 @@ def test_the_command(tmp_path: Path) -> None:
     wrong = harness("prove", "--settings", "vote_timeout_s=-1", cwd=tmp_path)
     assert wrong.returncode == 2
     assert [sentence.split()[0] for sentence in sentences(wrong.stderr)] == ["vote_timeout_s"]
+
+
+def test_each_agent_by_itself_against_all_that_could_be_said(tmp_path: Path) -> None:
+    proof = prove(Bounds(2, 2, "any", ("reboot",)))
+    assert proof.exit_status == 0
+    assert any("not looked at" in line for line in in_words(proof))
+    wrong = prove(Bounds(2, 2, "any", quirks={"commit_others_twice": True}, reduced=False))
+    assert wrong.flaw is not None
+    assert wrong.flaw.kind == "3"
+    assert wrong.way[-1].startswith("it hears a Commit Block")
