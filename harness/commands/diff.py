@@ -48,7 +48,7 @@ def _lines(difference: Difference) -> Iterator[str]:
         case "identical":
             yield f"identical to the last byte: {runs}"
         case "same but for times":
-            yield f"the same: {runs}; only times, and the hashes that cover them, differ"
+            yield f"the same: {runs}; what differs is not compared: times, hashes that cover them, tallies or states"
         case _:
             yield from _differences(difference)
 

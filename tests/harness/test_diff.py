@@ -103,8 +103,15 @@ def test_other_times_and_other_hashes_of_the_same_blocks_are_no_difference(a: Pa
     done = harness("diff", a, b)
     assert done.returncode == 0
     assert re.fullmatch(
-        r"the same: \d+ handler runs of 3 agents, and their chains; only times, .* differ\n", done.stdout
+        r"the same: \d+ handler runs of 3 agents, and their chains; what differs is not compared: .*\n", done.stdout
     )
+
+
+def test_a_state_that_was_edited_is_not_called_a_time(a: Path, b: Path) -> None:
+    trace(b).write_text(trace(b).read_text().replace('"deque":0', '"deque":7', 1))
+    done = harness("diff", a, b)
+    assert done.returncode == 0
+    assert "what differs is not compared: times, hashes that cover them, tallies or states" in done.stdout
 
 
 @pytest.mark.parametrize(
