@@ -809,6 +809,12 @@ typedef struct {
 
 static size_t completed_len(const Agent *a) { return a->completed.len / 32; }
 
+static bool has_completed(const Agent *a, const Block *block) {
+    for (size_t i = 0; i < completed_len(a) && block->agent == a->m.agent_id; i++)
+        if (memcmp(a->completed.data + 32 * i, block->hash.b, 32) == 0) return true;
+    return false;
+}
+
 static bool holds(const Agent *a, const Hash *hash) {
     return list_find(&a->chain, hash) >= 0 || list_find(&a->deque, hash) >= 0 || list_find(&a->stack, hash) >= 0;
 }
@@ -1521,7 +1527,7 @@ static void boot(Agent *a, double now) {
             put_change(&a->changes, changes[k], block->hash.b);
             put_be(&found, block->size, 2);
             put(&found, block->data, block->size);
-            if (block->agent == a->m.agent_id && (!a->has_newest || block->timestamp > a->newest)) {
+            if ((!a->has_newest || block->timestamp > a->newest) && has_completed(a, block)) {
                 a->has_newest = true;
                 a->newest = block->timestamp;
             }
@@ -2279,7 +2285,7 @@ static bool virtual_input(Virtual *v, const char *line, size_t n) {
         take_timers(a, t);
     } else if ((at = member(j, ROOT, "event_id")) != 0) {
         if (!json_uint(j, at, 1, 254, &id) || !json_bytes(j, member(j, ROOT, "data"), &v->bytes)
-            || !json_uint(j, member(j, ROOT, "timestamp_us"), 0, UINT64_MAX, &timestamp)
+            || !json_uint(j, member(j, ROOT, "timestamp_us"), 0, INT64_MAX, &timestamp)
             || !event_fits(a, v->bytes.len))
             return virtual_error(v, "This is no event, or it is too large.", false);
         take_event(a, t, (uint8_t)id, timestamp, v->bytes.data, v->bytes.len);
