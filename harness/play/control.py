@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic_core import from_json
 
 from harness.errors import VIOLATED, HarnessError
 from harness.play.last_words import last_words
@@ -102,7 +103,7 @@ class AgentControl:
         line = await reader.readline()
         if not line.endswith(b"\n"):
             raise ConnectionResetError("it closed its control socket")
-        answer = json.loads(line)
+        answer = from_json(line, allow_inf_nan=False)
         if not isinstance(answer, dict):
             raise ValueError("its answer is not a JSON object")
         return answer

@@ -1,7 +1,7 @@
 """`python -m tests.fuzz.keep [TARGET ...]`: makes tests/corpus anew: seeds, what `python -m tests.fuzz` has grown in
 .fuzz, and what was kept, of these the few that take the most ways through the code, and all regressions.
 
-A way is a line of the project's that runs after another. An input that covers more of them for its size comes first.
+A way is a line of the project that runs after another. What covers more of them comes first, then what is smaller.
 """
 
 import hashlib
@@ -18,9 +18,9 @@ from tests.fuzz.execute import executed
 from tests.fuzz.targets import NAMES, Target, named
 from tests.fuzz.targets.home import run_of_three
 
-MOST_FILES = 14
-MOST_BYTES = 26_000
-MOST_BYTES_EACH = 24_000
+MOST_FILES = 11
+MOST_BYTES = 45_000
+MOST_BYTES_EACH = 40_000
 """Of a target."""
 _PROJECT = tuple(str(Path(__file__).parents[2] / room) for room in ("ucp", "harness", "netem", "sitl"))
 
