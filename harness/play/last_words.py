@@ -1,7 +1,8 @@
 """What a program that has ended said last: for an agent that lacks what its mission needs, the reason.
 
-Such an agent ends with status 127 and a sentence on standard error (ucp/CONTRACT.md). A shell, or env(1), ends with 127
-as well, where it does not find a program: then nobody has said that anything is not supported, and something is broken.
+Such an agent ends with status 127 and a sentence on standard error (ucp/CONTRACT.md). A shell, env(1) or the first
+process of a container ends with 127 as well, where it does not find a program: then nobody has said that anything is
+not supported, and something is broken.
 """
 
 import re
@@ -14,7 +15,8 @@ CHARACTERS = 300
 _OF_A_SHELL = re.compile(
     r"(.+: (line )?\d+: .*(not found|No such file or directory)"  # sh, bash
     r"|\S+: command not found: .*|fish: Unknown command.*"  # zsh, fish
-    r"|(\S*/)?env: .*No such file or directory)"
+    r"|(\S*/)?env: .*No such file or directory"
+    r"|\[FATAL tini .*)"  # the first process of a container
 )
 
 
@@ -35,5 +37,5 @@ def last_words(text: str) -> str:
 
 
 def of_a_shell(words: str) -> bool:
-    """Whether a shell says so that it did not find a program."""
+    """Whether a shell, or what else starts programs, says so that it did not find one."""
     return _OF_A_SHELL.fullmatch(words) is not None

@@ -158,7 +158,7 @@ def test_a_name_that_is_taken(tmp_path: Path) -> None:
         (
             {"docker": {"image": "ucp-harness-host:empty"}, "agent_command": ["/usr/bin/env", "python3"]},
             1,
-            "agent 1 ended by itself with status 127: there is no such program in its image; its log is agents/1.log",
+            "agent 1 ended by itself with status 127: there is no such program in its image ([FATAL tini",
         ),
         ({"agent_command": ["/bin/false"]}, 1, "agent 1 ended by itself with status 1; its log is agents/1.log"),
         (

@@ -17,6 +17,7 @@ from harness.play.last_words import CHARACTERS, last_words_in, of_a_shell
         "zsh:1: command not found: no_such",
         "/usr/bin/env: \u2018no_such\u2019: No such file or directory",
         "env: no_such: No such file or directory",
+        "[FATAL tini (7)] exec /usr/bin/no_such failed: No such file or directory",
     ],
 )
 def test_a_shell_that_does_not_find_a_program_is_told_from_an_agent(words: str) -> None:
