@@ -1,9 +1,10 @@
 """The agents of a swarm that are not ours: whose program plays whom, in which life."""
 
+import errno
 from collections.abc import Mapping
 from typing import Any
 
-from harness.errors import ScenarioError
+from harness.errors import MachineError, ScenarioError
 from harness.play.process.agent import agent_command, reboots_with_disk
 from harness.play.process.mission_file import mission_file
 from harness.play.simulation.agents import Stored, VirtualAgent
@@ -45,7 +46,7 @@ class Foreigners:
         return self._commands[agent_id]
 
     def start(self) -> None:
-        """Start whoever will play, all at the same time. Raises ScenarioError if a program cannot be started."""
+        """Start whoever will play, all at the same time. Raises HarnessError if a program cannot be started."""
         for agent_id in self._commands:
             self._start(agent_id)
 
@@ -54,6 +55,10 @@ class Foreigners:
         try:
             self._playing[agent_id] = self._programs.take(command, agent_id)
         except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                raise MachineError(
+                    f"agent {agent_id} cannot be started: {error.strerror}; allow more with `ulimit -n`"
+                ) from None
             raise ScenarioError(f"`agent_command`: {command[0]} cannot be started: {error.strerror}") from None
 
     def begin(self, agent_id: int, life: int, now: float, stored: Stored | None) -> ForeignAgent:
