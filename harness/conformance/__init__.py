@@ -5,7 +5,10 @@ alphabet.py   the inputs that there are in a state: each message in the variants
 states.py     states as far as they differ to an agent, and the walk over all of them, breadth first
 vectors.py    the generated vectors, and the file of them that others use without this harness
 tours.py      one agent led through as many vectors as it takes, by the shortest ways
-subject.py    the agent: what it is given, and what is seen of it; over UDP (air.py) or in virtual time (virtual.py)
+suite.py      many tours side by side; what is suspected is tried again, alone
+subject.py    an agent under test; over UDP (over_udp.py, on the air of air.py) or in virtual time (virtual.py)
+seen.py       what is seen of it at one step, and whether that is right
 blame.py      which branch explains all failures
 cases/        what no state explains, written by hand: malformed datagrams, floods, reboots, wrong missions
+run.py        all of that together; results.py, table.py and keep.py show and keep what came of it
 """

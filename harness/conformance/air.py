@@ -11,14 +11,14 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from harness.conformance import ports
-from harness.conformance.mission import mission
+from harness.conformance.mission import NO_KEYS, mission
 from harness.conformance.states import Variant
 from harness.errors import HarnessError, MachineError
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError
@@ -128,10 +128,10 @@ class Air:
             air.setblocking(False)
         return sockets
 
-    def mission(self, variant: Variant, port: int, speedup: float, **other: Any) -> dict[str, Any]:
+    def mission(self, variant: Variant, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS) -> dict[str, Any]:
         """The mission file of an agent on this port."""
         address = self.lab.addresses[AGENTS]
-        return mission(variant, address=address, broadcast=self.lab.broadcast, port=port, speedup=speedup, **other)
+        return mission(variant, address=address, broadcast=self.lab.broadcast, port=port, speedup=speedup, keys=keys)
 
     def take_port(self) -> int:
         return self._ports.pop()

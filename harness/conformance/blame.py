@@ -25,6 +25,10 @@ ENDS = {
 """What runs when a timer has ended -> what began the count that it decides by."""
 
 
+STARTING = {"proposed", "asked", "recommitted, more to come"}
+"""Branches in which a handler starts its timer."""
+
+
 @dataclass(frozen=True)
 class Blamed:
     """`branch` is that which the reference takes there."""
@@ -42,11 +46,14 @@ class Blamed:
 
 
 class Evidence:
-    """How often each branch was in a vector that passed."""
+    """How often each branch was in a vector that passed, and in one that failed."""
 
     def __init__(self, tallies: Iterable[Tally]) -> None:
         self._passed: Counter[Branch] = Counter()
+        self._failed: Counter[Branch] = Counter()
         for tally in tallies:
+            for failure in tally.failures:
+                self._failed.update({(run.handler, run.branch) for run in failure.seen.outcome.runs})
             for pair in tally.passed:
                 step = tally.vectors.by_pair.get(pair)
                 if step is not None:
@@ -54,21 +61,26 @@ class Evidence:
 
     def blame(self, failure: Failure) -> Blamed:
         hidden, runs = failure.seen.hidden, failure.seen.outcome.runs
-        if hidden is not None:
-            return Blamed(hidden.handler, hidden.branch)
         if failure.seen.mistimed in STARTS:
             return self._starter(failure)
-        if failure.of_an_earlier_round and runs[0].handler in ENDS:
+        if hidden is not None:
+            return Blamed(hidden.handler, hidden.branch)
+        if failure.of_an_earlier_round and runs and runs[0].handler in ENDS:
             return Blamed(ENDS[runs[0].handler], "")
+        if not runs:
+            sent = set(failure.seen.unexpected)
+            sends = [handler for handler in HANDLERS.values() if {kind.NAME for kind in handler.sends} & sent]
+            return Blamed(sends[0].name if sends else "build_data_block", "")
         run = self._suspect(runs, failure)
         return Blamed(run.handler, run.branch)
 
     @staticmethod
     def _starter(failure: Failure) -> Blamed:
         """Who starts the timer that is not as it should be; if that ran now, in the branch that it took."""
-        handler = STARTS[str(failure.seen.mistimed)]
-        branch = next((run.branch for run in failure.seen.outcome.runs if run.handler == handler), "")
-        return Blamed(handler, branch)
+        for run in failure.seen.outcome.runs:
+            if HANDLERS[run.handler].starts and run.branch in STARTING:
+                return Blamed(run.handler, run.branch)
+        return Blamed(STARTS[str(failure.seen.mistimed)], "")
 
     def _suspect(self, runs: Sequence[Run], failure: Failure) -> Run:
         """Who should have sent what is missing, or sends what is too much; of these, whose branch passes least."""
@@ -76,8 +88,8 @@ class Evidence:
         if len(runs) == 1:
             return runs[0]
         never = [run for run in runs if not self._passed[run.handler, run.branch]]
-        if never:
-            return never[0]
+        if never:  # what is wrong about all of them is wrong first
+            return max(never, key=lambda run: self._failed[run.handler, run.branch])
         missing = [run for run in runs if {message.NAME for message in run.sent} & set(seen.missing)]
         if missing:
             return missing[0]

@@ -72,7 +72,7 @@ class Writer:
 
 
 def virtual_mission(variant: Variant) -> dict[str, Any]:
-    return mission(variant, address="10.0.0.1", broadcast="10.0.0.255", port=14600, speedup=1.0, epoch_us=0)
+    return mission(variant, address="10.0.0.1", broadcast="10.0.0.255", port=14600, speedup=1.0, keys={"epoch_us": 0})
 
 
 def given_line(action: Action, now: float, timestamp_us: int) -> dict[str, Any]:

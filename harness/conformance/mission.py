@@ -2,6 +2,8 @@
 
 import base64
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from harness.conformance.model import AGENT, INITIAL_DATA, ROSTER
@@ -10,11 +12,13 @@ from harness.play.process.mission_file import NO_QUIRKS
 from ucp.features import CONTRACT
 from ucp.mission import SCHEMA
 
+NO_KEYS: Mapping[str, Any] = MappingProxyType({})
+
 
 def mission(
-    variant: Variant, *, address: str, broadcast: str, port: int, speedup: float, **other: Any
+    variant: Variant, *, address: str, broadcast: str, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS
 ) -> dict[str, Any]:
-    """`other` keys take the place of those that are here."""
+    """`keys` take the place of those that are here."""
     return {
         "schema": SCHEMA,
         "contract": CONTRACT,
@@ -37,5 +41,5 @@ def mission(
         "speedup": speedup,
         "epoch_us": None,
         "store": None,
-        **other,
+        **keys,
     }

@@ -4,6 +4,7 @@ What is seen of it: what it broadcasts, and what it says of itself (`status`), o
 input. So nobody waits where nothing must come, but for an agent that counts its handler runs otherwise.
 """
 
+import asyncio
 import base64
 import binascii
 import dataclasses
@@ -39,10 +40,12 @@ class Pace:
     """So long after it should have come a message is late."""
     calm_s: float
     """So long nothing must have happened, if the agent does not say that it has handled its input."""
+    linger_s: float
+    """So long it is looked what else comes."""
 
 
-BESIDE_OTHERS = Pace(speedup=24.0, margin_s=0.08, early_s=0.15, patience_s=0.5, calm_s=0.08)
-ALONE = Pace(speedup=8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3)
+BESIDE_OTHERS = Pace(speedup=24.0, margin_s=0.08, early_s=0.15, patience_s=0.5, calm_s=0.08, linger_s=0.0)
+ALONE = Pace(speedup=8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1)
 
 
 class OverUdp(Subject):
@@ -112,16 +115,21 @@ class OverUdp(Subject):
         action = given.make(model)
         if action is None:
             return None
-        wrong = [f"it sent {told_datagram(data, Names(model))} unasked" for _, data in self.ear.take()]
+        self.ear.drain()
+        if self.ear.heard and not isinstance(action, Expire):  # what comes of the input could not be told from that
+            late = self._ended()
+            seen = compare(model, given, before, Outcome(()), self._heard(), {}, ["it sent something unasked"])
+            return dataclasses.replace(seen, mistimed=expired, late=late)
+        wrong: list[str] = []
         began, ends = self.now(), self._wall(deadline or 0.0) if isinstance(action, Expire) else 0.0
         waiting: list[Any] = []
         status: dict[str, Any] = {}
         mistimed = None
         try:
             if isinstance(action, Expire):
-                early = await self._wait_for_timer(ends, str(expired))
-                if early is not None:
-                    wrong, mistimed = [*wrong, early], expired
+                too_early = await self._wait_for_timer(ends, str(expired))
+                if too_early is not None:
+                    wrong, mistimed = [*wrong, too_early], expired
                 began = max(deadline or 0.0, self._first_heard())
             else:
                 waiting = await self._give(action)
@@ -137,10 +145,17 @@ class OverUdp(Subject):
             status, gave_up = await self._settle(len(outcome.sent), max(time.time(), ends))
         except (AgentEndedError, AgentRefusedError) as error:
             wrong.append(str(error))
-        seen = compare(model, given, before, outcome, [data for _, data in self.ear.take()], status, wrong)
-        following = model.agent.next_timer()
-        late = not gave_up and following is not None and self._wall(following) - time.time() < self._pace.early_s
-        return dataclasses.replace(seen, late=late, mistimed=mistimed)
+        late = not gave_up and self._ended()
+        seen = compare(model, given, before, outcome, self._heard(), status, wrong)
+        return dataclasses.replace(seen, late=late, mistimed=mistimed or seen.mistimed)
+
+    def _heard(self) -> list[bytes]:
+        return [data for _, data in self.ear.take()]
+
+    def _ended(self) -> bool:
+        """Whether the next timer may have ended by now."""
+        deadline = self.model.agent.next_timer()
+        return deadline is not None and self._wall(deadline) - time.time() < self._pace.early_s
 
     async def _wait_for_timer(self, until: float, name: str) -> str | None:
         """Until the timer's end, or until anything is heard: what is wrong about that."""
@@ -189,7 +204,10 @@ class OverUdp(Subject):
             self.ear.drain()
             handled = status.get("handled")
             if isinstance(handled, int) and handled >= should["handled"]:
-                return status, False
+                if not self._pace.linger_s:
+                    return status, False
+                await asyncio.sleep(self._pace.linger_s)
+                return await self.process.ask("status"), False
             calm = all(status.get(key, should[key]) == should[key] for key in COMPARED)
             calm_since = min(calm_since, time.time()) if calm else math.inf
             if over or time.time() - calm_since > self._pace.calm_s:

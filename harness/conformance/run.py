@@ -10,9 +10,18 @@ from pathlib import Path
 from harness.conformance import over_udp, virtual
 from harness.conformance.air import Air
 from harness.conformance.blame import Evidence
+from harness.conformance.by_hand import by_hand
 from harness.conformance.keep import keep
 from harness.conformance.results import Case, Results, Row
-from harness.conformance.suite import ALONE_AT_ONCE, FAILURES_OF_A_KIND, SIDE_BY_SIDE, Failure, Suite, Tally
+from harness.conformance.suite import (
+    ALONE_AT_ONCE,
+    FAILURES_OF_A_KIND,
+    MOST_SUSPICIONS,
+    SIDE_BY_SIDE,
+    Failure,
+    Suite,
+    Tally,
+)
 from harness.conformance.vectors import Vectors, generate
 
 IN_VIRTUAL_TIME = 2
@@ -29,19 +38,28 @@ class Asked:
     only: str | None
     keep: Path | None
     virtual: bool = False
+    by_hand: bool = True
+    enough: int = MOST_SUSPICIONS
     limit_s: float = LIMIT_S
 
 
-def conform(asked: Asked, place: Path, told: Callable[[int, int], None]) -> Results:
-    """Raises MachineError, NoAgentError. `told` is called with how many vectors have passed, of how many."""
+def conform(
+    asked: Asked, place: Path, told: Callable[[int, int], None], generated: Sequence[Vectors] | None = None
+) -> Results:
+    """Raises MachineError, NoAgentError. `told` is called with how many vectors have passed, of how many.
+
+    `generated` are other vectors than all that `asked` is about.
+    """
     results = Results(asked.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
     began = time.monotonic()
-    generated = generate(asked.only)
+    generated = generate(asked.only) if generated is None else generated
     total = sum(len(vectors.wanted) for vectors in generated)
     try:
         asyncio.run(_run(asked, place, generated, lambda count: told(count, total), results))
     except KeyboardInterrupt:
         results.interrupted = True
+    if asked.keep is not None:
+        results.cases = _kept(results.cases, asked.keep)
     results.wall_s = time.monotonic() - began
     return results
 
@@ -60,7 +78,11 @@ async def _run(
         return
     async with Air(place, asked.command, SIDE_BY_SIDE + ALONE_AT_ONCE) as air:
         start = over_udp.starting(air)
-        await _play(Suite(start, generated, told, side_by_side=SIDE_BY_SIDE), until, asked, results)
+        await _play(
+            Suite(start, generated, told, side_by_side=SIDE_BY_SIDE, enough=asked.enough), until, asked, results
+        )
+        if asked.by_hand:
+            results.cases += await by_hand(air, asked.only)
 
 
 async def _play(suite: Suite, until: float, asked: Asked, results: Results) -> None:
@@ -92,8 +114,6 @@ def _conclude(tallies: Sequence[Tally], asked: Asked, results: Results) -> None:
                 f"{tally.set_aside} vectors were set aside: the branches that they take had failed "
                 f"{FAILURES_OF_A_KIND} times"
             )
-    if asked.keep is not None:
-        results.cases = _kept(results.cases, asked.keep)
 
 
 def _case(failure: Failure, evidence: Evidence) -> Case:

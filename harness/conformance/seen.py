@@ -1,18 +1,20 @@
 """What is seen of an agent at one step, and whether it is what should have come."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from harness.conformance.alphabet import Input
-from harness.conformance.model import AGENT, Model, Outcome, Run
-from harness.conformance.states import Pair, State, pair_of
+from harness.conformance.model import AGENT, Expire, Model, Outcome, Run
+from harness.conformance.states import Pair, State, ends_next, pair_of
 from harness.conformance.words import Names, told, told_datagram
 from ucp.messages import MalformedDatagramError, Message, decode
 
 COMPARED = ("idle", "reconcile_in_progress", "chain", "deque", "stack", "completed", "reconciles", "top_chain_hash")
 """Keys of the status; what is not there is not compared."""
 SHOWN = 12
+MOST_ENDED = 3
+"""Timers that may have ended one after the other."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,9 @@ def compare(
     for key in COMPARED:
         if key in status and status[key] != should[key]:
             sentences.append(f"its status says {key} {status[key]!r}, not {should[key]!r}")
+    mistimed = _as_if_ended(model, outcome.sent, came, status) if sentences else None
+    if mistimed is not None:
+        sentences.append(f"that is as if its timer {mistimed} had ended already")
     return Seen(
         pair_of(before, given),
         outcome,
@@ -92,4 +97,21 @@ def compare(
         before,
         unexpected=tuple(message.NAME for message in unexpected),
         missing=tuple(message.NAME for message in missing),
+        mistimed=mistimed,
     )
+
+
+def _as_if_ended(
+    model: Model, expected: Sequence[Message], came: Sequence[Message], status: Mapping[str, Any]
+) -> str | None:
+    """The timer that the agent seems to have let end before its time; the reference is of no use any more then."""
+    sent, first = list(expected), ends_next(model)
+    for _ in range(MOST_ENDED):
+        deadline = model.agent.next_timer()
+        if deadline is None or not status:
+            return None
+        sent += model.feed(Expire(), deadline).sent
+        should = model.status()
+        if came == sent and all(status.get(key, should[key]) == should[key] for key in COMPARED):
+            return first
+    return None

@@ -60,7 +60,13 @@ class Suite:
     """`told` is called with how many vectors have been seen, whenever that changes."""
 
     def __init__(
-        self, start: Start, generated: Sequence[Vectors], told: Callable[[int], None], *, side_by_side: int
+        self,
+        start: Start,
+        generated: Sequence[Vectors],
+        told: Callable[[int], None],
+        *,
+        side_by_side: int,
+        enough: int = MOST_SUSPICIONS,
     ) -> None:
         self._start = start
         self._side_by_side = side_by_side
@@ -72,6 +78,7 @@ class Suite:
         self._at_work: Counter[int] = Counter()
         self._kinds: Counter[object] = Counter()
         self._in_vain = 0
+        self._enough = enough
 
     async def run(self, until: float) -> None:
         """All vectors, until that second of the monotonic clock; then what is suspected.
@@ -81,11 +88,16 @@ class Suite:
         workers = min(self._side_by_side, 1 + sum(atlas.left for atlas in self._maps) // 10)
         await _together([self._work(until) for _ in range(workers)])
         once_more = [(tally, suspicion) for tally in self.tallies for suspicion in self._worth(tally)]
-        waiting = iter(once_more[:MOST_SUSPICIONS])
+        waiting = iter(once_more[: self._enough])
         await _together([self._try_again(waiting) for _ in range(ALONE_AT_ONCE)])
 
+    @property
+    def _suspicious(self) -> bool:
+        """Whether there are as many suspicions as are tried again."""
+        return sum(len(tally.suspicions) for tally in self.tallies) >= self._enough
+
     async def _work(self, until: float) -> None:
-        while time.monotonic() < until and (number := self._most_left()) is not None:
+        while time.monotonic() < until and not self._suspicious and (number := self._most_left()) is not None:
             self._at_work[number] += 1
             try:
                 await self._tour(number, until)

@@ -142,7 +142,7 @@ class InVirtualTime(Subject):
             self._record.append(Exchange(self._now, False, data, told_datagram(data, names)))
         self._record += [Exchange(self._now, True, data, told_datagram(data, names)) for data in sent]
         seen = compare(model, given, before, outcome, sent, status, wrong)
-        return replace(seen, mistimed=mistimed)
+        return replace(seen, mistimed=mistimed or seen.mistimed)
 
     def _mistimed(self, ends: Any) -> str | None:
         """The timer that ends next, if the agent says another instant."""

@@ -1,0 +1,59 @@
+"""`ucp-harness conformance`, as a user gives it; and what is made of its results."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.conformance.air import NoAgentError
+from harness.conformance.run import Asked, conform
+from harness.conformance.states import VARIANTS, explore
+from harness.conformance.table import to_junit
+from harness.conformance.vectors import Vectors
+from harness.wrong_agents import quirky
+from tests.harness.command import harness, sentences
+
+OURS = (sys.executable, "-P", "-m", "ucp.node")
+
+
+@pytest.fixture(scope="module")
+def phase_one() -> list[Vectors]:
+    steps = list(explore(VARIANTS["default"]))
+    wanted = {step.pair: step for step in steps if step.before.doing in ("idle", "phase one") and len(step.way) <= 3}
+    assert len(wanted) > 100
+    return [Vectors(VARIANTS["default"], steps, wanted)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "which agent?"),
+        (["--only", "21", "--", "true"], "there are Algorithms 1 to 20"),
+        (["--", "./no such agent"], "no such agent"),
+    ],
+)
+def test_a_wrong_request_is_said_in_a_sentence(arguments: list[str], says: str, tmp_path: Path) -> None:
+    ended = harness("conformance", *arguments, cwd=tmp_path)
+    assert ended.returncode == 2, ended.stderr
+    assert says in sentences(ended.stderr)[-1]
+
+
+def test_in_virtual_time_ours_passes(phase_one: list[Vectors], tmp_path: Path) -> None:
+    results = conform(Asked(OURS, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one)
+    told = results.to_json()
+    assert sum(row["passed"] for row in told["algorithms"]) == len(phase_one[0].wanted)
+    assert results.exit_status == 0 and not told["cases"]
+    assert "<testsuite " in to_junit(results)
+
+
+def test_in_virtual_time_a_timer_that_is_too_short_is_named(phase_one: list[Vectors], tmp_path: Path) -> None:
+    command = (sys.executable, "-P", "-m", quirky.__name__, "hasty_phase1")
+    results = conform(Asked(command, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one)
+    assert {case.algorithm for case in results.failures} == {8}
+    assert any("its next timer ends at" in sentence for case in results.failures for sentence in case.wrong)
+
+
+def test_a_program_that_does_not_answer_is_no_agent(phase_one: list[Vectors], tmp_path: Path) -> None:
+    silent = (sys.executable, "-c", "pass")
+    with pytest.raises(NoAgentError, match="the agent does not start"):
+        conform(Asked(silent, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one)

@@ -1,0 +1,64 @@
+"""Over UDP: a right agent passes; wrong ones fail, and the right Algorithm is named."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.conformance.results import Results
+from harness.conformance.run import Asked, conform
+from harness.conformance.states import VARIANTS, explore
+from harness.conformance.table import to_junit
+from harness.conformance.vectors import Vectors
+from harness.wrong_agents import quirky
+
+pytestmark = pytest.mark.lab
+
+OURS = (sys.executable, "-P", "-m", "ucp.node")
+LIMIT_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def idle() -> list[Vectors]:
+    """What an agent does that is idle, with up to one block in its chain."""
+    steps = list(explore(VARIANTS["default"]))
+    wanted = {step.pair: step for step in steps if step.before.doing == "idle" and len(step.way) <= 1}
+    assert len(wanted) > 30
+    return [Vectors(VARIANTS["default"], steps, wanted)]
+
+
+def results_of(vectors: list[Vectors], place: Path, *command: str, keep: Path | None = None) -> Results:
+    place.mkdir()
+    asked = Asked(command, None, keep, by_hand=False, enough=4, limit_s=LIMIT_S)
+    return conform(asked, place, lambda count, total: None, vectors)
+
+
+def test_a_right_agent_passes_all(idle: list[Vectors], tmp_path: Path) -> None:
+    results = results_of(idle, tmp_path / "lab", *OURS)
+    assert not results.failures, [case.wrong for case in results.failures]
+    assert sum(row.passed for row in results.rows()) == len(idle[0].wanted)
+    assert results.exit_status == 0
+
+
+@pytest.mark.parametrize(
+    ("quirk", "algorithm"), [("approve_everything", 3), ("commit_without_succession", 6), ("diverged_and_unmoved", 13)]
+)
+def test_of_a_wrong_agent_the_algorithm_is_named(
+    quirk: str, algorithm: int, idle: list[Vectors], tmp_path: Path
+) -> None:
+    keep = tmp_path / "failures"
+    results = results_of(idle, tmp_path / "lab", sys.executable, "-P", "-m", quirky.__name__, quirk, keep=keep)
+    assert results.exit_status == 1
+    assert {case.algorithm for case in results.failures} == {algorithm}
+    first = results.failures[0]
+    assert first.directory is not None
+    assert {path.name for path in Path(first.directory).iterdir()} == {"failure.txt", "vector.jsonl", "air.pcapng"}
+    assert to_junit(results).count("<failure") == len(results.failures)
+
+
+def test_an_agent_that_lacks_what_the_settings_need_is_not_applicable(tmp_path: Path, idle: list[Vectors]) -> None:
+    variant = dataclasses.replace(VARIANTS["default"], features=("a feature that nobody has",))
+    results = results_of([dataclasses.replace(idle[0], variant=variant)], tmp_path / "lab", *OURS)
+    assert sum(row.not_applicable for row in results.rows()) == len(idle[0].wanted)
+    assert results.exit_status == 0 and "a feature that nobody has" in results.notes[0]
