@@ -43,7 +43,7 @@ def test_a_crash_is_found_and_shrunk_to_what_it_takes(tmp_path: Path) -> None:
     command = {2: small(tmp_path, EXPORT + THIRD_EVENT_KILLS)}
     events = {"source": "scripted", "script": [{"at_s": at_s, "agent": 1 + at_s % 2} for at_s in range(1, 10)]}
     asked = written(tmp_path, agent_command=command, duration_s=20, events=events)
-    done = harness("explore", asked, "--seeds", 1, "--jobs", 2, "--out", tmp_path / "shrunk.yaml")
+    done = harness("explore", asked, "--seeds", 1, "--jobs", 2, "--out", tmp_path / "shrunk.yaml", deadline_s=240)
     assert done.returncode == 1
     assert "agent 2: crashed: it ended by itself with status 1 when it was given an event at " in done.stdout
     assert "it said: the third event was too much" in done.stdout
