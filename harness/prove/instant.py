@@ -2,7 +2,7 @@
 
 Some agents act, none having heard of the others yet: so their messages cross. What they send is heard, in any order
 between different senders; then what was answered to it, and so on until nobody says anything. Who loses messages may
-lose any of them. Of a sender's messages in one go the first is heard first; what else may be is the network `any`.
+lose any of them. Of what an agent says of its own in one go the first is heard first; answers overtake each other.
 
 For each agent the outcomes of all orders, and of all losses, are worked out once and are mostly one or two.
 """
@@ -73,7 +73,7 @@ class Instants:
     def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
         """Whether it makes a difference to the agent at `place` in which order it hears what it heard of the wave."""
         reached = tuple((self.name_of(wave.air[number][0], place), wave.air[number][1]) for number in sorted(heard))
-        return len(self._outcomes_of(local, reached, lossy=False, answered=False)) > 1
+        return len(self._outcomes_of(local, reached, lossy=False, answered=wave.before is not None)) > 1
 
     def outcomes(self, locals_: tuple[int, ...], actions: Sequence[Action], lossy: bool) -> dict[Agents, Wave | None]:
         """All that may come of it, with one way to each."""
@@ -175,7 +175,7 @@ class Instants:
         key = local, heard, lossy, answered
         outcomes = self._outcomes.get(key)
         if outcomes is None:
-            outcomes = list(self._work_out(local, heard, lossy))
+            outcomes = list(self._work_out(local, heard, lossy, in_order=not answered))
             if self._bounds.reduced:
                 if answered:
                     settled = {step._replace(local=self._settled(step.local)): way for step, way in reversed(outcomes)}
@@ -185,11 +185,15 @@ class Instants:
             self._outcomes[key] = outcomes
         return outcomes
 
-    def _work_out(self, local: int, heard: Heard, lossy: bool) -> Iterator[tuple[Step, tuple[int, ...]]]:
+    def _work_out(
+        self, local: int, heard: Heard, lossy: bool, in_order: bool
+    ) -> Iterator[tuple[Step, tuple[int, ...]]]:
         matter = self._that_matter(local, heard)
         copies = 2 if self._twice else 1
         earlier = {  # of the same sender
-            position: [other for other in matter if other < position and heard[other][0] == heard[position][0]]
+            position: [
+                other for other in matter if in_order and other < position and heard[other][0] == heard[position][0]
+            ]
             for position in matter
         }
         begin = (Step(local, (), ()), tuple(copies if position in matter else 0 for position in range(len(heard))))
@@ -209,7 +213,7 @@ class Instants:
                 for other in earlier[position]:
                     still[other] = 0
                 after = (
-                    Step(step.local, sent + step.sent, self._still(started, step)),
+                    Step(step.local, tuple(sorted(sent + step.sent)), self._still(started, step)),
                     tuple(still),
                 )
                 if after not in ways:

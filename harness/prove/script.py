@@ -26,7 +26,7 @@ SETTLES_S = 60
 Document = dict[str, Any]
 
 
-@dataclass
+@dataclass(eq=False)
 class _Flight:
     """One broadcast: what it says, by which of the agents, when, and which of its kind it is."""
 
@@ -150,7 +150,7 @@ class Script:
             air += self._done(agent, step, now)
         self._end_s = max(self._end_s, acted_s)
         for wave in _in_order(move.wave):
-            air = self._hear(wave, air, acted_s)
+            air = self._hear(wave, self._as_in(wave, air), acted_s)
         self._agents = [self._agents[old] for old in move.places]
         for agent, local in zip(self._agents, move.state[AGENTS:], strict=True):
             agent.local = local
@@ -183,6 +183,16 @@ class Script:
             self._sent[agent.agent_id, name] += 1
             flights.append(_Flight(agent.agent_id, message, name, self._sent[agent.agent_id, name], now))
         return flights
+
+    def _as_in(self, wave: Wave, flights: Sequence[_Flight]) -> list[_Flight]:
+        """These flights in the order in which the wave has them."""
+        left, ordered = list(flights), []
+        for place, message in wave.air:
+            sender = self._agents[place].agent_id
+            flight = next(flight for flight in left if (flight.sender, flight.message) == (sender, message))
+            left.remove(flight)
+            ordered.append(flight)
+        return ordered
 
     def _hear(self, wave: Wave, air: Sequence[_Flight], acted_s: float) -> list[_Flight]:
         """Everybody hears what it does of what is on the air; what they answer."""

@@ -5,7 +5,7 @@ agents' local states: a tuple of small numbers. Where `bounds.reduced`, agents t
 of all orders of the agents one stands for all.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations, permutations, product
 from typing import NamedTuple
 
@@ -75,16 +75,34 @@ class Swarm:
             yield ending
             idle_hands = [place for place in alive if all(place != action.place for action in ending)]
             for count in range(1, min(left, len(idle_hands)) + 1):
-                for places in permutations(idle_hands, count):
+                for places in self._unlike(state, permutations(idle_hands, count)):
                     completed = (
                         Action(place, "complete", state[BLOCKS] + 1 + index) for index, place in enumerate(places)
                     )
                     yield (*ending, *completed)
         if left:
-            yield from ((Action(place, "complete", state[BLOCKS] + 1),) for place in alive)
+            for (place,) in self._unlike(state, ((place,) for place in alive)):
+                yield (Action(place, "complete", state[BLOCKS] + 1),)
         for bit, fault in enumerate(FAULTS):
             if state[LEFT] >> bit & 1:
                 yield from ((Action(place, fault),) for place in alive)
+
+    def _unlike(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
+        """Of all choices of agents one for each that makes a difference: agents at rest in one state are alike.
+
+        Unless somebody has heard one of them and not the other.
+        """
+        known = self.local.known
+        locals_ = state[AGENTS:]
+        if not self.bounds.reduced or any(local != DEAD and known[local].names_others for local in locals_):
+            yield from choices
+            return
+        seen = set()
+        for places in choices:
+            looks = tuple(place if known[locals_[place]].running else -1 - locals_[place] for place in places)
+            if looks not in seen:
+                seen.add(looks)
+                yield places
 
     # What comes of it
 
