@@ -1,21 +1,24 @@
 """`ucp-harness conformance`: does an agent do what Algorithms 1-20 say, alone, with its peers played?"""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from harness.commands.new_file import refuse_existing, write_new
 from harness.commands.terminal import complain, print_json
 from harness.conformance.file import to_lines
+from harness.conformance.page import read_agents, to_html
 from harness.conformance.progress import progress
-from harness.conformance.results import TITLES
+from harness.conformance.results import TITLES, Results
 from harness.conformance.run import Asked, conform
 from harness.conformance.table import render, summary, to_junit
 from harness.conformance.vectors import generate
-from harness.errors import HarnessError
+from harness.errors import HarnessError, MachineError
 from harness.play.program import located
 from harness.run.sweep import terminated_is_interrupted
 from ucp.agent import HANDLERS
@@ -39,6 +42,13 @@ def conformance_command(
         typer.Option(metavar="DIR", help="Where failures are put, with vector and capture; must be new."),
     ] = None,
     virtual: Annotated[bool, typer.Option("--virtual", help="In virtual time: COMMAND --virtual, in seconds.")] = False,
+    matrix: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Test all agents of a YAML file: name: [program, argument, ...]."),
+    ] = None,
+    page: Annotated[
+        Path, typer.Option(metavar="FILE", help="The page of --matrix, agents x Algorithms; must be new.")
+    ] = Path("conformance.html"),
     write: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Only write the generated vectors, as JSON lines; must be new.")
     ] = None,
@@ -50,6 +60,11 @@ def conformance_command(
     if write is not None:
         write_new(write, to_lines(generate(only)))
         return
+    if matrix is not None:
+        if command:
+            raise ConformanceRequestError("either --matrix with a file of agents, or one agent's command")
+        refuse_existing([page])
+        raise typer.Exit(_all_of(read_agents(matrix), only, page, virtual=virtual))
     if not command:
         raise ConformanceRequestError("which agent? `ucp-harness conformance -- python3 -m ucp.node` tests ours")
     console = Console(stderr=as_json, highlight=False)
@@ -66,6 +81,29 @@ def conformance_command(
     if results.interrupted:
         complain(f"interrupted; until then {summary(results)}")
     raise typer.Exit(results.exit_status)
+
+
+def _all_of(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *, virtual: bool) -> int:
+    """One agent after the other; their page; the exit status."""
+    console = Console(highlight=False)
+    outcomes: dict[str, Results | str] = {}
+    for name, command in agents.items():
+        with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
+            try:
+                asked = Asked(tuple(located(list(command), "the agent")), only, None, virtual)
+                outcomes[name] = conform(asked, Path(scratch), told)
+            except MachineError:
+                raise
+            except HarnessError as error:
+                outcomes[name] = str(error)
+        outcome = outcomes[name]
+        console.print(Text(f"{name}: {outcome if isinstance(outcome, str) else summary(outcome)}"), soft_wrap=True)
+        if isinstance(outcome, Results) and outcome.interrupted:
+            break
+    write_new(page, [to_html(outcomes)])
+    console.print(Text(str(page)), soft_wrap=True)
+    statuses = [outcome.exit_status if isinstance(outcome, Results) else 2 for outcome in outcomes.values()]
+    return max(statuses, default=0)
 
 
 def _fresh(place: Path) -> Path:

@@ -83,17 +83,17 @@ class Evidence:
         return Blamed(STARTS[str(failure.seen.mistimed)], "")
 
     def _suspect(self, runs: Sequence[Run], failure: Failure) -> Run:
-        """Who should have sent what is missing, or sends what is too much; of these, whose branch passes least."""
+        """Who sends what is too much, or should have sent what is missing; of these, whose branch passes least."""
         seen = failure.seen
         if len(runs) == 1:
             return runs[0]
         never = [run for run in runs if not self._passed[run.handler, run.branch]]
         if never:  # what is wrong about all of them is wrong first
             return max(never, key=lambda run: self._failed[run.handler, run.branch])
-        missing = [run for run in runs if {message.NAME for message in run.sent} & set(seen.missing)]
-        if missing:
-            return missing[0]
         sends = [run for run in runs if {kind.NAME for kind in HANDLERS[run.handler].sends} & set(seen.unexpected)]
         if sends:
             return sends[0]
+        missing = [run for run in runs if {message.NAME for message in run.sent} & set(seen.missing)]
+        if missing:
+            return missing[0]
         return min(runs, key=lambda run: self._passed[run.handler, run.branch])
