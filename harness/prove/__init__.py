@@ -12,6 +12,7 @@ times.py      mission seconds for a way through the graph
 script.py     a way through the graph as a scenario that the simulation plays
 prove.py      all of that together
 words.py      what came out, for people
+wrong_agents.py  what tells each wrong agent from the right one
 """
 
 from harness.prove.bounds import Bounds, BoundsError, Network

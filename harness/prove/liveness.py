@@ -47,9 +47,9 @@ def look(graph: Graph) -> Liveness:
                 votes[number] = _vote(graph, number)
         while len(graph.quiet) < len(graph.states):
             quieten(graph, len(graph.quiet))
-        safe |= {number for number in range(reachable, len(graph.states)) if _is_one(graph, number)}
-        safe = _attracted(graph, safe)
-        safe = _attracted(graph, safe | {number for number, choices in votes.items() if choices & safe})
+        safe = _attracted(graph, {number for number in range(len(graph.states)) if _is_one(graph, number)})
+        for _ in result.astray:  # one vote more, each time, of which all that follows is known by now
+            safe = _attracted(graph, safe | {number for number, choices in votes.items() if choices & safe})
 
 
 def _is_one(graph: Graph, number: int) -> bool:
