@@ -52,10 +52,10 @@ def conform(
     """
     results = Results(asked.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
     began = time.monotonic()
-    generated = generate(asked.only) if generated is None else generated
-    total = sum(len(vectors.wanted) for vectors in generated)
     try:
-        asyncio.run(_run(asked, place, generated, lambda count: told(count, total), results))
+        chosen = generate(asked.only) if generated is None else generated
+        total = sum(len(vectors.wanted) for vectors in chosen)
+        asyncio.run(_run(asked, place, chosen, lambda count: told(count, total), results))
     except KeyboardInterrupt:
         results.interrupted = True
     if asked.keep is not None:
