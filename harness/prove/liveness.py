@@ -12,6 +12,9 @@ from harness.prove.instant import Action
 from harness.prove.local import DEAD
 from harness.prove.swarm import AGENTS, BLOCKS
 
+MOST_ADDED = 200_000
+"""States that votes add, with wrong agents without end; with more it is not decided whether there is one chain."""
+
 
 @dataclass
 class Liveness:
@@ -25,6 +28,8 @@ class Liveness:
     cycles: list[list[int]] = field(default_factory=list)
     astray: list[int] = field(default_factory=list)
     lost: int | None = None
+    decided: bool = True
+    """Whether all that follows more votes was looked at."""
 
 
 def look(graph: Graph) -> Liveness:
@@ -46,6 +51,9 @@ def look(graph: Graph) -> Liveness:
             if number not in votes:
                 votes[number] = _vote(graph, number)
         while len(graph.quiet) < len(graph.states):
+            if len(graph.states) > reachable + MOST_ADDED:
+                result.decided = False
+                return result
             quieten(graph, len(graph.quiet))
         safe = _attracted(graph, {number for number in range(len(graph.states)) if _is_one(graph, number)})
         for _ in result.astray:  # one vote more, each time, of which all that follows is known by now

@@ -90,7 +90,7 @@ class Proof:
             return VIOLATED
         if self.ended == "interrupted":
             return INTERRUPTED
-        return 0 if self.complete else INCOMPLETE
+        return 0 if self.complete and (live is None or live.decided) else INCOMPLETE
 
     def to_json(self) -> dict[str, Any]:
         bounds, live, flaw = self.bounds, self.liveness, self.flaw

@@ -59,12 +59,14 @@ def _of_the_whole(proof: Proof) -> Iterator[str]:
     after = (
         "without another vote" if not votes else "after one more vote" if votes == 1 else f"after {votes} more votes"
     )
-    if live.lost is None:
+    if not live.decided:
+        yield "- not decided, one chain: what may follow more votes is more than is looked at"
+    elif live.lost is None:
         yield f"✔ holds, one chain: from every state some way without losses leads to rest with one chain, {after}"
     else:
         states = f"{live.astray[-1]:,} states"
         yield f"✘ not shown, one chain: from {states} no way without losses leads to rest with one chain, even {after}"
-    if votes:
+    if votes and live.decided:
         counts = ", ".join(f"{count:,} with {number}" for number, count in enumerate(live.astray[:-1]))
         yield f"    states that cannot yet, by how many more votes there are: {counts}"
     yield f"    {live.forks:,} states are at rest with several chains, and stay so until somebody votes"

@@ -31,6 +31,8 @@ def told_by(quirk: str) -> str:
         return "no way to one chain"
     if live.cycles:
         return "livelock"
+    if not live.decided:
+        return "not decided (states)"
     return "more votes for one chain" if len(live.astray) > 2 else "not told"
 
 
