@@ -205,9 +205,9 @@ class OverUdp(Subject):
             handled = status.get("handled")
             if isinstance(handled, int) and handled >= should["handled"]:
                 if not self._pace.linger_s:
-                    return status, False
+                    return status, over
                 await asyncio.sleep(self._pace.linger_s)
-                return await self.process.ask("status"), False
+                return await self.process.ask("status"), over
             calm = all(status.get(key, should[key]) == should[key] for key in COMPARED)
             calm_since = min(calm_since, time.time()) if calm else math.inf
             if over or time.time() - calm_since > self._pace.calm_s:
