@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from harness.conformance.seen import Exchange
-from harness.errors import INTERRUPTED, VIOLATED
+from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED
 from ucp.agent import HANDLERS
 from ucp.trace import in_base64
 
@@ -113,10 +113,17 @@ class Results:
         return [case for case in self.cases if case.verdict == "failed"]
 
     @property
+    def not_tried(self) -> int:
+        return sum(row.not_tried for row in self.rows())
+
+    @property
     def exit_status(self) -> int:
+        """What was not tried has not passed."""
         if self.interrupted:
             return INTERRUPTED
-        return VIOLATED if self.failures else 0
+        if self.failures:
+            return VIOLATED
+        return CANNOT_HERE if self.not_tried else 0
 
     def to_json(self) -> dict[str, Any]:
         return {

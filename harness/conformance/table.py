@@ -7,12 +7,17 @@ from rich.table import Table
 from rich.text import Text
 
 from harness.conformance.results import Case, Results, Row
+from harness.errors import CANNOT_HERE
 from harness.present.junit import Case as JunitCase
 from harness.present.junit import to_xml
 
 EXCHANGES_SHOWN = 14
 FAILURES_SHOWN = 12
 WRONG_SHOWN = 6
+NOT_TRIED = (
+    "Some vectors could not be tried in the time that there is: try again on a less busy machine, with one Algorithm "
+    "(--only), or in virtual time (--virtual)."
+)
 
 
 def render(results: Results) -> RenderableType:
@@ -31,7 +36,10 @@ def render(results: Results) -> RenderableType:
         if case.verdict == "not applicable":
             parts.append(Text(f"not applicable: {case.name}: {case.reason}", style="yellow"))
     parts += [Text(note, style="yellow") for note in results.notes]
-    parts.append(Text(summary(results), style="bold red" if results.failures else "bold green"))
+    if results.exit_status == CANNOT_HERE:
+        parts.append(Text(NOT_TRIED, style="yellow"))
+    colour = "red" if results.failures else "yellow" if results.exit_status else "green"
+    parts.append(Text(summary(results), style=f"bold {colour}"))
     return Group(*parts)
 
 
@@ -41,8 +49,8 @@ def summary(results: Results) -> str:
     words = f"{passed} passed, {failed} failed"
     if not_applicable := sum(row.not_applicable for row in rows):
         words += f", {not_applicable} not applicable"
-    if not_tried := sum(row.not_tried for row in rows):
-        words += f", {not_tried} not tried"
+    if results.not_tried:
+        words += f", {results.not_tried} not tried"
     return f"{words}; {results.wall_s:.0f} s"
 
 
@@ -88,10 +96,12 @@ def to_junit(results: Results) -> str:
 
 def _junit_cases(results: Results) -> Iterator[JunitCase]:
     for number, row in sorted(results.counted.items()):
+        algorithm = f"Algorithm {row.title}: " if number else ""
         if row.passed:
-            yield JunitCase(f"Algorithm {row.title}: {row.passed} vectors" if number else f"{row.passed} vectors")
-        elif row.not_applicable or row.not_tried:
-            yield JunitCase(f"Algorithm {row.title}", skipped="not tried")
+            yield JunitCase(f"{algorithm}{row.passed} vectors")
+        for count, why in ((row.not_applicable, "not applicable"), (row.not_tried, "not tried")):
+            if count:
+                yield JunitCase(f"{algorithm}{count} vectors {why}", skipped=why)
     for case in results.cases:
         if case.verdict == "failed":
             yield JunitCase(headline(case), list(lines_of(case)))

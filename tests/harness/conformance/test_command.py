@@ -46,6 +46,13 @@ def test_in_virtual_time_ours_passes(phase_one: list[Vectors], tmp_path: Path) -
     assert "<testsuite " in to_junit(results)
 
 
+def test_what_was_not_tried_has_not_passed(phase_one: list[Vectors], tmp_path: Path) -> None:
+    asked = Asked(OURS, None, None, virtual=True, limit_s=0.0)
+    results = conform(asked, tmp_path, lambda count, total: None, phase_one)
+    assert results.not_tried and not results.failures and results.exit_status == 3
+    assert "vectors not tried" in to_junit(results)
+
+
 def test_in_virtual_time_a_timer_that_is_too_short_is_named(phase_one: list[Vectors], tmp_path: Path) -> None:
     command = (sys.executable, "-P", "-m", quirky.__name__, "hasty_phase1")
     results = conform(Asked(command, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one)
