@@ -3,6 +3,7 @@
 They are skipped where there is none, and say why.
 """
 
+import os
 import signal
 
 import pytest
@@ -13,6 +14,10 @@ from tests.machine import require, require_docker, require_uml
 # How fast a machine is, is no property of the code.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
+
+# Where a build server says that it is one, pytest tells failures at greater length; tests of pytest read what it tells.
+for _build_server in ("CI", "BUILD_NUMBER"):
+    os.environ.pop(_build_server, None)
 
 # Where Ctrl-C is ignored (`make test &` in a script, some build servers) children would ignore it too, and tests press
 # it. What is handled here, if only by doing nothing, is at its default in them.

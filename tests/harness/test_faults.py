@@ -135,7 +135,7 @@ def test_losing_a_block_over_a_brown_out_is_a_violation(monkeypatch: pytest.Monk
     alone = [{"at_s": 0, "partition": [[2], [1, 3, 4, 5]]}, {"at_s": 400, "heal": True}]
     reboot = {"at_s": 300, "reboot": [2], "down_s": 30, "disk": "kept"}
     assert verdicts(played([*alone, reboot], final_reconcile=True)) == {"holds"}
-    monkeypatch.setattr("harness.play.simulation.backend.StoredState.of", lambda agent: StoredState())
+    monkeypatch.setattr("harness.play.simulation.agents.StoredState.of", lambda agent: StoredState())
     assert played([*alone, reboot], final_reconcile=True).result.characteristics["5"].verdict == "violated"
 
 

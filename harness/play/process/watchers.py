@@ -41,8 +41,12 @@ class Watchers:
             task.cancel()
 
     def task(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """One that the mission waits for."""
-        return self._group.create_task(coroutine)
+        """One that the mission waits for. Raises RuntimeError if the mission is ending by a failure already."""
+        try:
+            return self._group.create_task(coroutine)
+        except RuntimeError:
+            coroutine.close()
+            raise
 
 
 async def unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Event) -> T:
