@@ -4,8 +4,8 @@ Other settings make other agents. Of theirs only those count that differ from th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 from harness.conformance.model import Outcome
 from harness.conformance.states import VARIANTS, Pair, Step, Variant, explore, in_short
@@ -26,6 +26,17 @@ class Vectors:
 
 def generate(only: str | None = None) -> list[Vectors]:
     """The same at each call. `only`: a number or name of a handler, to whose branches the vectors are limited."""
+    if only is None:
+        return list(_all())
+    return [
+        replace(vectors, wanted={pair: step for pair, step in vectors.wanted.items() if is_of(step.outcome, only)})
+        for vectors in _all()
+    ]
+
+
+@cache
+def _all() -> tuple[Vectors, ...]:
+    """Made once, for however many agents: it takes seconds."""
     usual: dict[Pair, tuple[object, ...]] = {}
     generated = []
     for variant in VARIANTS.values():
@@ -33,10 +44,8 @@ def generate(only: str | None = None) -> list[Vectors]:
         told = {step.pair: in_short(step.outcome) for step in steps}
         wanted = {step.pair: step for step in steps if usual.get(step.pair) != told[step.pair]}
         usual = usual or told
-        if only is not None:
-            wanted = {pair: step for pair, step in wanted.items() if is_of(step.outcome, only)}
         generated.append(Vectors(variant, steps, wanted))
-    return generated
+    return tuple(generated)
 
 
 def is_of(outcome: Outcome, only: str) -> bool:
