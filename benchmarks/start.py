@@ -1,4 +1,4 @@
-"""How soon an agent is ready, and how large: `python -m benchmarks.start 0a5c1e6 [--rounds 20]`.
+"""How soon an agent is ready, and how large: `python -m benchmarks.start 00ebe8b [--rounds 20]`.
 
 Another revision of the project is checked out beside, and agents of both start in turn, alone on loopback: believe the
 ratios, of the same round. Ready is when the control socket answers; the processor time is of the whole process by then.
