@@ -60,8 +60,9 @@ class TraceFile:
         self.problem: str | None = None
         self._file: BinaryIO = path.open("a+b", buffering=0)
         end = _end_of_last_line(self._file)
-        self._file.truncate(end)
-        self._file.seek(end)
+        if self._file.seek(0, os.SEEK_END) > end:
+            self._file.truncate(end)
+            self._file.seek(end)
 
     def write(self, lines: str) -> None:
         if self.problem is not None or not lines:

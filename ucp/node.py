@@ -320,15 +320,17 @@ class Node:
 
 
 def _broadcast_socket(mission: Mission) -> socket.socket:
-    """A socket on the mission's port that hears broadcasts. Raises OSError."""
+    """A socket on the mission's port that hears broadcasts. Raises OSError, which names the port."""
+    port = mission.network.port
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        sock.bind(("", mission.network.port))
-    except OSError:
+        sock.bind(("", port))
+    except OSError as error:
         sock.close()
-        raise
+        way_out = "another agent may be running here, or choose another port"
+        raise OSError(error.errno, f"{error.strerror}; {way_out}", f"UDP port {port}") from None
     return sock
 
 
@@ -354,11 +356,8 @@ def main(arguments: list[str], node: Callable[[Mission, Path], Node] = Node) -> 
         sys.stderr.write(f"{error}\n")
         return WRONG_MISSION
     except OSError as error:
-        what = f"UDP port {mission.network.port}: " if error.filename is None else ""
-        message = f"agent {mission.agent_id}: {what}{error.strerror}{f': {error.filename}' if error.filename else ''}"
-        sys.stderr.write(
-            f"{message}; another agent may be running here, or choose another port\n" if what else f"{message}\n"
-        )
+        what = f"{error.filename}: " if error.filename else ""
+        sys.stderr.write(f"agent {mission.agent_id}: {what}{error.strerror or error}\n")
         return WRONG_MISSION
 
 

@@ -5,6 +5,7 @@ snapshot.py   an agent's whole state: copied, put back, as a key
 local.py      local states by number; each step computed once, by the real agent
 zones.py      how long timers have yet to run, compared with each other
 instant.py    what an instant makes of the agents: who hears what in which order, and loses what
+alone.py      network any: each agent by itself, against all that could ever be sent
 swarm.py      global states, and all that may happen next
 explore.py    all of them, breadth first
 liveness.py   whether there is always a way to rest with one chain, and whether one goes round for ever

@@ -495,6 +495,33 @@ def test_half_a_line_that_a_killed_agent_left_is_cut_away_before_its_trace_goes_
     assert path.read_text() == ("{}\n" if left.startswith("{}") else "") + '{"schema"}\n'
 
 
+def test_a_full_disk_ends_the_trace_and_not_the_agent(directory: Path) -> None:
+    (directory / "7.trace.jsonl").symlink_to("/dev/full")
+    agent = AgentUnderTest(directory, mission(epoch_us=round(time.time() * 1e6)))
+    agent.wait_for(lambda: agent.ask("status")["trace_problem"] == "No space left on device")
+    agent.process.terminate()
+    assert agent.process.wait(DEADLINE_S) == 0
+
+
+def test_what_cannot_be_had_is_named_and_is_not_the_port_unless_it_is(directory: Path) -> None:
+    (directory / "7.trace.jsonl").mkdir()
+    agent = AgentUnderTest(directory, mission())
+    assert (
+        agent.process.communicate(timeout=DEADLINE_S)[1] == f"agent 7: {directory / '7.trace.jsonl'}: Is a directory\n"
+    )
+    (directory / "7.trace.jsonl").rmdir()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("", 0))
+        port = taken.getsockname()[1]
+        network = {"address": "127.0.0.1", "broadcast": "127.255.255.255", "port": port}
+        agent = AgentUnderTest(directory, mission(network=network))
+        said = agent.process.communicate(timeout=DEADLINE_S)[1]
+    assert agent.process.returncode == 2
+    assert said == (
+        f"agent 7: UDP port {port}: Address already in use; another agent may be running here, or choose another port\n"
+    )
+
+
 def test_an_agent_that_joins_late_logs_no_events_of_before(directory: Path) -> None:
     """Else it would log a whole mission's at once."""
     epoch_us = round((time.time() - 100) * 1e6)
