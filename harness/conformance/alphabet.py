@@ -288,26 +288,34 @@ _message(
     lambda model: _succeeding(model, model.state.reconcile_stack[-1]) if model.state.reconcile_stack else None,
 )
 
-# Chain Contain Query and Response
+# Chain Contain Query and Chain Hash Successor Query
 
-_message("Chain Contain Query about the top", lambda model: ChainContainQuery(_top(model)))
-_message(
-    "Chain Contain Query about the inception block",
-    lambda model: ChainContainQuery(_chain_hashes(model)[0]) if len(model.state.chain) else None,
-)
-_message(
-    "Chain Contain Query about the chain below the top",
-    lambda model: ChainContainQuery(below) if len(model.state.chain) > 1 and (below := _below(model)) else None,
-)
-_message("Chain Contain Query about an unknown chain", lambda model: ChainContainQuery(UNKNOWN))
+for _query in (ChainContainQuery, ChainHashSuccessorQuery):
+    _message(f"{_query.NAME} about the top", lambda model, query=_query: query(_top(model)))  # type: ignore[misc]
+    _message(
+        f"{_query.NAME} about the inception block",
+        lambda model, query=_query: (  # type: ignore[misc]
+            query(_chain_hashes(model)[0]) if len(model.state.chain) else None
+        ),
+    )
+    _message(
+        f"{_query.NAME} about the chain below the top",
+        lambda model, query=_query: (  # type: ignore[misc]
+            query(below) if len(model.state.chain) > 1 and (below := _below(model)) else None
+        ),
+    )
+    _message(f"{_query.NAME} about an unknown chain", lambda model, query=_query: query(UNKNOWN))  # type: ignore[misc]
+    _message(
+        f"{_query.NAME} about the chain with the popped block",
+        lambda model, query=_query: query(popped) if (popped := _popped(model)) else None,  # type: ignore[misc]
+    )
 _message(
     "Chain Contain Query that names a block's hash",
     lambda model: ChainContainQuery(top.block_hash) if (top := _top_block(model)) else None,
 )
-_message(
-    "Chain Contain Query about the chain with the popped block",
-    lambda model: ChainContainQuery(popped) if (popped := _popped(model)) else None,
-)
+
+# Chain Contain Response
+
 for _contained, _word in ((True, "yes"), (False, "no")):
     for _who, _sender in (("", _nobody_yet(_of_phase_1)), (" of who has answered", _again(_of_phase_1))):
         _message(
@@ -334,22 +342,7 @@ for _contained, _word in ((True, "yes"), (False, "no")):
         f"Chain Contain Response {_word}",
     )
 
-# Chain Hash Successor Query, Next in Sequence Response
-
-_message("Chain Hash Successor Query about the top", lambda model: ChainHashSuccessorQuery(_top(model)))
-_message(
-    "Chain Hash Successor Query about the inception block",
-    lambda model: ChainHashSuccessorQuery(_chain_hashes(model)[0]) if len(model.state.chain) else None,
-)
-_message(
-    "Chain Hash Successor Query about the chain below the top",
-    lambda model: ChainHashSuccessorQuery(below) if len(model.state.chain) > 1 and (below := _below(model)) else None,
-)
-_message("Chain Hash Successor Query about an unknown chain", lambda model: ChainHashSuccessorQuery(UNKNOWN))
-_message(
-    "Chain Hash Successor Query about the chain with the popped block",
-    lambda model: ChainHashSuccessorQuery(popped) if (popped := _popped(model)) else None,
-)
+# Next in Sequence Response
 
 
 def _phase_two(model: Model) -> bool:
