@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from harness.conformance.alphabet import INPUTS, LOG, TIMER, Input
 from harness.conformance.model import AGENT, OLD_US, YOUNG_US, Model, Outcome
+from harness.conformance.moment import Moment
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.reconcile import IS_TOP_OF_CHAIN
 from ucp.settings import Settings
@@ -167,35 +168,34 @@ def advance(model: Model, given: Input, now: float) -> tuple[Outcome, float] | N
 def explore(variant: Variant) -> Iterator[Step]:
     """Each pair of a state and an input, once, by the shortest way to it; the same at each call."""
     seen: set[Pair] = set()
-    reached: dict[State, tuple[str, ...]] = {}
-    start = state_of(Model(variant.settings))
-    reached[start] = ()
-    waiting = deque([start])
+    model = Model(variant.settings)
+    start = state_of(model)
+    reached = {start}
+    waiting = deque([(start, (), Moment(model), 0.0)])
     while waiting and len(reached) < MOST_STATES:
-        before = waiting.popleft()
-        way = reached[before]
-        model, now = walk(variant, way)
+        before, way, moment, now = waiting.popleft()
+        model = moment.put_back()
         for given in INPUTS.values():
             pair = pair_of(before, given)
             if (
                 pair in seen
                 or _too_much(model, before, given)
-                or (given.first and not _tells(variant, way, before, given))
+                or (given.first and not _tells(moment, now, before, given))
             ):
                 continue
             expired = ends_next(model) if given.tally == "timer" else None
             advanced = advance(model, given, now)
             if advanced is None:
                 continue
-            outcome, _ = advanced
+            outcome, then = advanced
             seen.add(pair)
             after = state_of(model)
             yield Step(pair, way, before, after, outcome, expired)
             if after not in reached:
-                reached[after] = (*way, given.name)
-                waiting.append(after)
+                reached.add(after)
+                waiting.append((after, (*way, given.name), Moment(model), then))
             if not _unchanged(outcome):
-                model, now = walk(variant, way)
+                moment.put_back()
 
 
 def walk(variant: Variant, way: tuple[str, ...]) -> tuple[Model, float]:
@@ -242,18 +242,19 @@ COUNTED_IN = {
 """What the agent does and holds in those states in which it is looked at whether it counted what it should not."""
 
 
-def _tells(variant: Variant, way: tuple[str, ...], before: State, given: Input) -> bool:
+def _tells(moment: Moment, now: float, before: State, given: Input) -> bool:
     """Whether an agent that counts the input would do otherwise at the end of the timer."""
     if (before.doing, before.holds) not in COUNTED_IN or given.first is None or given.as_if is None:
         return False
-    rightly = _then_timer(variant, way, given.first, counts=False)
-    wrongly = _then_timer(variant, way, given.as_if, counts=True)
+    rightly = _then_timer(moment, now, given.first, counts=False)
+    wrongly = _then_timer(moment, now, given.as_if, counts=True)
+    moment.put_back()
     return rightly is not None and wrongly is not None and in_short(rightly) != in_short(wrongly)
 
 
-def _then_timer(variant: Variant, way: tuple[str, ...], name: str, *, counts: bool) -> Outcome | None:
+def _then_timer(moment: Moment, now: float, name: str, *, counts: bool) -> Outcome | None:
     """What comes when the timer ends after this input; None if there is no such, or it is not one that counts so."""
-    model, now = walk(variant, way)
+    model = moment.put_back()
     advanced = advance(model, INPUTS[name], now)
     if advanced is None or advanced[0].runs[0].handler not in COUNTING or _unchanged(advanced[0]) is counts:
         return None
