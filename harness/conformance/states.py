@@ -171,7 +171,7 @@ def explore(variant: Variant) -> Iterator[Step]:
     model = Model(variant.settings)
     start = state_of(model)
     reached = {start}
-    waiting = deque([(start, (), Moment(model), 0.0)])
+    waiting: deque[tuple[State, tuple[str, ...], Moment, float]] = deque([(start, (), Moment(model), 0.0)])
     while waiting and len(reached) < MOST_STATES:
         before, way, moment, now = waiting.popleft()
         model = moment.put_back()
