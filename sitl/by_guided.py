@@ -16,7 +16,7 @@ from sitl.mission import SPEED_TYPES, on_earth
 from sitl.procedure import Commander, HopelessError, Step
 from sitl.route import Waypoint, limit_s
 from sitl.take_off import TakeOff
-from sitl.vehicle import Home, VehicleType
+from sitl.vehicle import VehicleType
 
 GUIDED = Step("mode GUIDED")
 
@@ -41,11 +41,11 @@ class GuidedFlight:
 
     purpose = "fly its plan"
 
-    def __init__(self, link: Link, vehicle_type: VehicleType, waypoints: Sequence[Waypoint], home: Home) -> None:
+    def __init__(self, link: Link, vehicle_type: VehicleType, waypoints: Sequence[Waypoint]) -> None:
         self._to = Commander(link, vehicle_type)
         self._waypoints = waypoints
         self._legs = [Step(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]
-        self._home = home
+        self._home = link.home
         self._take_off: TakeOff | None = TakeOff(link, vehicle_type, waypoints[0].place.up_m)
         self._landing: MissionFlight | None = None
         lands = vehicle_type == "plane" and waypoints[-1].kind == "land"
@@ -69,7 +69,7 @@ class GuidedFlight:
                 raise HopelessError(f"it disarmed on {leg.name}")
             if self._done == self._landing_begins:
                 rest = self._waypoints[self._done :]  # its approach and its landing
-                self._landing = MissionFlight(self._to.link, "plane", rest, self._home, under_way=True)
+                self._landing = MissionFlight(self._to.link, "plane", rest, under_way=True)
                 return self._landing.next_step()
             if waypoint.kind == "land":
                 return leg

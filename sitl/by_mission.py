@@ -10,7 +10,7 @@ from sitl.link import Link
 from sitl.mission import Mission, Upload
 from sitl.procedure import ARM, HEARTBEAT, READY, Commander, HopelessError, Step
 from sitl.route import Waypoint, limit_s
-from sitl.vehicle import Home, VehicleType
+from sitl.vehicle import VehicleType
 
 GUIDED = Step("mode GUIDED")
 AUTO = Step("mode AUTO")
@@ -28,12 +28,12 @@ class MissionFlight:
     purpose = "fly its plan"
 
     def __init__(
-        self, link: Link, vehicle_type: VehicleType, waypoints: Sequence[Waypoint], home: Home, under_way: bool = False
+        self, link: Link, vehicle_type: VehicleType, waypoints: Sequence[Waypoint], under_way: bool = False
     ) -> None:
         self._to = Commander(link, vehicle_type)
         self._waypoints = waypoints
         self._legs = [Step(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]
-        self._mission = Mission(waypoints, home, link.sysid, vehicle_type)
+        self._mission = Mission(waypoints, link.home, link.sysid, vehicle_type)
         self._upload = Upload(link, self._mission)
         self._under_way = under_way
         self._done = 0  # waypoints

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.state import Battery, Position, VehicleState
 from sitl.tlog import TelemetryLog
+from sitl.vehicle import Home
 
 GCS_SYSTEM = 255  # what ArduPilot takes for its ground station unless told otherwise
 HEARTBEAT_INTERVAL_S = 1.0  # of our time
@@ -41,9 +42,13 @@ class Link(asyncio.Protocol):
     `heartbeat_at` and `position_at` are those of time.monotonic().
     """
 
-    def __init__(self, sysid: int, sock: socket.socket, tlog: Path, speedup: float) -> None:
-        """Take over `sock`, already connected to the vehicle. Raises OSError when `tlog` cannot be opened."""
+    def __init__(self, sysid: int, sock: socket.socket, tlog: Path, speedup: float, home: Home) -> None:
+        """Take over `sock`, already connected to the vehicle, which was started at `home`.
+
+        Raises OSError when `tlog` cannot be opened.
+        """
         self.sysid = sysid
+        self.home = home
         self.speedup = speedup
         self.tlog_path = tlog
         self.state = VehicleState()
@@ -79,6 +84,7 @@ class Link(asyncio.Protocol):
         self._asked_at: float | None = None  # for telemetry
         self._first_time: tuple[float, float] | None = None  # wall, simulated
         self._last_time: tuple[float, float] | None = None
+        self._estimate_is_good = False
 
     async def start(self) -> None:
         """Begin to read, to log and to send heartbeats."""
@@ -214,19 +220,21 @@ class Link(asyncio.Protocol):
         # firmware older than 4.0 does not report its pre-arm checks; it is asked to arm and says no
         reports = message.onboard_control_sensors_present & check
         self.state.ready_to_arm = not reports or bool(message.onboard_control_sensors_health & check)
+        tells = message.onboard_control_sensors_present & mavlink.MAV_SYS_STATUS_AHRS
+        self._estimate_is_good = not tells or bool(message.onboard_control_sensors_health & tells)
         voltage, left = message.voltage_battery, message.battery_remaining
         self.state.battery = Battery(None if voltage == 0xFFFF else voltage / 1e3, None if left < 0 else left / 100)
 
     def _on_position(self, message: Any) -> None:
         self.position_at = self.heard_at
         self._on_time(message)
-        if message.lat == 0 and message.lon == 0:  # ArduPilot before its first fix
-            return
+        if not self._estimate_is_good or (message.lat == 0 and message.lon == 0):
+            return  # ArduPlane 4.7 says after its boot that it is near 0 N, 0 E, and a rover that its altitude is 0
         self.state.position = Position(
             message.lat / 1e7,
             message.lon / 1e7,
             message.alt / 1e3,
-            message.relative_alt / 1e3,
+            message.alt / 1e3 - self.home.alt_m,
             message.vx / 100,
             message.vy / 100,
             -message.vz / 100,
@@ -237,6 +245,7 @@ class Link(asyncio.Protocol):
         now = (self.heard_at, message.time_boot_ms / 1e3)
         if self._last_time is None or now[1] < self._last_time[1] - 1.0:  # first heard, or rebooted
             self._first_time = now
+            self._estimate_is_good = False
         self._last_time = now
         self.state.time_s = now[1]
 

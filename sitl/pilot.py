@@ -40,15 +40,17 @@ class Pilot:
         sock: socket.socket,
         tlog: Path,
         speedup: float,
+        home: Home,
         vehicle_type: VehicleType = "copter",
         vehicle_id: int | None = None,
     ) -> None:
-        """Take over `sock`, already connected to the vehicle's pilot port. `speedup` is what the vehicle was given.
+        """Take over `sock`, already connected to the vehicle's pilot port. `speedup` is what the vehicle was given,
+        `home` where it was started.
 
         `vehicle_id` is what errors call the vehicle, if not by its system ID. Raises OSError when `tlog` cannot be
         opened.
         """
-        self.link = Link(sysid, sock, tlog, speedup)
+        self.link = Link(sysid, sock, tlog, speedup, home)
         self.vehicle_type: VehicleType = vehicle_type
         self.vehicle_id = sysid if vehicle_id is None else vehicle_id
         self._terminated = False
@@ -74,14 +76,14 @@ class Pilot:
         """Return at `altitude_m` above home; a rover is armed in GUIDED, and that is all. Raises FlightError."""
         await self._pursue(TakeOff(self.link, self.vehicle_type, altitude_m))
 
-    async def fly(self, plan: Plan, by: By, home: Home) -> None:
-        """Return when the plan's last leg is done. `home` is where the vehicle was started.
+    async def fly(self, plan: Plan, by: By) -> None:
+        """Return when the plan's last leg is done.
 
         Raises PlanError if this type of vehicle cannot fly the plan, FlightError if it does not.
         """
-        waypoints = route(plan, self.vehicle_type, home.heading_deg)
+        waypoints = route(plan, self.vehicle_type, self.link.home.heading_deg)
         flight = MissionFlight if by == "mission" else GuidedFlight
-        await self._pursue(flight(self.link, self.vehicle_type, waypoints, home))
+        await self._pursue(flight(self.link, self.vehicle_type, waypoints))
 
     async def terminate_flight(self) -> None:
         """Disarm in flight, by force, and return when the vehicle lies on the ground. Raises FlightError.

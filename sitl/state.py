@@ -38,7 +38,7 @@ class VehicleState:
     mode: int | None = None  # ArduPilot's custom_mode
     armed: bool = False
     ready_to_arm: bool | None = None
-    position: Position | None = None  # not before it has one
+    position: Position | None = None  # as it last said while its estimate was good
     battery: Battery | None = None
     time_s: float | None = None  # simulated, since boot
     item: int | None = None  # of the mission, where it is heading

@@ -24,7 +24,7 @@ from harness.logbook.text import document, lines
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.mission import CONNECTED, edit, fly, write_exports, write_run
 from tests.ucp.air import Air
-from tests.ucp.test_telemetry import frames, heartbeat, place, text
+from tests.ucp.test_telemetry import frames, good_estimate, heartbeat, place, text
 from ucp.events import LoggableEvent, decode_events
 from ucp.telemetry import EVENT_KINDS, POSITION, STATUS_TEXT, WAYPOINT, Position, TelemetryEvents
 
@@ -43,7 +43,11 @@ def fly_vehicles(agents: int = 3, seconds: int = 240) -> Air:
     for second in range(seconds):
         air.run_until(float(second))
         for agent_id, source in sources.items():
-            said = [heartbeat(4, armed=second > 2), place(1000 * second, 500_000_000 + agent_id, 80_000_000 + second)]
+            said = [
+                good_estimate(),
+                heartbeat(4, armed=second > 2),
+                place(1000 * second, 500_000_000 + agent_id, 80_000_000 + second),
+            ]
             if second % 60 == 30:
                 said.append(mavlink.MAVLink_mission_item_reached_message(second // 60))
             if second == 100:

@@ -61,7 +61,7 @@ def message_id(frame: bytes) -> int:
 @asynccontextmanager
 async def on_strings(tmp_path: Path, vehicle_type: VehicleType = "copter") -> AsyncIterator[tuple[Pilot, Puppet]]:
     ours, theirs = socket.socketpair()
-    pilot = Pilot(3, ours, tmp_path / "3.tlog", SPEEDUP, vehicle_type)
+    pilot = Pilot(3, ours, tmp_path / "3.tlog", SPEEDUP, HOME, vehicle_type)
     puppet = Puppet(vehicle_type, theirs)
     dancing = asyncio.create_task(puppet.dance())
     await pilot.start()

@@ -33,10 +33,10 @@ def fly(directory: Path, by: By) -> Path:
     launch = ArduPilot.find(None, os.environ).launch(3, HOME, SPEEDUP, directory)
 
     async def flight() -> None:
-        pilot = Pilot(3, connect(launch.pilot_port), tlog, SPEEDUP)
+        pilot = Pilot(3, connect(launch.pilot_port), tlog, SPEEDUP, HOME)
         await pilot.start()
         try:
-            await pilot.fly(SQUARE, by, HOME)
+            await pilot.fly(SQUARE, by)
         finally:
             await pilot.close()
 

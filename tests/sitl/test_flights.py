@@ -36,10 +36,10 @@ def plan_of(vehicle_type: VehicleType) -> Plan:
 
 def flown(vehicle_type: VehicleType, by: By, tlog: Path) -> Pilot:
     async def fly(port: int) -> Pilot:
-        pilot = Pilot(3, connect(port), tlog, SPEEDUP, vehicle_type)
+        pilot = Pilot(3, connect(port), tlog, SPEEDUP, HOME, vehicle_type)
         await pilot.start()
         try:
-            await pilot.fly(plan_of(vehicle_type), by, HOME)
+            await pilot.fly(plan_of(vehicle_type), by)
         finally:
             await pilot.close()
         return pilot
@@ -93,7 +93,7 @@ def test_a_plan_that_the_type_cannot_fly_is_refused_before_anything_is_asked(tmp
     async def fly() -> None:
         async with on_strings(tmp_path, "rover") as (pilot, _):
             with pytest.raises(PlanError, match="a rover neither takes off"):
-                await pilot.fly(PLAN, "mission", HOME)
+                await pilot.fly(PLAN, "mission")
 
     asyncio.run(fly())
 
@@ -113,7 +113,7 @@ def puppet_flown(
         async with on_strings(tmp_path, vehicle_type) as (pilot, puppet):
             strings(puppet)
             async with asyncio.timeout(DEADLINE_S):
-                await pilot.fly(plan_of(vehicle_type), by, HOME)
+                await pilot.fly(plan_of(vehicle_type), by)
             return pilot
 
     return asyncio.run(fly())
@@ -124,7 +124,7 @@ def failure(tmp_path: Path, strings: Callable[[Puppet], None], after_m: float = 
 
     async def fly() -> str:
         async with on_strings(tmp_path) as (pilot, puppet):
-            flight = asyncio.create_task(pilot.fly(PLAN, by, HOME))
+            flight = asyncio.create_task(pilot.fly(PLAN, by))
             await until(lambda: pilot.state.position is not None and pilot.state.position.relative_alt_m >= after_m)
             strings(puppet)
             with pytest.raises(FlightError) as error:
@@ -192,7 +192,7 @@ def test_garbage_in_the_stream_is_survived_and_counted(tmp_path: Path) -> None:
 def test_a_mode_that_is_undone_in_flight_is_asked_for_again(tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
-            flight = asyncio.create_task(pilot.fly(PLAN, "mission", HOME))
+            flight = asyncio.create_task(pilot.fly(PLAN, "mission"))
             await until(lambda: puppet.vehicle.airborne and puppet.vehicle.motion.up_m > 29)
             puppet.vehicle.set_mode(MODES["copter"]["GUIDED"])
             async with asyncio.timeout(DEADLINE_S):
@@ -255,7 +255,7 @@ def test_a_vehicle_that_spins_and_never_gets_ready_is_given_up(tmp_path: Path, m
 def test_a_flight_is_terminated_in_the_air_and_ends_without_an_error(by: By, tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
-            flight = asyncio.create_task(pilot.fly(PLAN, by, HOME))
+            flight = asyncio.create_task(pilot.fly(PLAN, by))
             await until(lambda: puppet.vehicle.motion.up_m > 29)
             async with asyncio.timeout(DEADLINE_S):
                 await pilot.terminate_flight()

@@ -29,7 +29,7 @@ SPEEDUP = 100.0
 async def piloting(
     port: int, tlog: Path, sysid: int = 3, speedup: float = SPEEDUP, vehicle_type: VehicleType = "copter"
 ) -> AsyncIterator[Pilot]:
-    pilot = Pilot(sysid, connect(port), tlog, speedup, vehicle_type)
+    pilot = Pilot(sysid, connect(port), tlog, speedup, HOME, vehicle_type)
     await pilot.start()
     try:
         yield pilot
@@ -129,7 +129,7 @@ def test_a_vehicle_that_dies_while_taking_off_is_given_up_at_once(tmp_path: Path
 def connected_pilot(tmp_path: Path) -> Iterator[tuple[Pilot, Channel]]:
     """A pilot fed by hand, and an autopilot's channel that packs what it is fed."""
     ours, theirs = socket.socketpair()
-    pilot = Pilot(3, ours, tmp_path / "3.tlog", 1.0)
+    pilot = Pilot(3, ours, tmp_path / "3.tlog", 1.0, HOME)
     channel = Channel(Autopilot(3, HOME, 0))
     with theirs:
         yield pilot, channel

@@ -48,6 +48,12 @@ def place(ms: int = 60_000, lat: int = -353632620, lon: int = 1491652370) -> Any
     return mavlink.MAVLink_global_position_int_message(ms, lat, lon, 604_000, 20_000, 300, -400, -250, 27_000)
 
 
+def good_estimate() -> Any:
+    """Without it a position does not count."""
+    bit = mavlink.MAV_SYS_STATUS_AHRS
+    return mavlink.MAVLink_sys_status_message(bit, bit, bit, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
+
+
 def text(words: str, identity: int = 0, chunk: int = 0, severity: int = 6) -> Any:
     return mavlink.MAVLink_statustext_message(severity, words.encode(), identity, chunk)
 
@@ -107,7 +113,7 @@ def test_data_never_exceeds_its_limit() -> None:
 
 def positions(events: TelemetryEvents, seconds: int) -> list[float]:
     """Feed a position every tenth of a second; return when position events came."""
-    data = frames(place())
+    data = frames(good_estimate(), place())
     return [now / 10 for now in range(10 * seconds) if events.receive(data, now / 10)]
 
 
@@ -157,7 +163,8 @@ def test_a_position_holds_attitude_battery_and_mode() -> None:
 
 def test_a_position_before_the_first_fix_is_no_event() -> None:
     events = source()
-    assert not any(events.receive(frames(place(lat=0, lon=0)), float(now)) for now in range(100))
+    nowhere = frames(good_estimate(), place(lat=0, lon=0))
+    assert not any(events.receive(nowhere, float(now)) for now in range(100))
 
 
 def test_a_ground_station_or_gimbal_on_the_same_link_makes_no_events() -> None:
@@ -213,6 +220,7 @@ _KINDS = (
     mavlink.MAVLink_attitude_message,
     mavlink.MAVLink_global_position_int_message,
     mavlink.MAVLink_statustext_message,
+    mavlink.MAVLink_mission_current_message,
     mavlink.MAVLink_mission_item_reached_message,
 )
 
@@ -290,7 +298,7 @@ def test_the_connection_waits_for_the_vehicle_asks_and_comes_back_after_a_restar
     connection = VehicleConnection(loop, "127.0.0.1", port, heard.extend)
     run_until(loop, lambda: True, after_s=0.02)  # the first attempt finds nobody
     vehicle.serve(port)
-    run_until(loop, lambda: vehicle.requested == {1, 2, 30, 33})
+    run_until(loop, lambda: vehicle.requested == {1, 2, 30, 33, 42})
     vehicle.hang_up()
     run_until(loop, lambda: b"hello 2" in heard)
     assert bytes(heard) == b"hello 1hello 2"

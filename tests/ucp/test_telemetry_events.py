@@ -140,7 +140,7 @@ def test_modes_have_the_names_of_their_vehicle(vehicle_type: int, mode: int, nam
 def test_the_default_is_what_was_always_logged() -> None:
     events = TelemetryEvents(10.0, random.Random(1))
     reached = mavlink.MAVLink_mission_item_reached_message(2)
-    made = [event_id for event_id, _ in events.receive(frames(heartbeat(CRITICAL), status(ALL, 50), reached), 0.0)]
+    made = [event_id for event_id, _ in events.receive(frames(heartbeat(CRITICAL), status(RADIO, 50), reached), 0.0)]
     assert made == [1, ARMED]
     text = mavlink.MAVLink_statustext_message(6, b"hello")
     made += [
@@ -153,7 +153,7 @@ def test_the_default_is_what_was_always_logged() -> None:
 def test_a_kind_that_was_not_chosen_is_not_logged(kind: EventKind) -> None:
     """And choosing it alone gives the same events as choosing all, without the others."""
     stream = [
-        frames(heartbeat(CRITICAL), status(ALL, 50), mavlink.MAVLink_mission_item_reached_message(2), place()),
+        frames(heartbeat(CRITICAL), status(RADIO, 50), mavlink.MAVLink_mission_item_reached_message(2), place()),
         frames(heartbeat(ACTIVE, armed=False), status(), mavlink.MAVLink_statustext_message(6, b"hello"), place()),
     ]
 

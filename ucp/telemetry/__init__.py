@@ -11,7 +11,8 @@
     3   arming    disarmed          `>II`     vehicle time ms, mode (HEARTBEAT)
     4   text      status text       `>IB`     vehicle time ms, MAV_SEVERITY, then the text in UTF-8 (STATUSTEXT)
     5   position  position          64 bytes, see `Position` (GLOBAL_POSITION_INT, ATTITUDE, SYS_STATUS, SYSTEM_TIME)
-    6   waypoint  waypoint reached  `>IH`     vehicle time ms, number of the mission item (MISSION_ITEM_REACHED)
+    6   waypoint  waypoint reached  `>IH`     vehicle time ms, number of the mission item (MISSION_ITEM_REACHED,
+                                              MISSION_CURRENT)
     7   failsafe  failsafe or over  `>IBI`    vehicle time ms, MAV_STATE, what failed (HEARTBEAT, SYS_STATUS)
     8   battery   battery level     `>IHhb`   vehicle time ms, mV (65535: unknown), 0.01 A (-1: unknown), % left
                                               (SYS_STATUS)
@@ -19,6 +20,12 @@
 Vehicle time is milliseconds since the vehicle's boot, in its own (perhaps simulated) time. A mode is ArduPilot's
 custom_mode. A position record is large enough that positions alone, one in 10 s, fill about nine blocks of 1024 bytes
 in the thesis's 20 minutes.
+
+A position counts while the vehicle says that its estimate is good: MAV_SYS_STATUS_AHRS of SYS_STATUS. Before, and if it
+is lost in flight, there are no positions: an ArduPlane that has booted says for some seconds that it is near 0 N, 0 E.
+
+What ArduPilot says every 30 s while it cannot be armed (`PreArm: ...`) is an event once, until its mode or its arming
+changes.
 
 Failsafes are read from what is meant for machines. While one acts (radio, battery, ground station, EKF, terrain, dead
 reckoning), ArduPilot's HEARTBEAT says MAV_STATE_CRITICAL; a plane that has crashed says MAV_STATE_EMERGENCY. Which one

@@ -9,7 +9,7 @@ from ucp.loop import Loop, Timer
 
 MAX_READ_BYTES = 65536
 
-_REQUESTED = {33: 1.0, 30: 1.0, 1: 2.0, 2: 2.0}
+_REQUESTED = {33: 1.0, 30: 1.0, 1: 2.0, 2: 2.0, 42: 1.0}
 """Message ID: interval in simulated seconds. HEARTBEAT, STATUSTEXT and MISSION_ITEM_REACHED come unasked; at an
 interval ArduPilot would repeat which mission item it reached last."""
 _SET_MESSAGE_INTERVAL = 511  # MAV_CMD_SET_MESSAGE_INTERVAL

@@ -15,6 +15,11 @@ _AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 _CHUNK_CHARS = 50  # STATUSTEXT: a full text is followed by more when it has an ID
 _BATTERY_LEVELS = (0, 5, 10, 15, *range(20, 101, 10))  # percent
 _CHARGED_PERCENT = 10  # a battery that has so much more than at the last level was charged or changed
+_NAGGING = "PreArm: "  # how a text begins that ArduPilot says again every 30 s while it cannot be armed
+_MOST_NAGGED = 100
+_BOOTED_MS = 1_000  # a clock that goes back as much as this has begun anew
+_HOME_OFF_MM = 10_000  # a vehicle that stands so far above its home has set it before it knew its altitude
+_HOME_MOVED_MM = 1_000
 
 
 class TelemetryEvents:
@@ -39,6 +44,7 @@ class TelemetryEvents:
         self._parser.robust_parsing = True  # garbage is reported as BAD_DATA, not raised
         self._armed_flag: int = common.MAV_MODE_FLAG_SAFETY_ARMED
         self._no_autopilot: int = common.MAV_AUTOPILOT_INVALID
+        self._estimate: int = common.MAV_SYS_STATUS_AHRS
         self._position_due: float | None = None
         self._vehicle_ms = 0
         self._mode = records.UNKNOWN_MODE
@@ -47,6 +53,11 @@ class TelemetryEvents:
         self._failsafe = (0, 0)  # MAV_STATE if critical, what failed: as last logged
         self._text = ""
         self._text_key = (0, 0)  # ID and severity of the text that is being collected
+        self._nagged: set[str] = (
+            set()
+        )  # texts that it says again and again, since it was last armed or changed its mode
+        self._heading_for: int | None = None  # item of its mission, if it has said so since it reached another
+        self._ground: _Ground | None = None
         self._attitude: Any = None
         self._status: Any = None
         self._battery_level: int | None = None
@@ -73,6 +84,8 @@ class TelemetryEvents:
             case "STATUSTEXT":
                 self._status_text(message, events)
             case "GLOBAL_POSITION_INT":
+                if message.time_boot_ms < self._vehicle_ms - _BOOTED_MS:
+                    self._boot()
                 self._vehicle_ms = message.time_boot_ms
                 self._position(message, now, events)
             case "ATTITUDE":
@@ -85,8 +98,15 @@ class TelemetryEvents:
             case "SYSTEM_TIME":
                 self._vehicle_ms = message.time_boot_ms
                 self._clock_us = message.time_unix_usec
+            case "MISSION_CURRENT":
+                self._heading_for = message.seq
             case "MISSION_ITEM_REACHED":
-                events.append((records.WAYPOINT, records.WAYPOINT_DATA.pack(self._vehicle_ms, message.seq)))
+                self._waypoint(message.seq, events)
+
+    def _boot(self) -> None:
+        """It has been started again: nothing that it said of its place and its mission is true any more."""
+        self._status = self._attitude = self._heading_for = self._ground = None
+        self._nagged.clear()
 
     def _heartbeat(self, message: Any, events: list[tuple[int, bytes]]) -> None:
         mode, armed = message.custom_mode, bool(message.base_mode & self._armed_flag)
@@ -94,6 +114,8 @@ class TelemetryEvents:
             events.append(
                 (records.MODE_CHANGE, records.MODE_CHANGE_DATA.pack(self._vehicle_ms, message.type, self._mode, mode))
             )
+        if (mode, armed) != (self._mode, self._armed):
+            self._nagged.clear()
         if armed != self._armed:
             events.append(
                 (records.ARMED if armed else records.DISARMED, records.ARMING_DATA.pack(self._vehicle_ms, mode))
@@ -132,13 +154,36 @@ class TelemetryEvents:
             self._end_text(events)
 
     def _end_text(self, events: list[tuple[int, bytes]]) -> None:
+        text, self._text = self._text, ""
+        if text in self._nagged:
+            return
+        if text.startswith(_NAGGING) and len(self._nagged) < _MOST_NAGGED:
+            self._nagged.add(text)
         head = records.STATUS_TEXT_DATA.pack(self._vehicle_ms, self._text_key[1])
-        events.append((records.STATUS_TEXT, head + self._text.encode()))
-        self._text = ""
+        events.append((records.STATUS_TEXT, head + text.encode()))
+
+    def _waypoint(self, reached: int, events: list[tuple[int, bytes]]) -> None:
+        """It has reached what it was heading for, of which ArduPilot 4.7 names the last command behind: a speed, say.
+
+        Item 0 is home, where it is heading before its mission begins: nothing has been reached then.
+        """
+        item = reached if self._heading_for is None else min(self._heading_for, reached)
+        self._heading_for = None
+        if item or not reached:
+            events.append((records.WAYPOINT, records.WAYPOINT_DATA.pack(self._vehicle_ms, item)))
+
+    def _means_its_position(self) -> bool:
+        """Whether it says that its estimate is good; firmware that says nothing of it is believed."""
+        if self._status is None:
+            return False
+        says = self._status.onboard_control_sensors_present & self._estimate
+        return not says or bool(self._status.onboard_control_sensors_health & self._estimate)
 
     def _position(self, message: Any, now: float, events: list[tuple[int, bytes]]) -> None:
-        if message.lat == 0 and message.lon == 0:  # no fix yet
+        if not self._means_its_position() or (message.lat == 0 and message.lon == 0):  # no fix yet
             return
+        if self._ground is None and self._mode != records.UNKNOWN_MODE:
+            self._ground = _Ground(message, stands=not self._armed)
         if self._position_due is None:
             self._position_due = now + self._draw()
         if now < self._position_due:
@@ -151,7 +196,7 @@ class TelemetryEvents:
             lat_e7=message.lat,
             lon_e7=message.lon,
             alt_mm=message.alt,
-            relative_alt_mm=message.relative_alt,
+            relative_alt_mm=self._ground.height_mm(message) if self._ground else message.relative_alt,
             north_cms=message.vx,
             east_cms=message.vy,
             down_cms=message.vz,
@@ -172,6 +217,24 @@ class TelemetryEvents:
 
     def _draw(self) -> float:
         return self._position_interval_s * self._rng.uniform(0.5, 1.5)
+
+
+class _Ground:
+    """What a vehicle's height above its home is off by, since its first good position.
+
+    A rover of ArduPilot 4.7 sets its home before it knows its altitude, and is 584 m above it ever after.
+    """
+
+    def __init__(self, message: Any, stands: bool) -> None:
+        """`stands`: it is on the ground, at its home, as it has not been armed."""
+        self._home_mm = message.alt - message.relative_alt
+        self._error_mm = message.relative_alt if stands and abs(message.relative_alt) > _HOME_OFF_MM else 0
+
+    def height_mm(self, message: Any) -> int:
+        """Above its home: as it says, once its home has been set to another altitude."""
+        moved_mm = abs(message.alt - message.relative_alt - self._home_mm)
+        height_mm = message.relative_alt - (self._error_mm if moved_mm <= _HOME_MOVED_MM else 0)
+        return int(max(-(2**31), min(2**31 - 1, height_mm)))
 
 
 def _milli(value: float) -> int:

@@ -91,7 +91,7 @@ class VehicleProcess:
                     ) from None
                 await asyncio.sleep(ASK_AGAIN_S)
         tlog = self._directory / "telemetry.tlog"
-        self.pilot = Pilot(self.sysid, sock, tlog, speedup, self.kind.vehicle_type, self.vehicle_id)
+        self.pilot = Pilot(self.sysid, sock, tlog, speedup, self._home, self.kind.vehicle_type, self.vehicle_id)
         await self.pilot.start()
 
     def place(self, field: Home) -> Place:
@@ -110,7 +110,7 @@ class VehicleProcess:
     async def fly(self, plan: Plan, by: By) -> None:
         """As `take_off`, but fly the plan."""
         assert self.pilot is not None
-        await self._piloted(self.pilot.fly(plan, by, self._home))
+        await self._piloted(self.pilot.fly(plan, by))
         await self._piloted(self.pilot.stay_in_touch())
 
     async def _piloted(self, flight: Coroutine[Any, Any, None]) -> None:

@@ -1,0 +1,75 @@
+"""Recorded telemetry of ArduPilot 4.7.0-dev, cut to what tests need: `tests/sitl/recordings/*.tlog.gz`.
+
+    python -m tests.sitl.recorded TELEMETRY.tlog OUT.tlog.gz
+
+cuts a telemetry log: what says where the vehicle is, all of it in its first 50 s and every 2 s after that, and every
+change of its mode, arming and mission, until it repeats itself.
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+RECORDINGS = Path(__file__).parent / "recordings"
+Name = Literal["copter-mission", "plane-mission", "plane-guided", "rover-mission"]
+
+EVERYTHING_S = 50.0
+EVERY_S = 2.0
+END_S = 420.0
+STREAMS = {"GLOBAL_POSITION_INT", "SYS_STATUS", "MISSION_CURRENT"}
+EVENTS = {"STATUSTEXT", "MISSION_ITEM_REACHED", "HOME_POSITION"}
+
+
+def frames(name: Name) -> Iterator[bytes]:
+    """The frames of a recording, as the vehicle sent them."""
+    for frame, _ in messages(name):
+        yield frame
+
+
+def messages(name: Name) -> Iterator[tuple[bytes, Any]]:
+    """Each frame, and the message in it."""
+    yield from _messages(gzip.decompress((RECORDINGS / f"{name}.tlog.gz").read_bytes()))
+
+
+def _messages(log: bytes) -> Iterator[tuple[bytes, Any]]:
+    parser, at = mavlink.MAVLink(None), 0
+    while at < len(log):
+        at += 8  # the time of its arrival
+        end = at + 12 + log[at + 1] + 13 * (log[at + 2] & 1)  # MAVLink 2, perhaps signed
+        yield log[at:end], parser.decode(bytearray(log[at:end]))
+        at = end
+
+
+def cut(log: bytes) -> bytes:
+    kept, last, now_s, due = bytearray(), dict[str, Any](), 0.0, dict[str, float]()
+    for frame, message in _messages(log):
+        kind = message.get_type()
+        if message.get_srcComponent() != mavlink.MAV_COMP_ID_AUTOPILOT1:
+            continue
+        now_s = getattr(message, "time_boot_ms", now_s * 1e3) / 1e3
+        if now_s > END_S:
+            break
+        if kind == "HEARTBEAT":
+            says = message.custom_mode, message.base_mode, message.system_status
+            wanted, last[kind] = last.get(kind) != says, says
+        elif kind == "MISSION_CURRENT" and last.get(kind) != message.seq:
+            wanted, last[kind] = True, message.seq
+        elif kind in STREAMS:
+            wanted = now_s < EVERYTHING_S or now_s >= due.get(kind, 0.0)
+        else:
+            wanted = kind in EVENTS
+        if wanted:
+            due[kind] = now_s + EVERY_S
+            kept += struct.pack(">Q", round(now_s * 1e6)) + frame
+    return bytes(kept)
+
+
+if __name__ == "__main__":
+    Path(sys.argv[2]).write_bytes(gzip.compress(cut(Path(sys.argv[1]).read_bytes()), mtime=0))

@@ -1,0 +1,88 @@
+"""What recorded telemetry of ArduPilot 4.7 becomes: where the pilot takes a vehicle to be, and what its agent logs."""
+
+from __future__ import annotations
+
+import random
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sitl.link import Link
+from sitl.vehicle import Home
+from tests.sitl.recorded import Name, frames, messages
+from ucp.telemetry import EVENT_KINDS, POSITION, STATUS_TEXT, WAYPOINT, Position, TelemetryEvents, describe
+
+HOME = Home(-35.363262, 149.165237, 584.0)
+FIELD_M = 200.0  # vehicles stood at most so far from HOME
+GOOD_S: dict[Name, float] = {"copter-mission": 22.9, "plane-mission": 21.9, "plane-guided": 21.9, "rover-mission": 42.1}
+
+
+@pytest.fixture
+def link(tmp_path: Path) -> Iterator[Link]:
+    ours, theirs = socket.socketpair()
+    link = Link(1, ours, tmp_path / "1.tlog", 8.0, HOME)
+    with ours, theirs:
+        yield link
+    link.connection_lost(None)
+
+
+@pytest.mark.parametrize("name", GOOD_S)
+def test_a_vehicle_is_nowhere_until_its_estimate_is_good_and_then_where_it_is(name: Name, link: Link) -> None:
+    """A plane says for seconds that it is near 0 N, 0 E, and a rover that its altitude is 0."""
+    for frame in frames(name):
+        link.data_received(frame)
+        if (link.state.time_s or 0.0) < GOOD_S[name] - 0.1:
+            assert link.state.position is None
+        elif (link.state.time_s or 0.0) > GOOD_S[name] + 1.0:
+            position = link.state.position
+            assert position is not None
+            north_m, east_m, up_m = HOME.metres_to(position.lat_deg, position.lon_deg, position.alt_m)
+            assert abs(north_m) < 1000 and abs(east_m) < 1000
+            assert position.relative_alt_m == pytest.approx(up_m)
+            assert -3 < up_m < 80
+            if link.state.time_s < 24:  # type: ignore[operator]
+                assert abs(north_m) < FIELD_M and abs(east_m) < FIELD_M
+
+
+def logged(name: Name, position_interval_s: float = 1.0) -> list[tuple[int, bytes]]:
+    source = TelemetryEvents(position_interval_s, random.Random(1), EVENT_KINDS)
+    events = []
+    for frame, message in messages(name):
+        events += source.receive(frame, getattr(message, "time_boot_ms", 0) / 1e3)
+    return events
+
+
+@pytest.mark.parametrize("name", GOOD_S)
+def test_positions_are_logged_from_then_on_with_heights_above_home(name: Name) -> None:
+    positions = [Position.unpack(data) for event_id, data in logged(name) if event_id == POSITION]
+    assert GOOD_S[name] * 1e3 - 100 < positions[0].vehicle_ms < GOOD_S[name] * 1e3 + 3000
+    for position in positions:
+        assert abs(position.lat_e7 / 1e7 - HOME.lat_deg) < 0.01
+        height_m = position.alt_mm / 1e3 - HOME.alt_m
+        assert position.relative_alt_mm / 1e3 == pytest.approx(height_m, abs=3)
+    assert abs(positions[0].relative_alt_mm) < 1_000
+
+
+REACHED: dict[Name, list[int]] = {
+    "copter-mission": [1, 3, 4, 6],
+    "plane-mission": [1, 3, 4, 6, 7],
+    "rover-mission": [2, 3, 5],
+}
+
+
+@pytest.mark.parametrize("name", REACHED)
+def test_the_item_that_was_reached_is_named_not_the_speed_command_behind_it(name: Name) -> None:
+    """Of a take-off, a place, a loiter, and places again: 4.7 says 2, 3, 5, 6 of a copter."""
+    reached = [int.from_bytes(data[4:6], "big") for event_id, data in logged(name) if event_id == WAYPOINT]
+    assert reached == REACHED[name]
+
+
+def test_a_plane_that_has_landed_does_not_say_again_and_again_why_it_cannot_be_armed() -> None:
+    texts = [describe(event_id, data) for event_id, data in logged("plane-mission") if event_id == STATUS_TEXT]
+    nagging = [text for text in texts if "PreArm: In landing sequence" in text]
+    said = [
+        message for _, message in messages("plane-mission") if getattr(message, "text", "").startswith("PreArm: In")
+    ]
+    assert (len(nagging), len(said)) == (1, 4)
