@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from itertools import product
 
-from harness.explore.search import simulated as explored
+from harness.explore.run import simulated as explored
 from harness.matrix.play import simulated as cell
 from harness.run.simulate import simulate
 from harness.scenario import Scenario

@@ -93,6 +93,10 @@ COMMANDS = {
         "harness.commands.explore:explore_command",
         "Play seed after seed in virtual time until a characteristic is violated; then find the smallest such run.",
     ),
+    "coverage": (
+        "harness.commands.coverage:coverage_command",
+        "Say which share of all local states, inputs and branches runs have tried.",
+    ),
     "prove": (
         "harness.commands.prove:prove_command",
         "Look at every state that the agents can come to within bounds: is any wrong, or without a way out?",

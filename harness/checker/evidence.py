@@ -3,7 +3,7 @@
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,8 @@ from harness.errors import RunDirectoryError
 from harness.packets.files import DIRECTORY, Captures, capture_files, read_captures
 from harness.play.rogue.line import OF_NO_INJECTION
 from ucp.block import HASH_BYTES
-from ucp.trace import Sent
+from ucp.state import AgentState
+from ucp.trace import HandlerRun, Sent
 
 if TYPE_CHECKING:
     from harness.checker.records import Examination
@@ -31,6 +32,9 @@ Sending = tuple[tuple[float, Sent], ...]
 """What an agent sent when with one type and sequence number: one message in each of its lives, at most."""
 Sendings = dict[Any, dict[Any, Sending]]
 """Of an agent, by type and sequence number."""
+
+Watch = Callable[[AgentState, HandlerRun | None], None]
+"""Is given the state of an agent after a handler has run, and that run; None where a life of it begins."""
 
 _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
 
@@ -105,6 +109,8 @@ class Evidence:
     conditions: list[Condition] | None = None
     """What was taken down of network and faults as it was made; None if nothing was."""
     captures: Captures | None = None
+    watch: Watch | None = None
+    """Is shown each step that the step judge follows."""
 
     def __post_init__(self) -> None:
         self.names = name_blocks(self.exports)

@@ -8,10 +8,11 @@ from harness.checker.judgement import Judgement
 from harness.errors import INTERRUPTED, VIOLATED
 from harness.explore.document import Document, document_of
 from harness.explore.recording import Recording, record
-from harness.explore.search import Judge, Searched, Violation, search, simulated
+from harness.explore.search import Searched, Violation, search
 from harness.explore.shrink import BudgetSpentError, Shrinker
 from harness.explore.smaller import replays, scenario_of, shrink, size
-from harness.explore.write import claim, evidence_lines, file_of, write
+from harness.explore.write import file_of
+from harness.run.finding import Judge, claim, evidence_lines, simulated, write
 from harness.run.simulate import same_twice
 from harness.scenario import Scenario
 

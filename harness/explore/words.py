@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from rich.console import Console
 
 from harness.explore.run import Explored, Watcher
-from harness.explore.search import ENDED, Violation
-from harness.explore.write import evidence_lines
+from harness.explore.search import Violation
+from harness.run.finding import ENDED, evidence_lines
 from harness.scenario.verdicts import BAD_IN_WORDS
 
 _WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}

@@ -50,13 +50,18 @@ def collect(
     most_bytes: float,
     most_s: float,
     watch: Callable[[Progress], None] = lambda progress: None,
+    keep: Callable[[LocalStates], None] = lambda local: None,
 ) -> Collected:
-    """All local states, and all messages, or as many as memory and time allow, or up to the first flaw."""
+    """All local states, and all messages, or as many as memory and time allow, or up to the first flaw.
+
+    `keep` is given the local states of each way to divide the blocks.
+    """
     collected, began = Collected(bounds), time.monotonic()
     try:
         for makers in divisions(bounds.agents, bounds.blocks):
             collected.divisions += 1
-            for progress in _Division(collected, makers).collect(began):
+            division = _Division(collected, makers)
+            for progress in division.collect(began):
                 watch(progress)
                 if memory_bytes() > most_bytes:
                     collected.ended = "memory"
@@ -66,6 +71,7 @@ def collect(
                     collected.ended = "flaw"
                 if collected.ended != "complete":
                     break
+            keep(division.local)
             if collected.ended != "complete":
                 break
     except KeyboardInterrupt:
@@ -94,7 +100,7 @@ class _Division:
             agent_id: [ordinal for ordinal, maker in enumerate(makers, 1) if maker == agent_id]
             for agent_id in range(1, bounds.agents + 1)
         }
-        self._local = LocalStates(bounds)
+        self.local = LocalStates(bounds)
         self._zones = Zones()
         self._came_from: dict[Alone, tuple[Alone, str] | None] = {}
         self._said: dict[Said, None] = {}
@@ -105,7 +111,7 @@ class _Division:
         """Until there is no more."""
         collected = self._collected
         before = collected.states, collected.said, collected.local_states, collected.steps, collected.zones
-        for agent_id, local in self._local.initial.items():
+        for agent_id, local in self.local.initial.items():
             self._add((agent_id, local, NOTHING_RUNS, 0), None)
         acted = dict.fromkeys(self._by_agent, 0)
         heard: dict[Said, int] = {}
@@ -136,8 +142,8 @@ class _Division:
                     )
         collected.looked_at += looked_at
         collected.said = before[1] + len(self._said)
-        collected.local_states = before[2] + len(self._local.known)
-        collected.steps = before[3] + self._local.steps
+        collected.local_states = before[2] + len(self.local.known)
+        collected.steps = before[3] + self.local.steps
         collected.zones = before[4] + len(self._zones)
 
     def _add(self, state: Alone, came_from: tuple[Alone, str] | None) -> None:
@@ -145,7 +151,7 @@ class _Division:
             return
         self._came_from[state] = came_from
         self._by_agent[state[0]].append(state)
-        flaw = self._local.known[state[1]].flaw
+        flaw = self.local.known[state[1]].flaw
         if flaw is not None and self._collected.flaw is None:
             self._collected.flaw = flaw
             way = []
@@ -160,36 +166,36 @@ class _Division:
         agent_id, local, zone, completed = state
         if self._known_flaw(local):
             return
-        running = self._local.known[local].running
+        running = self.local.known[local].running
         firsts = range(1, len(running) + 1) if self._bounds.timers_any else self._zones.firsts(zone)
         for first in firsts:
             timer = running[first - 1]
-            step = self._local.end_timer(local, timer)
-            self._go(state, step, f"its timer {self._local.timers[timer]} ends", ended=(first,))
+            step = self.local.end_timer(local, timer)
+            self._go(state, step, f"its timer {self.local.timers[timer]} ends", ended=(first,))
         if completed < len(self._own[agent_id]):
             ordinal = self._own[agent_id][completed]
-            step = self._local.complete(local, ordinal)
+            step = self.local.complete(local, ordinal)
             self._go(state, step, f"it completes block {ordinal}", completes=1)
         if "reboot" in self._bounds.faults:
-            self._go(state, self._local.reboot(local), "it reboots", forgets=True)
+            self._go(state, self.local.reboot(local), "it reboots", forgets=True)
 
     def _hear(self, state: Alone, said: Said) -> None:
         agent_id, local, _, completed = state
         if self._known_flaw(local) or not self._named(said[1]).isdisjoint(self._own[agent_id][completed:]):
             return
-        step = self._local.hear(local, *said)
+        step = self.local.hear(local, *said)
         self._collected.transitions += 1
         if step.local != local or step.sent or step.started:
-            self._go(state, step, f"it hears a {self._local.messages[said[1]].NAME} from agent {said[0]}")
+            self._go(state, step, f"it hears a {self.local.messages[said[1]].NAME} from agent {said[0]}")
 
     def _known_flaw(self, local: int) -> bool:
-        return self._local.known[local].flaw is not None
+        return self.local.known[local].flaw is not None
 
     def _named(self, message: int) -> frozenset[int]:
         """The blocks that must have been completed for the message to be sent: it names them, or a chain of them."""
         named = self._names.get(message)
         if named is None:
-            named = self._names[message] = self._local.blocks_named(message)
+            named = self._names[message] = self.local.blocks_named(message)
         return named
 
     def _go(
@@ -208,11 +214,11 @@ class _Division:
             self._said[agent_id, message] = None
         assert step.local != DEAD
         if not self._bounds.timers_any:
-            before = {} if forgets else {timer: at for at, timer in enumerate(self._local.known[local].running, 1)}
+            before = {} if forgets else {timer: at for at, timer in enumerate(self.local.known[local].running, 1)}
             started = dict(step.started)
             running = tuple(
-                -started[timer] - 1 if timer in started else before.get(timer) or -self._local.durations_us[timer] - 1
-                for timer in self._local.known[step.local].running
+                -started[timer] - 1 if timer in started else before.get(timer) or -self.local.durations_us[timer] - 1
+                for timer in self.local.known[step.local].running
             )
             after = self._zones.after(zone, ended, running)
             assert after is not None, "this timer can be the first to end"

@@ -6,7 +6,7 @@ looked at once, when it gets its number.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from random import Random
 from typing import Any, NamedTuple
@@ -169,6 +169,21 @@ class LocalStates:
             stored = StoredState.of(former.state)
             step = self._steps[key] = self._computed(local, agent, lambda: agent.boot(stored, NOW_S))
         return step
+
+    def state(self, local: int) -> AgentState:
+        """The whole of a local state, to look at before the next step is computed."""
+        return self._restored(local).state
+
+    def inputs(self) -> Iterator[tuple[int, Message | str | None, Step]]:
+        """Each local state with each input that was given there: what was heard, the timer that ended; None: a block.
+
+        And what came of it.
+        """
+        for (local, kind, number), step in self._steps.items():
+            if kind == -1:
+                yield local, self.timers[number], step
+            elif kind != -3:
+                yield local, None if kind == -2 else self.messages[number], step
 
     def _restored(self, local: int) -> Agent:
         known = self.known[local]

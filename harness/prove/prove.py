@@ -10,8 +10,6 @@ from typing import Any
 from harness.archive.directory import default_path
 from harness.checker.judgement import Judgement
 from harness.errors import INTERRUPTED, VIOLATED, HarnessError
-from harness.explore.search import simulated
-from harness.explore.write import claim, evidence_lines, write
 from harness.prove import liveness
 from harness.prove.alone import collect
 from harness.prove.bounds import Bounds
@@ -21,6 +19,7 @@ from harness.prove.local import Flaw, ReductionError
 from harness.prove.progress import Ended, Figures, Progress
 from harness.prove.script import Script
 from harness.prove.swarm import Swarm
+from harness.run.finding import claim, evidence_lines, simulated, write
 from harness.scenario.load import parse
 from harness.scenario.write import to_yaml
 

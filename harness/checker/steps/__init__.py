@@ -81,10 +81,14 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Fol
     """Take each life of the agent through all of its steps, up to the first that it tells in unknown words."""
     understood = not evidence.unknown.get(agent_id, {}).keys() - COMPARED_WITHOUT
     for follower, life in zip(followers, trace.lives(), strict=True):
+        if evidence.watch is not None:
+            evidence.watch(follower.state, None)
         for line, run in life:
             if not understood and unknown_words([run]).keys() - COMPARED_WITHOUT:
                 return
             follower.follow(line, run)
+            if evidence.watch is not None and follower.lost is None:
+                evidence.watch(follower.state, run)
     if agent_id in evidence.exports and not trace.cut_off and not trace.problem:
         followers[-1].end(evidence.end_of(agent_id))
 

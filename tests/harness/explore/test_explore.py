@@ -11,7 +11,7 @@ import pytest
 from harness.checker import Result
 from harness.errors import RunDirectoryError
 from harness.explore import Explored, explore
-from harness.explore.search import simulated
+from harness.run.finding import simulated
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences

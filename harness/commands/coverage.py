@@ -1,0 +1,71 @@
+"""`ucp-harness coverage`: how much of the protocol runs have tried."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from harness import checker, coverage
+from harness.archive.archive import RunArchive
+from harness.commands.terminal import complain, print_json
+from harness.coverage import Reached
+from harness.errors import WRONG_REQUEST, RunDirectoryError
+from harness.prove import Bounds
+from harness.prove.bounds import EVENT_FILLS_BLOCK
+from ucp.settings import Settings
+
+OF_BLOCKS = {*EVENT_FILLS_BLOCK, "max_event_bytes"}
+"""Settings that only say how large blocks are, of which bounds know nothing."""
+
+
+def coverage_command(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run directories, or directories of what agents left.")
+    ],
+    agents: Annotated[int, typer.Option(help="Share of what exists with so many agents,")] = 3,
+    blocks: Annotated[int, typer.Option(help="who complete so many blocks in all,")] = 3,
+    network: Annotated[str, typer.Option(help="on this network: lossless, lossy or any,")] = "lossy",
+    faults: Annotated[str, typer.Option(help="with these: reboot, death, duplicate, with commas between.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+) -> None:
+    """Say which share of all local states, inputs and branches runs have tried, of any agents that leave traces.
+
+    What exists is looked up by `prove` within the bounds that are given.
+    """
+    reached = Reached()
+    settings: dict[str, Any] | None = None
+    for path in runs:
+        evidence = checker.gather(RunArchive(path))
+        if not evidence.traces:
+            raise RunDirectoryError(f"{path} has no traces, and without them nobody knows what agents came to")
+        for trace in evidence.traces.values():
+            its = _that_matter(trace.header.settings)
+            if settings is not None and its != settings:
+                raise RunDirectoryError(f"{path} was played with other settings: ask about runs of one kind at a time")
+            settings = its
+        reached.add(coverage.reached_in(evidence))
+    chosen = tuple(name for name in faults.split(",") if name)
+    bounds = Bounds(agents, blocks, network, chosen, settings=settings or {})  # type: ignore[arg-type]  # it is checked
+    there = coverage.existing(bounds)
+    if as_json:
+        print_json({"runs": len(runs), **coverage.to_json(reached, there)})
+    else:
+        console = Console()
+        for line in coverage.in_words(reached, there):
+            console.print(line, highlight=False, soft_wrap=True, markup=False)
+    if not reached.steps:
+        complain("no step of any agent could be followed")
+        raise typer.Exit(WRONG_REQUEST)
+
+
+def _that_matter(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that are not as by default, and that an agent's steps depend on."""
+    default = dataclasses.asdict(Settings())
+    return {
+        name: value
+        for name, value in settings.items()
+        if name in default and name not in OF_BLOCKS and value != default[name]
+    }
