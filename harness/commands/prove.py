@@ -15,6 +15,7 @@ from harness.prove import Bounds, BoundsError, Limits, Progress
 
 LINE_EVERY_S = 10.0
 GIGABYTE = 1e9
+TIMERS = ("duration", "apart", "any")
 
 
 def prove_command(
@@ -26,7 +27,10 @@ def prove_command(
     faults: Annotated[
         str, typer.Option(help="Of reboot, death (each once, at any moment) and duplicate, with commas between.")
     ] = "",
-    timers: Annotated[str, typer.Option(help="When timers end: by duration, or any, in whatever order.")] = "duration",
+    timers: Annotated[
+        str,
+        typer.Option(help="When timers end: by duration; apart: nothing at once by chance; any: in whatever order."),
+    ] = "duration",
     settings: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="A setting of all agents; may be repeated.")
     ] = None,
@@ -46,8 +50,8 @@ def prove_command(
     Exit status 0: everything holds. 1: something does not, and a scenario shows it. 4: a bound was reached before
     everything had been looked at. 130: interrupted.
     """
-    if timers not in ("duration", "any"):
-        raise BoundsError(f"--timers must be duration or any, not {timers!r}")
+    if timers not in TIMERS:
+        raise BoundsError(f"--timers must be one of {', '.join(TIMERS)}, not {timers!r}")
     quirks = _pairs("--quirk", quirk)
     bounds = Bounds(
         agents,
@@ -55,6 +59,7 @@ def prove_command(
         network,  # type: ignore[arg-type]  # it is checked
         tuple(name for name in faults.split(",") if name),
         timers == "any",
+        timers == "apart",
         _pairs("--settings", settings),
         quirks,
         reduced=not whole and not quirks,

@@ -9,8 +9,10 @@ alone.py      network any: each agent by itself, against all that could ever be 
 swarm.py      global states, and all that may happen next
 explore.py    all of them, breadth first
 liveness.py   whether there is always a way to rest with one chain, and whether one goes round for ever
+livelock.py   the forms of going round, each with a scenario and what it takes to get there
 times.py      mission seconds for a way through the graph
 script.py     a way through the graph as a scenario that the simulation plays
+example.py    a scenario, played and written
 prove.py      all of that together
 words.py      what came out, for people
 wrong_agents.py  what tells each wrong agent from the right one

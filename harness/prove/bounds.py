@@ -25,7 +25,9 @@ class BoundsError(HarnessError):
 class Bounds:
     """`agents` that complete `blocks` blocks in all; each of `faults` but "duplicate" happens once at most.
 
-    `timers_any`: a timer may end whenever it runs, however long it should. `reduced`: states that behave alike are one.
+    `timers_any`: a timer may end whenever it runs, however long it should. `apart`: no two things happen at the same
+    moment by chance, but those only whose distance is fixed, as one began by the other. `reduced`: states that behave
+    alike are one.
     """
 
     agents: int = 2
@@ -33,6 +35,7 @@ class Bounds:
     network: Network = "lossy"
     faults: tuple[str, ...] = ()
     timers_any: bool = False
+    apart: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
     quirks: Mapping[str, bool | float] = field(default_factory=dict)
     reduced: bool = True
@@ -67,7 +70,7 @@ class Bounds:
             f"network {self.network}",
         ]
         parts += [f"faults {', '.join(self.faults)}"] if self.faults else []
-        parts += ["timers in any order"] if self.timers_any else []
+        parts += ["timers in any order"] if self.timers_any else ["nothing at once by chance"] if self.apart else []
         parts += [f"{name} {value}" for name, value in self.settings.items()]
         parts += [f"quirk {name}" for name in self.quirks]
         return ", ".join(parts)

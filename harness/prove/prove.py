@@ -1,33 +1,28 @@
 """From bounds to what holds within them: explore, look at the whole, and write what was found as scenarios."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from harness.archive.directory import default_path
-from harness.checker.judgement import Judgement
 from harness.errors import INTERRUPTED, VIOLATED, HarnessError
-from harness.prove import liveness
+from harness.prove import livelock, liveness
 from harness.prove.alone import collect
 from harness.prove.bounds import Bounds
+from harness.prove.example import Example, keep, play
 from harness.prove.explore import Graph, explore
+from harness.prove.livelock import Livelock
 from harness.prove.liveness import Liveness
 from harness.prove.local import Flaw, ReductionError
 from harness.prove.progress import Ended, Figures, Progress
 from harness.prove.script import Script
 from harness.prove.swarm import Swarm
-from harness.run.finding import claim, evidence_lines, simulated, write
-from harness.scenario.load import parse
-from harness.scenario.write import to_yaml
+from harness.run.finding import claim
 
 INCOMPLETE = 4
 """Exit status: a bound was reached before everything had been looked at."""
-SEED = 1
-MOST_PLAYED = 20
-"""So many ways to the same thing are played, to find one that the simulation goes too."""
 CLAIMS = {
     "2": "an idle agent has committed every block that it completed",
     "3": "no agent holds a block twice",
@@ -46,23 +41,6 @@ class Limits:
     most_s: float = float("inf")
 
 
-@dataclass(frozen=True)
-class Example:
-    """A way to something that was found, as a scenario in `path`; `judged` is what is bad about its simulated run."""
-
-    path: Path
-    instants: int
-    judged: dict[str, Judgement]
-
-    @property
-    def replay(self) -> str:
-        return f"ucp-harness run {self.path} --backend sim --seed {SEED}"
-
-    def to_json(self) -> dict[str, Any]:
-        judged = {key: judgement.verdict for key, judgement in self.judged.items()}
-        return {"path": str(self.path), "instants": self.instants, "replay": self.replay, "judged": judged}
-
-
 @dataclass
 class Proof:
     """What came out. `liveness` is None if it was not looked at: not all states are known, or the network is `any`.
@@ -76,6 +54,8 @@ class Proof:
     flaw: Flaw | None
     liveness: Liveness | None = None
     example: Example | None = None
+    livelocks: list[Livelock] = field(default_factory=list)
+    """The first of each form, those that were played."""
     way: list[str] = field(default_factory=list)
 
     @property
@@ -99,7 +79,7 @@ class Proof:
             "blocks": bounds.blocks,
             "network": bounds.network,
             "faults": list(bounds.faults),
-            "timers": "any" if bounds.timers_any else "duration",
+            "timers": "any" if bounds.timers_any else "apart" if bounds.apart else "duration",
             "settings": dict(bounds.settings),
             "quirks": dict(bounds.quirks),
             "reduced": bounds.reduced,
@@ -111,6 +91,7 @@ class Proof:
             "forks_at_rest": None if live is None else live.forks,
             "without_a_way_to_one_chain": None if live is None else live.astray,
             "livelocks": None if live is None else len(live.cycles),
+            "livelock_forms": [each.to_json() for each in self.livelocks],
             "example": None if self.example is None else self.example.to_json(),
         }
 
@@ -171,42 +152,24 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
     proof = Proof(bounds, figures, graph.ended, graph.flaw)
     if proof.complete:
         proof.liveness = liveness.look(graph)
-    proof.example = _example(graph, proof.liveness, path, name)
+    _show(proof, graph, path, name)
     return proof
 
 
-def _ways(graph: Graph, live: Liveness | None) -> Iterator[tuple[list[int], str, str]]:
-    """Ways to what was found, the shortest first, each with a sentence and the key of what is bad when it is played."""
-    if graph.flawed is not None and graph.flaw is not None:
-        kind = graph.flaw.kind
-        yield graph.path(graph.flawed), graph.flaw.sentence, kind if kind.isdecimal() else "liveness"
+def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
+    """Write what was found as scenarios: the first to `path`."""
+    live = proof.liveness
+    if proof.flaw is not None and graph.flawed is not None:
+        proof.example = _example(graph, graph.flawed, proof.flaw.sentence, path, name)
     elif live is not None and live.cycles:
-        ways = [[*graph.path(cycle[0]), *cycle[1:], cycle[0]] for cycle in live.cycles]
-        for way in sorted(ways, key=len):
-            yield way, "the swarm can go round in circles for ever", "liveness"
+        proof.livelocks = list(livelock.show(graph, live.cycles, path, name))
+        proof.example = proof.livelocks[0].example
     elif live is not None and live.lost is not None:
-        yield graph.path(live.lost), "no way was found from here to rest with one chain", "6"
+        proof.example = _example(graph, live.lost, "no way was found from here to rest with one chain", path, name)
 
 
-def _example(graph: Graph, live: Liveness | None, path: Path, name: str) -> Example | None:
-    """The first that the simulation plays as it is meant, or the first of all; written to `path`."""
-    first = None
-    for way, sentence, key in islice(_ways(graph, live), MOST_PLAYED):
-        document = Script(graph, way).document(name)
-        result = simulated(parse(document), SEED)
-        played = document, len(way) - 1, sentence, {bad: result.judgements[bad] for bad in result.bad}
-        first = first or played
-        if key in result.bad:
-            break
-    else:
-        if first is None:
-            return None
-        played = first
-    document, instants, sentence, judged = played
-    comment = [
-        f"{sentence.capitalize()}: {instants} instants after the beginning.",
-        f"A shortest way within {graph.swarm.bounds.in_words()}.",
-        *evidence_lines(judged),
-        f"  ucp-harness run {path} --backend sim --seed {SEED}",
-    ]
-    return Example(write(path, to_yaml(document, comment)), instants, judged)
+def _example(graph: Graph, number: int, sentence: str, path: Path, name: str) -> Example:
+    way = graph.path(number)
+    played = play(Script(graph, way).document(name))
+    said = f"{sentence.capitalize()}: {len(way) - 1} instants after the beginning."
+    return keep(played, path, graph.swarm.bounds, len(way) - 1, [said])

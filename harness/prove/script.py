@@ -1,26 +1,30 @@
 """A way through the graph as a scenario: scripted events, fates and lateness that make the simulation go the same way.
 
-A message takes LATENCY_S, or as long as it must so that everything reaches everybody in the order of the way; what is
-lost there has a fate here. A timer ends when it should, unless it has to wait for what was heard before.
+A message takes LATENCY_S, or as long as it must so that everything reaches everybody in the order of the way, and
+before what follows at once; what is lost there has a fate here. A timer ends when it should, unless it has to wait for
+what was heard before.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
+from math import inf
+from typing import Any, NamedTuple
 
 from harness.prove.bounds import EVENT_FILLS_BLOCK
 from harness.prove.explore import Graph
 from harness.prove.instant import Action, Wave
 from harness.prove.local import DEAD, Step
 from harness.prove.swarm import AGENTS, Move
-from harness.prove.times import Run, instants_s
+from harness.prove.times import Run, instants_s, windows_s
 from harness.scenario.numbered import in_text
 
 LATENCY_S = 0.02
 MOMENT_S = 0.001
 """Between two things of which one has to be the first."""
+SOON_S = 0.1
+"""When the next instant follows sooner, messages take a MOMENT_S, so that what begins then begins with the rest."""
 SETTLES_S = 60
 
 Document = dict[str, Any]
@@ -48,6 +52,14 @@ class _Agent:
     started: int = 0
 
 
+class Completion(NamedTuple):
+    """When an agent may complete a block for the way to be gone: seconds after the first instant of the way."""
+
+    agent: int
+    earliest_s: float
+    latest_s: float
+
+
 class Script:
     """Follows a way, step by step, and takes down what is to be scripted."""
 
@@ -55,6 +67,11 @@ class Script:
         self._graph = graph
         self._swarm = graph.swarm
         self._moves = [self._move(before, after) for before, after in pairwise(way)]
+        self.coincidences = sum(
+            self._swarm.coincidences(graph.states[number], move.actions)
+            for number, move in zip(way, self._moves, strict=False)
+        )
+        """So many moments on the way have to be the same by chance."""
         begin = graph.states[way[0]]
         self._agents = [_Agent(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
         self._sent: Counter[tuple[int, str]] = Counter()
@@ -63,11 +80,13 @@ class Script:
         self._fates: list[Document] = []
         self._late: dict[int, dict[int, float]] = defaultdict(dict)
         self._end_s = 0.0
+        self._latency_s = LATENCY_S
 
     def document(self, name: str) -> Document:
         """The scenario."""
         instants = instants_s(len(self._moves), list(self._runs()))
-        for move, at_s in zip(self._moves, instants, strict=True):
+        for move, at_s, next_s in zip(self._moves, instants, [*instants[1:], inf], strict=True):
+            self._latency_s = LATENCY_S if next_s - at_s > SOON_S else MOMENT_S
             self._play(move, at_s)
         self._let_nothing_end_before_the_end()
         bounds = self._swarm.bounds
@@ -86,6 +105,17 @@ class Script:
             **({"fates": self._fates} if self._fates else {}),
             **({"lateness": lateness} if lateness else {}),
         }
+
+    def completions(self) -> Iterator[Completion]:
+        """When blocks are completed on the way, if nothing but the durations of timers binds them."""
+        agents = [agent.agent_id for agent in self._agents]
+        for move, (earliest_s, latest_s) in zip(
+            self._moves, windows_s(len(self._moves), list(self._runs())), strict=True
+        ):
+            for action in move.actions:
+                if action.what == "complete":
+                    yield Completion(agents[action.place], earliest_s, latest_s)
+            agents = [agents[old] for old in move.places]
 
     def _move(self, before: int, after: int) -> Move:
         """How the one state followed from the other, losing nothing if that is possible."""
@@ -210,11 +240,13 @@ class Script:
             for number in heard:
                 heard_by_anybody.add(number)
                 flight = air[number]
-                arrives_s = flight.sent_s + LATENCY_S
+                arrives_s = flight.sent_s + self._latency_s
+                hurried = self._latency_s < LATENCY_S
                 if arrives_s <= last_s:
                     arrives_s = last_s + MOMENT_S
-                    if self._swarm.order_matters(agent.local, place, wave, heard):
-                        self._fate(flight, agent.agent_id, delay_s=round(arrives_s - flight.sent_s, 6))
+                    hurried = hurried or self._swarm.order_matters(agent.local, place, wave, heard)
+                if hurried:
+                    self._fate(flight, agent.agent_id, delay_s=round(arrives_s - flight.sent_s, 6))
                 last_s = arrives_s
                 self._end_s = max(self._end_s, arrives_s)
                 sender = self._swarm.name_of(wave.air[number][0], place)

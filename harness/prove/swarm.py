@@ -65,7 +65,9 @@ class Swarm:
             by_place.setdefault(action.place, []).append(action)
         for count in range(1, len(by_place) + 1):
             for places in combinations(by_place, count):
-                yield from product(*(by_place[place] for place in places))
+                for actions in product(*(by_place[place] for place in places)):
+                    if not (self.bounds.apart and self.coincidences(state, actions)):
+                        yield actions
 
     def actions(self, state: State) -> Iterator[tuple[Action, ...]]:
         """All sets of what may happen in one instant: timers that end at once, and blocks completed meanwhile."""
@@ -73,6 +75,8 @@ class Swarm:
         left = self.bounds.blocks - state[BLOCKS]
         for ending in self.ending(state):
             yield ending
+            if self.bounds.apart:
+                continue
             idle_hands = [place for place in alive if all(place != action.place for action in ending)]
             for count in range(1, min(left, len(idle_hands)) + 1):
                 for places in self._unlike(state, permutations(idle_hands, count)):
@@ -86,6 +90,18 @@ class Swarm:
         for bit, fault in enumerate(FAULTS):
             if state[LEFT] >> bit & 1:
                 yield from ((Action(place, fault),) for place in alive)
+
+    def coincidences(self, state: State, actions: Sequence[Action]) -> int:
+        """How many moments have to be the same by chance for this to happen in one instant, and before all else."""
+        if self.bounds.timers_any:
+            return 0
+        at = {timer: index + 1 for index, timer in enumerate(self._running(state[AGENTS:]))}
+        ended = tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer"))
+        if not ended:
+            return len(actions) - 1
+        if self.zones.after(state[ZONE], ended, ()) is None:
+            return len(actions)  # they never end at once
+        return self.zones.coincidences(state[ZONE], ended) + len(actions) - len(ended)
 
     def _unlike(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
         """Of all choices of agents one for each that makes a difference: agents at rest in one state are alike.

@@ -6,6 +6,7 @@ solution (Bellman and Ford), if there is one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 
 APART_S = (5.0, 2.0, 1.0, 0.5, 0.2, 0.0)
 """How far from each other two instants should be: as far as can be."""
@@ -33,8 +34,39 @@ def instants_s(count: int, runs: Sequence[Run]) -> list[float]:
     return solution
 
 
+def windows_s(count: int, runs: Sequence[Run]) -> list[tuple[float, float]]:
+    """How long after the first instant each of `count` can be, at the earliest and at the latest."""
+    later = _later(count, runs, 0.0, punctual=True)
+    begin = [0.0, *[-inf] * (count - 1)]
+    earliest = _longest(begin, later)
+    latest = _longest(begin, [(after, before, least) for before, after, least in later])
+    assert earliest is not None, "the way was found"
+    assert latest is not None, "the way was found"
+    return [(first + 0.0, -last) for first, last in zip(earliest, latest, strict=True)]
+
+
 def _solved(count: int, runs: Sequence[Run], apart_s: float, *, punctual: bool) -> list[float] | None:
     """The earliest times: each is the longest way over what has to lie between."""
+    later = _later(count, runs, apart_s, punctual=punctual)
+    return _longest([BEGINS_S] * count, later)
+
+
+def _longest(at_least: Sequence[float], later: Sequence[tuple[int, int, float]]) -> list[float] | None:
+    """The longest way to each instant over what has to lie between; None if there is none."""
+    longest = [*at_least]
+    for _ in range(len(longest) + 1):
+        changed = False
+        for before, after, least in later:
+            if longest[before] + least > longest[after] + 1e-9:
+                longest[after] = longest[before] + least
+                changed = True
+        if not changed:
+            return longest
+    return None
+
+
+def _later(count: int, runs: Sequence[Run], apart_s: float, *, punctual: bool) -> list[tuple[int, int, float]]:
+    """(instant, another, how many seconds at least the other is later)."""
     later: list[tuple[int, int, float]] = [(number - 1, number, apart_s) for number in range(1, count)]
     for run in runs:
         if run.ended:
@@ -43,13 +75,4 @@ def _solved(count: int, runs: Sequence[Run], apart_s: float, *, punctual: bool) 
                 later.append((run.until, run.started, -run.duration_s))
         elif punctual:
             later.append((run.until, run.started, apart_s - run.duration_s))
-    times = [BEGINS_S] * count
-    for _ in range(count + 1):
-        changed = False
-        for before, after, least in later:
-            if times[before] + least > times[after] + 1e-9:
-                times[after] = times[before] + least
-                changed = True
-        if not changed:
-            return times
-    return None
+    return later

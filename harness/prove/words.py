@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from harness.prove.example import Example
 from harness.prove.prove import CLAIMS, Proof
 
 WHY = {
@@ -27,13 +28,21 @@ def in_words(proof: Proof) -> Iterator[str]:
     yield from _of_the_whole(proof)
     if proof.way:
         yield f"  an agent may, if all that it hears can be sent in one run: {'; '.join(proof.way)}"
+    for livelock in proof.livelocks:
+        ways = f"{livelock.ways} way{'s' if livelock.ways > 1 else ''}"
+        yield f"  {ways} of one form, {livelock.in_words()}: {livelock.example.replay}"
+        yield from _played(livelock.example)
     example = proof.example
-    if example is not None:
+    if example is not None and not proof.livelocks:
         yield f"  a shortest way there, {example.instants} instants: {example.replay}"
-        for key, judgement in example.judged.items():
-            yield f"    played: {key} {judgement.verdict}, {judgement.reason}"
-        if not example.judged:
-            yield "    played: the simulation goes another way in the end, and nothing is bad about it"
+        yield from _played(example)
+
+
+def _played(example: Example) -> Iterator[str]:
+    for key, judgement in example.judged.items():
+        yield f"    played: {key} {judgement.verdict}, {judgement.reason}"
+    if not example.judged:
+        yield "    played: the simulation goes another way in the end, and nothing is bad about it"
 
 
 def _name(kind: str) -> str:

@@ -20,6 +20,7 @@ class Zones:
         self._numbers: dict[Matrix, int] = {}
         self._after: dict[tuple[int, tuple[int, ...], tuple[int, ...]], int | None] = {}
         self._permuted: dict[tuple[int, tuple[int, ...]], int] = {}
+        self._coincidences: dict[tuple[int, tuple[int, ...]], int] = {}
         self._intern(((0,),))
 
     def __len__(self) -> int:
@@ -57,7 +58,22 @@ class Zones:
             self._permuted[key] = self._intern(tuple(tuple(matrix[i][j] for j in order) for i in order))
         return self._permuted[key]
 
-    def _work_out(self, zone: int, ended: Sequence[int], running: Sequence[int]) -> int | None:
+    def coincidences(self, zone: int, ended: tuple[int, ...]) -> int:
+        """How many moments have to be the same by chance for these to be the next to end, and at once.
+
+        As many as differences between timers are open in the zone and are not when these end; they must be able to.
+        """
+        key = zone, ended
+        if key not in self._coincidences:
+            before = self._matrices[zone]
+            after = self._ended(zone, ended)
+            assert after is not None, "these timers can end at once"
+            timers = range(1, len(before))
+            self._coincidences[key] = _apart(before, timers) - _apart(after, range(len(before)))
+        return self._coincidences[key]
+
+    def _ended(self, zone: int, ended: Sequence[int]) -> list[list[int]] | None:
+        """The bounds at the moment when these end, and no other has before; None if that cannot be."""
         matrix = [list(row) for row in self._matrices[zone]]
         size = range(len(matrix))
         for timer in ended:
@@ -71,6 +87,12 @@ class Zones:
                         matrix[i][j] = over
             if any(matrix[i][i] < 0 for i in size):
                 return None
+        return matrix
+
+    def _work_out(self, zone: int, ended: Sequence[int], running: Sequence[int]) -> int | None:
+        matrix = self._ended(zone, ended)
+        if matrix is None:
+            return None
         places = [0, *running]
 
         def bound(left: int, right: int) -> int:
@@ -89,3 +111,11 @@ class Zones:
         if number == len(self._matrices):
             self._matrices.append(matrix)
         return number
+
+
+def _apart(matrix: Sequence[Sequence[int]], timers: range) -> int:
+    """How many of the timers are left if of those whose distance from each other is fixed only one counts."""
+    return sum(
+        not any(matrix[timer][other] + matrix[other][timer] == 0 for other in timers if other < timer)
+        for timer in timers
+    )

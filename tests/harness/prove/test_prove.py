@@ -16,7 +16,7 @@ def test_the_livelock_in_step_is_found_without_being_told(tmp_path: Path) -> Non
     assert proof.liveness.lost is None
     assert proof.example is not None
     assert proof.example.judged["liveness"].verdict == "never finishes"
-    assert "fates" not in proof.example.path.read_text()
+    assert "drop" not in proof.example.path.read_text()
     assert proof.exit_status == 1
 
 

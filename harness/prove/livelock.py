@@ -1,0 +1,111 @@
+"""Livelocks, each form of going round once: who, how often, what has to be the same moment, and a scenario of it.
+
+Ways round are of one form if the same timers run in their states, whoever runs them and whatever the chains are.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from harness.archive.record import Cycle
+from harness.prove.example import Example, keep, play
+from harness.prove.explore import Graph
+from harness.prove.local import DEAD
+from harness.prove.script import Completion, Script
+from harness.prove.swarm import AGENTS
+
+MOST_FORMS = 12
+"""So many forms are played, the nearest first."""
+MOST_PLAYED = 5
+"""So many ways of one form are played, to find one that the simulation goes too."""
+ROUNDS = 3
+"""For so many rounds it is worked out how far apart what leads there may be."""
+
+_Form = tuple[object, ...]
+
+
+@dataclass(frozen=True)
+class Livelock:
+    """`ways` parts of the graph go round in this form. `completions` are when blocks may be completed to come there.
+
+    `coincidences`: so many moments have to be the same by chance on the way, to within the time that a message takes.
+    `cycle` is what the simulation was found to go round in when it played the example; None if it went another way.
+    """
+
+    ways: int
+    coincidences: int
+    completions: tuple[Completion, ...]
+    example: Example
+    cycle: Cycle | None
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "ways": self.ways,
+            "coincidences": self.coincidences,
+            "completions": [completion._asdict() for completion in self.completions],
+            "cycle": None if self.cycle is None else self.cycle.model_dump(mode="json"),
+            "example": self.example.to_json(),
+        }
+
+    def in_words(self) -> str:
+        """What it takes to get there."""
+        if not self.coincidences:
+            return "it takes no coincidence"
+        moments = "two moments have" if self.coincidences == 1 else f"{self.coincidences} times two moments have"
+        return f"it takes that {moments} to be the same by chance, to within the time that a message takes"
+
+
+def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
+    """The ways round by form, the nearest first."""
+    alike: dict[_Form, list[list[int]]] = defaultdict(list)
+    for cycle in cycles:
+        alike[_form(graph, cycle)].append(cycle)
+    return list(alike.values())
+
+
+def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
+    """The same wherever one begins to go round."""
+    known = graph.swarm.local.known
+    looks = [
+        tuple(
+            sorted(
+                (known[local].running, known[local].waits) for local in graph.states[number][AGENTS:] if local != DEAD
+            )
+        )
+        for number in cycle
+    ]
+    return min(tuple(looks[first:] + looks[:first]) for first in range(len(looks)))
+
+
+def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> Iterator[Livelock]:
+    """Of each form one, written to `path` and beside it."""
+    for number, alike in enumerate(islice(forms(graph, cycles), MOST_FORMS), 1):
+        file = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        yield _shown(graph, alike, file, name if number == 1 else f"{name} {number}")
+
+
+def _shown(graph: Graph, alike: Sequence[list[int]], path: Path, name: str) -> Livelock:
+    """With as few coincidences as there are: the first that the simulation goes too, or the first of all."""
+    tried: list[tuple[int, int, list[int], list[int], Script]] = []
+    for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MOST_PLAYED]:
+        begin = graph.path(cycle[0])
+        script = Script(graph, [*begin, *cycle[1:], cycle[0]])
+        tried.append((script.coincidences, len(tried), begin, cycle, script))
+    first = None
+    for coincidences, _, begin, cycle, script in sorted(tried, key=lambda each: each[:2]):
+        played = play(script.document(name))
+        first = first or (coincidences, begin, cycle, played)
+        if "liveness" in played.judged:
+            first = coincidences, begin, cycle, played
+            break
+    assert first is not None, "there is a way round"
+    coincidences, begin, cycle, played = first
+    bounds = graph.swarm.bounds
+    several = Script(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
+    completions = () if bounds.timers_any else tuple(several.completions())
+    sentence = f"The swarm can go round in circles for ever: {len(begin) - 1} instants after the beginning."
+    example = keep(played, path, bounds, len(begin) - 1 + len(cycle), [sentence])
+    return Livelock(len(alike), coincidences, completions, example, played.cycle)

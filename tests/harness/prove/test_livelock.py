@@ -1,0 +1,55 @@
+"""Ways to go round for ever: what they take, and that the simulation goes round too."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.prove import Bounds, in_words, prove
+from harness.prove.zones import NOTHING_RUNS, Zones
+
+
+@pytest.mark.parametrize(("blocks", "network"), [(4, "lossless"), (3, "lossy")])
+def test_each_form_becomes_a_scenario_that_goes_round(tmp_path: Path, blocks: int, network: str) -> None:
+    proof = prove(Bounds(2, blocks, network), out=tmp_path / "round.yaml")  # type: ignore[arg-type]
+    assert proof.liveness is not None
+    (livelock,) = proof.livelocks
+    assert livelock.ways == len(proof.liveness.cycles) > 1
+    assert livelock.coincidences == 1
+    assert livelock.example.judged["liveness"].verdict == "never finishes"
+    assert livelock.cycle is not None
+    assert livelock.cycle.period_s == pytest.approx(15.0)
+    assert livelock.cycle.agents == [1, 2]
+    assert {"vote_timer_expiration", "reconcile_finalize"} <= {step.handler for step in livelock.cycle.steps}
+    assert any("two moments have to be the same by chance" in line for line in in_words(proof))
+
+
+def test_blocks_may_come_when_they_like_but_for_one(tmp_path: Path) -> None:
+    """Of the first of each agent one follows the other at once; the others have until that is decided."""
+    proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "round.yaml")
+    completions = proof.livelocks[0].completions
+    assert sorted(completion.agent for completion in completions) == [1, 1, 2, 2]
+    assert sum(completion.earliest_s == completion.latest_s for completion in completions) == 2
+    assert max(completion.latest_s for completion in completions) == 10.0
+
+
+def test_nothing_goes_round_if_nothing_is_at_once_by_chance(tmp_path: Path) -> None:
+    proof = prove(Bounds(2, 4, "lossless", apart=True), out=tmp_path / "none.yaml")
+    assert proof.exit_status == 0
+    assert proof.liveness is not None
+    assert not proof.liveness.cycles
+    assert not proof.liveness.forks
+
+
+def test_a_coincidence_is_a_difference_that_was_open() -> None:
+    zones = Zones()
+    ten_s = -10_000_000 - 1
+    first = zones.after(NOTHING_RUNS, (), (ten_s,))
+    assert first is not None
+    both = zones.after(first, (), (1, ten_s))
+    assert both is not None
+    assert zones.coincidences(both, (1,)) == 0
+    assert zones.coincidences(both, (2,)) == 1
+    assert zones.coincidences(both, (1, 2)) == 1
+    at_once = zones.after(NOTHING_RUNS, (), (ten_s, ten_s))
+    assert at_once is not None
+    assert zones.coincidences(at_once, (1, 2)) == 0
