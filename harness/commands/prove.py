@@ -40,6 +40,9 @@ def prove_command(
     whole: Annotated[
         bool, typer.Option("--whole", help="Take no two states for one, though they behave alike.")
     ] = False,
+    steps: Annotated[
+        bool, typer.Option("--steps", help="Hold each step of wrong agents (--quirk) against that of a right one, too.")
+    ] = False,
     memory: Annotated[float, typer.Option(help="Gigabytes at which to give up.")] = 4.0,
     for_s: Annotated[float | None, typer.Option("--for", help="Seconds after which to give up.")] = None,
     out: Annotated[Path | None, typer.Option(help="File of the scenario that shows what was found; new.")] = None,
@@ -63,6 +66,7 @@ def prove_command(
         _pairs("--settings", settings),
         quirks,
         reduced=not whole and not quirks,
+        steps=steps,
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s)
     with _Watcher() as watcher:

@@ -3,6 +3,7 @@
 bounds.py     within which everything is looked at
 snapshot.py   an agent's whole state: copied, put back, as a key
 local.py      local states by number; each step computed once, by the real agent
+reference.py  whether a step is that of a right agent
 zones.py      how long timers have yet to run, compared with each other
 instant.py    what an instant makes of the agents: who hears what in which order, and loses what
 alone.py      network any: each agent by itself, against all that could ever be sent

@@ -27,7 +27,7 @@ class Bounds:
 
     `timers_any`: a timer may end whenever it runs, however long it should. `apart`: no two things happen at the same
     moment by chance, but those only whose distance is fixed, as one began by the other. `reduced`: states that behave
-    alike are one.
+    alike are one. `steps`: each step of the agents is held against that of right ones, too.
     """
 
     agents: int = 2
@@ -39,6 +39,7 @@ class Bounds:
     settings: Mapping[str, Any] = field(default_factory=dict)
     quirks: Mapping[str, bool | float] = field(default_factory=dict)
     reduced: bool = True
+    steps: bool = False
 
     def __post_init__(self) -> None:
         for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):

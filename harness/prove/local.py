@@ -6,20 +6,20 @@ looked at once, when it gets its number.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from random import Random
 from typing import Any, NamedTuple
 
 from harness.prove.bounds import Bounds
-from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, is_as, key_of, put_back, take
+from harness.prove.reference import Give, Reference
+from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, dead, is_as, key_of, put_back, take
 from ucp.agent import Agent
 from ucp.block import Block, next_chain_hash
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.messages import Message
 from ucp.quirks import wrong_handlers
-from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import StoredState
 
@@ -44,10 +44,14 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Flaw:
-    """Something that must never be: of which characteristic ("2", "3", "4"), or "hang" or "crash", and a sentence."""
+    """Something that must never be: of which characteristic ("2", "3", "4"), or "hang", "crash" or "steps"; a sentence.
+
+    `handler` is that of a wrong step.
+    """
 
     kind: str
     sentence: str
+    handler: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,10 @@ class Known:
     anonymous: int
     """The same for states that differ only in who has voted and answered."""
     names_others: bool
+
+
+WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us": -1}
+"""Parts of the state that no handler needs where nothing is ever lost, as they are at the beginning."""
 
 
 class ReductionError(Exception):
@@ -86,9 +94,10 @@ class LocalStates:
         """In which local state each of the real agents is."""
         roster = range(1, bounds.agents + 1)
         settings = bounds.agent_settings()
-        self._agents = {agent_id: self._agent(agent_id, roster, settings) for agent_id in roster}
-        self.timers = [timer.name for timer in self._agents[1].state.timers]
         self.settings, self._roster = settings, roster
+        self._agents = {agent_id: self._agent(agent_id) for agent_id in roster}
+        self._reference = Reference(self._agent) if bounds.steps else None
+        self.timers = [timer.name for timer in self._agents[1].state.timers]
         durations = (
             settings.vote_timeout_s,
             settings.phase1_timeout_s,
@@ -112,9 +121,9 @@ class LocalStates:
         self._renamed: dict[tuple[int, tuple[int, ...]], int] = {}
         self.initial = {agent_id: self._intern(agent_id) for agent_id in roster}
 
-    def _agent(self, agent_id: int, roster: Iterable[int], settings: Settings) -> Agent:
-        handlers = wrong_handlers(self.bounds.quirks, Random(0))
-        return Agent(agent_id, roster, INITIAL_DATA, settings, handlers=handlers, tracing=False)
+    def _agent(self, agent_id: int, right: bool = False, tracing: bool = False) -> Agent:
+        handlers = [] if right else wrong_handlers(self.bounds.quirks, Random(0))
+        return Agent(agent_id, self._roster, INITIAL_DATA, self.settings, handlers=handlers, tracing=tracing)
 
     # Steps
 
@@ -123,9 +132,9 @@ class LocalStates:
         key = local, sender, message
         step = self._steps.get(key)
         if step is None:
-            agent = self._restored(local)
+            heard = self.messages[message]
             step = self._steps[key] = self._computed(
-                local, agent, lambda: agent.receive_message(sender, 0, self.messages[message], NOW_S), hears=True
+                local, lambda agent: agent.receive_message(sender, 0, heard, NOW_S), hears=True
             )
         return step
 
@@ -134,9 +143,8 @@ class LocalStates:
         key = local, -1, timer
         step = self._steps.get(key)
         if step is None:
-            agent = self._restored(local)
             step = self._steps[key] = self._computed(
-                local, agent, lambda: agent.end_timer(agent.state.timers[timer], NOW_S)
+                local, lambda agent: agent.end_timer(agent.state.timers[timer], NOW_S)
             )
         return step
 
@@ -145,18 +153,7 @@ class LocalStates:
         key = local, -2, ordinal
         step = self._steps.get(key)
         if step is None:
-            agent = self._restored(local)
-            event = LoggableEvent(ordinal * MICROSECONDS, 1, bytes(256))
-
-            def logged() -> None:
-                agent.add_event(event, NOW_S)
-                for block in agent.state.blocks_to_be_committed:
-                    if block.timestamp_us == event.timestamp_us:
-                        self._ordinals[block.block_hash] = frozenset((ordinal,))
-                for block_hash in agent.state.completed:
-                    self._blocks.setdefault(block_hash, agent.agent_id)
-
-            step = self._steps[key] = self._computed(local, agent, logged)
+            step = self._steps[key] = self._computed(local, lambda agent: _log(agent, ordinal), completes=ordinal)
         return step
 
     def reboot(self, local: int) -> Step:
@@ -164,10 +161,8 @@ class LocalStates:
         key = local, -3, 0
         step = self._steps.get(key)
         if step is None:
-            former = self._restored(local)
-            agent = self._agent(former.agent_id, self._roster, self.settings)
-            stored = StoredState.of(former.state)
-            step = self._steps[key] = self._computed(local, agent, lambda: agent.boot(stored, NOW_S))
+            stored = StoredState.of(self._restored(local).state)
+            step = self._steps[key] = self._computed(local, lambda agent: agent.boot(stored, NOW_S), boots=True)
         return step
 
     def state(self, local: int) -> AgentState:
@@ -193,23 +188,31 @@ class LocalStates:
             self._loaded[known.agent_id] = local
         return agent
 
-    def _computed(self, local: int, agent: Agent, give: Callable[[], None], *, hears: bool = False) -> Step:
+    def _computed(
+        self, local: int, give: Give, *, hears: bool = False, boots: bool = False, completes: int | None = None
+    ) -> Step:
         self.steps += 1
-        crashed = None
+        before = self.known[local]
+        agent = self._agent(before.agent_id) if boots else self._restored(local)
+        completed = len(agent.state.completed)
+        crashed = wrong = None
         try:
-            give()
-            for _ in range(MOST_AT_ONCE):
-                soon = [t for t in agent.state.timers if t.deadline is not None and t.deadline <= NOW_S + AT_ONCE_S]
-                if not soon:
-                    break
-                agent.end_timer(min(soon, key=lambda timer: timer.deadline or 0.0), NOW_S)
-            else:
-                crashed = "its timers end at once again and again"
+            give(agent)
         except Exception as error:  # whatever a handler raises is what we look for
             crashed = f"{type(error).__name__}: {error}"
+        if completes is not None:
+            self._has_completed(agent, completed, completes)
+        if self._reference is not None:
+            snapshot = None if boots else before.snapshot
+            wrong = self._reference.deviation(agent, crashed, snapshot, give, self._block_in_words)
+        if crashed is None:
+            crashed = _end_at_once(agent)
+        flaw = Flaw("crash", f"a handler ended by {crashed}") if crashed else None
+        if wrong is not None:
+            handler, sentence = wrong
+            flaw = Flaw("steps", sentence, handler)
         sent = tuple(self._message(message) for _, message in agent.messages_to_send())
-        before = self.known[local]
-        if crashed is None and agent is self._agents[before.agent_id] and is_as(agent, before.snapshot):
+        if flaw is None and agent is self._agents[before.agent_id] and is_as(agent, before.snapshot):
             return Step(local, sent, ())
         self._loaded.pop(agent.agent_id, None)
         started = tuple(
@@ -220,9 +223,18 @@ class LocalStates:
         if self.bounds.reduced:
             if hears and any(self.timers[timer] == "voting" for timer, _ in started):
                 raise ReductionError("an agent begins a vote because of a message: try again with --whole")
-            self._check_that_nothing_is_lost(self.known[local].snapshot, agent.state)
-            _forget_what_is_dead(agent.state)
-        return Step(self._intern(agent.agent_id, agent, crashed), sent, started)
+            self._check_that_nothing_is_lost(before.snapshot, agent.state)
+        return Step(self._intern(agent.agent_id, agent, flaw), sent, started)
+
+    def _has_completed(self, agent: Agent, completed: int, ordinal: int) -> None:
+        """The agent had `completed` blocks before; what it has completed now is the `ordinal`th of all."""
+        for block_hash in agent.state.completed[completed:]:
+            self._ordinals[block_hash] = frozenset((ordinal,))
+            self._blocks.setdefault(block_hash, agent.agent_id)
+
+    def _block_in_words(self, block_hash: str) -> str:
+        ordinals = sorted(self._ordinals.get(bytes.fromhex(block_hash), ()))
+        return f"block {ordinals[-1]}" if ordinals else block_hash[:12]
 
     def _message(self, message: Message) -> int:
         number = self._message_numbers.setdefault(message, len(self.messages))
@@ -267,10 +279,12 @@ class LocalStates:
             number = self._renamed[key] = self._intern(agent.agent_id, agent)
         return number
 
-    def _intern(self, agent_id: int, agent: Agent | None = None, crashed: str | None = None) -> int:
+    def _intern(self, agent_id: int, agent: Agent | None = None, flaw: Flaw | None = None) -> int:
         agent = agent or self._agents[agent_id]
         snapshot = take(agent)
-        key = (agent_id, crashed, *key_of(snapshot, self._name))
+        if self.bounds.reduced:
+            snapshot |= WHAT_ONLY_CHECKS_READ | dead(agent.state)
+        key = (agent_id, flaw, *key_of(snapshot, self._name))
         number = self._numbers.setdefault(key, len(self.known))
         if number == len(self.known):
             state = agent.state
@@ -285,8 +299,8 @@ class LocalStates:
                     state.idle,
                     state.reconcile_in_progress,
                     tuple(self._name(block.block_hash) for block in state.chain),
-                    Flaw("crash", f"a handler ended by {crashed}") if crashed else self._flaw(state),
-                    self._anonymous.setdefault((agent_id, crashed, *key_of(_nameless(snapshot), self._name)), number),
+                    flaw or self._flaw(state),
+                    self._anonymous.setdefault((agent_id, flaw, *key_of(_nameless(snapshot), self._name)), number),
                     bool(state.voters or state.reconcile_responders),
                 )
             )
@@ -325,23 +339,26 @@ class LocalStates:
             raise ReductionError("a block that an agent held is gone: try again with --whole")
 
 
-def _forget_what_is_dead(state: AgentState) -> None:
-    """What every handler writes before it reads it again; and counters of which only the check above makes use."""
-    state.completed.clear()
-    state.newest_block_timestamp_us = -1
-    if not state.voting_timer.active:
-        state.vote_count = {"yes": 0, "no": 0}
-        state.voters = set()
-        state.candidate_block = None
-        state.top_chain_hash_at_initiation = b""
-    if not state.phase_one_timer.active:
-        state.reconcile_vote_count = {"yes": 0, "no": 0}
-        if not state.phase_two_timer.active:
-            state.reconcile_responders = set()
-    if not state.phase_two_timer.active:
-        state.reconcile_response_dictionary = {}
-    if not state.phase_three_timer.active:
-        state.majority_response_block_hash = None
+def _log(agent: Agent, ordinal: int) -> None:
+    """Log events until a block is complete: the `ordinal`th of all."""
+    completed = len(agent.state.completed)
+    for number in range(MOST_AT_ONCE):
+        if len(agent.state.completed) > completed:
+            return
+        agent.add_event(LoggableEvent(ordinal * MICROSECONDS + number, 1, bytes(256)), NOW_S)
+
+
+def _end_at_once(agent: Agent) -> str | None:
+    """End the timers that end before anything can be heard; what a handler raised, if one did."""
+    try:
+        for _ in range(MOST_AT_ONCE):
+            soon = [t for t in agent.state.timers if t.deadline is not None and t.deadline <= NOW_S + AT_ONCE_S]
+            if not soon:
+                return None
+            agent.end_timer(min(soon, key=lambda timer: timer.deadline or 0.0), NOW_S)
+    except Exception as error:  # whatever a handler raises is what we look for
+        return f"{type(error).__name__}: {error}"
+    return "its timers end at once again and again"
 
 
 def _nameless(snapshot: Snapshot) -> Snapshot:

@@ -29,8 +29,11 @@ CLAIMS = {
     "4": "every block is genuine",
     "hang": "no agent reconciles without a timer that would end it",
     "crash": "no handler ends by an error",
+    "steps": "every step is that of a right agent",
 }
-"""What is looked at in every state."""
+"""What is looked at in every state; "steps" where it is asked for."""
+PLAYED = {"2": "2", "3": "3", "4": "4", "hang": "liveness", "crash": "liveness", "steps": "steps"}
+"""Kinds of flaws, and by what a simulated run shows them."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ class Proof:
             "settings": dict(bounds.settings),
             "quirks": dict(bounds.quirks),
             "reduced": bounds.reduced,
+            "steps_judged": bounds.steps,
             "complete": self.complete,
             "ended": self.ended,
             **asdict(self.figures),

@@ -12,6 +12,7 @@ from typing import Any
 from ucp.agent import Agent
 from ucp.block import Block
 from ucp.chain import Chain
+from ucp.state import AgentState
 from ucp.timers import Timer
 
 REPORTED = frozenset(("now", "sent", "reconciles", "chain_changed_at", "_sequence"))
@@ -34,6 +35,25 @@ NameOf = Callable[[bytes], int]
 def take(agent: Agent) -> Snapshot:
     """A copy of the agent's state."""
     return {name: _copied(value) for name, value in vars(agent.state).items() if name not in LEFT_OUT}
+
+
+def dead(state: AgentState) -> Snapshot:
+    """What every handler of a right agent writes before it reads it again, as it is at the beginning."""
+    parts: Snapshot = {}
+    if not state.voting_timer.active:
+        parts["vote_count"] = {"yes": 0, "no": 0}
+        parts["voters"] = set()
+        parts["candidate_block"] = None
+        parts["top_chain_hash_at_initiation"] = b""
+    if not state.phase_one_timer.active:
+        parts["reconcile_vote_count"] = {"yes": 0, "no": 0}
+        if not state.phase_two_timer.active:
+            parts["reconcile_responders"] = set()
+    if not state.phase_two_timer.active:
+        parts["reconcile_response_dictionary"] = {}
+    if not state.phase_three_timer.active:
+        parts["majority_response_block_hash"] = None
+    return parts
 
 
 def put_back(agent: Agent, snapshot: Snapshot) -> None:

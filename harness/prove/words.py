@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from harness.prove.example import Example
-from harness.prove.prove import CLAIMS, Proof
+from harness.prove.prove import CLAIMS, PLAYED, Proof
 
 WHY = {
     "flaw": "it ends where the first flaw is",
@@ -24,7 +24,10 @@ def in_words(proof: Proof) -> Iterator[str]:
         f"local states, {figures.zones:,} zones, {instants}, in {figures.seconds:.1f} s"
     )
     for kind, claim in CLAIMS.items():
-        yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
+        if kind != "steps" or proof.bounds.steps:
+            yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
+    if proof.flaw is not None:
+        yield f"    {proof.flaw.sentence}"
     yield from _of_the_whole(proof)
     if proof.way:
         yield f"  an agent may, if all that it hears can be sent in one run: {'; '.join(proof.way)}"
@@ -35,6 +38,8 @@ def in_words(proof: Proof) -> Iterator[str]:
     example = proof.example
     if example is not None and not proof.livelocks:
         yield f"  a shortest way there, {example.instants} instants: {example.replay}"
+        if proof.flaw is not None and PLAYED[proof.flaw.kind] not in example.judged:
+            yield "    not shown by playing: the simulation goes another way"
         yield from _played(example)
 
 

@@ -1,27 +1,60 @@
 """`python -m harness.prove.wrong_agents [QUIRK ...]`: what tells each wrong agent from the right one, as a table.
 
-Of 2 agents with 2 blocks that may lose any message everything holds if they are right (tests/harness/prove): whatever
-does not, tells.
+First by its steps: some state that it comes to within small bounds, and some input, of which the right agent would make
+something else. Then by what comes of that, within bounds in which everything holds of right agents.
 """
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 from harness.prove import liveness
 from harness.prove.bounds import Bounds
 from harness.prove.explore import explore
 from harness.prove.swarm import Swarm
+from ucp.agent import HANDLERS
 from ucp.quirks import QUIRKS
 
 MOST_S = 60.0
 MOST_BYTES = 4e9
+SMALL = Bounds(2, 2, "lossy", reduced=False)
+"""Everything holds of right agents (tests/harness/prove)."""
+TRIED = (
+    SMALL,
+    replace(SMALL, faults=("duplicate",)),
+    replace(SMALL, blocks=1, settings={"max_block_bytes": 535}),
+    Bounds(3, 2, "lossless", reduced=False),
+    Bounds(3, 2, "lossy", reduced=False),
+    Bounds(2, 3, "lossy", reduced=False),
+    Bounds(3, 3, "lossless", reduced=False),
+    Bounds(3, 3, "lossy", reduced=False),
+)
+"""Where a wrong step is looked for, one after the other."""
 
 
-def told_by(quirk: str) -> str:
-    """What does not hold, in a few words."""
-    value = 1.0 if QUIRKS[quirk].chance else True
-    swarm = Swarm(Bounds(2, 2, "lossy", quirks={quirk: value}, reduced=False))
-    graph = explore(swarm, most_bytes=MOST_BYTES, most_s=MOST_S)
+class Told(NamedTuple):
+    """Of a wrong step: which handler's it is, within which bounds, how many instants after the beginning."""
+
+    handler: str
+    bounds: Bounds
+    instants: int
+
+
+def wrong_step(quirk: str, most_s: float = MOST_S) -> Told | str:
+    """The nearest; or in a few words why there is none."""
+    for bounds in TRIED:
+        graph = explore(Swarm(_with(quirk, replace(bounds, steps=True))), most_bytes=MOST_BYTES, most_s=most_s)
+        if graph.flaw is not None and graph.flaw.handler is not None and graph.flawed is not None:
+            return Told(graph.flaw.handler, bounds, len(graph.path(graph.flawed)) - 1)
+        if graph.ended != "complete":
+            return f"not decided ({graph.ended})"
+    return "none"
+
+
+def consequence(quirk: str, most_s: float = MOST_S) -> str:
+    """What does not hold within the small bounds, in a few words."""
+    graph = explore(Swarm(_with(quirk, SMALL)), most_bytes=MOST_BYTES, most_s=most_s)
     if graph.flaw is not None:
         return f"characteristic {graph.flaw.kind}" if graph.flaw.kind.isdecimal() else graph.flaw.kind
     if graph.ended != "complete":
@@ -33,12 +66,29 @@ def told_by(quirk: str) -> str:
         return "livelock"
     if not live.decided:
         return "not decided (states)"
-    return "more votes for one chain" if len(live.astray) > 2 else "not told"
+    return "more votes for one chain" if len(live.astray) > 2 else "nothing"
+
+
+def _with(quirk: str, bounds: Bounds) -> Bounds:
+    return replace(bounds, quirks={quirk: 1.0 if QUIRKS[quirk].chance else True})
+
+
+def row(quirk: str) -> str:
+    """One of the table."""
+    algorithms = ", ".join(map(str, QUIRKS[quirk].algorithms))
+    step = wrong_step(quirk)
+    if isinstance(step, Told):
+        where = f"Algorithm {HANDLERS[step.handler].algorithm} | {step.bounds.in_words()} | {step.instants}"
+    else:
+        where = f"{step} | | "
+    return f"| `{quirk}` | {algorithms} | {where} | {consequence(quirk)} |"
 
 
 def main(names: Sequence[str]) -> None:
+    sys.stdout.write("| quirk | Algorithm | a wrong step of | within | instants | what comes of it |\n")
+    sys.stdout.write("|---|---|---|---|--:|---|\n")
     for name in names or QUIRKS:
-        sys.stdout.write(f"| `{name}` | {', '.join(map(str, QUIRKS[name].algorithms))} | {told_by(name)} |\n")
+        sys.stdout.write(f"{row(name)}\n")
         sys.stdout.flush()
 
 

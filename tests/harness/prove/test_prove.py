@@ -41,6 +41,32 @@ def test_a_wrong_agent_is_found_and_its_scenario_shows_it(tmp_path: Path, quirk:
     assert key in proof.example.judged
 
 
+@pytest.mark.parametrize(
+    ("quirk", "handler"),
+    [
+        ("propose_during_vote", "process_next_deque_block"),
+        ("hasty_vote", "process_next_deque_block"),
+        ("approve_everything", "receive_request_add_block"),
+        ("hide_commits", "vote_timer_expiration"),
+        ("youngest_on_tie", "reconcile_phase_2_timer_expiration"),
+    ],
+)
+def test_a_wrong_step_is_found_also_if_nothing_comes_of_it(tmp_path: Path, quirk: str, handler: str) -> None:
+    bounds = Bounds(2 if quirk != "youngest_on_tie" else 3, 2, "lossy", quirks={quirk: True}, reduced=False, steps=True)
+    proof = prove(bounds, out=tmp_path / "wrong.yaml")
+    assert proof.flaw is not None
+    assert (proof.flaw.kind, proof.flaw.handler) == ("steps", handler)
+    assert proof.example is not None
+    assert proof.example.judged["steps"].verdict == "deviates"
+    assert handler in proof.example.judged["steps"].reason
+
+
+def test_every_step_of_right_agents_is_right() -> None:
+    proof = prove(Bounds(2, 2, "lossy", ("reboot",), steps=True))
+    assert proof.exit_status == 0
+    assert any("every step" in line and line.startswith("✔") for line in in_words(proof))
+
+
 def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:
     proof = prove(Bounds(3, 3, "lossy"), Limits(most_s=0.0), tmp_path / "none.yaml")
     assert proof.exit_status == INCOMPLETE
