@@ -6,18 +6,29 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from tests.harness import forks
 
 DEADLINE_S = 60.0
 COMMAND = [sys.executable, "-m", "harness.cli"]
 
 
-def harness(*arguments: object, deadline_s: float = DEADLINE_S, **options: Any) -> subprocess.CompletedProcess[str]:
+def harness(
+    *arguments: object,
+    deadline_s: float = DEADLINE_S,
+    env: Mapping[str, str] = os.environ,
+    cwd: Path | None = None,
+    input: str = "",
+) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
+    words = [str(argument) for argument in arguments]
+    if forks.suits(env):
+        return forks.call(words, env, cwd or Path.cwd(), input, deadline_s)
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=deadline_s, **options
+        [*COMMAND, *words], capture_output=True, text=True, timeout=deadline_s, env=env, cwd=cwd, input=input
     )
 
 
