@@ -1,7 +1,7 @@
 """What this machine can do, for tests that need more than Python.
 
-`UCP_REQUIRE` is a list of "lab", "netem", "nftables", "uml", "cc", "browser", "tshark", "docker" and "ros" (comma
-between): what it names may not be missing, a test that would be skipped for the lack of it fails instead.
+`UCP_REQUIRE` is a list of "lab", "netem", "nftables", "uml", "cc", "browser", "tshark", "docker", "tlc" and "ros"
+(comma between): what it names may not be missing, a test that would be skipped for the lack of it fails instead.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import pytest
 
 from harness.play.containers.engine import DockerError, Engine
 from harness.play.containers.preflight import require_root
+from harness.specification import tlc
 from netem import uml
 from netem.errors import UmlError
 from netem.lab import Lab, LabUnavailable
@@ -62,6 +63,14 @@ def require_docker() -> None:
         require_root()
     except DockerError as error:
         do_without("docker", str(error))
+
+
+def require_tlc() -> None:
+    """The same of TLC, and of the Java that it needs."""
+    try:
+        tlc.command()
+    except tlc.NoCheckerError as error:
+        do_without("tlc", str(error))
 
 
 def require_tshark() -> str:

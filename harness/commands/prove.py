@@ -1,6 +1,7 @@
 """`ucp-harness prove`: look at everything that can happen within bounds."""
 
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -9,7 +10,7 @@ import typer
 import yaml
 from rich.console import Console
 
-from harness import prove
+from harness import prove, specification
 from harness.commands.terminal import complain, print_json
 from harness.prove import Bounds, BoundsError, Limits, Progress
 
@@ -43,6 +44,10 @@ def prove_command(
     steps: Annotated[
         bool, typer.Option("--steps", help="Hold each step of wrong agents (--quirk) against that of a right one, too.")
     ] = False,
+    second_opinion: Annotated[
+        bool,
+        typer.Option("--second-opinion", help="Look at the specification in TLA+, too: are its states the same?"),
+    ] = False,
     memory: Annotated[float, typer.Option(help="Gigabytes at which to give up.")] = 4.0,
     for_s: Annotated[float | None, typer.Option("--for", help="Seconds after which to give up.")] = None,
     out: Annotated[Path | None, typer.Option(help="File of the scenario that shows what was found; new.")] = None,
@@ -69,17 +74,26 @@ def prove_command(
         steps=steps,
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s)
+    if second_opinion:
+        with _Watcher() as watcher:
+            opinion = specification.second_opinion(bounds, limits, watch=watcher.show)
+        _say(opinion.to_json(), opinion.in_words(), as_json)
+        raise typer.Exit(opinion.exit_status)
     with _Watcher() as watcher:
         proof = prove.prove(bounds, limits, out, watch=watcher.show)
-    if as_json:
-        print_json(proof.to_json())
-    else:
-        console = Console()
-        for line in prove.in_words(proof):
-            console.print(line, highlight=False, soft_wrap=True, markup=False)
+    _say(proof.to_json(), prove.in_words(proof), as_json)
     if proof.ended == "interrupted":
         complain("interrupted")
     raise typer.Exit(proof.exit_status)
+
+
+def _say(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
+    if as_json:
+        print_json(document)
+        return
+    console = Console()
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 def _pairs(option: str, texts: list[str] | None) -> dict[str, Any]:

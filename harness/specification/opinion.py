@@ -1,0 +1,180 @@
+"""The same bounds looked at twice: the real agent by `harness.prove`, and the specification by TLC."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from math import gcd
+from typing import Any
+
+from harness.errors import VIOLATED
+from harness.prove.bounds import Bounds, BoundsError
+from harness.prove.explore import explore
+from harness.prove.progress import Ended, Progress
+from harness.prove.prove import INCOMPLETE, Limits
+from harness.prove.swarm import Swarm
+from harness.specification import states
+from harness.specification.tlc import CHECKED, checked, command
+from ucp.clock import MICROSECONDS
+from ucp.settings import Settings
+
+MEGABYTE = 1e6
+AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
+"""Quirks that the specification has, too: what the thesis prints, and cannot mean."""
+TIMEOUTS = {
+    "VoteTimeout": "vote_timeout_s",
+    "Phase1Timeout": "phase1_timeout_s",
+    "Phase2Timeout": "phase2_timeout_s",
+    "Phase3Timeout": "phase3_timeout_s",
+    "FinalizeGap": "finalize_gap_s",
+}
+INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
+"""In the specification, and as `prove` calls what they forbid."""
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """What both say. `states` and `specified` are None where somebody has not looked at everything.
+
+    States of timers that run for different times are one, so that `specified` is what TLC counts if timers end in any
+    order, and less otherwise. `only_*`: how many states only one of the two has.
+    """
+
+    bounds: Bounds
+    ended: Ended
+    flaw: str | None
+    violated: str | None
+    states: int | None = None
+    specified: int | None = None
+    distinct: int | None = None
+    only_real: int | None = None
+    only_specified: int | None = None
+
+    @property
+    def decided(self) -> bool:
+        return self.ended in ("complete", "flaw")
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both say the same, and have found the same states if nothing is wrong about them."""
+        return self.decided and self.flaw == self.violated and not self.only_real and not self.only_specified
+
+    @property
+    def exit_status(self) -> int:
+        if not self.decided:
+            return INCOMPLETE
+        return 0 if self.agrees and self.flaw is None else VIOLATED
+
+    def to_json(self) -> dict[str, Any]:
+        bounds = asdict(self.bounds)
+        return {
+            "schema": "ucp-second-opinion/1",
+            "agents": bounds["agents"],
+            "blocks": bounds["blocks"],
+            "network": bounds["network"],
+            "timers": "any" if bounds["timers_any"] else "duration",
+            "settings": dict(self.bounds.settings),
+            "quirks": dict(self.bounds.quirks),
+            "ended": self.ended,
+            "agree": self.agrees,
+            "prove": {"states": self.states, "flaw": self.flaw, "only_here": self.only_real},
+            "tlc": {
+                "states": self.specified,
+                "distinct": self.distinct,
+                "violated": self.violated,
+                "only_here": self.only_specified,
+            },
+        }
+
+    def in_words(self) -> Iterator[str]:
+        yield f"{self.bounds.in_words()}: the agent, and the specification in TLA+"
+        if not self.decided:
+            yield f"- not decided: not everything was looked at ({self.ended})"
+            return
+        if self.flaw is None and self.violated is None:
+            yield "✔ both hold: characteristics 2, 3 and 4, and nobody hangs"
+            yield f"  states: {self.states:,} of the agent, {self.specified:,} of the specification"
+            if self.agrees:
+                yield "✔ they are the same states"
+            else:
+                yield f"✘ {self.only_real:,} states only the agent has, {self.only_specified:,} only the specification"
+            return
+        yield f"{'✔ both violate' if self.agrees else '✘ they differ'}: the agent {_word(self.flaw)}, the " + (
+            f"specification {_word(self.violated)}"
+        )
+
+
+def _word(kind: str | None) -> str:
+    return "nothing" if kind is None else f"characteristic {kind}" if kind.isdecimal() else kind
+
+
+def second_opinion(
+    bounds: Bounds, limits: Limits | None = None, *, watch: Callable[[Progress], None] = lambda progress: None
+) -> Opinion:
+    """What both say. Raises BoundsError for what the specification does not have, NoCheckerError without TLC."""
+    bounds, limits = replace(bounds, reduced=False), limits or Limits()
+    config = _config(bounds)
+    command()
+    graph = explore(Swarm(bounds), most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
+    flaw = None if graph.flaw is None else graph.flaw.kind
+    if graph.ended not in ("complete", "flaw"):
+        return Opinion(bounds, graph.ended, flaw, None)
+    most_s = None if limits.most_s == float("inf") else limits.most_s
+    memory_mb = int(limits.most_bytes / MEGABYTE)
+    module = f"---- MODULE {CHECKED} ----\nEXTENDS Swarm\n====\n"
+    try:
+        with checked(module, config, dump=True, memory_mb=memory_mb, most_s=most_s) as said:
+            violated = said.violated and INVARIANTS[said.violated]
+            if flaw or violated:
+                return Opinion(bounds, "flaw", flaw, violated)
+            real, specified = set(states.real(graph)), set(states.specified(said.states))
+            return Opinion(
+                bounds,
+                "complete",
+                None,
+                None,
+                len(real),
+                len(specified),
+                said.distinct,
+                len(real - specified),
+                len(specified - real),
+            )
+    except TimeoutError:
+        return Opinion(bounds, "time", flaw, None)
+
+
+def _config(bounds: Bounds) -> str:
+    """What TLC is to check. Raises BoundsError."""
+    if bounds.network == "any":
+        raise BoundsError("the specification is of --network lossless and lossy: any is looked at in another way")
+    if bounds.faults:
+        raise BoundsError("the specification has no faults: leave --faults out")
+    unknown = [name for name in bounds.quirks if name not in AS_PRINTED]
+    if unknown:
+        raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}, not {unknown[0]}")
+    settings = bounds.agent_settings()
+    durations = {name: round(getattr(settings, key) * MICROSECONDS) for name, key in TIMEOUTS.items()}
+    unit = gcd(*durations.values())
+    constants = {
+        "Agents": bounds.agents,
+        "MostBlocks": bounds.blocks,
+        "Lossy": bounds.network == "lossy",
+        "Timed": not bounds.timers_any,
+        **{name: duration // unit for name, duration in durations.items()},
+        **readings(settings),
+        "AsPrinted": f"{{{', '.join(str(AS_PRINTED[name]) for name, value in bounds.quirks.items() if value)}}}",
+    }
+    assigned = (f"  {name} = {in_tla(value)}" for name, value in constants.items())
+    return "\n".join(["SPECIFICATION Spec", "CONSTANTS", *assigned, "INVARIANTS", *INVARIANTS, ""])
+
+
+def readings(settings: Settings) -> dict[str, bool]:
+    """The constants of the specification that are readings of the thesis with a setting."""
+    return {
+        "VoteNamesChain": settings.vote_names_chain,
+        "ChangedBeforeTally": settings.changed_before_tally,
+        "Phase1TiePops": settings.phase1_tie == "pop",
+        "Phase2TieTakesBlock": settings.phase2_tie == "block",
+    }
+
+
+def in_tla(value: object) -> str:
+    return str(value).upper() if isinstance(value, bool) else str(value)
