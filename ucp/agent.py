@@ -171,8 +171,13 @@ class Agent:
             self._drop(now, reason, datagram)
             return
         self.received[message.NAME] += 1
-        trigger: Trigger = {"message": message.NAME, "from": sender, "seq": sequence}
-        self._handle(now, trigger, datagram, self._on_message[type(message)], sender, message)
+        core, handler = self._core, self._on_message[type(message)]
+        core.now, core.running = now, handler
+        branch = handler.run(core, sender, message)
+        if self._tracing:
+            self._trace_run({"message": message.NAME, "from": sender, "seq": sequence}, datagram, handler, branch)
+        if core.triggered:
+            self._run_triggered()
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
         """Log an event. Raises ValueError if it is larger than the mission's largest event."""
@@ -239,7 +244,12 @@ class Agent:
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
         """What to broadcast, in order, as (sequence, message); empties the outbox."""
-        outbox, self._core.outbox = self._core.outbox, []
+        return [(sequence, message) for sequence, message, _ in self._taken_from_outbox()]
+
+    def _taken_from_outbox(self) -> list[tuple[int, Message, Recorded | None]]:
+        outbox = self._core.outbox
+        if outbox:
+            self._core.outbox = []
         return outbox
 
     def datagrams_to_send(self) -> list[bytes]:
@@ -264,16 +274,22 @@ class Agent:
     ) -> None:
         """Run a handler, and then those that it triggered, in order. `came` is the trace's `input`."""
         core = self._core
-        core.now = now
-        while True:
-            core.running = handler
-            branch = handler.run(core, *inputs)
-            if self._tracing:
-                self._trace_run(trigger, came, handler, branch)
-            if not core.triggered:
-                return
+        core.now, core.running = now, handler
+        branch = handler.run(core, *inputs)
+        if self._tracing:
+            self._trace_run(trigger, came, handler, branch)
+        if core.triggered:
+            self._run_triggered()
+
+    def _run_triggered(self) -> None:
+        """Run the handlers of local events, and of those that these trigger, in order."""
+        core = self._core
+        while core.triggered:
             event, by = core.triggered.popleft()
-            trigger, came, handler, inputs = {"local": by}, None, self._on_local_event[event], ()
+            handler = core.running = self._on_local_event[event]
+            branch = handler.run(core)
+            if self._tracing:
+                self._trace_run({"local": by}, None, handler, branch)
 
     def _trace_run(self, trigger: Trigger, came: Recorded | None, handler: EventHandler[Any], branch: str) -> None:
         core, state = self._core, self._traced_state

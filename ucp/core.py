@@ -13,14 +13,15 @@ from ucp.messages import Message
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.timers import Timer
-from ucp.trace import Sent
+from ucp.trace import Recorded, Sent
 
 
 class Core(AgentState):
     """The state, what handlers do to it, and what has come of that since the agent last took it away.
 
-    `outbox` has (sequence, message) to broadcast; `changes`, `announced` and `started`, kept only while `tracing`, are
-    what the running handler changed, sent and started, as a line of the trace says it.
+    `outbox` has (sequence, message, its datagram as it is on record) to broadcast. `changes`, `announced` and `started`
+    are what the running handler changed, sent and started, as a line of the trace says it; like the record of datagrams
+    they are kept only while `tracing`.
     """
 
     running: EventHandler[Any]
@@ -28,7 +29,7 @@ class Core(AgentState):
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Settings, *, tracing: bool = True) -> None:
         super().__init__(agent_id, initial_data, settings)
-        self.outbox: list[tuple[int, Message]] = []
+        self.outbox: list[tuple[int, Message, Recorded | None]] = []
         self.changes: list[tuple[str, str]] = []
         self.announced: list[Sent] = []
         self.started: dict[str, float] = {}
@@ -43,10 +44,13 @@ class Core(AgentState):
     def send(self, message: Message) -> None:
         """Broadcast `message` to the local UVS."""
         assert type(message) in self.running.sends, f"{self.running.name} does not declare that it sends {message.NAME}"
-        self.outbox.append((self._sequence, message))
         self.sent[message.NAME] += 1
+        datagram = None
         if self._tracing:
-            self.announced.append(Sent.of(self.agent_id, self._sequence, message))
+            announced = Sent.of(self.agent_id, self._sequence, message)
+            self.announced.append(announced)
+            datagram = announced.datagram
+        self.outbox.append((self._sequence, message, datagram))
         self._sequence += 1
 
     def start(self, timer: Timer, duration_s: float) -> None:

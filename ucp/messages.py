@@ -13,10 +13,10 @@ A message's WIRE declares its fields as they are sent, and the layers of `ucp.sc
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ucp.block import BLOCK_HEADER, HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
-from ucp.wire import Fields, Kind, struct_of
+from ucp.wire import VARIABLE, Fields, Kind, struct_of
 
 PORT = 14600
 """The UDP port of the harness's swarms; an agent is told its own in its mission file."""
@@ -247,16 +247,25 @@ def block_named(message: Message) -> bytes | None:
     return getattr(message, "block_hash", None)
 
 
-_BYTES: dict[type[Message], int] = {
-    message: HEADER.size + struct_of(message.WIRE).size
-    for message in (BlockAddRequest, ChainContainQuery, ChainContainResponse, ChainHashSuccessorQuery, RequestForBlock)
+_FIXED_BYTES: dict[type[Message], int] = {
+    message: HEADER.size + struct_of({name: kind for name, kind in message.WIRE.items() if kind not in VARIABLE}).size
+    for message in TYPE_CODES
 }
-"""Length of the datagram of each message that has always the same."""
+"""Length of each message's datagram, without what may be longer or shorter."""
+_MORE_BYTES: dict[type[Message], Callable[[Any], int]] = {
+    BlockAddResponse: lambda message: HASH_BYTES if message.chain_hash else 0,
+    CommitBlock: lambda message: BLOCK_HEADER.size + len(message.block.event_data),
+    NextInSequenceResponse: lambda message: HASH_BYTES if message.block_hash else 0,
+    BlockResponse: lambda message: BLOCK_HEADER.size + len(message.block.event_data),
+}
+"""Length of just that."""
 
 
 def datagram_bytes(message: Message) -> int:
     """Length of the datagram that `encode` makes of `message`."""
-    return _BYTES.get(type(message)) or HEADER.size + len(message.body())
+    kind = type(message)
+    more = _MORE_BYTES.get(kind)
+    return _FIXED_BYTES[kind] if more is None else _FIXED_BYTES[kind] + more(message)
 
 
 class Datagram(NamedTuple):

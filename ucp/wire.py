@@ -28,6 +28,9 @@ class Kind(Enum):
 
 Fields = Mapping[str, Kind]
 
+VARIABLE = frozenset((Kind.OPTIONAL_HASH, Kind.BLOCK))
+"""Kinds that have no fixed size."""
+
 
 def struct_of(fields: Fields) -> Struct:
     """Packs and unpacks fields of fixed size in their order."""

@@ -52,7 +52,7 @@ def check_quirk(name: str, value: object) -> None:
 
 def in_force(quirks: Mapping[str, bool | float]) -> dict[str, float]:
     """The quirks that are neither false nor 0; with none the agent is a right one."""
-    return {name: float(quirks[name]) for name in QUIRKS if quirks.get(name)}
+    return {name: float(quirks[name]) for name in QUIRKS if quirks.get(name)} if quirks else {}
 
 
 def wrong_handlers(quirks: Mapping[str, bool | float], lots: Random) -> list[EventHandler[Any]]:
@@ -61,8 +61,10 @@ def wrong_handlers(quirks: Mapping[str, bool | float], lots: Random) -> list[Eve
     What is random about them is drawn from `lots`.
     """
     wrong = in_force(quirks)
+    if not wrong:
+        return []
     handlers = {handler.algorithm: handler for handler in HANDLERS.values()}
     for name, value in wrong.items():
         for algorithm in QUIRKS[name].algorithms:
             handlers[algorithm] = QUIRKS[name].in_place_of(handlers[algorithm], value, lots)
-    return [ending_by_exceptions(handler) for handler in handlers.values()] if wrong else []
+    return [ending_by_exceptions(handler) for handler in handlers.values()]

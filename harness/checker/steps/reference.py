@@ -46,7 +46,7 @@ class ReferenceCore(Core):
     def unchanging(self) -> Iterator[object]:
         """What it refers to and never changes: a copy of it may refer to the same."""
         yield from (self.settings, self.chain.inception, self._moved, *self._moved.values(), *HANDLERS.values())
-        yield from (message for _, message in self.outbox)
+        yield from (message for _, message, _ in self.outbox)
 
     def be_idle_with(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
         """Be, from the beginning, what an agent is that holds no more than these, and waits for nothing."""
@@ -76,14 +76,14 @@ class ReferenceCore(Core):
 
     def send(self, message: Message) -> None:
         """As any core does, but for the record, which is made when it is wanted."""
-        self.outbox.append((self._sequence, message))
+        self.outbox.append((self._sequence, message, None))
         self._sequence += 1
 
     def has_sent(self, sent: Sequence[Sent]) -> bool:
         """Whether these are the messages that the step has sent."""
         if len(sent) != len(self.outbox):
             return False
-        for told, (sequence, message) in zip(sent, self.outbox, strict=True):
+        for told, (sequence, message, _) in zip(sent, self.outbox, strict=True):
             try:
                 datagram = decoded(told.datagram)
             except MalformedDatagramError:
@@ -97,7 +97,7 @@ class ReferenceCore(Core):
 
     def sent_in_full(self) -> list[Sent]:
         """What the step has sent, as a trace says it."""
-        return [Sent.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
+        return [Sent.of(self.agent_id, sequence, message) for sequence, message, _ in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
         """It has differed, and runs this by itself: which block it is after says what it does."""

@@ -10,7 +10,7 @@ from ucp.export import export_chain
 from ucp.messages import Message
 from ucp.settings import Settings
 from ucp.store import StoredState
-from ucp.trace import Entry, HandlerRun, Recorded
+from ucp.trace import Entry, Recorded
 
 Outgoing = tuple[int, Message | None, Recorded | None]
 """What an agent broadcasts: sequence, message, and the datagram as it is on record, None if nobody has that.
@@ -56,8 +56,8 @@ class VirtualAgent(Protocol):
 
     def answers_nobody_until(self) -> float | None: ...
 
-    def outgoing(self, entries: list[Entry]) -> Iterable[Outgoing]:
-        """What it broadcasts since it was last asked, in order; `entries` is what its trace says of that."""
+    def outgoing(self) -> Iterable[Outgoing]:
+        """What it broadcasts since it was last asked, in order."""
 
     def trace(self) -> list[Entry]: ...
 
@@ -99,14 +99,8 @@ class OwnAgent(Agent):
     def chain_changed_at(self) -> float:
         return self.state.chain_changed_at
 
-    def outgoing(self, entries: list[Entry]) -> Iterable[Outgoing]:
-        if not self._core.outbox:
-            return ()
-        messages = self.messages_to_send()
-        if not entries:
-            return [(sequence, message, None) for sequence, message in messages]
-        datagrams = (sent.datagram for run in entries if isinstance(run, HandlerRun) for sent in run.sent)
-        return [(*said, datagram) for said, datagram in zip(messages, datagrams, strict=True)]
+    def outgoing(self) -> Iterable[Outgoing]:
+        return self._taken_from_outbox()
 
     def status(self) -> Status:
         state = self.state

@@ -193,7 +193,7 @@ class Simulation(Clockwork):
 
     def _stands_still(self) -> bool:
         """Whether all agents are idle, now that nothing is on its way and no timer runs; those that are not hang."""
-        hanging = [life.agent for life in self.living() if life.waiting is None and not life.agent.status().idle]
+        hanging = [life.agent for life in self.living() if life.waiting is None and not life.idle]
         if hanging and not self._generating:
             agents = [agent.agent_id for agent in hanging]
             self.played.cycle = {"since_s": round(self._now, 3), "proven": True, "agents": agents}
@@ -203,8 +203,8 @@ class Simulation(Clockwork):
         """None while there is more to come than agents themselves do, or lots decide what becomes of them."""
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
-        unknown = self.scenario.has_wrong_agents or self._foreigners is not None
-        if self._generating or moving or self._rogue is not None or unknown or delays is None or self._late:
+        unknown = self._anybody_is_unknown or self._rogue is not None or bool(self._late)
+        if self._generating or moving or unknown or delays is None:
             return None
         return Recurrence(delays)
 
@@ -221,7 +221,7 @@ class Simulation(Clockwork):
             wakes_s = {number: life.deadline for number, life in lives.items() if life.deadline is not None}
             next_s = min(wakes_s.values())
             swarm = [
-                Waiting(life.state, self._local(life, next_s), life.deadline)
+                Waiting(life.state, life.local_s(next_s), life.deadline)
                 for life in lives.values()
                 if life.state is not None
             ]
@@ -242,11 +242,11 @@ class Simulation(Clockwork):
         life = self._alive[number]
         if life is not None and life.waiting is None:
             self._hear(number, life)
-            life.agent.begin_reconcile(self._local(life))
+            life.agent.begin_reconcile(life.local_s(self._now))
             self._after(number, life)
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        return {life.agent.agent_id: life.agent.status().top_chain_hash for life in self.living()}
+        return {life.agent.agent_id: life.top_chain_hash for life in self.living()}
 
     async def completed(self) -> dict[int, int]:
         return {life.agent.agent_id: len(life.agent.completed()) for life in self.living() if life.waiting is None}
@@ -329,7 +329,7 @@ class Simulation(Clockwork):
             "restarts": max(0, len(lives) - 1 - reboots),
             "reboots": reboots,
             "completed_before": list(completed),
-            "idle": life.agent.status().idle if life else None,
+            "idle": life.idle if life else None,
             "bytes_sent": sum(life.bytes_sent for life in lives),
             **({"dropped": dict(dropped)} if self._rogue is not None else {}),
             "messages_sent": sum(life.agent.messages_sent for life in lives),
@@ -366,8 +366,8 @@ class Simulation(Clockwork):
             self._hear(number, life)
             life.ended_at = self._now
             if disk_kept:
-                self._disks[number] = life.agent.stored(self._local(life))
-            life.agent.leave(self._local(life))
+                self._disks[number] = life.agent.stored(life.local_s(self._now))
+            life.agent.leave(life.local_s(self._now))
             if self._foreigners is not None:
                 self._foreigners.ended(life.agent)
         self._alive[number] = None

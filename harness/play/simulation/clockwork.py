@@ -29,7 +29,7 @@ from ucp.interest import ONLY_COUNTED
 from ucp.messages import Message, datagram_bytes
 from ucp.quirks import wrong_handlers
 from ucp.store import StoredState
-from ucp.trace import Entry, HandlerRun
+from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
     from harness.play.simulation.foreign.foreigners import Foreigners
@@ -69,7 +69,9 @@ class Clockwork:
         self._initial_data = initial_data
         self._recorder = recorder
         self._tracing = recorder.tracing
-        self._deliver_all = deliver_all = deliver_all or scenario.has_wrong_agents or bool(scenario.foreign)
+        self._anybody_is_unknown = scenario.has_wrong_agents or bool(scenario.foreign)
+        """Whether anybody may do what no right agent of ours does."""
+        self._deliver_all = deliver_all = deliver_all or self._anybody_is_unknown
         self._now = 0.0
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
@@ -129,33 +131,39 @@ class Clockwork:
             if life is None:
                 if self._rogue is not None and number == len(self.roster):
                     self._rogue.wake(self._now)
-            elif life.waiting is None:
+            elif life.waiting is not None:
+                if what is not None:
+                    life.waiting.append(happening)
+            elif isinstance(what, InFlight):
+                self._arrive(number, life, what)
+            else:
                 self._happen(number, life, what)
-            elif what is not None:
-                life.waiting.append(happening)
             if self._found is not None:
                 return
 
-    def _happen(self, number: int, life: Incarnation, what: InFlight | Logged | StrayDatagram | None) -> None:
+    def _arrive(self, number: int, life: Incarnation, flight: InFlight) -> None:
+        """A message reaches the agent."""
+        sender, message = flight.sender, flight.message
+        if self._tracing or type(message) in ONLY_COUNTED:
+            self._hear(number, life)
+        if flight.sent_at < life.born_at:
+            return
+        state = life.state
+        if self._deliver_all or state is None or flight.matters(state, sender, message):
+            now = self._now if life.clock is None else life.local_s(self._now)
+            life.agent.receive_message(sender, flight.sequence, message, now, flight.datagram)
+            self._say(number, life)
+            if self._deliver_all or state is None or state.reconcile_in_progress:
+                self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
+
+    def _happen(self, number: int, life: Incarnation, what: Logged | StrayDatagram | None) -> None:
+        """Anything else: the end of a timer, an event, or a datagram that is no message of an agent's."""
         agent = life.agent
-        if isinstance(what, InFlight):
-            message = what.message
-            if self._tracing or type(message) in ONLY_COUNTED:
-                self._hear(number, life)
-            if what.sent_at < life.born_at:
-                return
-            state = life.state
-            if self._deliver_all or state is None or what.matters(state, what.sender, message):
-                now = self._now if life.clock is None else self._local(life)
-                agent.receive_message(what.sender, what.sequence, message, now, what.datagram)
-                self._say(number, life)
-                if self._deliver_all or state is None or state.reconcile_in_progress:
-                    self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
-        elif what is None:
+        if what is None:
             self._timer_ends(number, life)
         elif isinstance(what, StrayDatagram):
             self._hear(number, life)
-            agent.receive_datagram(what.datagram, self._local(life))
+            agent.receive_datagram(what.datagram, life.local_s(self._now))
             self._after(number, life)
         elif self._generating and life.logs and what[0] in (ANY_LIFE, len(self._lives[number])):
             if self._tracing:
@@ -164,7 +172,7 @@ class Clockwork:
             if timestamp_us is None:
                 timestamp_us = self.timestamp_us(life)
             self._recorder.logged(self._now, agent.agent_id, len(data))
-            agent.add_event(LoggableEvent(timestamp_us, event_id, data), self._local(life))
+            agent.add_event(LoggableEvent(timestamp_us, event_id, data), life.local_s(self._now))
             self._expect_event(number, life)
             self._after(number, life)
 
@@ -174,11 +182,11 @@ class Clockwork:
         life.deadline = None
         self._hear(number, life)
         if self._recurrence is not None:
-            self._recurrence.timers_end(self._now, max(soonest, self._local(life)), _own(life).state)
+            self._recurrence.timers_end(self._now, max(soonest, life.local_s(self._now)), _own(life).state)
         if number in self._late:
             self._late_timer_ends(number, life)
         else:
-            life.agent.handle_timer(max(soonest, self._local(life)))
+            life.agent.handle_timer(max(soonest, life.local_s(self._now)))
         if life.state is not None:
             self._air.no_longer_asked(number, life.state)
         self._after(number, life)
@@ -194,7 +202,7 @@ class Clockwork:
         for at, _, answer in self._air.hear(number):
             if answer.matters(state, answer.sender, answer.message):
                 at = max(at, life.resumed_at)
-                local = max(state.now, self._local(life, at))
+                local = max(state.now, life.local_s(at))
                 agent.receive_message(answer.sender, answer.sequence, answer.message, local, answer.datagram)
                 if self._tracing:
                     self._take_down(life, at)
@@ -206,8 +214,9 @@ class Clockwork:
 
     def _say(self, number: int, life: Incarnation) -> None:
         """Send what the agent has to say, and take down what it has done."""
-        entries = self._take_down(life, self._now) if self._tracing else []
-        for sequence, message, datagram in life.agent.outgoing(entries):
+        if self._tracing:
+            self._take_down(life, self._now)
+        for sequence, message, datagram in life.agent.outgoing():
             if message is None:
                 assert datagram is not None, "it is there, if it is no message"
                 self._send_stray(number, life, base64.b64decode(datagram.text))
@@ -253,9 +262,9 @@ class Clockwork:
         name, _, deadline = ends[1]
         agent = _own(life)
         timer = next(timer for timer in agent.state.timers if timer.name == name)
-        agent.end_timer(timer, max(deadline, self._local(life)))
+        agent.end_timer(timer, max(deadline, life.local_s(self._now)))
 
-    def _take_down(self, life: Incarnation, mission_s: float) -> list[Entry]:
+    def _take_down(self, life: Incarnation, mission_s: float) -> None:
         """Write what the agent has done into its trace."""
         entries = life.agent.trace()
         for entry in entries:
@@ -264,7 +273,6 @@ class Clockwork:
                 life.handler_runs += 1
                 self._look(life.agent.agent_id, entry)
         self._recorder.write(life.agent.agent_id, entries)
-        return entries
 
     def _look(self, agent_id: int, run: HandlerRun) -> None:
         """Whether it is what somebody waits for, or will wait for in a moment."""
@@ -323,30 +331,35 @@ class Clockwork:
         life.waiting, life.resumed_at = None, self._now
         place = self._air.place
         for happening in waiting:
-            if isinstance(happening[3], InFlight | StrayDatagram):
+            what = happening[3]
+            if isinstance(what, InFlight | StrayDatagram):
                 self._air.place = happening
-                self._happen(number, life, happening[3])
+                if isinstance(what, InFlight):
+                    self._arrive(number, life, what)
+                else:
+                    self._happen(number, life, what)
         self._air.place = place
         del self._air.paused_at[number]
         self._hear(number, life)
         self._timer_ends(number, life)
         for happening in waiting:
-            if not isinstance(happening[3], InFlight | StrayDatagram):
-                self._happen(number, life, happening[3])
+            what = happening[3]
+            if not isinstance(what, InFlight | StrayDatagram):
+                self._happen(number, life, what)
 
     # An agent's clock
 
-    def _local(self, life: Incarnation, mission_s: float | None = None) -> float:
-        """What the agent takes for mission time: now, or at `mission_s`."""
-        return life.local_s(self._now if mission_s is None else mission_s)
+    def _local_at_end(self, life: Incarnation) -> float:
+        """What the agent takes for mission time, or did at its end."""
+        return life.local_s(self._now if life.ended_at is None else life.ended_at)
 
     def timestamp_us(self, life: Incarnation) -> int:
         """What the agent's clock shows, or showed at its end, in microseconds; never less than 0."""
-        return max(0, round(self._local(life, life.ended_at) * MICROSECONDS))
+        return max(0, round(self._local_at_end(life) * MICROSECONDS))
 
     def export_of(self, life: Incarnation) -> dict[str, Any]:
         """The agent's chain export, as a document."""
-        return life.agent.export(self._local(life, life.ended_at), self.timestamp_us(life))
+        return life.agent.export(self._local_at_end(life), self.timestamp_us(life))
 
 
 def _own(life: Incarnation) -> OwnAgent:

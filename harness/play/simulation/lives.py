@@ -36,6 +36,14 @@ class Incarnation:
     logs: bool = True
     """Whether it still logs events."""
 
+    @property
+    def idle(self) -> bool:
+        return self.agent.status().idle if self.state is None else self.state.idle
+
+    @property
+    def top_chain_hash(self) -> str:
+        return self.agent.status().top_chain_hash if self.state is None else self.state.chain.top_chain_hash.hex()
+
     def local_s(self, mission_s: float) -> float:
         """What the agent takes for mission time."""
         return mission_s if self.clock is None else self.clock.shows(mission_s)

@@ -153,7 +153,7 @@ class ForeignAgent:
         """Nobody knows."""
         return None
 
-    def outgoing(self, entries: list[Entry]) -> Iterable[Outgoing]:
+    def outgoing(self) -> Iterable[Outgoing]:
         sent, self._sent = self._sent, []
         outgoing: list[Outgoing] = []
         for _, datagram in sent:
