@@ -62,6 +62,7 @@ class Autopilot:
         self._speed_ms = self._model.cruise_ms
         self._in_mission = False
         self._then: Callable[[], None] = self._stand
+        self._goal: tuple[Point, float] | None = None  # in GUIDED: where it was sent, and how fast
         self._course = Course(0.0, [Rest(Motion(yaw_rad=math.radians(home.heading_deg)))])
 
     @property
@@ -178,7 +179,9 @@ class Autopilot:
             return FAILED
         if not all(map(math.isfinite, place)) or abs(place.up_m) > MAX_ALTITUDE_M:
             return FAILED
-        self._begin(self._model.loiter(self.motion, place, self._speed_ms, math.inf), self._stand)
+        if (goal := (place, self._speed_ms)) != self._goal:  # else it is on its way, however often it is told
+            self._begin(self._model.loiter(self.motion, place, self._speed_ms, math.inf), self._stand)
+            self._goal = goal
         return ACCEPTED
 
     def load(self, mission: Sequence[Any]) -> None:
@@ -195,7 +198,7 @@ class Autopilot:
 
     def _begin(self, segments: Sequence[Segment], then: Callable[[], None]) -> None:
         """Move like this from now on, and do `then` where it ends."""
-        self._course, self._then = Course(self.now_s, segments), then
+        self._course, self._then, self._goal = Course(self.now_s, segments), then, None
 
     def _act(self) -> None:
         """Do, armed, what the mode has just been set for."""

@@ -42,7 +42,7 @@ class MissionFlight:
         state = self._to.state
         if state.mode is None:
             return HEARTBEAT
-        if not (state.ready_to_arm or self._under_way):
+        if not ((state.ready_to_arm and state.position) or self._under_way):
             return READY
         if self._upload.refused is not None:
             raise HopelessError(f"it refused its mission with {self._upload.refused}")

@@ -156,38 +156,6 @@ class Climbing:
         return replace(self._level.at(since_s), up_m=self._up_m)
 
 
-class Spiral:
-    """Go round home for ever, at a constant angular rate, while the radius grows or shrinks to that of the circle."""
-
-    duration_s = math.inf
-
-    def __init__(self, start: Motion, radius_m: float, speed_ms: float) -> None:
-        self._start, self._radius_m, self._speed_ms = start, radius_m, speed_ms
-        self._rate_rads = speed_ms / radius_m
-        self._from_m = math.hypot(start.north_m, start.east_m)
-        self._bearing_rad = math.atan2(start.east_m, start.north_m) if self._from_m else start.yaw_rad
-
-    def at(self, since_s: float) -> Motion:
-        missing_m = self._radius_m - self._from_m
-        outward_ms = math.copysign(self._speed_ms, missing_m) if abs(missing_m) > self._speed_ms * since_s else 0.0
-        radius = self._from_m + outward_ms * since_s if outward_ms else self._radius_m
-        bearing = self._bearing_rad + self._rate_rads * since_s
-        cos, sin = math.cos(bearing), math.sin(bearing)
-        around_ms = self._rate_rads * radius
-        north_ms = outward_ms * cos - around_ms * sin
-        east_ms = outward_ms * sin + around_ms * cos
-        return Motion(
-            radius * cos,
-            radius * sin,
-            self._start.up_m,
-            north_ms,
-            east_ms,
-            roll_rad=math.atan(around_ms * self._rate_rads / GRAVITY_MS2),
-            yaw_rad=math.atan2(east_ms, north_ms) % math.tau,
-            yaw_rate_rads=self._rate_rads,
-        )
-
-
 class Fall:
     """Fall to the ground without power and without drag."""
 

@@ -1,9 +1,9 @@
 """The pilot: the client that flies a vehicle over MAVLink, real ArduPilot and the embedded vehicle alike.
 
 A pilot keeps a link (link.py), and pursues one procedure after another (procedure.py): a take-off, a plan by mission or
-in GUIDED, the end of a flight. Whatever a procedure waits for has a limit, and so has the vehicle's silence: a vehicle
-that spins, crawls, falls mute or leaves is given up with a FlightError that says what it was waited for and what it
-last said.
+in GUIDED, the end of a flight; and of the first two at first only what comes before arming. Whatever a procedure waits
+for has a limit, and so has the vehicle's silence: a vehicle that spins, crawls, falls mute or leaves is given up with a
+FlightError that says what it was waited for and what it last said.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sitl.by_mission import MissionFlight
 from sitl.link import Link
 from sitl.modes import mode_name
 from sitl.plan import By, Plan
-from sitl.procedure import HopelessError, Procedure, Step
+from sitl.procedure import GettingReady, HopelessError, Procedure, Step
 from sitl.route import route
 from sitl.state import VehicleState
 from sitl.take_off import TakeOff, Termination
@@ -72,18 +72,27 @@ class Pilot:
         """End the connection and complete the telemetry log. May be called twice, and before `start`."""
         await self.link.close()
 
-    async def take_off(self, altitude_m: float) -> None:
-        """Return at `altitude_m` above home; a rover is armed in GUIDED, and that is all. Raises FlightError."""
-        await self._pursue(TakeOff(self.link, self.vehicle_type, altitude_m))
+    def ascent(self, altitude_m: float) -> Procedure:
+        """To `altitude_m` above home; a rover is armed in GUIDED, and that is all."""
+        return TakeOff(self.link, self.vehicle_type, altitude_m)
 
-    async def fly(self, plan: Plan, by: By) -> None:
-        """Return when the plan's last leg is done.
-
-        Raises PlanError if this type of vehicle cannot fly the plan, FlightError if it does not.
-        """
+    def flight(self, plan: Plan, by: By) -> Procedure:
+        """Of a plan. Raises PlanError if this type of vehicle cannot fly it."""
         waypoints = route(plan, self.vehicle_type, self.link.home.heading_deg)
         flight = MissionFlight if by == "mission" else GuidedFlight
-        await self._pursue(flight(self.link, self.vehicle_type, waypoints))
+        return flight(self.link, self.vehicle_type, waypoints)
+
+    async def get_ready(self, flight: Procedure) -> None:
+        """Do what comes before arming, and return when nothing else has been left to do for READY_FOR_S.
+
+        ArduPilot runs its checks now and then, and others in another mode: what it said at first it may take back.
+        Raises FlightError.
+        """
+        await self._pursue(GettingReady(flight, self.state))
+
+    async def fly(self, flight: Procedure) -> None:
+        """Return when the last of it is done. Raises FlightError."""
+        await self._pursue(flight)
 
     async def terminate_flight(self) -> None:
         """Disarm in flight, by force, and return when the vehicle lies on the ground. Raises FlightError.

@@ -15,9 +15,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.link import Link
 from sitl.modes import MODES
+from sitl.state import VehicleState
 from sitl.vehicle import VehicleType
 
 STEP_LIMIT_S = 60.0
+READY_FOR_S = 3.0
 READY_LIMIT_S = 180.0  # ArduPilot calibrates, and waits for its estimates to agree
 
 
@@ -32,6 +34,7 @@ class Step:
 HEARTBEAT = Step("the first heartbeat")
 READY = Step("ready to arm", READY_LIMIT_S)
 ARM = Step("arming")
+STAY_READY = Step("ready to arm, and not only for a moment", READY_LIMIT_S)
 
 
 class HopelessError(Exception):
@@ -48,6 +51,32 @@ class Procedure(Protocol):
 
     def ask(self, step: Step) -> None:
         """Ask the vehicle for a step; called once at every heartbeat while it is not made."""
+
+
+class GettingReady:
+    """Of a flight all that comes before arming, until there has been nothing of that left for READY_FOR_S."""
+
+    purpose = "get ready"
+
+    def __init__(self, flight: Procedure, state: VehicleState) -> None:
+        self._flight = flight
+        self._state = state
+        self._since_s: float | None = None  # simulated
+
+    def next_step(self) -> Step | None:
+        step, now_s = self._flight.next_step(), self._state.time_s
+        if step is not None and step is not ARM:
+            self._since_s = None
+            return step
+        if now_s is None or self._since_s is None or now_s < self._since_s:
+            self._since_s = now_s
+        if now_s is None or self._since_s is None or now_s - self._since_s < READY_FOR_S:
+            return STAY_READY
+        return None
+
+    def ask(self, step: Step) -> None:
+        if step is not STAY_READY:
+            self._flight.ask(step)
 
 
 class Commander:
@@ -71,7 +100,7 @@ class Commander:
         """The step towards being armed that is not made."""
         if self.state.armed:
             return None
-        return ARM if self.state.ready_to_arm else READY
+        return ARM if self.state.ready_to_arm and self.state.position else READY
 
     def arm(self) -> None:
         self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)

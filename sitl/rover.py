@@ -9,6 +9,8 @@ from sitl.kinematics import Line, Motion, Point, Rest, Segment, end_of
 
 CRUISE_MS = 5.0  # CRUISE_SPEED
 ACCEL_MS2 = 1.0  # ATC_ACCEL_MAX
+START_S = 1.5  # before it moves, as measured with 4.7
+TURN_RATE_RADS = math.radians(45.0)  # what it takes to turn round first, as measured with 4.7
 
 
 class Rover:
@@ -21,7 +23,11 @@ class Rover:
         return [Rest(start, 0.0)]
 
     def go_to(self, start: Motion, place: Point, speed_ms: float) -> Sequence[Segment]:
-        return [Line(start, place._replace(up_m=start.up_m), speed_ms, ACCEL_MS2)]
+        there = Line(start, place._replace(up_m=start.up_m), speed_ms, ACCEL_MS2)
+        if not there.duration_s:
+            return [there]
+        turn_rad = abs((there.at(0.0).yaw_rad - start.yaw_rad + math.pi) % math.tau - math.pi)
+        return [Rest(start, START_S + turn_rad / TURN_RATE_RADS), there]
 
     def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
         there = self.go_to(start, place, speed_ms)

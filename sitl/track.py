@@ -13,7 +13,7 @@ from sitl.kinematics import Course, Motion, Rest, Segment, end_of
 from sitl.models import MODELS, MotionModel
 from sitl.plan import Plan
 from sitl.route import Waypoint, route
-from sitl.vehicle import READY_S, VehicleType
+from sitl.vehicle import VehicleType
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,15 @@ def track(
     heading_deg: float = 0.0,
     takeoff_altitude_m: float = 20.0,
 ) -> Track:
-    """The track of a vehicle that is booted at mission second `begin_s` and flies `plan` as soon as it can.
+    """The track of a vehicle that is ready at mission second `begin_s`, and begins to fly `plan` then.
 
-    It stands at home until `begin_s` + READY_S, the embedded vehicle's own time to ready; after the plan it stays, a
-    plane circling, unless it has landed. `home_offset` is the home's place in the field (metres north and east of its
-    centre), `heading_deg` the home's heading. A `plan` of None is that of a vehicle in no plan: a copter or plane
-    takes off to `takeoff_altitude_m` and circles, a rover stays. Raises PlanError if the type cannot fly the plan.
+    It stands at home until then; after the plan it stays, a plane circling, unless it has landed. `home_offset` is the
+    home's place in the field (metres north and east of its centre), `heading_deg` the home's heading. A `plan` of None
+    is that of a vehicle in no plan: a copter takes off to `takeoff_altitude_m` and stays there, a plane circles, a
+    rover stands. Raises PlanError if the type cannot fly the plan.
     """
     model = MODELS[vehicle_type]
-    segments: list[Segment] = [Rest(Motion(yaw_rad=math.radians(heading_deg)), READY_S)]
+    segments: list[Segment] = [Rest(Motion(yaw_rad=math.radians(heading_deg)), 0.0)]
     if plan is None:
         segments += model.take_off(end_of(segments), takeoff_altitude_m)
         segments += model.idle(end_of(segments))

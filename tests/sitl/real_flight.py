@@ -36,7 +36,7 @@ def fly(directory: Path, by: By) -> Path:
         pilot = Pilot(3, connect(launch.pilot_port), tlog, SPEEDUP, HOME)
         await pilot.start()
         try:
-            await pilot.fly(SQUARE, by)
+            await pilot.fly(pilot.flight(SQUARE, by))
         finally:
             await pilot.close()
 

@@ -17,6 +17,8 @@ from typing import Any, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sitl.vehicle import Home
+
 RECORDINGS = Path(__file__).parent / "recordings"
 Name = Literal["copter-mission", "plane-mission", "plane-guided", "rover-mission"]
 
@@ -36,6 +38,27 @@ def frames(name: Name) -> Iterator[bytes]:
 def messages(name: Name) -> Iterator[tuple[bytes, Any]]:
     """Each frame, and the message in it."""
     yield from _messages(gzip.decompress((RECORDINGS / f"{name}.tlog.gz").read_bytes()))
+
+
+def flight(name: Name) -> list[tuple[float, float, float, float]]:
+    """From its arming on: seconds since then, metres north, east and up from where it stood."""
+    points: list[tuple[float, float, float, float]] = []
+    home, armed_s, now_s = Home(0.0, 0.0), None, 0.0
+    for _, message in messages(name):
+        if message.get_type() == "HEARTBEAT" and message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
+            armed_s = now_s if armed_s is None else armed_s
+        elif message.get_type() == "GLOBAL_POSITION_INT":
+            now_s, lat_deg, lon_deg, alt_m = (
+                message.time_boot_ms / 1e3,
+                message.lat / 1e7,
+                message.lon / 1e7,
+                message.alt / 1e3,
+            )
+            if armed_s is None:
+                home = Home(lat_deg, lon_deg, 584.0)
+            else:
+                points.append((now_s - armed_s, *home.metres_to(lat_deg, lon_deg, alt_m)))
+    return points
 
 
 def _messages(log: bytes) -> Iterator[tuple[bytes, Any]]:

@@ -19,12 +19,14 @@ import sitl.pilot
 from sitl.modes import MODES
 from sitl.pilot import Pilot
 from sitl.plan import By, GoTo, Land, Loiter, Plan, PlanError, TakeOff
+from sitl.procedure import READY_FOR_S
 from sitl.track import track
 from sitl.vehicle import FlightError, VehicleType
 from tests.sitl.flying import DEADLINE_S, HOME, connect, embedded
 from tests.sitl.puppet import Puppet, message_id, on_strings
 
 SPEEDUP = 100.0
+SYS_STATUS = mavlink.MAVLINK_MSG_ID_SYS_STATUS
 PLAN = Plan((TakeOff(30), GoTo(150, 0, speed_ms=10), Loiter(10), GoTo(0, 100, altitude_m=40), GoTo(0, 0), Land()))
 DRIVE = Plan((GoTo(100, 0), Loiter(10), GoTo(0, 0)))
 TYPES: list[VehicleType] = ["copter", "plane", "rover"]
@@ -39,7 +41,7 @@ def flown(vehicle_type: VehicleType, by: By, tlog: Path) -> Pilot:
         pilot = Pilot(3, connect(port), tlog, SPEEDUP, HOME, vehicle_type)
         await pilot.start()
         try:
-            await pilot.fly(plan_of(vehicle_type), by)
+            await pilot.fly(pilot.flight(plan_of(vehicle_type), by))
         finally:
             await pilot.close()
         return pilot
@@ -66,7 +68,7 @@ def test_a_mission_flown_in_auto_is_the_computed_track(vehicle_type: VehicleType
     computed = track(vehicle_type, plan_of(vehicle_type), heading_deg=HOME.heading_deg)
     samples = list(places(tlog))
     moving = next(index for index, (_, place) in enumerate(samples) if math.dist(place, (0, 0, 0)) > 1)
-    shifts = [samples[moving][0] - tenth / 10 for tenth in range(100, 400)]
+    shifts = [samples[moving][0] - tenth / 10 for tenth in range(300)]
 
     def apart(shift_s: float, count: int) -> float:
         return max(math.dist(computed.at(at_s - shift_s), place) for at_s, place in samples[moving : moving + count])
@@ -93,7 +95,7 @@ def test_a_plan_that_the_type_cannot_fly_is_refused_before_anything_is_asked(tmp
     async def fly() -> None:
         async with on_strings(tmp_path, "rover") as (pilot, _):
             with pytest.raises(PlanError, match="a rover neither takes off"):
-                await pilot.fly(PLAN, "mission")
+                await pilot.fly(pilot.flight(PLAN, "mission"))
 
     asyncio.run(fly())
 
@@ -113,7 +115,7 @@ def puppet_flown(
         async with on_strings(tmp_path, vehicle_type) as (pilot, puppet):
             strings(puppet)
             async with asyncio.timeout(DEADLINE_S):
-                await pilot.fly(plan_of(vehicle_type), by)
+                await pilot.fly(pilot.flight(plan_of(vehicle_type), by))
             return pilot
 
     return asyncio.run(fly())
@@ -124,7 +126,7 @@ def failure(tmp_path: Path, strings: Callable[[Puppet], None], after_m: float = 
 
     async def fly() -> str:
         async with on_strings(tmp_path) as (pilot, puppet):
-            flight = asyncio.create_task(pilot.fly(PLAN, by))
+            flight = asyncio.create_task(pilot.fly(pilot.flight(PLAN, by)))
             await until(lambda: pilot.state.position is not None and pilot.state.position.relative_alt_m >= after_m)
             strings(puppet)
             with pytest.raises(FlightError) as error:
@@ -192,7 +194,7 @@ def test_garbage_in_the_stream_is_survived_and_counted(tmp_path: Path) -> None:
 def test_a_mode_that_is_undone_in_flight_is_asked_for_again(tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
-            flight = asyncio.create_task(pilot.fly(PLAN, "mission"))
+            flight = asyncio.create_task(pilot.fly(pilot.flight(PLAN, "mission")))
             await until(lambda: puppet.vehicle.airborne and puppet.vehicle.motion.up_m > 29)
             puppet.vehicle.set_mode(MODES["copter"]["GUIDED"])
             async with asyncio.timeout(DEADLINE_S):
@@ -255,7 +257,7 @@ def test_a_vehicle_that_spins_and_never_gets_ready_is_given_up(tmp_path: Path, m
 def test_a_flight_is_terminated_in_the_air_and_ends_without_an_error(by: By, tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
-            flight = asyncio.create_task(pilot.fly(PLAN, by))
+            flight = asyncio.create_task(pilot.fly(pilot.flight(PLAN, by)))
             await until(lambda: puppet.vehicle.motion.up_m > 29)
             async with asyncio.timeout(DEADLINE_S):
                 await pilot.terminate_flight()
@@ -271,10 +273,50 @@ def test_a_flight_is_terminated_in_the_air_and_ends_without_an_error(by: By, tmp
 def test_after_its_flight_a_vehicle_is_still_listened_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def listen() -> str:
         async with on_strings(tmp_path) as (pilot, puppet):
-            await pilot.take_off(10.0)
+            await pilot.fly(pilot.ascent(10.0))
             without(monkeypatch)(puppet)
             with pytest.raises(FlightError) as error:
                 await pilot.stay_in_touch()
             return str(error.value)
 
     assert "vehicle 3 did not stay in touch: waiting for its next word, it has been silent" in asyncio.run(listen())
+
+
+@pytest.mark.parametrize("vehicle_type", TYPES)
+@pytest.mark.parametrize("by", ["mission", "guided"])
+def test_a_vehicle_that_is_ready_has_only_to_be_armed(by: By, vehicle_type: VehicleType, tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path, vehicle_type) as (pilot, puppet):
+            flight = pilot.flight(plan_of(vehicle_type), by)
+            await pilot.get_ready(flight)
+            assert pilot.state.position is not None
+            assert (puppet.vehicle.ready, puppet.vehicle.armed) == (True, False)
+            assert puppet.vehicle.now_s >= sitl.autopilot.READY_S + READY_FOR_S
+            assert bool(puppet.vehicle.mission) is (by == "mission")
+            mission = puppet.vehicle.mission
+            flying = asyncio.create_task(pilot.fly(flight))
+            await until(lambda: puppet.vehicle.armed)
+            assert puppet.vehicle.mission is mission
+            flying.cancel()
+
+    asyncio.run(fly())
+
+
+def test_a_vehicle_that_takes_back_that_it_is_ready_is_not(tmp_path: Path) -> None:
+    """ArduPilot 4.7 says for 2.4 s that a rover is ready, and then for 17 s that it is not."""
+
+    async def fly() -> None:
+        async with on_strings(tmp_path, "rover") as (pilot, puppet):
+            link = pilot.link
+
+            def take_back(frame: bytes) -> bytes:
+                if 2.0 < puppet.vehicle.now_s - sitl.autopilot.READY_S < 30.0 and message_id(frame) == SYS_STATUS:
+                    link.state.ready_to_arm = False
+                    return b""
+                return frame
+
+            puppet.tamper = take_back
+            await pilot.get_ready(pilot.flight(DRIVE, "mission"))
+            assert puppet.vehicle.now_s > sitl.autopilot.READY_S + 30.0 + READY_FOR_S
+
+    asyncio.run(fly())

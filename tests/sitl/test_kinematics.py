@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.kinematics import Arc, Climbing, Course, Fall, Line, Motion, Point, Rest, Segment, Spiral, end_of
+from sitl.kinematics import Arc, Climbing, Course, Fall, Line, Motion, Point, Rest, Segment, end_of
 from sitl.models import MODELS
 from sitl.vehicle import VehicleType
 
@@ -65,12 +65,6 @@ def test_a_fall_ends_on_the_ground_at_the_speed_of_free_fall() -> None:
     fall = Fall(Motion(up_m=100, north_ms=3))
     assert fall.at(fall.duration_s).point == pytest.approx((3 * fall.duration_s, 0, 0))
     assert fall.impact_ms == pytest.approx(math.sqrt(2 * 9.81 * 100))
-
-
-def test_a_spiral_ends_in_its_circle() -> None:
-    spiral = Spiral(Motion(up_m=20), radius_m=30, speed_ms=5)
-    assert math.hypot(*spiral.at(100).point[:2]) == pytest.approx(30)
-    assert math.hypot(spiral.at(100).north_ms, spiral.at(100).east_ms) == pytest.approx(5)
 
 
 def test_a_course_is_its_segments_one_after_another() -> None:

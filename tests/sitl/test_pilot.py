@@ -46,7 +46,7 @@ def messages_of(tlog: Path) -> Iterator[Any]:
 def test_it_takes_an_embedded_vehicle_off_and_the_tlog_holds_the_flight(tmp_path: Path) -> None:
     async def fly(port: int) -> Pilot:
         async with piloting(port, tmp_path / "3.tlog") as pilot:
-            await pilot.take_off(20.0)
+            await pilot.fly(pilot.ascent(20.0))
             assert pilot.state.armed
             assert pilot.state.position is not None
             assert pilot.state.position.relative_alt_m >= 19.0
@@ -81,7 +81,7 @@ def test_it_measures_the_real_time_factor(tmp_path: Path, monkeypatch: pytest.Mo
 async def failure(port: int, tlog: Path, sysid: int = 3) -> str:
     async with piloting(port, tlog, sysid) as pilot:
         with pytest.raises(FlightError) as error:
-            await pilot.take_off(1000.0)
+            await pilot.fly(pilot.ascent(1000.0))
     return str(error.value)
 
 
@@ -113,7 +113,7 @@ def test_a_mute_vehicle_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_vehicle_that_dies_while_taking_off_is_given_up_at_once(tmp_path: Path) -> None:
     async def fly(port: int) -> None:
         async with piloting(port, tmp_path / "3.tlog") as pilot:
-            flight = asyncio.create_task(pilot.take_off(1000.0))
+            flight = asyncio.create_task(pilot.fly(pilot.ascent(1000.0)))
             async with asyncio.timeout(DEADLINE_S):
                 while not pilot.state.armed:
                     await asyncio.sleep(0.01)

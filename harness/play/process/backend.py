@@ -167,13 +167,7 @@ class ProcessRun:
                     raise AgentRefusedError(f"{error}; scripted events need that command (ucp/CONTRACT.md)") from None
 
     def _fly(self, vehicle: VehicleProcess) -> None:
-        flight = self.scenario.flight_of(vehicle.vehicle_id)
-        flown = (
-            vehicle.take_off(self.scenario.vehicles.takeoff_altitude_m)
-            if flight is None
-            else vehicle.fly(flight.planned(), flight.by)
-        )
-        self._watchers.start(flown, of=f"flight {vehicle.vehicle_id}")
+        self._watchers.start(vehicle.fly(), of=f"flight {vehicle.vehicle_id}")
 
     def _home(self, number: int) -> Home:
         vehicles = self.scenario.vehicles
@@ -189,6 +183,15 @@ class ProcessRun:
         )
         for vehicle in self.vehicles:
             self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
+            self._prepare(vehicle)
+        readied = [self._watchers.task(vehicle.get_ready()) for vehicle in self.vehicles]
+        for ready, next_one in enumerate(asyncio.as_completed(readied)):
+            self._show(f"vehicles get ready, {ready} of {len(readied)} are")
+            await next_one
+
+    def _prepare(self, vehicle: VehicleProcess) -> None:
+        flight = self.scenario.flight_of(vehicle.vehicle_id)
+        vehicle.prepare(flight, self.scenario.vehicles.takeoff_altitude_m)
 
     async def _start_agents(self, lab: MissionLab) -> None:
         self._show("starting agents")
@@ -290,6 +293,7 @@ class ProcessRun:
             self.vehicles[number] = vehicle
             await vehicle.start(self._lab, self._home(number), self.scenario.speedup)
             self._watchers.start(vehicle.watch(), of=f"vehicle {agent.agent_id}")
+            self._prepare(vehicle)
             self._fly(vehicle)
         await self._start_agent(agent, self._lab)
 

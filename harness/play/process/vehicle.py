@@ -11,9 +11,10 @@ from typing import Any
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
 from harness.play.process.lab import MissionLab, Program
+from harness.scenario.flight import Flight
 from netem.radio import Place
 from sitl.pilot import Pilot
-from sitl.plan import By, Plan
+from sitl.procedure import Procedure
 from sitl.vehicle import MAX_SYSID, Home, Launch, VehicleError, VehicleKind
 
 LISTEN_LIMIT_S = 20.0
@@ -51,6 +52,7 @@ class VehicleProcess:
         self.pilot: Pilot | None = None
         self._directory = rundir.vehicle(vehicle_id, life)
         self._process: Program | None = None
+        self._flight: Procedure | None = None
 
     @property
     def _output(self) -> Path:
@@ -101,16 +103,20 @@ class VehicleProcess:
             return Place(*field.metres_to(self._home.lat_deg, self._home.lon_deg, self._home.alt_m))
         return Place(*field.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
 
-    async def take_off(self, altitude_m: float) -> None:
-        """And stay in touch with it as long as the mission takes. Raises VehicleFailedError, having killed it."""
+    def prepare(self, flight: Flight | None, altitude_m: float) -> None:
+        """What it is to fly: a plan, or without one up to `altitude_m`."""
         assert self.pilot is not None
-        await self._piloted(self.pilot.take_off(altitude_m))
-        await self._piloted(self.pilot.stay_in_touch())
+        self._flight = self.pilot.flight(flight.planned(), flight.by) if flight else self.pilot.ascent(altitude_m)
 
-    async def fly(self, plan: Plan, by: By) -> None:
-        """As `take_off`, but fly the plan."""
-        assert self.pilot is not None
-        await self._piloted(self.pilot.fly(plan, by))
+    async def get_ready(self) -> None:
+        """Up to arming. Raises VehicleFailedError, having killed it."""
+        assert self.pilot is not None and self._flight is not None
+        await self._piloted(self.pilot.get_ready(self._flight))
+
+    async def fly(self) -> None:
+        """And stay in touch with it as long as the mission takes. Raises VehicleFailedError, having killed it."""
+        assert self.pilot is not None and self._flight is not None
+        await self._piloted(self.pilot.fly(self._flight))
         await self._piloted(self.pilot.stay_in_touch())
 
     async def _piloted(self, flight: Coroutine[Any, Any, None]) -> None:
