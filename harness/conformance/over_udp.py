@@ -11,20 +11,23 @@ import dataclasses
 import math
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from harness.conformance.air import AgentEndedError, Air, Ear, Process
 from harness.conformance.alphabet import Input
 from harness.conformance.model import AGENT, EVENT_ID, Action, Command, Datagram, Expire, Log, Model, Outcome
-from harness.conformance.seen import COMPARED, Exchange, Seen, compare
+from harness.conformance.moment import Moment
+from harness.conformance.seen import COMPARED, MOST_ENDED, Exchange, Seen, compare
 from harness.conformance.states import Variant, ends_next, state_of
 from harness.conformance.subject import Start, Subject
 from harness.conformance.words import Names, told_datagram
 from harness.play.control import AgentRefusedError
 from ucp.clock import MICROSECONDS
 from ucp.events import MalformedEventsError, decode_events
+from ucp.messages import MalformedDatagramError, Message, decode
 
 
 @dataclass(frozen=True)
@@ -42,10 +45,14 @@ class Pace:
     """So long nothing must have happened, if the agent does not say that it has handled its input."""
     linger_s: float
     """So long it is looked what else comes."""
+    ask_again_s: float
+    """After so long of waiting for a message the agent is asked whether it runs at all."""
 
 
-BESIDE_OTHERS = Pace(speedup=24.0, margin_s=0.08, early_s=0.15, patience_s=0.5, calm_s=0.08, linger_s=0.0)
-ALONE = Pace(speedup=8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1)
+BESIDE_OTHERS = Pace(24.0, margin_s=0.08, early_s=0.15, patience_s=0.5, calm_s=0.08, linger_s=0.0, ask_again_s=0.1)
+ALONE = Pace(8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1, ask_again_s=0.25)
+CHANCES = 2
+"""So often an agent answers before it is said that it was not the machine that was late."""
 
 
 class OverUdp(Subject):
@@ -92,13 +99,17 @@ class OverUdp(Subject):
         """All that has crossed the air."""
         names = Names(self.model)
         return tuple(
-            Exchange(round((at_s - self._epoch) * self._pace.speedup, 3), by_agent, data, told_datagram(data, names))
+            Exchange(round(self._mission(at_s), 3), by_agent, data, told_datagram(data, names))
             for at_s, by_agent, data in self.ear.record
         )
 
     def now(self) -> float:
         """In mission seconds."""
-        return (time.time() - self._epoch) * self._pace.speedup
+        return self._mission(time.time())
+
+    def _mission(self, at_s: float) -> float:
+        """The mission second at which it is so many seconds since the Unix epoch."""
+        return (at_s - self._epoch) * self._pace.speedup
 
     def _wall(self, mission_s: float) -> float:
         """Seconds since the Unix epoch at a mission second."""
@@ -115,10 +126,14 @@ class OverUdp(Subject):
         action = given.make(model)
         if action is None:
             return None
+        moment = Moment(model)
         self.ear.drain()
         if self.ear.heard and not isinstance(action, Expire):  # what comes of the input could not be told from that
-            late = self._ended()
-            seen = compare(model, given, before, Outcome(()), self._heard(), {}, ["it sent something unasked"])
+            heard = self.ear.take()
+            seen = compare(model, given, before, Outcome(()), _data(heard), {}, ["it sent something unasked"])
+            late = self._ended(deadline)
+            if late:
+                self.in_step = self._explained(moment, [], heard, await self._status())
             return dataclasses.replace(seen, mistimed=expired, late=late)
         wrong: list[str] = []
         began, ends = self.now(), self._wall(deadline or 0.0) if isinstance(action, Expire) else 0.0
@@ -140,21 +155,56 @@ class OverUdp(Subject):
             wrong += made
         else:
             outcome = model.feed(action, began)
-        gave_up = False
+        ends_then = model.agent.next_timer()
+        chances, gave_up = 0, False
         try:
-            status, gave_up = await self._settle(len(outcome.sent), max(time.time(), ends))
+            status, chances, gave_up = await self._settle(len(outcome.sent), max(time.time(), ends), ends_then)
         except (AgentEndedError, AgentRefusedError) as error:
             wrong.append(str(error))
-        late = not gave_up and self._ended()
-        seen = compare(model, given, before, outcome, self._heard(), status, wrong)
+        heard = self.ear.take()
+        timestamp_us = model.state.newest_block_timestamp_us
+        seen = compare(model, given, before, outcome, _data(heard), status, wrong)
+        late = chances < CHANCES and self._ended(ends_then)
+        if seen.wrong and late:
+            given_now = [(action, began, timestamp_us)]
+            self.in_step = bool(status) and self._explained(moment, given_now, heard, status)
+            late = self.in_step or not gave_up
         return dataclasses.replace(seen, late=late, mistimed=mistimed or seen.mistimed)
 
-    def _heard(self) -> list[bytes]:
-        return [data for _, data in self.ear.take()]
+    def _explained(
+        self,
+        moment: Moment,
+        given: Sequence[tuple[Action, float, int]],
+        heard: Sequence[tuple[float, bytes]],
+        status: Mapping[str, Any],
+    ) -> bool:
+        """Whether all is as it should be if timers ended before or after the input; the reference is there then."""
+        first, last = (self._mission(heard[0][0]), self._mission(heard[-1][0])) if heard else (self.now(), self.now())
+        for before, after in sorted(product(range(MOST_ENDED), repeat=2), key=sum):
+            model, sent = moment.put_back(), list[bytes]()
+            for _ in range(before):
+                sent += _expire(model, first)
+            for action, now, timestamp_us in given:
+                model.feed(action, max(now, model.state.now), timestamp_us)
+                sent += model.datagrams
+            for _ in range(after):
+                sent += _expire(model, last)
+            should = model.status()
+            if _messages(sent) == _messages(_data(heard)) and all(
+                status.get(key, should[key]) == should[key] for key in COMPARED
+            ):
+                return True
+        return False
 
-    def _ended(self) -> bool:
-        """Whether the next timer may have ended by now."""
-        deadline = self.model.agent.next_timer()
+    async def _status(self) -> dict[str, Any]:
+        """What the agent says of itself now; nothing if it does not."""
+        try:
+            return await self.process.ask("status")
+        except (AgentEndedError, AgentRefusedError):
+            return {}
+
+    def _ended(self, deadline: float | None) -> bool:
+        """Whether the timer may have ended by now."""
         return deadline is not None and self._wall(deadline) - time.time() < self._pace.early_s
 
     async def _wait_for_timer(self, until: float, name: str) -> str | None:
@@ -169,7 +219,7 @@ class OverUdp(Subject):
 
     def _first_heard(self) -> float:
         """In mission seconds."""
-        return (self.ear.heard[0][0] - self._epoch) * self._pace.speedup if self.ear.heard else 0.0
+        return self._mission(self.ear.heard[0][0]) if self.ear.heard else 0.0
 
     async def _give(self, action: Action) -> list[Any]:
         """Of an event, the blocks of the agent's export that it now holds."""
@@ -186,33 +236,65 @@ class OverUdp(Subject):
                 return waiting if isinstance(waiting, list) else []
         return []
 
-    async def _settle(self, messages: int, since: float) -> tuple[dict[str, Any], bool]:
+    async def _settle(self, messages: int, since: float, deadline: float | None) -> tuple[dict[str, Any], int, bool]:
         """The status once the agent has handled the input and sent as much as it should, or when that is too late.
 
-        And whether it was too late. Of an agent that counts its handler runs otherwise all else must be as it should
-        for a while.
+        And how often it has answered since it was given the input, before its next timer may have ended: whoever
+        answers runs, and could have handled what came before. And whether it was too late. Of an agent that counts its
+        handler runs otherwise all else must be as it should for a while.
         """
-        give_up, calm_since = since + self._pace.patience_s, math.inf
+        pace = self._pace
+        give_up, calm_since = since + pace.patience_s, math.inf
         should = self.model.status()
+        chances = too_late = 0
         while True:
             self.ear.drain()
             over = time.time() >= give_up
             if len(self.ear.heard) < messages and not over:
-                await self.ear.arrival(give_up)
-                continue
+                await self.ear.arrival(min(give_up, time.time() + pace.ask_again_s))
+                if self.ear.heard and len(self.ear.heard) >= messages:
+                    continue
             status = await self.process.ask("status")
+            if time.time() > since and not self._ended(deadline):
+                chances += 1
             self.ear.drain()
+            too_late += over
+            if too_late >= CHANCES:
+                return status, chances, True
+            if len(self.ear.heard) < messages:
+                continue
             handled = status.get("handled")
             if isinstance(handled, int) and handled >= should["handled"]:
-                if not self._pace.linger_s:
-                    return status, over
-                await asyncio.sleep(self._pace.linger_s)
-                return await self.process.ask("status"), over
+                if not pace.linger_s:
+                    return status, chances, False
+                await asyncio.sleep(pace.linger_s)
+                return await self.process.ask("status"), chances, False
             calm = all(status.get(key, should[key]) == should[key] for key in COMPARED)
             calm_since = min(calm_since, time.time()) if calm else math.inf
-            if over or time.time() - calm_since > self._pace.calm_s:
-                return status, over
-            await self.ear.arrival(min(give_up, time.time() + 0.004))
+            if time.time() - calm_since > pace.calm_s:
+                return status, chances, False
+            await self.ear.arrival(time.time() + 0.004)
+
+
+def _data(heard: Sequence[tuple[float, bytes]]) -> list[bytes]:
+    return [data for _, data in heard]
+
+
+def _messages(datagrams: Iterable[bytes]) -> list[Message] | None:
+    """None if any of them is not one."""
+    try:
+        return [decode(data).message for data in datagrams]
+    except MalformedDatagramError:
+        return None
+
+
+def _expire(model: Model, now: float) -> list[bytes]:
+    """What the reference sends when its next timer ends, then or when it is due."""
+    deadline = model.agent.next_timer()
+    if deadline is None:
+        return []
+    model.feed(Expire(), max(deadline, now))
+    return model.datagrams
 
 
 def log_as(model: Model, action: Log, now: float, waiting: list[Any]) -> tuple[Outcome, list[str]]:

@@ -15,6 +15,8 @@ class Subject(ABC):
 
     def __init__(self, variant: Variant) -> None:
         self.model = Model(variant.settings)
+        self.in_step = True
+        """Whether the reference still is where the agent is, after the machine was late."""
 
     async def step(self, given: Input) -> Seen | None:
         """Both are given an input, and compared; None if there is no such input now."""

@@ -3,8 +3,9 @@
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum, auto
 from typing import Any
 
 from harness.conformance.air import AgentEndedError, NoAgentError, UnsupportedError
@@ -28,6 +29,8 @@ MOST_HIDDEN = 16
 LONGEST_WAY = 80
 TIMES = 2
 """A failure is one only if it comes so often."""
+MOST_TIMES = 4
+"""That it is tried, where the machine was late."""
 STARTS_IN_VAIN = 3
 
 
@@ -56,6 +59,18 @@ class Tally:
     set_aside: int = 0
 
 
+class Verdict(Enum):
+    """Of a way on which nothing failed."""
+
+    RIGHT = auto()
+    TOO_LATE = auto()
+    """The machine was late: nothing can be said."""
+
+
+RIGHT, TOO_LATE = Verdict.RIGHT, Verdict.TOO_LATE
+Outcome = Failure | Verdict
+
+
 class Suite:
     """`told` is called with how many vectors have been seen, whenever that changes."""
 
@@ -76,6 +91,8 @@ class Suite:
             Map(tally.vectors.variant, list(tally.vectors.steps), set(tally.vectors.wanted)) for tally in self.tallies
         ]
         self._at_work: Counter[int] = Counter()
+        self._on_tour: Counter[int] = Counter()
+        """Of those at work, who may yet see something; the others wait for that."""
         self._kinds: Counter[object] = Counter()
         self._in_vain = 0
         self._enough = enough
@@ -116,10 +133,18 @@ class Suite:
     async def _tour(self, number: int, until: float) -> None:
         tally, atlas = self.tallies[number], self._maps[number]
         if atlas.way_from(atlas.start) is None:
-            if not self._at_work[number] > 1:
+            if not self._on_tour[number]:
                 atlas.give_up()
             await asyncio.sleep(0.1)
             return
+        self._on_tour[number] += 1
+        try:
+            await self._life(tally, atlas, until)
+        finally:
+            self._on_tour[number] -= 1
+
+    async def _life(self, tally: Tally, atlas: Map, until: float) -> None:
+        """Of an agent, as long as its tour lasts."""
         try:
             subject = await self._start(tally.vectors.variant, False)
         except UnsupportedError as error:
@@ -140,12 +165,11 @@ class Suite:
         try:
             suspicion = await Tour(atlas, subject, passed).go_on(until)
             if suspicion is not None:
-                self._suspect(number, suspicion)
+                self._suspect(tally, atlas, suspicion)
         finally:
             await subject.close()
 
-    def _suspect(self, number: int, suspicion: Suspicion) -> None:
-        tally, atlas = self.tallies[number], self._maps[number]
+    def _suspect(self, tally: Tally, atlas: Map, suspicion: Suspicion) -> None:
         tally.suspicions.append(suspicion)
         atlas.avoid(suspicion.seen.pair)
         kind = in_short(suspicion.seen.outcome)
@@ -168,57 +192,69 @@ class Suite:
 
     async def _try_again(self, waiting: Iterator[tuple[Tally, Suspicion]]) -> None:
         for tally, suspicion in waiting:
-            failure = await self._alone(tally, suspicion)
-            if failure is None:
+            outcomes = [outcome async for outcome in self._alone(tally, suspicion)]
+            failures = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
+            tally.passed.discard(suspicion.seen.pair)
+            if failures:
+                tally.failures.append(failures[0])
+                tally.passed.discard(failures[0].seen.pair)
+            elif all(outcome is RIGHT for outcome in outcomes):
                 tally.passed.add(suspicion.seen.pair)  # it was the machine
-            else:
-                tally.failures.append(failure)
-                tally.passed.discard(failure.seen.pair)
 
-    async def _alone(self, tally: Tally, suspicion: Suspicion) -> Failure | None:
-        """By the shortest way; after each input on the way that should have changed nothing; and at last as it was."""
+    async def _alone(self, tally: Tally, suspicion: Suspicion) -> AsyncIterator[Outcome]:
+        """By the shortest way; after each input on the way that should have changed nothing; and at last as it was.
+
+        Until it fails.
+        """
         variant = tally.vectors.variant
         name = suspicion.way[-1]
         step = tally.vectors.by_pair.get(suspicion.seen.pair)
         if step is not None:
-            failure = await self._repeated(variant, (*step.way, name))
-            if failure is not None:
-                return failure
+            yield (outcome := await self._repeated(variant, (*step.way, name)))
+            if isinstance(outcome, Failure):
+                return
             for hidden in list(dict.fromkeys(reversed(suspicion.way[:-1])))[:MOST_HIDDEN]:
                 run = _run_without_effect(variant, step.way, hidden)
                 if run is not None and run.handler in COUNTING:
-                    failure = await self._repeated(variant, (*step.way, hidden, name))
-                    if failure is not None:
-                        return replace(failure, seen=replace(failure.seen, hidden=run))
+                    outcome = await self._repeated(variant, (*step.way, hidden, name))
+                    if isinstance(outcome, Failure):
+                        yield replace(outcome, seen=replace(outcome.seen, hidden=run))
+                        return
         for way in _tails(variant, suspicion.way):
-            failure = await self._repeated(variant, way)
-            if failure is not None:
-                return replace(failure, of_an_earlier_round=True)
-        return None
+            outcome = await self._repeated(variant, way)
+            if isinstance(outcome, Failure):
+                yield replace(outcome, of_an_earlier_round=True)
+                return
+            yield outcome
 
-    async def _repeated(self, variant: Variant, way: Sequence[str]) -> Failure | None:
-        failure = None
-        for _ in range(TIMES):
-            failure = await self.play(variant, way)
-            if failure is None:
-                return None
-        return failure
+    async def _repeated(self, variant: Variant, way: Sequence[str]) -> Outcome:
+        """Right if it is so once; a failure if it fails each time; too late if nothing else came."""
+        failures = 0
+        for _ in range(MOST_TIMES):
+            outcome = await self.play(variant, way)
+            if outcome is RIGHT:
+                return RIGHT
+            if isinstance(outcome, Failure):
+                failures += 1
+                if failures >= TIMES:
+                    return outcome
+        return TOO_LATE
 
-    async def play(self, variant: Variant, way: Sequence[str]) -> Failure | None:
+    async def play(self, variant: Variant, way: Sequence[str]) -> Outcome:
         """An agent is given all these inputs: where it was wrong first, if it was not the machine that was late."""
         try:
             subject = await self._start(variant, True)
         except (AgentEndedError, UnsupportedError):
-            return None
+            return TOO_LATE
         try:
             for number, name in enumerate(way, 1):
                 seen = await subject.step(INPUTS[name])
                 if seen is not None and seen.wrong:
                     failure = Failure(variant.name, tuple(way[:number]), seen, subject.exchanges())
-                    return None if seen.late else failure
+                    return TOO_LATE if seen.late else failure
         finally:
             await subject.close()
-        return None
+        return RIGHT
 
 
 def _run_without_effect(variant: Variant, way: tuple[str, ...], name: str) -> Run | None:

@@ -187,10 +187,11 @@ class Tour:
             if seen is None or (seen.wrong and seen.late):
                 if taken:
                     self._map.put_back(pair)
-                if seen is not None:
-                    return None
                 self._plan_anew()
-                self._misled.add(pair)
+                if seen is None:
+                    self._misled.add(pair)
+                elif not self._subject.in_step:
+                    return None
                 continue
             if seen.wrong:
                 return Suspicion(tuple(self._way), seen)
