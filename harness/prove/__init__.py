@@ -7,6 +7,7 @@ reference.py  whether a step is that of a right agent
 zones.py      how long timers have yet to run, compared with each other
 instant.py    what an instant makes of the agents: who hears what in which order, and loses what
 alone.py      network any: each agent by itself, against all that could ever be sent
+order.py      of all orders of the agents one that stands for all
 swarm.py      global states, and all that may happen next
 explore.py    all of them, breadth first
 liveness.py   whether there is always a way to rest with one chain, and whether one goes round for ever

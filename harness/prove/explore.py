@@ -8,7 +8,6 @@ from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from harness.prove.instant import Action
 from harness.prove.local import Flaw
 from harness.prove.progress import Ended, Progress, memory_bytes
 from harness.prove.swarm import State, Swarm
@@ -30,7 +29,6 @@ class Graph:
     states: list[State] = field(default_factory=list)
     number: dict[State, int] = field(default_factory=dict)
     parents: "array[int]" = field(default_factory=lambda: array("q"))
-    actions: list[tuple[Action, ...]] = field(default_factory=list)
     quiet: list[tuple[tuple[int, ...], ...]] = field(default_factory=list)
     crossing: dict[int, tuple[int, ...]] = field(default_factory=dict)
     transitions: int = 0
@@ -46,13 +44,12 @@ class Graph:
     def flaw(self) -> Flaw | None:
         return None if self.flawed is None else self.swarm.flaw(self.states[self.flawed])
 
-    def add(self, state: State, parent: int, actions: tuple[Action, ...]) -> int:
+    def add(self, state: State, parent: int) -> int:
         """Its number; a new one if it is new."""
         number = self.number.setdefault(state, len(self.states))
         if number == len(self.states):
             self.states.append(state)
             self.parents.append(parent)
-            self.actions.append(actions)
         return number
 
     def path(self, number: int) -> list[int]:
@@ -95,7 +92,7 @@ def explore(
 
 def _all(graph: Graph, began: float) -> Iterator[Progress]:
     swarm = graph.swarm
-    graph.add(swarm.initial, NO_PARENT, ())
+    graph.add(swarm.initial, NO_PARENT)
     looked_at = 0
     layer_ends = 1
     while looked_at < len(graph.states):
@@ -114,11 +111,11 @@ def expand(graph: Graph, number: int) -> None:
     swarm, state = graph.swarm, graph.states[number]
     lossy = swarm.bounds.network == "lossy"
     for actions in swarm.actions(state):
-        for move in swarm.moves(state, actions, lossy):
+        for after in swarm.after(state, actions, lossy):
             graph.transitions += 1
             known = len(graph.states)
-            new = graph.add(move.state, number, actions)
-            if new == known and graph.flawed is None and swarm.flaw(move.state):
+            new = graph.add(after, number)
+            if new == known and graph.flawed is None and swarm.flaw(after):
                 graph.flawed = new
     quieten(graph, number)
 
@@ -129,7 +126,7 @@ def quieten(graph: Graph, number: int) -> None:
     alone: list[tuple[int, ...]] = []
     crossing: set[int] = set()
     for actions in swarm.ending(state):
-        after = {graph.add(move.state, number, actions) for move in swarm.moves(state, actions, lossy=False)}
+        after = {graph.add(state_after, number) for state_after in swarm.after(state, actions, lossy=False)}
         if len(actions) == 1:
             alone.append(tuple(after))
         else:

@@ -59,7 +59,6 @@ class Instants:
         self._local = local
         self._bounds = bounds
         self._twice = "duplicate" in bounds.faults
-        self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], dict[Agents, Wave | None]] = {}
         self._outcomes: dict[tuple[int, Heard, bool, bool], list[tuple[Step, tuple[int, ...]]]] = {}
         self._choices_of: dict[tuple[int, int, Started, tuple[tuple[int, int], ...], bool, bool], list[_Choice]] = {}
         self._places = range(bounds.agents)
@@ -75,15 +74,10 @@ class Instants:
         reached = tuple((self.name_of(wave.air[number][0], place), wave.air[number][1]) for number in sorted(heard))
         return len(self._outcomes_of(local, reached, lossy=False, answered=wave.before is not None)) > 1
 
-    def outcomes(self, locals_: tuple[int, ...], actions: Sequence[Action], lossy: bool) -> dict[Agents, Wave | None]:
-        """All that may come of it, with one way to each."""
-        key = locals_, tuple(actions), lossy
-        known = self._known.get(key)
-        if known is None:
-            known = self._known[key] = self._of(locals_, actions, lossy)
-        return known
-
-    def _of(self, locals_: tuple[int, ...], actions: Sequence[Action], lossy: bool) -> dict[Agents, Wave | None]:
+    def outcomes(
+        self, locals_: tuple[int, ...], actions: Sequence[Action], lossy: bool, *, tell: bool
+    ) -> dict[Agents, Wave | None]:
+        """All that may come of it; with one way to each, if it is to be told."""
         agents, started = list(locals_), [()] * len(locals_)  # type: list[int], list[Started]
         air: list[tuple[int, int]] = []
         for action in actions:
@@ -97,28 +91,25 @@ class Instants:
         waiting: dict[tuple[Agents, tuple[tuple[int, int], ...]], Wave | None]
         waiting = {(Agents(tuple(agents), tuple(started)), tuple(air)): None}
         silent: dict[Agents, Wave | None] = {}
+        flawed = self._local.flawed
         rounds = 0
         while waiting:
             rounds += 1
             after: dict[tuple[Agents, tuple[tuple[int, int], ...]], Wave | None] = {}
             for (there, said), way in waiting.items():
-                if not said or any(map(self._is_flawed, there.locals)):
+                if not said or not flawed.isdisjoint(there.locals):
                     silent.setdefault(there, way)
                     continue
                 for heard, answers, orders in self._hear(there, said, lossy, rounds):
                     if (heard, answers) not in after:
-                        after[heard, answers] = Wave(way, said, orders)
+                        after[heard, answers] = Wave(way, said, orders) if tell else None
             waiting = after
+        if not self._bounds.reduced:
+            return silent
         settled: dict[Agents, Wave | None] = {}
         for there, way in silent.items():
-            settled.setdefault(Agents(tuple(map(self._settled, there.locals)), there.started), way)
+            settled.setdefault(Agents(tuple(map(self._local.settled, there.locals)), there.started), way)
         return settled
-
-    def _settled(self, local: int) -> int:
-        return local if local == DEAD or self._is_flawed(local) else self._local.settled(local)
-
-    def _is_flawed(self, local: int) -> bool:
-        return local != DEAD and self._local.known[local].flaw is not None
 
     def _act(self, local: int, action: Action) -> Step:
         if action.what == "timer":
@@ -178,7 +169,9 @@ class Instants:
             outcomes = list(self._work_out(local, heard, lossy, in_order=not answered))
             if self._bounds.reduced:
                 if answered:
-                    settled = {step._replace(local=self._settled(step.local)): way for step, way in reversed(outcomes)}
+                    settled = {
+                        step._replace(local=self._local.settled(step.local)): way for step, way in reversed(outcomes)
+                    }
                     outcomes = list(settled.items())
                 if lossy:
                     outcomes = [outcome for outcome in outcomes if not _is_covered(outcome[0], outcomes)]
@@ -221,7 +214,7 @@ class Instants:
                     waiting.append(after)
         outcomes: dict[Step, tuple[int, ...]] = {}
         for (step, left), way in ways.items():
-            ends_here = lossy or self._is_flawed(step.local) or all(left[position] < copies for position in matter)
+            ends_here = lossy or step.local in self._local.flawed or all(left[position] < copies for position in matter)
             if ends_here and len(way) >= len(outcomes.get(step, ())):
                 outcomes[step] = way
         others = [position for position in range(len(heard)) if position not in matter]

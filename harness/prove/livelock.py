@@ -88,14 +88,16 @@ def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> It
 
 
 def _shown(graph: Graph, alike: Sequence[list[int]], path: Path, name: str) -> Livelock:
-    """With as few coincidences as there are: the first that the simulation goes too, or the first of all."""
-    tried: list[tuple[int, int, list[int], list[int], Script]] = []
+    """With as few coincidences as there are, and blocks as free as can be: the first that the simulation goes too."""
+    bounds = graph.swarm.bounds
+    tried: list[tuple[int, int, int, list[int], list[int], Script]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MOST_PLAYED]:
         begin = graph.path(cycle[0])
         script = Script(graph, [*begin, *cycle[1:], cycle[0]])
-        tried.append((script.coincidences, len(tried), begin, cycle, script))
+        bound = 0 if bounds.timers_any else sum(each.earliest_s == each.latest_s for each in script.completions())
+        tried.append((script.coincidences, bound, len(tried), begin, cycle, script))
     first = None
-    for coincidences, _, begin, cycle, script in sorted(tried, key=lambda each: each[:2]):
+    for coincidences, _, _, begin, cycle, script in sorted(tried, key=lambda each: each[:3]):
         played = play(script.document(name))
         first = first or (coincidences, begin, cycle, played)
         if "liveness" in played.judged:
@@ -103,7 +105,6 @@ def _shown(graph: Graph, alike: Sequence[list[int]], path: Path, name: str) -> L
             break
     assert first is not None, "there is a way round"
     coincidences, begin, cycle, played = first
-    bounds = graph.swarm.bounds
     several = Script(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
     completions = () if bounds.timers_any else tuple(several.completions())
     sentence = f"The swarm can go round in circles for ever: {len(begin) - 1} instants after the beginning."

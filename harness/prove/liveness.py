@@ -74,10 +74,10 @@ def _vote(graph: Graph, number: int) -> set[int]:
     """What follows a state at rest when somebody completes one more block."""
     state = graph.states[number]
     return {
-        graph.add(move.state, number, move.actions)
+        graph.add(after, number)
         for place, local in enumerate(state[AGENTS:])
         if local != DEAD
-        for move in graph.swarm.moves(state, (Action(place, "complete", state[BLOCKS] + 1),), lossy=False)
+        for after in graph.swarm.after(state, (Action(place, "complete", state[BLOCKS] + 1),), lossy=False)
     }
 
 

@@ -7,13 +7,14 @@ looked at once, when it gets its number.
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from hashlib import blake2b
 from random import Random
 from typing import Any, NamedTuple
 
 from harness.prove.bounds import Bounds
 from harness.prove.reference import Give, Reference
-from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, dead, is_as, key_of, put_back, take
+from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, dead, keyed, put_back, take
 from ucp.agent import Agent
 from ucp.block import Block, next_chain_hash
 from ucp.clock import MICROSECONDS
@@ -66,12 +67,16 @@ class Known:
     chain: tuple[int, ...]
     flaw: Flaw | None
     anonymous: int
-    """The same for states that differ only in who has voted and answered."""
+    """The same for states that differ only in who has voted and answered; the same number on any machine."""
     names_others: bool
 
 
 WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us": -1}
 """Parts of the state that no handler needs where nothing is ever lost, as they are at the beginning."""
+
+
+NAMES_OF_OTHERS = ("voters", "reconcile_responders")
+"""Parts of the state that are sets of other agents."""
 
 
 class ReductionError(Exception):
@@ -88,10 +93,12 @@ class LocalStates:
     def __init__(self, bounds: Bounds) -> None:
         self.bounds = bounds
         self.known: list[Known] = []
+        self.flawed: set[int] = set()
+        """Those that must never be."""
         self.steps = 0
         """How many the real agent has computed."""
-        self._loaded: dict[int, int] = {}
-        """In which local state each of the real agents is."""
+        self._loaded: dict[int, Snapshot] = {}
+        """In what state each of the real agents is, while that is known."""
         roster = range(1, bounds.agents + 1)
         settings = bounds.agent_settings()
         self.settings, self._roster = settings, roster
@@ -108,7 +115,11 @@ class LocalStates:
         self.durations_us = [round(duration * MICROSECONDS) for duration in durations]
         """By timer."""
         self._numbers: dict[tuple[Any, ...], int] = {}
-        self._hashes: dict[bytes, int] = {}
+        self._parts: dict[tuple[str, Any], Any] = {}
+        """All parts of states, each once: so states are equal if their parts are the same."""
+        self._digests: dict[int, bytes] = {}
+        """Of each part, by its `id`: the same on any machine."""
+        self._hashes: dict[int, bytes] = {}
         self._blocks: dict[bytes, int] = {}
         """Hashes of completed blocks: who made them, by the agent's number here."""
         self._ordinals: dict[bytes, frozenset[int]] = {}
@@ -116,10 +127,9 @@ class LocalStates:
         self.messages: list[Message] = []
         self._message_numbers: dict[Message, int] = {}
         self._steps: dict[tuple[int, int, int], Step] = {}
-        self._anonymous: dict[tuple[Any, ...], int] = {}
         self._settled: dict[int, int] = {}
         self._renamed: dict[tuple[int, tuple[int, ...]], int] = {}
-        self.initial = {agent_id: self._intern(agent_id) for agent_id in roster}
+        self.initial = {agent_id: self._intern(agent) for agent_id, agent in self._agents.items()}
 
     def _agent(self, agent_id: int, right: bool = False, tracing: bool = False) -> Agent:
         handlers = [] if right else wrong_handlers(self.bounds.quirks, Random(0))
@@ -183,9 +193,7 @@ class LocalStates:
     def _restored(self, local: int) -> Agent:
         known = self.known[local]
         agent = self._agents[known.agent_id]
-        if self._loaded.get(known.agent_id) != local:
-            put_back(agent, known.snapshot)
-            self._loaded[known.agent_id] = local
+        put_back(agent, known.snapshot, self._loaded.pop(known.agent_id, None))
         return agent
 
     def _computed(
@@ -212,19 +220,18 @@ class LocalStates:
             handler, sentence = wrong
             flaw = Flaw("steps", sentence, handler)
         sent = tuple(self._message(message) for _, message in agent.messages_to_send())
-        if flaw is None and agent is self._agents[before.agent_id] and is_as(agent, before.snapshot):
-            return Step(local, sent, ())
-        self._loaded.pop(agent.agent_id, None)
         started = tuple(
             (number, round((timer.deadline - NOW_S) * MICROSECONDS))
             for number, timer in enumerate(agent.state.timers)
             if timer.deadline is not None and timer.deadline < RUNNING_S
         )
+        for number, _ in started:
+            agent.state.timers[number].start(RUNNING_S, 0.0)
         if self.bounds.reduced:
             if hears and any(self.timers[timer] == "voting" for timer, _ in started):
                 raise ReductionError("an agent begins a vote because of a message: try again with --whole")
             self._check_that_nothing_is_lost(before.snapshot, agent.state)
-        return Step(self._intern(agent.agent_id, agent, flaw), sent, started)
+        return Step(self._intern(agent, before, flaw, keep=not boots), sent, started)
 
     def _has_completed(self, agent: Agent, completed: int, ordinal: int) -> None:
         """The agent had `completed` blocks before; what it has completed now is the `ordinal`th of all."""
@@ -252,17 +259,13 @@ class LocalStates:
 
     def settled(self, local: int) -> int:
         """The same agent when all answers to what was asked have come, or are lost: who voted matters no more."""
-        if not self.bounds.reduced:
-            return local
         number = self._settled.get(local)
         if number is None:
-            agent = self._restored(local)
-            state = agent.state
-            self._loaded.pop(agent.agent_id, None)
-            if state.voting_timer.active:
-                state.vote_count = {"yes": int(state.vote_count["yes"] > state.vote_count["no"]), "no": 0}
-                state.voters = set()
-            number = self._settled[local] = self._intern(agent.agent_id, agent)
+            parts = {}
+            if local != DEAD and local not in self.flawed and self.known[local].snapshot["voting_timer"].active:
+                count = self.known[local].snapshot["vote_count"]
+                parts = {"vote_count": {"yes": int(count["yes"] > count["no"]), "no": 0}, "voters": set()}
+            number = self._settled[local] = self._with(local, parts) if parts else local
         return number
 
     def renamed(self, local: int, names: tuple[int, ...]) -> int:
@@ -270,21 +273,39 @@ class LocalStates:
         key = local, names
         number = self._renamed.get(key)
         if number is None:
-            agent = self._restored(local)
-            state = agent.state
-            self._loaded.pop(agent.agent_id, None)
+            snapshot = self.known[local].snapshot
             new = dict(zip(range(2, 2 + len(names)), names, strict=True))
-            state.voters = {new[voter] for voter in state.voters}
-            state.reconcile_responders = {new[responder] for responder in state.reconcile_responders}
-            number = self._renamed[key] = self._intern(agent.agent_id, agent)
+            parts = {name: {new[other] for other in snapshot[name]} for name in NAMES_OF_OTHERS}
+            number = self._renamed[key] = self._with(local, parts)
         return number
 
-    def _intern(self, agent_id: int, agent: Agent | None = None, flaw: Flaw | None = None) -> int:
-        agent = agent or self._agents[agent_id]
-        snapshot = take(agent)
+    def _with(self, local: int, parts: Snapshot) -> int:
+        """The same agent but for who is in its tallies."""
+        known = self.known[local]
+        snapshot = known.snapshot | {name: self._part(name, value) for name, value in parts.items()}
+        key = self._key(known.agent_id, known.flaw, snapshot)
+        number = self._numbers.setdefault(key, len(self.known))
+        if number == len(self.known):
+            anonymous = self._anonymous(known.agent_id, known.flaw, snapshot)
+            names_others = any(snapshot[name] for name in NAMES_OF_OTHERS)
+            self.known.append(replace(known, snapshot=snapshot, anonymous=anonymous, names_others=names_others))
+        return number
+
+    def _intern(self, agent: Agent, before: Known | None = None, flaw: Flaw | None = None, *, keep: bool = True) -> int:
+        """The number of the state that the agent is in; it was in `before`. `keep`: it will be given more inputs."""
+        like = {} if before is None else before.snapshot
+        snapshot = {
+            name: value if like.get(name, self) is value else self._part(name, value)
+            for name, value in take(agent, like).items()
+        }
+        if keep:
+            self._loaded[agent.agent_id] = snapshot
         if self.bounds.reduced:
-            snapshot |= WHAT_ONLY_CHECKS_READ | dead(agent.state)
-        key = (agent_id, flaw, *key_of(snapshot, self._name))
+            forgotten = WHAT_ONLY_CHECKS_READ | dead(agent.state)
+            snapshot = snapshot | {
+                name: self._part(name, value) for name, value in forgotten.items() if snapshot[name] != value
+            }
+        key = self._key(agent.agent_id, flaw, snapshot)
         number = self._numbers.setdefault(key, len(self.known))
         if number == len(self.known):
             state = agent.state
@@ -293,21 +314,43 @@ class LocalStates:
                 below = self._ordinals[chain_hash] = below | self._ordinals.get(block.block_hash, frozenset())
             self.known.append(
                 Known(
-                    agent_id,
+                    agent.agent_id,
                     snapshot,
                     tuple(index for index, timer in enumerate(state.timers) if timer.deadline is not None),
                     state.idle,
                     state.reconcile_in_progress,
                     tuple(self._name(block.block_hash) for block in state.chain),
                     flaw or self._flaw(state),
-                    self._anonymous.setdefault((agent_id, flaw, *key_of(_nameless(snapshot), self._name)), number),
-                    bool(state.voters or state.reconcile_responders),
+                    self._anonymous(agent.agent_id, flaw, snapshot),
+                    any(snapshot[name] for name in NAMES_OF_OTHERS),
                 )
             )
+            if self.known[number].flaw is not None:
+                self.flawed.add(number)
         return number
 
+    def _part(self, name: str, value: Any) -> Any:
+        """The one part that stands for all that are equal."""
+        key = name, keyed(value, self._name)
+        part = self._parts.setdefault(key, value)
+        if part is value:
+            self._digests[id(part)] = blake2b(repr(key[1]).encode(), digest_size=8).digest()
+        return part
+
+    def _key(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> tuple[Any, ...]:
+        return (agent_id, flaw, *map(id, snapshot.values()))
+
+    def _anonymous(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> int:
+        parts = [
+            len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()
+        ]
+        return int.from_bytes(blake2b(repr((agent_id, flaw, parts)).encode(), digest_size=8).digest())
+
     def _name(self, digest: bytes) -> int:
-        return self._hashes.setdefault(digest, len(self._hashes))
+        """A number for a hash, the same on any machine."""
+        name = int.from_bytes(digest[:8])
+        assert self._hashes.setdefault(name, digest) == digest, "no two hashes that there are begin alike"
+        return name
 
     # What is looked at
 
@@ -359,10 +402,3 @@ def _end_at_once(agent: Agent) -> str | None:
     except Exception as error:  # whatever a handler raises is what we look for
         return f"{type(error).__name__}: {error}"
     return "its timers end at once again and again"
-
-
-def _nameless(snapshot: Snapshot) -> Snapshot:
-    """With how many have voted and answered in the place of who."""
-    return {
-        name: len(value) if name in ("voters", "reconcile_responders") else value for name, value in snapshot.items()
-    }

@@ -68,7 +68,7 @@ def _outcome(agent: Agent) -> tuple[Any, ...]:
     """What the agent is, as far as a right one will ever ask, what it says, and when its timers end."""
     return (
         key_of(take(agent) | dead(agent.state), int.from_bytes),
-        [message for _, message in vars(agent.state)["outbox"]],
+        [said[1] for said in vars(agent.state)["outbox"]],
         [timer.deadline for timer in agent.state.timers],
     )
 

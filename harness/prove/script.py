@@ -122,9 +122,8 @@ class Script:
         state, wanted = self._graph.states[before], self._graph.states[after]
         for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
             for actions in self._swarm.actions(state):
-                for move in self._swarm.moves(state, actions, lossy):
-                    if move.state == wanted:
-                        return move
+                if wanted in self._swarm.after(state, actions, lossy):
+                    return next(move for move in self._swarm.moves(state, actions, lossy) if move.state == wanted)
         raise AssertionError("a state on the way follows from the one before")
 
     # When

@@ -32,58 +32,80 @@ NameOf = Callable[[bytes], int]
 """A small number for a hash, always the same."""
 
 
-def take(agent: Agent) -> Snapshot:
-    """A copy of the agent's state."""
-    return {name: _copied(value) for name, value in vars(agent.state).items() if name not in LEFT_OUT}
+_DEAD_VOTE: Snapshot = {
+    "vote_count": {"yes": 0, "no": 0},
+    "voters": set(),
+    "candidate_block": None,
+    "top_chain_hash_at_initiation": b"",
+}
+_DEAD_PHASE_1: Snapshot = {"reconcile_vote_count": {"yes": 0, "no": 0}}
+_DEAD_RESPONDERS: Snapshot = {"reconcile_responders": set()}
+_DEAD_PHASE_2: Snapshot = {"reconcile_response_dictionary": {}}
+_DEAD_PHASE_3: Snapshot = {"majority_response_block_hash": None}
+
+
+def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
+    """A copy of the agent's state; of what is still as in `like` it has the very parts of that."""
+    state = vars(agent.state)
+    if like is None:
+        return {name: _copied(value) for name, value in state.items() if name not in LEFT_OUT}
+    return {
+        name: like[name] if name in like and _is_part(like[name], value) else _copied(value)
+        for name, value in state.items()
+        if name not in LEFT_OUT
+    }
 
 
 def dead(state: AgentState) -> Snapshot:
     """What every handler of a right agent writes before it reads it again, as it is at the beginning."""
     parts: Snapshot = {}
     if not state.voting_timer.active:
-        parts["vote_count"] = {"yes": 0, "no": 0}
-        parts["voters"] = set()
-        parts["candidate_block"] = None
-        parts["top_chain_hash_at_initiation"] = b""
+        parts |= _DEAD_VOTE
     if not state.phase_one_timer.active:
-        parts["reconcile_vote_count"] = {"yes": 0, "no": 0}
+        parts |= _DEAD_PHASE_1
         if not state.phase_two_timer.active:
-            parts["reconcile_responders"] = set()
+            parts |= _DEAD_RESPONDERS
     if not state.phase_two_timer.active:
-        parts["reconcile_response_dictionary"] = {}
+        parts |= _DEAD_PHASE_2
     if not state.phase_three_timer.active:
-        parts["majority_response_block_hash"] = None
+        parts |= _DEAD_PHASE_3
     return parts
 
 
-def put_back(agent: Agent, snapshot: Snapshot) -> None:
-    """Let the agent be in the state of the snapshot. Its running timers have the deadline RUNNING_S."""
+def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) -> None:
+    """Let the agent be in the state of the snapshot. Its running timers have the deadline RUNNING_S.
+
+    `since` is what it is now, if that is known: parts that both have are left alone.
+    """
     state = vars(agent.state)
     state["now"] = NOW_S
     for name in HANDED_OVER & state.keys():
         state[name].clear()
     for name, value in snapshot.items():
+        if since is not None and name in since and since[name] is value:
+            continue
         if isinstance(value, _TimerState | _ChainState):
             value.put_back(state[name])
         else:
             state[name] = _copied(value)
 
 
-def is_as(agent: Agent, snapshot: Snapshot) -> bool:
-    """Whether the agent, which was in the state of the snapshot, still is."""
-    state = vars(agent.state)
-    for name, value in snapshot.items():
-        if isinstance(value, _TimerState | _ChainState):
-            if not value.is_of(state[name]):
-                return False
-        elif state[name] != value:
-            return False
-    return state.keys() - LEFT_OUT == snapshot.keys()
+def _is_part(part: Any, value: Any) -> bool:
+    """Whether this part of the state still is what it was."""
+    if isinstance(part, _TimerState | _ChainState):
+        return part.is_of(value)
+    return bool(part == value)
+
+
+def keyed(value: Any, name_of: NameOf) -> Any:
+    """A part of the state as numbers and tuples, equal for equal parts and whichever machine it is."""
+    key = _KEYED.get(type(value))
+    return value if key is None else key(value, name_of)
 
 
 def key_of(snapshot: Snapshot, name_of: NameOf) -> tuple[Any, ...]:
     """Equal for equal states, and only for these."""
-    return tuple(_keyed(value, name_of) for value in snapshot.values())
+    return tuple(keyed(value, name_of) for value in snapshot.values())
 
 
 class _TimerState:
@@ -92,6 +114,10 @@ class _TimerState:
     def __init__(self, timer: Timer) -> None:
         self.running = timer.deadline is not None
         self.paused = timer.active and not self.running
+
+    @property
+    def active(self) -> bool:
+        return self.running or self.paused
 
     def is_of(self, timer: Timer) -> bool:
         """A timer that was started anew is not what it was."""
@@ -150,23 +176,18 @@ _COPIED: dict[type, Callable[[Any], Any]] = {
 }
 
 
-def _keyed(value: Any, name_of: NameOf) -> Any:
-    key = _KEYED.get(type(value))
-    return value if key is None else key(value, name_of)
-
-
 _KEYED: dict[type, Callable[[Any, NameOf], Any]] = {
     bytes: lambda value, name_of: name_of(value),
     Block: lambda value, name_of: name_of(value.block_hash),
     _TimerState: lambda value, name_of: (value.running, value.paused),
     _ChainState: lambda value, name_of: (
         value.kind.__name__,
-        *[_keyed(part, name_of) for part in value.parts.values()],
+        *[keyed(part, name_of) for part in value.parts.values()],
     ),
-    dict: lambda value, name_of: frozenset(
-        [(_keyed(key, name_of), _keyed(item, name_of)) for key, item in value.items()]
+    dict: lambda value, name_of: tuple(
+        sorted([(keyed(key, name_of), keyed(item, name_of)) for key, item in value.items()])
     ),
-    set: lambda value, name_of: frozenset([_keyed(item, name_of) for item in value]),
+    set: lambda value, name_of: tuple(sorted([keyed(item, name_of) for item in value])),
     bytearray: lambda value, name_of: bytes(value),
-    **dict.fromkeys((list, deque, tuple), lambda value, name_of: tuple([_keyed(item, name_of) for item in value])),
+    **dict.fromkeys((list, deque, tuple), lambda value, name_of: tuple([keyed(item, name_of) for item in value])),
 }

@@ -12,15 +12,16 @@ from typing import NamedTuple
 from harness.prove.bounds import FAULTS, Bounds
 from harness.prove.instant import Action, Agents, Instants, Wave
 from harness.prove.local import DEAD, Flaw, LocalStates, Started
+from harness.prove.order import Order, Places
 from harness.prove.zones import NOTHING_RUNS, Zones
 
 State = tuple[int, ...]
 """Blocks completed, faults left (a bit for each), zone, then the agents."""
+MOST_KNOWN = 200_000
+"""So many instants are remembered; then they are worked out again."""
+ALL_FAULTS = (1 << len(FAULTS)) - 1
 BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 """Where they stand in it."""
-
-Places = tuple[int, ...]
-"""For each place of a state the place at which its agent stood before."""
 
 
 class Move(NamedTuple):
@@ -34,6 +35,24 @@ class Move(NamedTuple):
     """By the places before."""
 
 
+class _Outcome(NamedTuple):
+    """Agents after an instant. `running` says of each of their timers which it was; the rest says how it came so."""
+
+    agents: tuple[int, ...]
+    running: tuple[int, ...]
+    started: tuple[Started, ...]
+    wave: Wave | None
+
+
+class _Instant(NamedTuple):
+    """What may come of agents, whatever the zone: the timers that end, blocks completed, faults left, and outcomes."""
+
+    ended: tuple[int, ...]
+    completed: int
+    left: int
+    outcomes: tuple[_Outcome, ...]
+
+
 class Swarm:
     """All global states of `bounds` are made here."""
 
@@ -42,7 +61,9 @@ class Swarm:
         self.local = LocalStates(bounds)
         self.zones = Zones()
         self._instants = Instants(self.local, bounds)
-        self._in_order: dict[tuple[tuple[int, ...], int], tuple[tuple[int, ...], int, Places]] = {}
+        self._order = Order(self.local, self.zones, self.name_of) if bounds.reduced else None
+        self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], _Instant] = {}
+        self._as_they_are = tuple(range(bounds.agents))
         own = [1] * bounds.agents if bounds.reduced else range(1, bounds.agents + 1)
         faults = sum(1 << FAULTS.index(name) for name in bounds.faults if name != "duplicate")
         self.initial: State = (0, faults, NOTHING_RUNS, *(self.local.initial[agent_id] for agent_id in own))
@@ -122,25 +143,63 @@ class Swarm:
 
     # What comes of it
 
-    def moves(self, state: State, actions: Sequence[Action], lossy: bool) -> Iterator[Move]:
-        """All that may come of these actions in one instant; none if their timers cannot end at once."""
-        locals_ = state[AGENTS:]
-        running = self._running(locals_)
-        at = {timer: index + 1 for index, timer in enumerate(running)}
-        ended = tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer"))
-        if len(ended) > 1 and not self.bounds.timers_any and self.zones.after(state[ZONE], ended, ()) is None:
-            return
-        blocks = state[BLOCKS] + sum(action.what == "complete" for action in actions)
-        left = state[LEFT]
+    def after(self, state: State, actions: tuple[Action, ...], lossy: bool) -> Iterator[State]:
+        """The states that may come of these actions in one instant; none if their timers cannot end at once."""
+        key = state[AGENTS:], actions, lossy
+        instant = self._known.get(key)
+        if instant is None:
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
+            instant = self._known[key] = self._instant(*key, tell=False)
+        if self._can_be(state, instant):
+            for agents, zone, _ in self._ordered(state, instant):
+                yield (state[BLOCKS] + instant.completed, state[LEFT] & instant.left, zone, *agents)
+
+    def moves(self, state: State, actions: tuple[Action, ...], lossy: bool) -> Iterator[Move]:
+        """The same, with how each comes about."""
+        instant = self._instant(state[AGENTS:], actions, lossy, tell=True)
+        if self._can_be(state, instant):
+            ordered = self._ordered(state, instant)
+            for outcome, (agents, zone, places) in zip(instant.outcomes, ordered, strict=True):
+                after = (state[BLOCKS] + instant.completed, state[LEFT] & instant.left, zone, *agents)
+                yield Move(actions, after, places, outcome.wave, outcome.started)
+
+    def _can_be(self, state: State, instant: _Instant) -> bool:
+        """Whether these timers can end at once, before all others; it is known that each can by itself."""
+        if len(instant.ended) < 2 or self.bounds.timers_any:
+            return True
+        return self.zones.after(state[ZONE], instant.ended, ()) is not None
+
+    def _ordered(self, state: State, instant: _Instant) -> Iterator[tuple[tuple[int, ...], int, Places]]:
+        for outcome in instant.outcomes:
+            zone = NOTHING_RUNS
+            if not self.bounds.timers_any:
+                after = self.zones.after(state[ZONE], instant.ended, outcome.running)
+                assert after is not None, "these timers can end at once"
+                zone = after
+            if self._order is None:
+                yield outcome.agents, zone, self._as_they_are
+            else:
+                yield self._order.of(outcome.agents, zone)
+
+    def _instant(self, locals_: tuple[int, ...], actions: tuple[Action, ...], lossy: bool, *, tell: bool) -> _Instant:
+        at = {timer: index + 1 for index, timer in enumerate(self._running(locals_))}
+        left = ALL_FAULTS
         for action in actions:
             if action.what in FAULTS:
                 left &= ~(1 << FAULTS.index(action.what))
-        for there, wave in self._instants.outcomes(locals_, actions, lossy).items():
-            zone = NOTHING_RUNS if self.bounds.timers_any else self._zone_after(state[ZONE], ended, at, there)
-            agents, zone, places = self._ordered(there.locals, zone)
-            yield Move(tuple(actions), (blocks, left, zone, *agents), places, wave, there.started)
+        return _Instant(
+            tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer")),
+            sum(action.what == "complete" for action in actions),
+            left,
+            tuple(
+                _Outcome(there.locals, self._running_after(at, there), there.started if tell else (), wave)
+                for there, wave in self._instants.outcomes(locals_, actions, lossy, tell=tell).items()
+            ),
+        )
 
-    def _zone_after(self, zone: int, ended: tuple[int, ...], at: dict[tuple[int, int], int], there: Agents) -> int:
+    def _running_after(self, at: dict[tuple[int, int], int], there: Agents) -> tuple[int, ...]:
+        """Of each timer that runs then which it was, or, if it has just been started, minus its duration less one."""
         running = []
         for place, local in enumerate(there.locals):
             if local == DEAD:
@@ -151,9 +210,7 @@ class Swarm:
                     running.append(-started[timer] - 1)
                 else:
                     running.append(at.get((place, timer)) or -self.local.durations_us[timer] - 1)
-        after = self.zones.after(zone, ended, tuple(running))
-        assert after is not None, "these timers can end at once"
-        return after
+        return tuple(running)
 
     def _running(self, locals_: Sequence[int]) -> list[tuple[int, int]]:
         """(place, timer) of all timers that run, in the order of the zone."""
@@ -161,43 +218,6 @@ class Swarm:
         return [
             (place, timer) for place, local in enumerate(locals_) if local != DEAD for timer in known[local].running
         ]
-
-    def _ordered(self, locals_: tuple[int, ...], zone: int) -> tuple[tuple[int, ...], int, Places]:
-        """One of all orders of the agents, and where each of them stood."""
-        if not self.bounds.reduced:
-            return locals_, zone, tuple(range(len(locals_)))
-        key = locals_, zone
-        ordered = self._in_order.get(key)
-        if ordered is None:
-            ordered = self._in_order[key] = self._put_in_order(locals_, zone)
-        return ordered
-
-    def _put_in_order(self, locals_: tuple[int, ...], zone: int) -> tuple[tuple[int, ...], int, Places]:
-        known = self.local.known
-        running = self._running(locals_)
-
-        def looks(place: int) -> tuple[object, ...]:
-            if locals_[place] == DEAD:
-                return (DEAD,)
-            mine = [index + 1 for index, (owner, _) in enumerate(running) if owner == place]
-            bounds = [] if self.bounds.timers_any else [self.zones.bounds(zone, timer) for timer in mine]
-            return (known[locals_[place]].anonymous, *bounds)
-
-        places = tuple(sorted(range(len(locals_)), key=looks))
-        agents = []
-        for new, old in enumerate(places):
-            local = locals_[old]
-            if local != DEAD and known[local].names_others and known[local].flaw is None:
-                names = [0] * (len(places) - 1)
-                for other_new, other_old in enumerate(places):
-                    if other_old != old:
-                        names[self._instants.name_of(other_old, old) - 2] = self._instants.name_of(other_new, new)
-                local = self.local.renamed(local, tuple(names))
-            agents.append(local)
-        if not self.bounds.timers_any:
-            order = [index + 1 for place in places for index, (owner, _) in enumerate(running) if owner == place]
-            zone = self.zones.permuted(zone, tuple(order))
-        return tuple(agents), zone, places
 
     def name_of(self, other: int, place: int) -> int:
         """What the agent at `place` calls the one at `other`."""
