@@ -231,8 +231,8 @@ class Autopilot:
     def _stand(self) -> None:
         self._begin([Rest(self.motion)], self._stand)
 
-    def _land(self, place: Point) -> None:
-        self._begin(self._model.land(self.motion, place), self._landed)
+    def _land(self, place: Point, before: Point | None = None) -> None:
+        self._begin(self._model.land(self.motion, place, before), self._landed)
 
     def _landed(self) -> None:
         self.airborne = False
@@ -287,7 +287,8 @@ class Autopilot:
             case mavlink.MAV_CMD_NAV_TAKEOFF:  # again, after a pause
                 self._begin(self._model.take_off(self.motion, item.z), self._item_reached)
             case mavlink.MAV_CMD_NAV_WAYPOINT:
-                self._begin(self._model.go_to(self.motion, place, self._speed_ms), self._item_reached)
+                way = self._model.go_to(self.motion, place, self._speed_ms, self._place_before(number))
+                self._begin(way, self._item_reached)
             case mavlink.MAV_CMD_NAV_LOITER_TIME:
                 self._begin(self._model.loiter(self.motion, place, self._speed_ms, item.param1), self._item_reached)
             case mavlink.MAV_CMD_NAV_LOITER_UNLIM:
@@ -295,7 +296,18 @@ class Autopilot:
             case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
                 self._return_home(self._stay)
             case mavlink.MAV_CMD_NAV_LAND:
-                self._land(place)
+                self._land(place, self._place_before(number))
+
+    def _place_before(self, number: int) -> Point | None:
+        """Where the item before this one was, if it was a place."""
+        for item in reversed(self.mission[1:number]):
+            match item.command:
+                case mavlink.MAV_CMD_NAV_WAYPOINT | mavlink.MAV_CMD_NAV_LOITER_TIME:
+                    return self.place(item.frame, item.x, item.y, item.z)
+                case mavlink.MAV_CMD_DO_CHANGE_SPEED:
+                    continue
+            return None
+        return None
 
     def _item_reached(self) -> None:
         number = self.current_item

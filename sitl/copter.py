@@ -29,7 +29,7 @@ class Copter:
         spin_up = [Rest(start, SPIN_UP_S)] if start.up_m < NEAR_M else []
         return [*spin_up, Line(start, top, CLIMB_MS, VERTICAL_ACCEL_MS2)]
 
-    def go_to(self, start: Motion, place: Point, speed_ms: float) -> Sequence[Segment]:
+    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
         level_m = math.dist(start.point[:2], place[:2])
         climb_m = place.up_m - start.up_m
         length_m = math.hypot(level_m, climb_m)
@@ -47,7 +47,7 @@ class Copter:
         there = self.go_to(start, place, speed_ms)
         return [*there, Rest(end_of(there), seconds)]
 
-    def land(self, start: Motion, place: Point) -> Sequence[Segment]:
+    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
         there = self.go_to(start, place._replace(up_m=start.up_m), CRUISE_MS)
         above = end_of(there)
         segments: list[Segment] = [*there, Rest(above, SETTLING_S)]

@@ -24,13 +24,14 @@ class MotionModel(Protocol):
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]: ...
 
-    def go_to(self, start: Motion, place: Point, speed_ms: float) -> Sequence[Segment]: ...
+    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
+        """A plane comes back to the line that leads there from `before`, the place that it was sent to before."""
 
     def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
         """Stay at `place` for so many seconds after having come there, which may be infinite."""
 
-    def land(self, start: Motion, place: Point) -> Sequence[Segment]:
-        """Come down at `place`, and stand there."""
+    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
+        """Come down at `place`, and stand there; `before` as in `go_to`."""
 
     def idle(self, start: Motion) -> Sequence[Segment]:
         """What it does in the air when it has taken off and has been told nothing since, for ever."""

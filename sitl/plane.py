@@ -1,7 +1,8 @@
 """How a plane moves: never slower than it flies, in arcs and straight lines.
 
-The figures are those of ArduPlane's SITL (plane.parm, parameters by name). Its paths are shortest turns, as those of
-Dubins (1957), not those of ArduPlane's L1 controller: turns may differ from that by some tens of metres.
+The figures are those of ArduPlane's SITL (plane.parm, parameters by name), or, where it says so, measured with
+ArduPlane 4.7. Its paths are shortest turns, as those of Dubins (1957), not those of ArduPlane's L1 controller: turns
+may differ from that by some tens of metres.
 """
 
 from __future__ import annotations
@@ -9,17 +10,33 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
-from sitl.kinematics import NEAR_M, Arc, Climbing, Line, Motion, Point, Segment, end_of
+from sitl.kinematics import NEAR_M, Arc, Climbing, Line, Motion, Point, Rest, Segment, end_of
 
 CRUISE_MS = 22.0  # AIRSPEED_CRUISE
+OVER_GROUND = (
+    1.06  # metres over the ground for each that its airspeed sensor counts, measured: the air is thin up there
+)
 CLIMB_MS = 5.0  # TECS_CLMB_MAX
-LOITER_RADIUS_M = 80.0  # WP_LOITER_RAD, clockwise
-REACHED_M = 50.0  # WP_RADIUS
-TURN_RADIUS_M = 50.0  # so that a right angle, flown by at REACHED_M, meets the next leg
+LOITER_RADIUS_M = 94.0  # clockwise; measured, of WP_LOITER_RAD 80, which grows in thin air
+JOIN_RAD = 0.65  # measured: how far to the left of straight ahead it leaves a place that it is to circle
+REACHED_M = 40.0  # measured: 20 to 28, and 52 before it turns round
+TURN_RADIUS_M = 55.0  # measured
+WIDE_TURN_RADIUS_M, WIDE_TURN_RAD = 110.0, 1.0  # measured: small turns are flown less tightly
+RATHER_RIGHT_M = 20.0  # measured: where it is about as far, it turns to the right
+LINE_AHEAD_M = 150.0  # how far ahead, on the line between two places, it aims at to come back to it
 LOW_M = 10.0  # low enough to land from a circle of LOITER_RADIUS_M
-RUNWAY_ACCEL_MS2 = 4.0
-RUNWAY_M = CRUISE_MS**2 / (2 * RUNWAY_ACCEL_MS2)  # from standing to flying, and back
+
+SPOOL_UP_S = 0.7  # the take-off, measured
+RUNWAY_ACCEL_MS2 = 8.0
+RUNWAY_M = CRUISE_MS**2 / (2 * RUNWAY_ACCEL_MS2)  # from standing to flying
+TAKE_OFF_CLIMB_MS, TAKE_OFF_MS = 10.0, 26.5
+LEVEL_OFF_M = 40.0  # straight on, before it turns
+
+LANDING_MS = 17.5  # the landing, measured
+ROLL_OUT_M, PAST_M = 60.0, 9.0  # how far before its place it touches down, and behind it stands
+ROLL_OUT_ACCEL_MS2 = LANDING_MS**2 / (2 * (ROLL_OUT_M + PAST_M))
 
 
 class Plane:
@@ -29,34 +46,42 @@ class Plane:
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
         run = Line(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
-        path = _Path(end_of([run]), CRUISE_MS, altitude_m, CLIMB_MS)
-        path.straight(CRUISE_MS * max(0.0, altitude_m - start.up_m) / CLIMB_MS)
-        return [run, *path.segments]
+        path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
+        path.straight(TAKE_OFF_MS * max(0.0, altitude_m - start.up_m) / TAKE_OFF_CLIMB_MS)
+        return [Rest(start, SPOOL_UP_S), run, *path.segments]
 
-    def go_to(self, start: Motion, place: Point, speed_ms: float) -> Sequence[Segment]:
-        return _fly_by(start, place, speed_ms, CLIMB_MS, REACHED_M)
+    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
+        return _back_and_on(start, place, before, speed_ms * OVER_GROUND, CLIMB_MS, REACHED_M)
 
     def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
-        """From one clockwise circle, the turn that begins here, along the tangent to the other, round the place."""
-        path = _Path(start, speed_ms, place.up_m, CLIMB_MS)
-        turning = _beside(start, LOITER_RADIUS_M)
-        north, east = place.north_m - turning[0], place.east_m - turning[1]
-        if (across_m := math.hypot(north, east)) > NEAR_M:
+        """Clockwise round the place, for so many seconds from when it has come to the circle.
+
+        From inside it crosses the circle straight; from outside it flies from one clockwise circle, the turn that
+        begins here, along the tangent to the other.
+        """
+        path = _Path(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS)
+        if math.dist(start.point[:2], place[:2]) < LOITER_RADIUS_M:
+            path.straight_to(_on_circle(place, start.yaw_rad - JOIN_RAD))
+        else:
+            turning = _beside(start, LOITER_RADIUS_M)
+            north, east = place.north_m - turning[0], place.east_m - turning[1]
             path.arc(turning, (math.atan2(east, north) - start.yaw_rad) % math.tau)
-            path.straight(across_m)
-        path.arc(place[:2], seconds * speed_ms / LOITER_RADIUS_M)
+            path.straight(math.hypot(north, east))
+        path.arc(place[:2], seconds * path.speed_ms / LOITER_RADIUS_M)
         return path.segments
 
-    def land(self, start: Motion, place: Point) -> Sequence[Segment]:
-        """Glide straight to the place, and roll to a stand; who is too high for that circles down before."""
-        glide_s = _duration_s(_fly_by(start, place, CRUISE_MS, 0.0, 0.0))
+    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
+        """Glide straight to the ground before the place, and roll to a stand; who is too high circles down before."""
+        touchdown = _towards(place, start.point, ROLL_OUT_M)._replace(up_m=0.0)
+        glide_s = _duration_s(_back_and_on(start, touchdown, before, LANDING_MS, 0.0, 0.0))
         if start.up_m > CLIMB_MS * glide_s:
             circling = self.loiter(start, place._replace(up_m=LOW_M), CRUISE_MS, (start.up_m - LOW_M) / CLIMB_MS)
             return [*circling, *self.land(end_of(circling), place)]
-        ground = place._replace(up_m=0.0)
-        glide = _fly_by(start, ground, CRUISE_MS, start.up_m / glide_s if glide_s else 0.0, 0.0)
-        touchdown = replace(end_of(glide), up_m=0.0)
-        return [*glide, Line(touchdown, _ahead(touchdown, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, from_ms=CRUISE_MS)]
+        sink_ms = start.up_m / glide_s if glide_s else 0.0
+        glide = _back_and_on(start, touchdown, before, LANDING_MS, sink_ms, 0.0)
+        ground = replace(end_of(glide), up_m=0.0)
+        stand = _ahead(ground, ROLL_OUT_M + PAST_M)
+        return [*glide, Line(ground, stand, LANDING_MS, ROLL_OUT_ACCEL_MS2, from_ms=LANDING_MS)]
 
     def idle(self, start: Motion) -> Sequence[Segment]:
         return self.loiter(start, start.point, CRUISE_MS, math.inf)
@@ -75,7 +100,10 @@ class _Path:
         self._end, self._up_m, self._rate_ms = start, up_m, rate_ms
 
     def straight(self, length_m: float) -> None:
-        end = _ahead(self._end, length_m)
+        self.straight_to(_ahead(self._end, length_m))
+
+    def straight_to(self, place: Point) -> None:
+        end = place._replace(up_m=self._end.up_m)
         self._add(Line(self._end, end, self.speed_ms, RUNWAY_ACCEL_MS2, self.speed_ms, self.speed_ms))
 
     def arc(self, centre: tuple[float, float], turn_rad: float) -> None:
@@ -87,36 +115,87 @@ class _Path:
             self._end = end_of(self.segments)
 
 
+def _back_and_on(
+    start: Motion, place: Point, before: Point | None, speed_ms: float, rate_ms: float, reached_m: float
+) -> Sequence[Segment]:
+    """Back to the line that leads to `place` from `before`, and on it until it is `reached_m` away."""
+    aim = None if before is None else _back_on_line(start.point, before, place)
+    if aim is None:
+        return _fly_by(start, place, speed_ms, rate_ms, reached_m)
+    back = _fly_by(start, aim, max(speed_ms, CRUISE_MS * OVER_GROUND), rate_ms, REACHED_M)
+    return [*back, *_fly_by(end_of(back), place, speed_ms, rate_ms, reached_m)]
+
+
 def _fly_by(start: Motion, place: Point, speed_ms: float, rate_ms: float, reached_m: float) -> Sequence[Segment]:
     """Turn towards `place`, whichever way is shorter, and go straight until it is `reached_m` away."""
     path = _Path(start, speed_ms, place.up_m, rate_ms)
     if math.dist(start.point[:2], place[:2]) > max(reached_m, NEAR_M):
-        ways = [way for side in (1, -1) if (way := _turn_towards(start, place, side)) is not None]
-        centre, turn_rad, straight_m = min(ways, key=lambda way: abs(way[1]) * TURN_RADIUS_M + way[2])
-        if abs(turn_rad) > NEAR_M:
-            path.arc(centre, turn_rad)
-        path.straight(max(0.0, straight_m - reached_m))
+        turn = _turn_towards(start, place, WIDE_TURN_RADIUS_M)
+        if turn is None or abs(turn.turn_rad) > WIDE_TURN_RAD:
+            turn = _turn_towards(start, place, TURN_RADIUS_M)
+        if turn is None:  # neither way: it is beside and too close, so first get away from it
+            path.straight(2 * TURN_RADIUS_M)
+            return [*path.segments, *_fly_by(end_of(path.segments), place, speed_ms, rate_ms, reached_m)]
+        if abs(turn.turn_rad) > NEAR_M:
+            path.arc(turn.centre, turn.turn_rad)
+        path.straight(max(0.0, turn.ahead_m - reached_m))
     else:
         path.straight(0.0)
     return path.segments
 
 
-def _turn_towards(start: Motion, place: Point, side: int) -> tuple[tuple[float, float], float, float] | None:
-    """The turn to the right (side 1) or left (-1) after which `place` is straight ahead: centre, angle, metres ahead.
+class _Turn(NamedTuple):
+    """A turn after which a place is straight ahead: centre, angle clockwise, and how far ahead it is then."""
 
-    None: the place is inside that circle.
-    """
-    centre = _beside(start, side * TURN_RADIUS_M)
-    north, east = place.north_m - centre[0], place.east_m - centre[1]
-    away_m = math.hypot(north, east)
-    if away_m < TURN_RADIUS_M:
+    centre: tuple[float, float]
+    turn_rad: float
+    ahead_m: float
+
+
+def _turn_towards(start: Motion, place: Point, radius_m: float) -> _Turn | None:
+    """The turn that makes the shorter way; None: the place is inside both circles."""
+    ways = []
+    for side in (1, -1):  # to the right, to the left
+        centre = _beside(start, side * radius_m)
+        north, east = place.north_m - centre[0], place.east_m - centre[1]
+        away_m = math.hypot(north, east)
+        if away_m < radius_m:
+            continue
+        leaves = math.atan2(east, north) - side * math.acos(radius_m / away_m)
+        enters = start.yaw_rad - side * math.pi / 2
+        turn_rad = side * (leaves - enters) % math.tau
+        if math.tau - turn_rad < NEAR_M:  # straight ahead, but for rounding
+            turn_rad = 0.0
+        ways.append(_Turn(centre, side * turn_rad, math.sqrt(away_m**2 - radius_m**2)))
+    lengths_m = {way: abs(way.turn_rad) * radius_m + way.ahead_m for way in ways}
+    return min(ways, key=lambda way: lengths_m[way] + (0.0 if way.turn_rad >= 0 else RATHER_RIGHT_M), default=None)
+
+
+def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
+    """Where on the line between two places to aim at from beside it; None: the place itself is as near."""
+    north, east = place.north_m - before.north_m, place.east_m - before.east_m
+    length_m = math.hypot(north, east)
+    if length_m < NEAR_M:
         return None
-    leaves = math.atan2(east, north) - side * math.acos(TURN_RADIUS_M / away_m)
-    enters = start.yaw_rad - side * math.pi / 2
-    turn_rad = side * (leaves - enters) % math.tau
-    if math.tau - turn_rad < NEAR_M:  # straight ahead, but for rounding
-        turn_rad = 0.0
-    return centre, side * turn_rad, math.sqrt(away_m**2 - TURN_RADIUS_M**2)
+    along_m = ((here.north_m - before.north_m) * north + (here.east_m - before.east_m) * east) / length_m + LINE_AHEAD_M
+    if along_m > length_m - LINE_AHEAD_M:
+        return None
+    part = along_m / length_m
+    return Point(before.north_m + part * north, before.east_m + part * east, place.up_m)
+
+
+def _on_circle(place: Point, bearing_rad: float) -> Point:
+    """The point of the circle round a place in this direction from it."""
+    north_m, east_m = LOITER_RADIUS_M * math.cos(bearing_rad), LOITER_RADIUS_M * math.sin(bearing_rad)
+    return Point(place.north_m + north_m, place.east_m + east_m, place.up_m)
+
+
+def _towards(place: Point, other: Point, length_m: float) -> Point:
+    """So far from a place, on the way to the other."""
+    away_m = max(math.dist(place[:2], other[:2]), NEAR_M)
+    part = min(1.0, length_m / away_m)
+    north_m, east_m = (a + part * (b - a) for a, b in zip(place[:2], other[:2], strict=True))
+    return Point(north_m, east_m, place.up_m)
 
 
 def _ahead(start: Motion, length_m: float) -> Point:

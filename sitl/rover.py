@@ -22,7 +22,7 @@ class Rover:
         """It cannot, and stays."""
         return [Rest(start, 0.0)]
 
-    def go_to(self, start: Motion, place: Point, speed_ms: float) -> Sequence[Segment]:
+    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
         there = Line(start, place._replace(up_m=start.up_m), speed_ms, ACCEL_MS2)
         if not there.duration_s:
             return [there]
@@ -33,7 +33,7 @@ class Rover:
         there = self.go_to(start, place, speed_ms)
         return [*there, Rest(end_of(there), seconds)]
 
-    def land(self, start: Motion, place: Point) -> Sequence[Segment]:
+    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
         """It never left the ground, and stays."""
         return [Rest(start, 0.0)]
 

@@ -57,22 +57,25 @@ def track(
         segments += model.idle(end_of(segments))
     else:
         waypoints = route(plan, vehicle_type, heading_deg)
-        for waypoint in waypoints:
-            segments += manoeuvre(model, waypoint, end_of(segments))
+        for waypoint, before in zip(waypoints, (None, *waypoints), strict=False):
+            segments += manoeuvre(model, waypoint, end_of(segments), before)
         last = waypoints[-1]
         if last.kind != "land":
             segments += model.loiter(end_of(segments), last.place, last.speed_ms, math.inf)
     return Track(Course(begin_s, segments), home_offset)
 
 
-def manoeuvre(model: MotionModel, waypoint: Waypoint, start: Motion) -> Sequence[Segment]:
-    """How a vehicle does what one waypoint of a route asks for, from where it is."""
+def manoeuvre(
+    model: MotionModel, waypoint: Waypoint, start: Motion, before: Waypoint | None = None
+) -> Sequence[Segment]:
+    """How a vehicle does what one waypoint of a route asks for, from where it is, after the waypoint `before`."""
+    led = before.place if before is not None and before.kind in ("go_to", "loiter") else None
     match waypoint.kind:
         case "take_off":
             return model.take_off(start, waypoint.place.up_m)
         case "go_to":
-            return model.go_to(start, waypoint.place, waypoint.speed_ms)
+            return model.go_to(start, waypoint.place, waypoint.speed_ms, led)
         case "loiter":
             return model.loiter(start, waypoint.place, waypoint.speed_ms, waypoint.seconds)
         case "land":
-            return model.land(start, waypoint.place)
+            return model.land(start, waypoint.place, led)

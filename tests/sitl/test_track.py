@@ -12,6 +12,7 @@ from typing import Literal
 import pytest
 
 from sitl.plan import GoTo, Land, Loiter, Plan, PlanError, TakeOff
+from sitl.plane import LOITER_RADIUS_M
 from sitl.track import Track, track
 from sitl.vehicle import VehicleType
 from tests.sitl.cockpit import Cockpit
@@ -50,7 +51,7 @@ def test_it_stands_until_it_is_ready_and_stays_where_it_ends() -> None:
     assert square.at(10.0)[2] > 0
     assert square.at(1e6) == (0, 0, 0)
     circling = track("plane", ROUND_TRIP)
-    assert math.hypot(*circling.at(5000)[:2]) == pytest.approx(80)
+    assert math.hypot(*circling.at(5000)[:2]) == pytest.approx(LOITER_RADIUS_M)
     assert circling.at(5000) != circling.at(5001)
 
 
@@ -126,6 +127,16 @@ def test_a_vehicle_of_today_is_at_each_place_within_5_s_of_the_computed_one(
     for second, *place in flown:
         nearby = (computed.at(second + tenth / 10) for tenth in range(-50, 51))
         assert min(math.dist(place, near) for near in nearby) < 3.0, f"{second:.1f} s after arming"
+
+
+def test_a_plane_of_today_is_near_the_computed_one() -> None:
+    """Within 80 m at the same second after arming, and within 30 m of the computed path over the ground."""
+    plan = Plan((TakeOff(50), GoTo(600, 350, speed_ms=20), Loiter(120), GoTo(0, 0), Land()))
+    computed = track("plane", plan, heading_deg=353.0)
+    path = [computed.at(quarter / 4)[:2] for quarter in range(1200)]
+    flown = flight("plane-mission")
+    assert max(math.dist(place, computed.at(second)) for second, *place in flown) < 80.0
+    assert max(min(math.dist(place[:2], near) for near in path) for _, *place in flown) < 30.0
 
 
 def legs_s(points: list[tuple[float, float, float, float]]) -> Iterator[float]:
