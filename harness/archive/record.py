@@ -6,11 +6,12 @@ is a default for every key of a `RunRecord`, which says that nothing is known of
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from harness.backend_names import BackendName
 from harness.scenario import Scenario, faults
 from harness.scenario.faults import Disk
+from harness.scenario.stagger import Stagger
 from harness.scenario.verdicts import BESIDE, CharacteristicVerdict, Verdict
 
 SCHEMA = "ucp-run/1"
@@ -298,6 +299,8 @@ class JudgedRecord(_Model):
     cycle: Cycle | None = None
     """Where agents were shown never to finish; if `proven`, the run stopped there."""
     mission_s: float | None = None
+    stagger: Annotated[Stagger, Field(exclude=True)] = {}
+    """As the scenario has it: by how much agents were told different timers."""
     agents: dict[AgentKey, AgentRecord] = {}
     engine: str | None = None
     counters: Counters | None = None
@@ -344,6 +347,12 @@ class RunRecord(JudgedRecord):
     """What the rogue node sent and the agents did with it, for each injection of the timeline, in order."""
     errors: list[str] = []
     """A sentence for each file that the checker could not use, or not wholly."""
+
+    @model_validator(mode="after")
+    def _staggered_as_the_scenario_says(self) -> "RunRecord":
+        if self.scenario is not None:
+            self.stagger = self.scenario.stagger
+        return self
 
     @property
     def known_agents(self) -> list[int]:

@@ -35,6 +35,10 @@ def prove_command(
     settings: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="A setting of all agents; may be repeated.")
     ] = None,
+    stagger: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TIMER=SECONDS", help="How much longer each next agent's timer runs; may be repeated."),
+    ] = None,
     quirk: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="A mistake that all agents make; may be repeated.")
     ] = None,
@@ -72,6 +76,7 @@ def prove_command(
         quirks,
         reduced=not whole and not quirks,
         steps=steps,
+        stagger=_pairs("--stagger", stagger),  # type: ignore[arg-type]  # it is checked
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s)
     if second_opinion:

@@ -138,7 +138,17 @@ def _fewer_of_each(shrinker: Shrinker) -> None:
 
 def _plainer(shrinker: Shrinker) -> None:
     """What can be as by default; and if not, one latency for all messages."""
-    for key in ("initial_data", "lateness", "settings", "quirks", "network", "settle", "timeline", "schedule"):
+    for key in (
+        "initial_data",
+        "lateness",
+        "settings",
+        "stagger",
+        "quirks",
+        "network",
+        "settle",
+        "timeline",
+        "schedule",
+    ):
         shrinker.first([with_key(shrinker.best, key, None)])
     for part in ("settings", "quirks", "network"):
         for key in list(at(shrinker.best, part) or ()):

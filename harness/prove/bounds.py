@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from harness.errors import HarnessError
+from harness.scenario.stagger import Stagger, Staggered, staggered
 from ucp.quirks import check_quirk
-from ucp.settings import Settings
+from ucp.settings import MAX_TIMER_S, Settings
+from ucp.shown import shown
 
 Network = Literal["lossless", "lossy", "any"]
 FAULTS = ("reboot", "death", "duplicate")
@@ -27,7 +29,8 @@ class Bounds:
 
     `timers_any`: a timer may end whenever it runs, however long it should. `apart`: no two things happen at the same
     moment by chance, but those only whose distance is fixed, as one began by the other. `reduced`: states that behave
-    alike are one. `steps`: each step of the agents is held against that of right ones, too.
+    alike are one. `steps`: each step of the agents is held against that of right ones, too. `stagger`: agents' timers
+    differ, as a scenario's `stagger` says.
     """
 
     agents: int = 2
@@ -40,6 +43,7 @@ class Bounds:
     quirks: Mapping[str, bool | float] = field(default_factory=dict)
     reduced: bool = True
     steps: bool = False
+    stagger: Stagger = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):
@@ -50,19 +54,30 @@ class Bounds:
         for fault in self.faults:
             if fault not in FAULTS:
                 raise BoundsError(f"--faults must be some of {', '.join(FAULTS)}, not {fault!r}")
-        known = [field.name for field in dataclasses.fields(Settings)]
+        if self.stagger and self.network == "any":
+            raise BoundsError("--stagger is not for --network any, where each agent is looked at by itself")
+        for name, step_s in self.stagger.items():
+            if name not in get_args(Staggered) or type(step_s) not in (int, float) or not 0 <= step_s <= MAX_TIMER_S:
+                known = ", ".join(get_args(Staggered))
+                raise BoundsError(f"--stagger must be seconds for one of {known}, not {name}={shown(step_s)}")
+        names = [field.name for field in dataclasses.fields(Settings)]
         for name in self.settings:
-            if name not in known:
-                raise BoundsError(f"--settings {name} is unknown: there are {', '.join(known)}")
+            if name not in names:
+                raise BoundsError(f"--settings {name} is unknown: there are {', '.join(names)}")
         try:
-            self.agent_settings()
+            self.agent_settings(self.agents)
             for name, value in self.quirks.items():
                 check_quirk(name, value)
         except (TypeError, ValueError) as error:
             raise BoundsError(f"{error}") from None
 
-    def agent_settings(self) -> Settings:
-        return Settings(**{**EVENT_FILLS_BLOCK, **self.settings})
+    @property
+    def alike(self) -> bool:
+        """Whether it makes no difference who is who."""
+        return self.reduced and not self.stagger
+
+    def agent_settings(self, agent_id: int = 1) -> Settings:
+        return staggered(Settings(**{**EVENT_FILLS_BLOCK, **self.settings}), self.stagger, agent_id - 1)
 
     def in_words(self) -> str:
         parts = [
@@ -73,5 +88,6 @@ class Bounds:
         parts += [f"faults {', '.join(self.faults)}"] if self.faults else []
         parts += ["timers in any order"] if self.timers_any else ["nothing at once by chance"] if self.apart else []
         parts += [f"{name} {value}" for name, value in self.settings.items()]
+        parts += [f"stagger {name} {step_s}" for name, step_s in self.stagger.items()]
         parts += [f"quirk {name}" for name in self.quirks]
         return ", ".join(parts)

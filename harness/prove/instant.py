@@ -65,7 +65,7 @@ class Instants:
 
     def name_of(self, other: int, place: int) -> int:
         """What the agent at `place` calls the one at `other`."""
-        if not self._bounds.reduced:
+        if not self._bounds.alike:
             return other + 1
         return other + 2 if other < place else other + 1
 

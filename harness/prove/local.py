@@ -133,7 +133,8 @@ class LocalStates:
 
     def _agent(self, agent_id: int, right: bool = False, tracing: bool = False) -> Agent:
         handlers = [] if right else wrong_handlers(self.bounds.quirks, Random(0))
-        return Agent(agent_id, self._roster, INITIAL_DATA, self.settings, handlers=handlers, tracing=tracing)
+        settings = self.bounds.agent_settings(agent_id)
+        return Agent(agent_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
 
     # Steps
 

@@ -84,6 +84,7 @@ class Proof:
             "faults": list(bounds.faults),
             "timers": "any" if bounds.timers_any else "apart" if bounds.apart else "duration",
             "settings": dict(bounds.settings),
+            "stagger": dict(bounds.stagger),
             "quirks": dict(bounds.quirks),
             "reduced": bounds.reduced,
             "steps_judged": bounds.steps,

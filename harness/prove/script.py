@@ -99,6 +99,7 @@ class Script:
             "duration_s": float(round(self._end_s) + SETTLES_S),
             "network": {"delay": LATENCY_S},
             "settings": {**EVENT_FILLS_BLOCK, **bounds.settings},
+            **({"stagger": dict(bounds.stagger)} if bounds.stagger else {}),
             **({"quirks": dict(bounds.quirks)} if bounds.quirks else {}),
             **({"timeline": self._timeline} if self._timeline else {}),
             "events": {"source": "scripted", **({"script": self._events} if self._events else {})},

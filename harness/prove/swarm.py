@@ -1,7 +1,7 @@
 """Global states, and all that may happen next in each.
 
 A global state is how many blocks were completed, which faults are left, the zone of the timers that run, and the
-agents' local states: a tuple of small numbers. Where `bounds.reduced`, agents that are alike change places freely:
+agents' local states: a tuple of small numbers. Where `bounds.alike`, agents that are alike change places freely:
 of all orders of the agents one stands for all.
 """
 
@@ -61,10 +61,10 @@ class Swarm:
         self.local = LocalStates(bounds)
         self.zones = Zones()
         self._instants = Instants(self.local, bounds)
-        self._order = Order(self.local, self.zones, self.name_of) if bounds.reduced else None
+        self._order = Order(self.local, self.zones, self.name_of) if bounds.alike else None
         self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], _Instant] = {}
         self._as_they_are = tuple(range(bounds.agents))
-        own = [1] * bounds.agents if bounds.reduced else range(1, bounds.agents + 1)
+        own = [1] * bounds.agents if bounds.alike else range(1, bounds.agents + 1)
         faults = sum(1 << FAULTS.index(name) for name in bounds.faults if name != "duplicate")
         self.initial: State = (0, faults, NOTHING_RUNS, *(self.local.initial[agent_id] for agent_id in own))
 
@@ -131,7 +131,7 @@ class Swarm:
         """
         known = self.local.known
         locals_ = state[AGENTS:]
-        if not self.bounds.reduced or any(local != DEAD and known[local].names_others for local in locals_):
+        if not self.bounds.alike or any(local != DEAD and known[local].names_others for local in locals_):
             yield from choices
             return
         seen = set()

@@ -146,6 +146,7 @@ class InMemory:
                 "cycle": simulation.played.cycle,
                 "faults": simulation.played.faults,
                 "mission_s": simulation.played.mission_s,
+                "stagger": simulation.scenario.stagger,
                 "agents": simulation.played.agents,
             }
         )

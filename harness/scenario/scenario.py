@@ -22,6 +22,7 @@ from harness.scenario.numbered import Lateness
 from harness.scenario.quirks import AskedQuirks, OfSome, of_agent
 from harness.scenario.quirks import check as check_quirks
 from harness.scenario.schedule import NEEDED, Schedule
+from harness.scenario.stagger import Stagger, staggered
 from harness.scenario.states import Step, refuse_ambiguity, steps
 from harness.scenario.timeline import TimelineEntry
 from harness.scenario.vehicles import Vehicles
@@ -90,6 +91,8 @@ class Scenario(Model):
     """What containers are made from, and may use."""
     settings: Settings = Settings()
     """The agents' timers, and how they read what the thesis leaves open."""
+    stagger: Stagger = {}
+    """By how many seconds timers of each agent run longer than those of the agent before it: it is told so."""
     quirks: AskedQuirks = {}
     """Mistakes that all agents make, or those that are named (`ucp.quirks`)."""
     clocks: dict[VehicleKey, Clock] = {}
@@ -116,6 +119,10 @@ class Scenario(Model):
     def roster(self) -> tuple[int, ...]:
         """The agents' IDs, ascending."""
         return tuple(range(1, self.agents + 1)) if isinstance(self.agents, int) else tuple(sorted(self.agents))
+
+    def settings_of(self, agent_id: int) -> Settings:
+        """What the mission tells the agent."""
+        return staggered(self.settings, self.stagger, self.roster.index(agent_id))
 
     @property
     def rogue(self) -> int | None:
@@ -266,6 +273,14 @@ class Scenario(Model):
                     flight.planned().check(self.vehicles.type_of(vehicle))
                 except PlanError as error:
                     raise ValueError(f"flight.{index}.plan, for vehicle {vehicle}: {error}") from None
+        return self
+
+    @model_validator(mode="after")
+    def _timers_can_be_staggered(self) -> "Scenario":
+        try:
+            staggered(self.settings, self.stagger, len(self.roster) - 1)
+        except ValueError as error:
+            raise ValueError(f"by `stagger` the last agent's {error}") from None
         return self
 
     @model_validator(mode="after")

@@ -15,6 +15,7 @@ ORDER = (
     "network",
     "clocks",
     "settings",
+    "stagger",
     "quirks",
     "expect",
     "timeline",

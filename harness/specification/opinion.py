@@ -147,6 +147,8 @@ def _config(bounds: Bounds) -> str:
         raise BoundsError("the specification is of --network lossless and lossy: any is looked at in another way")
     if bounds.faults:
         raise BoundsError("the specification has no faults: leave --faults out")
+    if bounds.stagger:
+        raise BoundsError("the specification has one duration for all agents: leave --stagger out")
     unknown = [name for name in bounds.quirks if name not in AS_PRINTED]
     if unknown:
         raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}, not {unknown[0]}")

@@ -1,6 +1,10 @@
-"""The headers of all traces against each other and the run's record: one mission has one roster and one clock."""
+"""The headers of all traces against each other and the run's record: one mission has one roster and one clock.
+
+Timers differ between agents as far as the scenario staggers them: they are compared less what an agent's place adds.
+"""
 
 from collections.abc import Iterator
+from typing import Any
 
 from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
@@ -19,7 +23,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     for agent_id, trace in evidence.traces.items():
         header = trace.header
         told: dict[str, object] = {"roster": sorted(header.roster)}
-        told |= {f"settings.{name}": value for name, value in header.settings.items()}
+        told |= {f"settings.{name}": value for name, value in _in_common(evidence, agent_id).items()}
         told |= {name: header.clock.get(name) for name in ("epoch_us", "speedup")}
         if header.initial_data is not None:
             told["initial_data"] = header.initial_data
@@ -29,6 +33,19 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                 what = WORDS.get(name, name)
                 detail = f"its trace says that {what} is {_short(value)}, and {source} that it is {_short(common)}"
                 yield of_agent(agent_id, detail)
+
+
+def _in_common(evidence: Evidence, agent_id: int) -> dict[str, object]:
+    """The agent's settings, less what it was told for itself."""
+    settings: dict[str, Any] = {**evidence.traces[agent_id].header.settings}
+    record = evidence.record
+    if record is None or not record.stagger or agent_id not in record.roster:
+        return settings
+    place = sorted(record.roster).index(agent_id)
+    for name, step_s in record.stagger.items():
+        if isinstance(settings.get(name), int | float):
+            settings[name] = round(settings[name] - step_s * place, 6)
+    return settings
 
 
 def _short(value: object) -> str:

@@ -47,7 +47,7 @@ def mission_file(
             "vehicle_host": "127.0.0.1",
             "vehicle_port": AGENT_PORT,
         },
-        "settings": dataclasses.asdict(scenario.settings),
+        "settings": dataclasses.asdict(scenario.settings_of(agent_id)),
         "quirks": {**NO_QUIRKS, **scenario.quirks_of(agent_id)},
         "seed": agent_seed(seed, agent_id, life),
         "speedup": scenario.speedup,

@@ -312,7 +312,7 @@ class Clockwork:
             agent_id,
             self.roster,
             self._initial_data,
-            self.scenario.settings,
+            self.scenario.settings_of(agent_id),
             handlers=wrong_handlers(self.scenario.quirks_of(agent_id), Random(seed)),
             tracing=self._tracing,
         )

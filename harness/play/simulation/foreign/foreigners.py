@@ -69,7 +69,7 @@ class Foreigners:
         agent = ForeignAgent(
             self._mission(agent_id, life),
             self._initial_data,
-            self._scenario.settings,
+            self._scenario.settings_of(agent_id),
             program,
             now,
             tracing=self._tracing,

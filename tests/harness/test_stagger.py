@@ -1,0 +1,48 @@
+"""Timers that run longer from agent to agent."""
+
+import pytest
+
+from harness.checker.records import headers
+from harness.errors import ScenarioError
+from harness.prove import Bounds, BoundsError
+from harness.prove.explore import explore
+from harness.prove.liveness import look
+from harness.prove.swarm import Swarm
+from harness.run.simulate import simulate
+from harness.scenario.load import parse
+from tests.harness.test_recurrence import in_step
+
+
+def test_each_agent_is_told_timers_of_its_own_and_records_agree() -> None:
+    document = {"name": "a", "agents": [3, 7, 9], "duration_s": 100, "stagger": {"vote_timeout_s": 0.5}}
+    simulated = simulate(parse(document), 1, tracing=True)
+    timers = {
+        agent_id: trace.header.settings["vote_timeout_s"] for agent_id, trace in simulated.evidence.traces.items()
+    }
+    assert timers == {3: 10.0, 7: 10.5, 9: 11.0}
+    assert not simulated.result.bad
+    trace = simulated.evidence.traces[7]
+    trace.header.settings["vote_timeout_s"] = 10.0
+    assert len([*headers.compare(simulated.evidence)]) == 1
+
+
+def test_agents_in_step_get_out_of_step() -> None:
+    scenario = in_step()
+    assert simulate(scenario, 1).result.judgements["liveness"].verdict == "never finishes"
+    for timer in ("vote_timeout_s", "phase1_timeout_s"):
+        staggered = scenario.model_copy(update={"stagger": {timer: 0.5}})
+        assert simulate(staggered, 1).result.judgements["liveness"].verdict == "finished"
+
+
+def test_no_way_round_is_left_within_bounds() -> None:
+    for timer in ("vote_timeout_s", "phase1_timeout_s"):
+        graph = explore(Swarm(Bounds(2, 3, "lossy", stagger={timer: 0.5})), most_bytes=4e9, most_s=60)  # type: ignore[dict-item]
+        assert graph.ended == "complete"
+        assert not look(graph).cycles
+
+
+def test_what_cannot_be_staggered() -> None:
+    with pytest.raises(ScenarioError, match="the last agent's vote_timeout_s"):
+        parse({"name": "a", "agents": 5, "stagger": {"vote_timeout_s": 9e8}})
+    with pytest.raises(BoundsError, match="--stagger must be seconds"):
+        Bounds(stagger={"max_block_bytes": 1})  # type: ignore[dict-item]
