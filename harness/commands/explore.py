@@ -1,5 +1,6 @@
-"""`ucp-harness explore`: look for a violation, and shrink it."""
+"""`ucp-harness explore`: look for a violation, and shrink it; or hunt through the night."""
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -8,8 +9,14 @@ from rich.console import Console
 
 from harness import explore
 from harness.archive.played import scenario_of
-from harness.commands.terminal import complain
+from harness.archive.runs import RUNS
+from harness.commands.terminal import complain, print_json
 from harness.run.sweep import cores
+
+SEEDS = 1000
+_DURATION = re.compile(r"(\d{1,9}(?:\.\d{1,6})?)(s|m|h|)")
+_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
+LONGEST_S = 31 * 86400.0
 
 
 def explore_command(
@@ -20,7 +27,9 @@ def explore_command(
             help="A scenario's file (YAML), or the name of one that comes along; or a run, from its seed on.",
         ),
     ],
-    seeds: Annotated[int, typer.Option(min=1, help="How many seeds to play at most.")] = 1000,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help=f"How many seeds to play at most; {SEEDS} if not given.")
+    ] = None,
     first_seed: Annotated[
         int | None, typer.Option(min=0, help="The first of them; 0, or that of RUN, if not given.")
     ] = None,
@@ -28,14 +37,43 @@ def explore_command(
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
     ] = None,
+    for_time: Annotated[
+        str | None,
+        typer.Option(
+            "--for",
+            metavar="TIME",
+            help="New: hunt for so long (90s, 30m, 8h): keep runs that reach something new, and change them.",
+        ),
+    ] = None,
+    runs: Annotated[
+        int | None, typer.Option(min=1, help="New: hunt for so many runs; the same ones for the same --first-seed.")
+    ] = None,
+    corpus: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="New: where a hunt keeps runs and findings, and goes on the next time."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="New: what a hunt came to as JSON.")] = False,
 ) -> None:
-    """Play seed after seed in virtual time until a characteristic is violated; then find the smallest such run."""
+    """Play seed after seed in virtual time until a characteristic is violated; then find the smallest such run.
+
+    With --for or --runs it hunts instead: it changes events, fates, timings, partitions, deaths, settings, and keeps
+    what reaches new local states. Each run ends in a liveness phase. Findings are new, ongoing, rare or resolved
+    since the last time with the same --corpus.
+    """
+    if for_time is not None or runs is not None:
+        if seeds is not None or out is not None:
+            raise typer.BadParameter(
+                "a hunt (--for, --runs) needs no --seeds and no --out: its findings are in --corpus"
+            )
+        _hunt(scenario, first_seed, for_time, runs, corpus, jobs, as_json)
+    if corpus is not None or as_json:
+        raise typer.BadParameter("--corpus and --json are for a hunt: add --for TIME or --runs NUMBER")
     console = Console()
     request, own_seed = scenario_of(scenario)
     if first_seed is None:
         first_seed = own_seed or 0
     with explore.watching(console) as watcher:
-        seeds_asked = range(first_seed, first_seed + seeds)
+        seeds_asked = range(first_seed, first_seed + (seeds or SEEDS))
         explored = explore.explore(request, str(scenario), seeds_asked, jobs or cores(), out, watcher=watcher)
     for line in explore.in_words(explored):
         console.print(line, highlight=False, soft_wrap=True, markup=False)
@@ -44,3 +82,53 @@ def explore_command(
     if explored.interrupted:
         complain("interrupted")
     raise typer.Exit(explored.exit_status)
+
+
+def _hunt(
+    scenario: Path,
+    first_seed: int | None,
+    for_time: str | None,
+    runs: int | None,
+    corpus: Path | None,
+    jobs: int | None,
+    as_json: bool,
+) -> None:
+    from harness.explore import guided  # pages take long to import
+
+    request, own_seed = scenario_of(scenario)
+    directory = corpus or RUNS / _directory_name(request.name)
+    with guided.watching(Console(stderr=True)) as watcher:
+        night = guided.spend(
+            request,
+            directory,
+            first_seed=own_seed or 0 if first_seed is None else first_seed,
+            for_s=float("inf") if for_time is None else _seconds(for_time),
+            most_runs=float("inf") if runs is None else runs,
+            jobs=jobs or cores(),
+            watcher=watcher,
+        )
+    if as_json:
+        print_json(night.to_json())
+    else:
+        console = Console()
+        for line in guided.in_words(night):
+            console.print(line, highlight=False, soft_wrap=True, markup=False)
+    for sentence in night.left_out[:3]:
+        complain(sentence)
+    if len(night.left_out) > 3:
+        complain(f"and {len(night.left_out) - 3} more files are left out")
+    if night.interrupted:
+        complain(f"interrupted: what was found by then is in {directory}")
+    raise typer.Exit(night.exit_status)
+
+
+def _directory_name(name: str) -> str:
+    return f"{re.sub(r'[^A-Za-z0-9_-]+', '_', name)[:80]}-corpus"
+
+
+def _seconds(text: str) -> float:
+    duration = _DURATION.fullmatch(text.strip())
+    seconds = float(duration[1]) * _UNITS[duration[2]] if duration else 0.0
+    if not 0 < seconds <= LONGEST_S:
+        raise typer.BadParameter(f"--for {text!r} is no time: 90s, 30m or 8h are, up to 31 days")
+    return seconds

@@ -8,6 +8,7 @@ smaller.py   what smaller means: fewer agents, events and fates, less time, less
 write.py     the smallest one as a scenario file, for people
 run.py       the story: all of these, one after the other
 words.py     what is said meanwhile, and at the end
+guided/      instead of seed after seed: scenarios changed, and kept where they reach something new
 """
 
 from harness.explore.run import MAX_RUNS, Explored, Watcher, explore

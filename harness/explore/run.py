@@ -86,13 +86,30 @@ def explore(
     def recorded(document: Document) -> Recording:
         return record(scenario_of(document), seed)
 
-    original = document_of(scenario)
+    smallest, words, explored.interrupted = smallest_of(
+        document_of(scenario), still, recorded, jobs=jobs, max_runs=max_runs, on_step=watcher.on_step
+    )
+    explored.shrunk = _written(smallest, path, source, seed, words, judge, recorded)
+    return explored
+
+
+def smallest_of(
+    original: Document,
+    still: Callable[[Scenario], bool],
+    recorded: Callable[[Document], Recording],
+    *,
+    jobs: int,
+    max_runs: int,
+    on_step: Callable[[int, str], None],
+) -> tuple[Document, str, bool]:
+    """The smallest document that `still` is what it is; how it came about, in words; whether Ctrl-C ended that."""
+    interrupted = False
     shrinker = Shrinker(
         original,
         still,
         jobs=jobs,
         max_runs=max_runs,
-        adopted=lambda shrinker: watcher.on_step(shrinker.runs, size(shrinker.best)),
+        adopted=lambda shrinker: on_step(shrinker.runs, size(shrinker.best)),
     )
     how = "and nothing more could be left out"
     first = size(original)
@@ -103,11 +120,9 @@ def explore(
     except BudgetSpentError:
         how = "when the bound was reached: it may not be the smallest"
     except KeyboardInterrupt:
-        explored.interrupted = True
+        interrupted = True
         how = "when it was interrupted: it may not be the smallest"
-    words = f"{first} -> {size(shrinker.best)} in {shrinker.runs} runs, {how}"
-    explored.shrunk = _written(shrinker.best, path, source, seed, words, judge, recorded)
-    return explored
+    return shrinker.best, f"{first} -> {size(shrinker.best)} in {shrinker.runs} runs, {how}", interrupted
 
 
 def _written(

@@ -1,0 +1,16 @@
+"""Exploration that is guided by what runs reach, and that goes on from night to night. See docs/nightly.md.
+
+change.py    a scenario changed by chance into another
+trial.py     one run, with a liveness phase at its end: what it reached, and what it showed
+identity.py  what a finding is, whichever run shows it
+hunt.py      changing, playing, keeping
+corpus.py    what is kept between nights, in a directory
+night.py     a night: known findings, the hunt, what is new made small
+page.py      the page of it
+words.py     what is said meanwhile, and at the end
+"""
+
+from harness.explore.guided.night import Night, spend
+from harness.explore.guided.words import in_words, watching
+
+__all__ = ["Night", "in_words", "spend", "watching"]

@@ -1,0 +1,156 @@
+"""The hunt: documents are changed, played, and kept if they reach something new; kept ones are changed again.
+
+It goes by rounds. What a round tries depends on what was kept before it and on the lots alone, never on how fast
+anything was, so that it is the same however many processes play.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from random import Random
+from typing import NamedTuple
+
+from pydantic import ValidationError
+
+from harness.coverage import Reached
+from harness.errors import ScenarioError, UnsupportedError
+from harness.explore.document import Document
+from harness.explore.guided.change import Limits, changed
+from harness.explore.guided.identity import Identity
+from harness.explore.guided.trial import Tried, tried, with_liveness_phase
+from harness.run.sweep import Failed, sweep
+from harness.scenario import Scenario
+
+ROUND = 64
+"""Runs that are tried before it is looked at what they reached."""
+MOST_KEPT = 3000
+"""Documents that are kept; those that gave least for their length go first."""
+NEWEST = 24
+SEEDS = 1 << 16
+
+
+class Candidate(NamedTuple):
+    """A document to be played with a seed; without its liveness phase, which every run has."""
+
+    document: Document
+    seed: int
+
+    def scenario(self) -> Scenario:
+        """What is played. Raises ValidationError if that cannot be."""
+        return Scenario.model_validate(with_liveness_phase(self.document))
+
+
+@dataclass
+class Kept:
+    """A candidate that reached something new: `gave` local states for `steps` handler runs."""
+
+    candidate: Candidate
+    gave: int
+    steps: int
+    picked: int = 0
+
+    @property
+    def worth(self) -> float:
+        """How promising it is to change it."""
+        return (1 + self.gave) / (1 + self.picked) / (100 + self.steps)
+
+
+@dataclass(frozen=True)
+class News:
+    """What a run reached that nobody had before its round, and which findings it showed."""
+
+    reached: Reached
+    found: tuple[Identity, ...]
+
+    @classmethod
+    def of(cls, run: Tried, known: Reached) -> "News":
+        new = Reached(
+            run.reached.states - known.states,
+            run.reached.pairs - known.pairs,
+            run.reached.branches,
+            run.reached.steps,
+            run.reached.untold,
+        )
+        return cls(new, run.found)
+
+
+@dataclass
+class Hunt:
+    """What is known by now, and what is kept."""
+
+    limits: Limits
+    lots: Random
+    reached: Reached = field(default_factory=Reached)
+    kept: list[Kept] = field(default_factory=list)
+    runs: int = 0
+    found: dict[Identity, Candidate] = field(default_factory=dict)
+    """Findings, and the first run that showed each."""
+    shown: Counter[Identity] = field(default_factory=Counter)
+    """In how many runs."""
+    failed: list[tuple[Candidate, str]] = field(default_factory=list)
+    """Runs without a verdict, and why."""
+    _dropped: list[Candidate] = field(default_factory=list)
+
+    def begin(self, candidates: Iterable[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
+        """Play these as they are; each run that was played, and whether it is kept."""
+        yield from self._play(list(candidates), jobs)
+
+    def round(self, jobs: int) -> Iterator[tuple[Candidate, bool]]:
+        """Change what is kept, and play it; each run that was played, and whether it is kept."""
+        yield from self._play([self._next() for _ in range(ROUND)], jobs)
+
+    def dropped(self) -> list[Candidate]:
+        """What is no longer kept, since it was last asked for."""
+        dropped, self._dropped = self._dropped, []
+        return dropped
+
+    def _play(self, candidates: Sequence[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
+        known = self.reached
+
+        def play(candidate: Candidate) -> News | None:
+            try:
+                return News.of(tried(candidate.scenario(), candidate.seed), known)
+            except (ValidationError, ScenarioError, UnsupportedError):  # a change has asked for what cannot be played
+                return None
+
+        with sweep(candidates, play, jobs) as outcomes:
+            for candidate, outcome in outcomes:
+                if outcome is None:
+                    continue
+                self.runs += 1
+                if isinstance(outcome, Failed):
+                    self.failed.append((candidate, outcome.reason))
+                    yield candidate, False
+                else:
+                    yield candidate, self._learn(candidate, outcome)
+
+    def _learn(self, candidate: Candidate, news: News) -> bool:
+        """Whether it reached anything that nobody had before it."""
+        for identity in news.found:
+            self.shown[identity] += 1
+            self.found.setdefault(identity, candidate)
+        before = len(self.reached.states), len(self.reached.pairs)
+        branches = any(branch not in self.reached.branches for branch in news.reached.branches)
+        self.reached.add(news.reached)
+        gave = len(self.reached.states) - before[0]
+        if not (gave or branches or len(self.reached.pairs) > before[1]):
+            return False
+        self.kept.append(Kept(candidate, gave, news.reached.steps))
+        if len(self.kept) > MOST_KEPT:
+            least = min(self.kept[:-NEWEST], key=lambda kept: kept.worth)
+            self.kept.remove(least)
+            self._dropped.append(least.candidate)
+        return True
+
+    def _next(self) -> Candidate:
+        lots, kept = self.lots, self._pick()
+        kept.picked += 1
+        other = lots.choice(self.kept).candidate.document
+        document = changed(kept.candidate.document, other, self.limits, lots)
+        return Candidate(document, kept.candidate.seed if lots.random() < 0.8 else lots.randrange(SEEDS))
+
+    def _pick(self) -> Kept:
+        """One of the newest as often as any of the others, which are picked by their worth."""
+        if self.lots.random() < 0.5:
+            return self.lots.choice(self.kept[-NEWEST:])
+        return self.lots.choices(self.kept, [kept.worth for kept in self.kept])[0]

@@ -1,0 +1,203 @@
+"""A hunt finds what seeds alone do not, is the same however many play it, and goes on from night to night."""
+
+import json
+import signal
+import subprocess
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from harness.errors import RunDirectoryError
+from harness.explore.document import document_of
+from harness.explore.guided import Night, spend
+from harness.explore.guided.change import changed
+from harness.explore.guided.corpus import MOST_BYTES, opened
+from harness.explore.guided.hunt import Candidate, Hunt
+from harness.explore.guided.trial import (
+    beginnings,
+    found_in,
+    tried,
+    with_liveness_phase,
+    without_liveness_phase,
+)
+from harness.run.simulate import simulate
+from harness.scenario import Scenario, load_scenario
+from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
+
+ORDINARY = {
+    "name": "ordinary",
+    "agents": 2,
+    "duration_s": 60,
+    "network": {"loss": 0.2},
+    "settings": {"max_block_bytes": 267},
+    "events": {"source": "random", "mean_s": 40},
+}
+
+
+def ordinary(**keys: Any) -> Scenario:
+    return Scenario.model_validate({**ORDINARY, **keys})
+
+
+def night(directory: Path, scenario: Scenario | None = None, *, runs: int = 70, jobs: int = 1) -> Night:
+    return spend(scenario or ordinary(), directory, most_runs=runs, jobs=jobs)
+
+
+def test_equal_lots_make_equal_changes_and_most_can_be_played() -> None:
+    limits, begun = beginnings(ordinary(agents=3), range(2))
+    document = begun[0][0]
+
+    def many(seed: int) -> list[Any]:
+        lots, last = Random(seed), document
+        documents = []
+        for _ in range(200):
+            last = changed(document if lots.random() < 0.2 else last, begun[-1][0], limits, lots)
+            documents.append(last)
+        return documents
+
+    assert many(1) == many(1) != many(2)
+    playable = 0
+    for each in many(1):
+        assert len(each["events"].get("script", [])) <= limits.blocks
+        try:
+            playable += bool(Candidate(each, 1).scenario())
+        except ValidationError:
+            continue
+    assert playable > 100
+
+
+def test_in_the_liveness_phase_everybody_hears_everybody() -> None:
+    document = document_of(
+        ordinary(
+            timeline=[{"at_s": 5, "partition": [[1], [2]]}, {"at_s": 20, "loss": 0.9, "for_s": 40}],
+            fates=[{"message": "Commit Block", "drop": True}],
+        )
+    )
+    phased = with_liveness_phase(document)
+    assert with_liveness_phase(phased) == phased
+    assert without_liveness_phase(phased)["timeline"][0] == document["timeline"][0]
+    evidence = simulate(Scenario.model_validate(phased), 1, tracing=True).evidence
+    assert evidence.connected_since_s == pytest.approx(60, abs=0.01)
+
+
+def test_a_hunt_is_the_same_however_many_play_it() -> None:
+    def hunted(jobs: int) -> Hunt:
+        limits, begun = beginnings(ordinary(), range(2))
+        hunt = Hunt(limits, Random(1))
+        for _ in (*hunt.begin([Candidate(*each) for each in begun], jobs), *hunt.round(jobs)):
+            pass
+        return hunt
+
+    alone, shared = hunted(1), hunted(2)
+    assert alone.reached == shared.reached
+    assert [kept.candidate for kept in alone.kept] == [kept.candidate for kept in shared.kept]
+
+
+def test_an_agent_alone_that_others_refuse_for_ever_is_shown_by_a_short_document() -> None:
+    """What a hunt found: of five with four chains at rest one has a block, and nobody takes it."""
+    script = [(1.0, 3), (42.944, 2), (48.087, 1), (82.944, 4)]
+    document = {
+        "name": "c",
+        "agents": 5,
+        "duration_s": 112.944,
+        "settings": {"max_block_bytes": 267},
+        "events": {"source": "scripted", "script": [{"at_s": at_s, "agent": agent} for at_s, agent in script]},
+        "network": {"loss": 0.5},
+        "timeline": [{"at_s": 112.943, "network": {"loss": 0.0}}],
+    }
+    (finding,) = tried(Scenario.model_validate(document), 3).found
+    assert str(finding) == "liveness never finishes, 1 agent going round every 20 s"
+
+
+def test_nights_tell_new_ongoing_and_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory, wrong = tmp_path / "corpus", ordinary(quirks={"approve_everything": True})
+    first = night(directory, wrong)
+    assert {told.status for told in first.told} == {"new"}
+    assert first.exit_status == 1
+    told = first.told[0]
+    assert told.path is not None
+    assert told.finding.identity in found_in(load_scenario(told.path), told.finding.seed)
+    assert [*(directory / "runs").iterdir()]
+    again = {each.finding.identity: each.status for each in night(directory, wrong, runs=1).told}
+    assert again.keys() == {each.finding.identity for each in first.told}
+    assert {*again.values()} <= {"ongoing", "rare"}
+    monkeypatch.setattr("harness.explore.guided.trial.identities", lambda *found: ())  # the agents are mended
+    mended = night(directory, wrong, runs=1)
+    assert {each.status for each in mended.told} == {"resolved"}
+    assert mended.exit_status == 0
+    assert "resolved" in (directory / "report.html").read_text()
+
+
+def test_hostile_files_are_left_out_with_a_sentence(tmp_path: Path) -> None:
+    directory = tmp_path / "corpus"
+    night(directory, runs=1)
+    mark = tmp_path / "started"
+    document = document_of(ordinary())
+    hostile: dict[str, Any] = {
+        "agent_command": ["touch", str(mark)],
+        "duration_s": 1e6,
+        "agents": 40,
+        "quirks": {"approve_everything": True},
+        "capture": True,
+    }
+    for number, (key, value) in enumerate(hostile.items()):
+        (directory / "runs" / f"{number:012}-seed-1.yaml").write_text(json.dumps({**document, key: value}))
+    (directory / "runs" / "00000000000a-seed-1.yaml").write_text("[" * 100_000)
+    (directory / "runs" / "00000000000b-seed-1.yaml").write_text("{" + " " * MOST_BYTES)
+    (directory / "runs" / "00000000000c-seed-1.yaml").symlink_to("/dev/zero")
+    (directory / "runs" / "mine.txt").write_text("mine")
+    (directory / "findings.json").write_text('{"schema": "ucp-findings/1", "findings": [{}]}')
+    (directory / "nights" / "20260101T000000Z.json").write_text('{"local_states": 1' + "0" * 400 + "}")
+    again = night(directory, runs=1)
+    assert len(again.left_out) == len(hostile) + 6, again.left_out
+    assert not mark.exists()
+    assert (directory / "runs" / "mine.txt").read_text() == "mine"
+
+
+def test_a_corpus_is_of_one_scenario_and_of_one_command(tmp_path: Path) -> None:
+    limits, _ = beginnings(ordinary(), range(1))
+    corpus = opened(tmp_path / "corpus", ordinary(), limits)
+    with pytest.raises(RunDirectoryError, match="another command works"):
+        opened(tmp_path / "corpus", ordinary(), limits)
+    corpus.close()
+    with pytest.raises(RunDirectoryError, match="of another scenario"):
+        opened(tmp_path / "corpus", ordinary(name="other"), limits)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").write_text("mine")
+    with pytest.raises(RunDirectoryError, match="no corpus"):
+        opened(tmp_path / "mine", ordinary(), limits)
+
+
+def test_ctrl_c_keeps_what_was_found(tmp_path: Path) -> None:
+    path, directory = tmp_path / "wrong.yaml", tmp_path / "corpus"
+    path.write_text(json.dumps({**ORDINARY, "quirks": {"approve_everything": True}}))
+    command = [*COMMAND, "explore", str(path), "--for", "1h", "--jobs", "1", "--corpus", str(directory), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert any(line.startswith("found: ") for line in iter(process.stderr.readline, ""))
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    document = json.loads(out)
+    assert document["outcome"] == "interrupted"
+    assert document["findings"][0]["status"] == "new"
+    assert Path(document["findings"][0]["scenario"]).is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--for", "soon"], "is no time"),
+        (["--runs", "3", "--seeds", "5"], "needs no --seeds"),
+        (["--corpus", "there"], "are for a hunt"),
+    ],
+)
+def test_wrong_options_are_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
+    path = tmp_path / "ordinary.yaml"
+    path.write_text(json.dumps(ORDINARY))
+    told = harness("explore", path, *arguments)
+    assert told.returncode == 2
+    assert said in " ".join(" ".join(sentences(told.stderr)).replace("│", " ").split())
