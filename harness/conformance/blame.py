@@ -7,10 +7,12 @@ before. What is missing or too much, which branches pass elsewhere, and when it 
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from harness.conformance.model import Run
 from harness.conformance.suite import Failure, Tally
 from ucp.agent import HANDLERS
+from ucp.messages import Message
 
 Branch = tuple[str, str]
 """Handler and branch."""
@@ -46,33 +48,46 @@ class Blamed:
 
 
 class Evidence:
-    """How often each branch was in a vector that passed, and in one that failed."""
+    """How often each branch was in a vector that passed, and in one that failed; and which led on to which."""
 
     def __init__(self, tallies: Iterable[Tally]) -> None:
         self._passed: Counter[Branch] = Counter()
         self._failed: Counter[Branch] = Counter()
+        self._led_on: set[tuple[Branch, Branch]] = set()
         for tally in tallies:
             for failure in tally.failures:
-                self._failed.update({(run.handler, run.branch) for run in failure.seen.outcome.runs})
+                self._failed.update({_branch(run) for run in failure.seen.outcome.runs})
             for pair in tally.passed:
                 step = tally.vectors.by_pair.get(pair)
                 if step is not None:
-                    self._passed.update({(run.handler, run.branch) for run in step.outcome.runs})
+                    branches = [_branch(run) for run in step.outcome.runs]
+                    self._passed.update(set(branches))
+                    self._led_on.update(pairwise(branches))
 
     def blame(self, failure: Failure) -> Blamed:
-        hidden, runs = failure.seen.hidden, failure.seen.outcome.runs
-        if failure.seen.mistimed in STARTS:
+        seen, runs = failure.seen, failure.seen.outcome.runs
+        if seen.mistimed in STARTS:
             return self._starter(failure)
-        if hidden is not None:
-            return Blamed(hidden.handler, hidden.branch)
-        if failure.of_an_earlier_round and runs and runs[0].handler in ENDS:
-            return Blamed(ENDS[runs[0].handler], "")
+        if seen.hidden is not None:
+            return Blamed(seen.hidden.handler, seen.hidden.branch)
         if not runs:
-            sent = set(failure.seen.unexpected)
-            sends = [handler for handler in HANDLERS.values() if {kind.NAME for kind in handler.sends} & sent]
+            sends = [handler for handler in HANDLERS.values() if _names(handler.sends) & set(seen.unexpected)]
             return Blamed(sends[0].name if sends else "build_data_block", "")
+        for run in runs:  # another content of the same message
+            if {message.NAME for message in run.sent} & set(seen.missing) & set(seen.unexpected):
+                return Blamed(run.handler, run.branch)
+        if self._began_wrongly(failure):
+            return Blamed(ENDS[runs[0].handler], "")
         run = self._suspect(runs, failure)
         return Blamed(run.handler, run.branch)
+
+    def _began_wrongly(self, failure: Failure) -> bool:
+        """Whether the count was wrong from its beginning: it decides rightly where anything was counted."""
+        seen, first = failure.seen, failure.seen.outcome.runs[0]
+        if first.handler not in ENDS:
+            return False
+        nothing_counted = seen.before.counted[:2] in ((), (0, 0), (1, 0))
+        return failure.of_an_earlier_round or bool(nothing_counted and seen.unexpected and self._passed[_branch(first)])
 
     @staticmethod
     def _starter(failure: Failure) -> Blamed:
@@ -83,17 +98,28 @@ class Evidence:
         return Blamed(STARTS[str(failure.seen.mistimed)], "")
 
     def _suspect(self, runs: Sequence[Run], failure: Failure) -> Run:
-        """Who sends what is too much, or should have sent what is missing; of these, whose branch passes least."""
+        """Who sends what is too much, or should have sent what is missing, or should have led on to that."""
         seen = failure.seen
         if len(runs) == 1:
             return runs[0]
-        never = [run for run in runs if not self._passed[run.handler, run.branch]]
+        never = [run for run in runs if not self._passed[_branch(run)]]
         if never:  # what is wrong about all of them is wrong first
-            return max(never, key=lambda run: self._failed[run.handler, run.branch])
-        sends = [run for run in runs if {kind.NAME for kind in HANDLERS[run.handler].sends} & set(seen.unexpected)]
+            return max(never, key=lambda run: self._failed[_branch(run)])
+        sends = [run for run in runs if _names(HANDLERS[run.handler].sends) & set(seen.unexpected)]
         if sends:
             return sends[0]
+        for run, then in reversed(list(pairwise(runs))):
+            if (_branch(run), _branch(then)) not in self._led_on:
+                return run
         missing = [run for run in runs if {message.NAME for message in run.sent} & set(seen.missing)]
         if missing:
             return missing[0]
-        return min(runs, key=lambda run: self._passed[run.handler, run.branch])
+        return min(runs, key=lambda run: self._passed[_branch(run)])
+
+
+def _branch(run: Run) -> Branch:
+    return run.handler, run.branch
+
+
+def _names(sends: Iterable[type[Message]]) -> set[str]:
+    return {kind.NAME for kind in sends}

@@ -194,7 +194,7 @@ def explore(variant: Variant) -> Iterator[Step]:
             if after not in reached:
                 reached.add(after)
                 waiting.append((after, (*way, given.name), Moment(model), then))
-            if not _unchanged(outcome):
+            if not is_unchanged(outcome):
                 moment.put_back()
 
 
@@ -222,7 +222,8 @@ _CHANGE_NOTHING = {
 """Handler -> the branches that change the agent; None if none does."""
 
 
-def _unchanged(outcome: Outcome) -> bool:
+def is_unchanged(outcome: Outcome) -> bool:
+    """Whether the agent is as it was."""
     if len(outcome.runs) != 1:
         return False
     (run,) = outcome.runs
@@ -256,7 +257,7 @@ def _then_timer(moment: Moment, now: float, name: str, *, counts: bool) -> Outco
     """What comes when the timer ends after this input; None if there is no such, or it is not one that counts so."""
     model = moment.put_back()
     advanced = advance(model, INPUTS[name], now)
-    if advanced is None or advanced[0].runs[0].handler not in COUNTING or _unchanged(advanced[0]) is counts:
+    if advanced is None or advanced[0].runs[0].handler not in COUNTING or is_unchanged(advanced[0]) is counts:
         return None
     ended = advance(model, INPUTS[TIMER], advanced[1])
     return None if ended is None else ended[0]

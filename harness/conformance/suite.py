@@ -12,7 +12,7 @@ from harness.conformance.air import AgentEndedError, NoAgentError, UnsupportedEr
 from harness.conformance.alphabet import INPUTS
 from harness.conformance.model import Model, Run
 from harness.conformance.seen import Exchange, Seen
-from harness.conformance.states import COUNTING, Pair, Variant, advance, in_short, walk
+from harness.conformance.states import COUNTING, Pair, Variant, advance, in_short, is_unchanged, walk
 from harness.conformance.subject import Start
 from harness.conformance.tours import Map, Suspicion, Tour
 from harness.conformance.vectors import Vectors
@@ -223,9 +223,21 @@ class Suite:
         for way in _tails(variant, suspicion.way):
             outcome = await self._repeated(variant, way)
             if isinstance(outcome, Failure):
-                yield replace(outcome, of_an_earlier_round=True)
+                yield await self._what_counted(variant, way, outcome)
                 return
             yield outcome
+
+    async def _what_counted(self, variant: Variant, way: Sequence[str], failure: Failure) -> Failure:
+        """The failure with what should not have counted on its way, without which it does not fail."""
+        counted = _uncounted(variant, way)
+        for handler in dict.fromkeys(run.handler for run in counted.values()):
+            others = [
+                name for place, name in enumerate(way) if place not in counted or counted[place].handler != handler
+            ]
+            if await self._repeated(variant, others) is RIGHT:
+                run = next(run for run in reversed(counted.values()) if run.handler == handler)
+                return replace(failure, seen=replace(failure.seen, hidden=run))
+        return replace(failure, of_an_earlier_round=True)
 
     async def _repeated(self, variant: Variant, way: Sequence[str]) -> Outcome:
         """Right if it is so once; a failure if it fails each time; too late if nothing else came."""
@@ -262,6 +274,19 @@ def _run_without_effect(variant: Variant, way: tuple[str, ...], name: str) -> Ru
     model, now = walk(variant, way)
     advanced = advance(model, INPUTS[name], now)
     return advanced[0].runs[0] if advanced is not None and len(advanced[0].runs) == 1 else None
+
+
+def _uncounted(variant: Variant, way: Sequence[str]) -> dict[int, Run]:
+    """The runs on a way that look at an answer and must not count it, by their place."""
+    model, now = Model(variant.settings), 0.0
+    uncounted = {}
+    for place, name in enumerate(way[:-1]):
+        advanced = advance(model, INPUTS[name], now)
+        if advanced is not None:
+            outcome, now = advanced
+            if outcome.runs and outcome.runs[0].handler in COUNTING and is_unchanged(outcome):
+                uncounted[place] = outcome.runs[0]
+    return uncounted
 
 
 def _tails(variant: Variant, way: tuple[str, ...]) -> Iterator[tuple[str, ...]]:

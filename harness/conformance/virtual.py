@@ -122,15 +122,13 @@ class InVirtualTime(Subject):
         timestamp_us = round(self._now * MICROSECONDS)
         outcome = model.feed(action, self._now, timestamp_us)
         line = given_line(action, self._now, timestamp_us)
-        wrong, sent, mistimed, status = [], list[bytes](), None, dict[str, Any]()
+        wrong, sent, status = list[str](), list[bytes](), dict[str, Any]()
+        ends, should = model.agent.next_timer(), model.agent.next_timer()
         names = Names(model)
         try:
             answer = await self._program.ask(line)
             sent = [base64.b64decode(text, validate=True) for text in answer["sent"]]
-            mistimed = self._mistimed(answer.get("timer"))
-            if mistimed is not None:
-                ends, should = answer.get("timer"), model.agent.next_timer()
-                wrong.append(f"it says that its next timer ends at {ends} s, not at {should} s")
+            ends = answer.get("timer")
             told = (await self._program.ask({"t": self._now, "command": "status"})).get("answer")
             status = told if isinstance(told, dict) else {}
         except (AgentEndedError, UnsupportedError) as error:
@@ -141,16 +139,19 @@ class InVirtualTime(Subject):
             data = base64.b64decode(line["datagram"])
             self._record.append(Exchange(self._now, False, data, told_datagram(data, names)))
         self._record += [Exchange(self._now, True, data, told_datagram(data, names)) for data in sent]
+        timer = ends_next(model)
         seen = compare(model, given, before, outcome, sent, status, wrong)
-        return replace(seen, mistimed=mistimed or seen.mistimed)
+        if _same_instant(ends, should):
+            return seen
+        mistimed = None if seen.wrong else timer or "none"  # what does something else starts other timers
+        sentence = f"it says that its next timer ends at {ends} s, not at {should} s"
+        return replace(seen, wrong=(*seen.wrong, sentence), mistimed=mistimed or seen.mistimed)
 
-    def _mistimed(self, ends: Any) -> str | None:
-        """The timer that ends next, if the agent says another instant."""
-        should = self.model.agent.next_timer()
-        if should is None and ends is None:
-            return None
-        right = isinstance(ends, int | float) and should is not None and math.isclose(ends, should, rel_tol=1e-9)
-        return None if right else (ends_next(self.model) or "none")
+
+def _same_instant(ends: Any, should: float | None) -> bool:
+    if should is None or ends is None:
+        return should is ends
+    return isinstance(ends, int | float) and math.isclose(ends, should, rel_tol=1e-9)
 
 
 def starting(command: Sequence[str], errors: Path) -> tuple[Start, list[Program]]:
