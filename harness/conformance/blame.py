@@ -73,9 +73,10 @@ class Evidence:
         if not runs:
             sends = [handler for handler in HANDLERS.values() if _names(handler.sends) & set(seen.unexpected)]
             return Blamed(sends[0].name if sends else "build_data_block", "")
-        for run in runs:  # another content of the same message
-            if {message.NAME for message in run.sent} & set(seen.missing) & set(seen.unexpected):
-                return Blamed(run.handler, run.branch)
+        if set(seen.missing) == set(seen.unexpected):  # another content of the same messages
+            for run in runs:
+                if {message.NAME for message in run.sent} & set(seen.missing):
+                    return Blamed(run.handler, run.branch)
         if self._began_wrongly(failure):
             return Blamed(ENDS[runs[0].handler], "")
         run = self._suspect(runs, failure)

@@ -18,6 +18,12 @@ from harness.conformance.tours import Map, Suspicion, Tour
 from harness.conformance.vectors import Vectors
 
 SIDE_BY_SIDE = 24
+MORE_ROOM = 0.01
+"""For another agent, with each vector that passes."""
+FEWEST = 6
+"""Side by side, where the machine is late again and again."""
+STARTS_AT_ONCE = 4
+"""An agent that starts needs the processor, and those that are under test would be late."""
 ALONE_AT_ONCE = 3
 """What is suspected is tried again by so few agents that none is in another's way."""
 FAILURES_OF_A_KIND = 3
@@ -96,6 +102,8 @@ class Suite:
         self._kinds: Counter[object] = Counter()
         self._in_vain = 0
         self._enough = enough
+        self._room = float(side_by_side)
+        self._starting = asyncio.Semaphore(STARTS_AT_ONCE)
 
     async def run(self, until: float) -> None:
         """All vectors, until that second of the monotonic clock; then what is suspected.
@@ -103,7 +111,7 @@ class Suite:
         Raises NoAgentError if the agent never starts.
         """
         workers = min(self._side_by_side, 1 + sum(atlas.left for atlas in self._maps) // 10)
-        await _together([self._work(until) for _ in range(workers)])
+        await _together([self._work(place, until) for place in range(workers)])
         once_more = [(tally, suspicion) for tally in self.tallies for suspicion in self._worth(tally)]
         waiting = iter(once_more[: self._enough])
         await _together([self._try_again(waiting) for _ in range(ALONE_AT_ONCE)])
@@ -113,8 +121,11 @@ class Suite:
         """Whether there are as many suspicions as are tried again."""
         return sum(len(tally.suspicions) for tally in self.tallies) >= self._enough
 
-    async def _work(self, until: float) -> None:
+    async def _work(self, place: int, until: float) -> None:
         while time.monotonic() < until and not self._suspicious and (number := self._most_left()) is not None:
+            if place >= self._room:
+                await asyncio.sleep(0.1)
+                continue
             self._at_work[number] += 1
             try:
                 await self._tour(number, until)
@@ -146,7 +157,8 @@ class Suite:
     async def _life(self, tally: Tally, atlas: Map, until: float) -> None:
         """Of an agent, as long as its tour lasts."""
         try:
-            subject = await self._start(tally.vectors.variant, False)
+            async with self._starting:
+                subject = await self._start(tally.vectors.variant, False)
         except UnsupportedError as error:
             tally.unsupported = str(error)
             atlas.give_up()
@@ -160,10 +172,13 @@ class Suite:
 
         def passed(pair: Pair) -> None:
             tally.passed.add(pair)
+            self._room = min(self._side_by_side, self._room + MORE_ROOM)
             self._told(sum(len(each.passed) for each in self.tallies))
 
         try:
             suspicion = await Tour(atlas, subject, passed).go_on(until)
+            if not subject.in_step:  # an agent was lost because all are late: make room
+                self._room = max(FEWEST, self._room - 1)
             if suspicion is not None:
                 self._suspect(tally, atlas, suspicion)
         finally:

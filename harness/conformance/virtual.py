@@ -13,7 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from harness.conformance.air import ANSWER_LIMIT_S, AgentEndedError, NoAgentError, UnsupportedError, last_line
+from harness.conformance.air import (
+    ANSWER_LIMIT_S,
+    START_LIMIT_S,
+    AgentEndedError,
+    NoAgentError,
+    UnsupportedError,
+    last_line,
+)
 from harness.conformance.alphabet import Input
 from harness.conformance.lines import given_line, virtual_mission
 from harness.conformance.model import Expire
@@ -46,18 +53,18 @@ class Program:
             raise NoAgentError(f"the agent could not be started: {error.strerror}") from None
         return cls(process, errors)
 
-    async def ask(self, line: dict[str, Any]) -> dict[str, Any]:
+    async def ask(self, line: dict[str, Any], limit_s: float = ANSWER_LIMIT_S) -> dict[str, Any]:
         """Its answer. Raises AgentEndedError, UnsupportedError."""
         assert self._process.stdin is not None and self._process.stdout is not None, "they are pipes"
         try:
-            async with asyncio.timeout(ANSWER_LIMIT_S):
+            async with asyncio.timeout(limit_s):
                 self._process.stdin.write(json.dumps(line).encode("ascii") + b"\n")
                 await self._process.stdin.drain()
                 text = await self._process.stdout.readline()
                 answer = json.loads(text) if text else None
         except (TimeoutError, OSError, ValueError, RecursionError) as error:
             self.broken = True
-            raise AgentEndedError(f"no answer that can be read: {error or 'it is silent'}") from None
+            raise AgentEndedError(f"no answer that can be read: {str(error) or 'it is silent'}") from None
         if answer is None:
             self.broken = True
             await self._process.wait()
@@ -92,7 +99,7 @@ class InVirtualTime(Subject):
     async def start(cls, variant: Variant, program: Program, idle: list[Program]) -> "InVirtualTime":
         subject = cls(variant, program, idle)
         try:
-            await program.ask({"t": 0.0, "mission": virtual_mission(variant), "trace": False})
+            await program.ask({"t": 0.0, "mission": virtual_mission(variant), "trace": False}, START_LIMIT_S)
         except BaseException:
             await subject.close()
             raise
