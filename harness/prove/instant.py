@@ -22,6 +22,10 @@ ANSWERED = 2
 """In the first round of an instant questions are heard, in the second what is answered."""
 
 
+MOST_SEEN = 500
+"""An agent comes to fewer states by hearing what is said in one round of an instant, unless it counts for ever."""
+
+
 class Action(NamedTuple):
     """What an agent does of its own: "timer" and its number, "complete" and the block's ordinal, or a fault."""
 
@@ -222,11 +226,16 @@ class Instants:
             yield step, (*way, *others)
 
     def _that_matter(self, local: int, heard: Heard) -> list[int]:
-        """Positions of what may change the agent or make it answer, whatever of the rest it has heard before."""
+        """Positions of what may change the agent or make it answer, whatever of the rest it has heard before.
+
+        All of them, if a wrong agent comes to ever more states by hearing the same again and again.
+        """
         matter: list[int] = []
         while True:
             seen, waiting = {local}, [local]
             while waiting:
+                if len(seen) > MOST_SEEN:
+                    return list(range(len(heard)))
                 at = waiting.pop()
                 for position in matter:
                     after = self._local.hear(at, *heard[position]).local

@@ -43,13 +43,14 @@ class Told(NamedTuple):
 
 def wrong_step(quirk: str, most_s: float = MOST_S) -> Told | str:
     """The nearest; or in a few words why there is none."""
+    undecided = []
     for bounds in TRIED:
         graph = explore(Swarm(_with(quirk, replace(bounds, steps=True))), most_bytes=MOST_BYTES, most_s=most_s)
         if graph.flaw is not None and graph.flaw.handler is not None and graph.flawed is not None:
             return Told(graph.flaw.handler, bounds, len(graph.path(graph.flawed)) - 1)
         if graph.ended != "complete":
-            return f"not decided ({graph.ended})"
-    return "none"
+            undecided.append(bounds)
+    return "not decided" if undecided else "none"
 
 
 def consequence(quirk: str, most_s: float = MOST_S) -> str:
