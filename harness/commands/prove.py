@@ -13,6 +13,7 @@ from rich.console import Console
 from harness import prove, specification
 from harness.commands.terminal import complain, print_json
 from harness.prove import Bounds, BoundsError, Limits, Progress
+from harness.run.sweep import cores
 
 LINE_EVERY_S = 10.0
 GIGABYTE = 1e9
@@ -52,7 +53,10 @@ def prove_command(
         bool,
         typer.Option("--second-opinion", help="Look at the specification in TLA+, too: are its states the same?"),
     ] = False,
-    memory: Annotated[float, typer.Option(help="Gigabytes at which to give up.")] = 4.0,
+    cores_: Annotated[
+        int | None, typer.Option("--cores", help="How many processes look at states; as many as there are cores.")
+    ] = None,
+    memory: Annotated[float, typer.Option(help="Gigabytes of all processes at which to give up.")] = 4.0,
     for_s: Annotated[float | None, typer.Option("--for", help="Seconds after which to give up.")] = None,
     out: Annotated[Path | None, typer.Option(help="File of the scenario that shows what was found; new.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -78,7 +82,7 @@ def prove_command(
         steps=steps,
         stagger=_pairs("--stagger", stagger),  # type: ignore[arg-type]  # it is checked
     )
-    limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s)
+    limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:
         with _Watcher() as watcher:
             opinion = specification.second_opinion(bounds, limits, watch=watcher.show)

@@ -9,6 +9,8 @@ instant.py    what an instant makes of the agents: who hears what in which order
 alone.py      network any: each agent by itself, against all that could ever be sent
 order.py      of all orders of the agents one that stands for all
 swarm.py      global states, and all that may happen next
+expansion.py  what may follow one state
+crew.py       other processes that look at states, too
 explore.py    all of them, breadth first
 liveness.py   whether there is always a way to rest with one chain, and whether one goes round for ever
 livelock.py   the forms of going round, each with a scenario and what it takes to get there

@@ -7,13 +7,18 @@ import time
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
+from harness.prove.crew import Crew
+from harness.prove.expansion import Expansion, expanded, quiet
 from harness.prove.local import Flaw
 from harness.prove.progress import Ended, Progress, memory_bytes
 from harness.prove.swarm import State, Swarm
 
 LOOK_EVERY = 200
 """States between two looks at memory, clock and whoever watches."""
+WORTH_A_CREW = 500
+"""So many states that have not been looked at are shared among the cores."""
 NO_PARENT = -1
 
 
@@ -39,6 +44,14 @@ class Graph:
     looked_at: int = 0
     ended: Ended = "complete"
     flawed: int | None = None
+    crew_bytes: float = 0.0
+    crew_s: float = 0.0
+    crew_steps: int = 0
+    """Memory and processor time of other processes, and the steps that they have computed."""
+
+    @property
+    def memory_bytes(self) -> float:
+        return memory_bytes() + self.crew_bytes
 
     @property
     def flaw(self) -> Flaw | None:
@@ -51,6 +64,22 @@ class Graph:
             self.states.append(state)
             self.parents.append(parent)
         return number
+
+    def reach(self, state: State, parent: int) -> int:
+        """The same of a state that can be reached: it should have no flaw."""
+        known = len(self.states)
+        number = self.add(state, parent)
+        if number == known and self.flawed is None and self.swarm.flaw(state) is not None:
+            self.flawed = number
+        return number
+
+    def take_in(self, expansion: Expansion) -> None:
+        """What follows the next state of which that is not known yet."""
+        number = len(self.quiet)
+        self.transitions += expansion.ways
+        self.quiet.append(expansion.alone)
+        if expansion.crossing:
+            self.crossing[number] = expansion.crossing
 
     def path(self, number: int) -> list[int]:
         """The states on the way to this one, from the beginning."""
@@ -65,19 +94,23 @@ def explore(
     *,
     most_bytes: float,
     most_s: float,
+    cores: int = 1,
     watch: Callable[[Progress], None] = lambda progress: None,
 ) -> Graph:
-    """All states, or as many as memory and time allow, or up to the first that has a flaw."""
+    """All states, or as many as memory and time allow, or up to the first that has a flaw; on so many cores.
+
+    What comes out is the same on any number of cores.
+    """
     graph = Graph(swarm)
     began = time.monotonic()
     try:
-        for progress in _all(graph, began):
+        for progress in _all(graph, began, cores):
             graph.seconds = progress.seconds
             watch(progress)
             if graph.flawed is not None:
                 graph.ended = "flaw"
                 break
-            if memory_bytes() > most_bytes:
+            if graph.memory_bytes > most_bytes:
                 graph.ended = "memory"
                 break
             if progress.seconds > most_s:
@@ -90,14 +123,11 @@ def explore(
     return graph
 
 
-def _all(graph: Graph, began: float) -> Iterator[Progress]:
-    swarm = graph.swarm
-    graph.add(swarm.initial, NO_PARENT)
-    looked_at = 0
+def _all(graph: Graph, began: float, cores: int) -> Iterator[Progress]:
+    graph.reach(graph.swarm.initial, NO_PARENT)
     layer_ends = 1
-    while looked_at < len(graph.states):
-        expand(graph, looked_at)
-        looked_at += 1
+    for looked_at, expansion in enumerate(_expansions(graph, cores), 1):
+        graph.take_in(expansion)
         graph.looked_at = looked_at
         if looked_at == layer_ends:
             graph.depth += 1
@@ -106,31 +136,23 @@ def _all(graph: Graph, began: float) -> Iterator[Progress]:
             yield Progress(len(graph.states), looked_at, graph.transitions, graph.depth, time.monotonic() - began)
 
 
-def expand(graph: Graph, number: int) -> None:
-    """All that can follow this state."""
-    swarm, state = graph.swarm, graph.states[number]
-    lossy = swarm.bounds.network == "lossy"
-    for actions in swarm.actions(state):
-        for after in swarm.after(state, actions, lossy):
-            graph.transitions += 1
-            known = len(graph.states)
-            new = graph.add(after, number)
-            if new == known and graph.flawed is None and swarm.flaw(after):
-                graph.flawed = new
-    quieten(graph, number)
+def _expansions(graph: Graph, cores: int) -> Iterator[Expansion]:
+    """What follows each state, in order, also of those that are reached meanwhile; by a crew if it is many."""
+    swarm, states, looked_at = graph.swarm, graph.states, 0
+    while looked_at < len(states):
+        if cores > 1 and len(states) - looked_at >= WORTH_A_CREW:
+            crew = Crew(swarm, cores)
+            try:
+                for expansion in crew.expansions(states, looked_at, graph.reach):
+                    graph.crew_bytes, graph.crew_s, graph.crew_steps = crew.memory_bytes, crew.processor_s, crew.steps
+                    yield expansion
+            finally:
+                crew.stop()
+            return
+        yield expanded(swarm, states[looked_at], partial(graph.reach, parent=looked_at))
+        looked_at += 1
 
 
 def quieten(graph: Graph, number: int) -> None:
-    """Where the state goes on when nothing is lost and no new block comes."""
-    swarm, state = graph.swarm, graph.states[number]
-    alone: list[tuple[int, ...]] = []
-    crossing: set[int] = set()
-    for actions in swarm.ending(state):
-        after = {graph.add(state_after, number) for state_after in swarm.after(state, actions, lossy=False)}
-        if len(actions) == 1:
-            alone.append(tuple(after))
-        else:
-            crossing |= after
-    graph.quiet.append(tuple(alone))
-    if crossing:
-        graph.crossing[number] = tuple(crossing)
+    """Where a state goes on that was added to those that can be reached."""
+    graph.take_in(quiet(graph.swarm, graph.states[number], lambda state: graph.add(state, number)))

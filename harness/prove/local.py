@@ -6,7 +6,7 @@ looked at once, when it gets its number.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from random import Random
@@ -75,6 +75,9 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 """Parts of the state that no handler needs where nothing is ever lost, as they are at the beginning."""
 
 
+Content = tuple[int, Snapshot, "Flaw | None"]
+FLAWS_OF_STEPS = ("crash", "steps")
+"""Kinds that the state after a step does not show."""
 NAMES_OF_OTHERS = ("voters", "reconcile_responders")
 """Parts of the state that are sets of other agents."""
 
@@ -120,8 +123,10 @@ class LocalStates:
         self._digests: dict[int, bytes] = {}
         """Of each part, by its `id`: the same on any machine."""
         self._hashes: dict[int, bytes] = {}
+        self.completed: list[tuple[bytes, int, int]] = []
+        """Hashes of completed blocks, as they were: of whom, by the agent's number here, and the how manieth it is."""
         self._blocks: dict[bytes, int] = {}
-        """Hashes of completed blocks: who made them, by the agent's number here."""
+        """The same by hash: who made them."""
         self._ordinals: dict[bytes, frozenset[int]] = {}
         """Hashes of blocks and chains: which blocks they are of."""
         self.messages: list[Message] = []
@@ -236,9 +241,15 @@ class LocalStates:
 
     def _has_completed(self, agent: Agent, completed: int, ordinal: int) -> None:
         """The agent had `completed` blocks before; what it has completed now is the `ordinal`th of all."""
-        for block_hash in agent.state.completed[completed:]:
-            self._ordinals[block_hash] = frozenset((ordinal,))
-            self._blocks.setdefault(block_hash, agent.agent_id)
+        self.note_completed((digest, agent.agent_id, ordinal) for digest in agent.state.completed[completed:])
+
+    def note_completed(self, blocks: Iterable[tuple[bytes, int, int]]) -> None:
+        """These blocks were completed, here or in another process."""
+        for block_hash, agent_id, ordinal in blocks:
+            if block_hash not in self._blocks:
+                self._blocks[block_hash] = agent_id
+                self._ordinals[block_hash] = frozenset((ordinal,))
+                self.completed.append((block_hash, agent_id, ordinal))
 
     def _block_in_words(self, block_hash: str) -> str:
         ordinals = sorted(self._ordinals.get(bytes.fromhex(block_hash), ()))
@@ -329,6 +340,20 @@ class LocalStates:
             if self.known[number].flaw is not None:
                 self.flawed.add(number)
         return number
+
+    def content(self, local: int) -> Content:
+        """What another process needs to know of it."""
+        known = self.known[local]
+        flaw = known.flaw if known.flaw is not None and known.flaw.kind in FLAWS_OF_STEPS else None
+        return known.agent_id, known.snapshot, flaw
+
+    def adopt(self, content: Content) -> int:
+        """The number of a state that another process has come upon."""
+        agent_id, snapshot, flaw = content
+        agent = self._agents[agent_id]
+        self._loaded.pop(agent_id, None)
+        put_back(agent, snapshot)
+        return self._intern(agent, None, flaw)
 
     def _part(self, name: str, value: Any) -> Any:
         """The one part that stands for all that are equal."""

@@ -21,7 +21,11 @@ class Progress:
 
 @dataclass(frozen=True)
 class Figures:
-    """What was looked at; `steps` is how many steps the real agent computed. `seconds` are of the clock on the wall."""
+    """What was looked at: all but `steps` and the seconds is the same on any number of cores.
+
+    `local_states` and `zones` are those that occur in states. `steps` is how many steps the real agent computed, in all
+    processes. `seconds` are of the clock on the wall, `processor_s` of all processes.
+    """
 
     states: int
     looked_at: int

@@ -10,7 +10,7 @@ from harness.archive.directory import default_path
 from harness.errors import INTERRUPTED, VIOLATED, HarnessError
 from harness.prove import livelock, liveness
 from harness.prove.alone import collect
-from harness.prove.bounds import Bounds
+from harness.prove.bounds import Bounds, BoundsError
 from harness.prove.example import Example, keep, play
 from harness.prove.explore import Graph, explore
 from harness.prove.livelock import Livelock
@@ -18,7 +18,7 @@ from harness.prove.liveness import Liveness
 from harness.prove.local import Flaw, ReductionError
 from harness.prove.progress import Ended, Figures, Progress
 from harness.prove.script import Script
-from harness.prove.swarm import Swarm
+from harness.prove.swarm import AGENTS, ZONE, Swarm
 from harness.run.finding import claim
 
 INCOMPLETE = 4
@@ -38,10 +38,15 @@ PLAYED = {"2": "2", "3": "3", "4": "4", "hang": "liveness", "crash": "liveness",
 
 @dataclass(frozen=True)
 class Limits:
-    """When to give up: memory of this process, and time."""
+    """When to give up: memory of all processes, and time; and on how many cores to look."""
 
     most_bytes: float = 4e9
     most_s: float = float("inf")
+    cores: int = 1
+
+    def __post_init__(self) -> None:
+        if self.cores < 1:
+            raise BoundsError(f"--cores must be 1 or more, not {self.cores}")
 
 
 @dataclass
@@ -142,17 +147,17 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
     path = claim(out or default_path(name).with_suffix(".yaml"), name)
     began_s = time.process_time()
     swarm = Swarm(bounds)
-    graph = explore(swarm, most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
+    graph = explore(swarm, most_bytes=limits.most_bytes, most_s=limits.most_s, cores=limits.cores, watch=watch)
     figures = Figures(
         graph.reached,
         graph.looked_at,
         graph.transitions,
-        len(swarm.local.known),
-        swarm.local.steps,
-        len(swarm.zones),
+        len({local for state in graph.states for local in state[AGENTS:]}),
+        swarm.local.steps + graph.crew_steps,
+        len({state[ZONE] for state in graph.states}),
         graph.depth,
         round(graph.seconds, 3),
-        round(time.process_time() - began_s, 3),
+        round(time.process_time() - began_s + graph.crew_s, 3),
     )
     proof = Proof(bounds, figures, graph.ended, graph.flaw)
     if proof.complete:

@@ -29,6 +29,10 @@ class Zones:
     def matrix(self, zone: int) -> Matrix:
         return self._matrices[zone]
 
+    def adopt(self, matrix: Matrix) -> int:
+        """The number of a zone that another process has come upon."""
+        return self._intern(matrix)
+
     def firsts(self, zone: int) -> list[int]:
         """The timers, from 1, that may be the next to end."""
         least = self._matrices[zone][0]

@@ -95,7 +95,7 @@ def raised(outcome: R | HarnessError) -> R:
     return outcome
 
 
-class _Worker(Generic[T, R]):
+class Worker(Generic[T, R]):
     """A process that answers each task with an outcome, until it is killed; it dies with this process."""
 
     def __init__(self, work: Callable[[T], R]) -> None:
@@ -128,8 +128,8 @@ class _Pool(Generic[T, R]):
 
     def __init__(self, work: Callable[[T], R], jobs: int, count: Callable[[Any], Any], in_order: bool) -> None:
         self._work, self._jobs, self._count, self._in_order = work, jobs, count, in_order
-        self._idle: list[_Worker[T, R]] = []
-        self._busy: dict[Connection, tuple[int, _Worker[T, R]]] = {}
+        self._idle: list[Worker[T, R]] = []
+        self._busy: dict[Connection, tuple[int, Worker[T, R]]] = {}
 
     def outcomes(self, tasks: Iterable[T]) -> Iterator[tuple[T, R | Failed]]:
         numbered = enumerate(tasks)
@@ -159,7 +159,7 @@ class _Pool(Generic[T, R]):
 
     def _begin(self, number: int, task: T) -> None:
         with _signals_held():  # no worker is ever unknown to us
-            worker = self._idle.pop() if self._idle else _Worker(self._work)
+            worker = self._idle.pop() if self._idle else Worker(self._work)
             self._busy[worker.connection] = number, worker
         with contextlib.suppress(BrokenPipeError):  # killed while it waited: told when its connection is read
             worker.connection.send(task)

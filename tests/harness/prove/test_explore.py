@@ -66,6 +66,23 @@ def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, fa
     assert all_seen(reduced) == all_seen(whole)
 
 
+def test_on_two_cores_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.prove.explore.WORTH_A_CREW", 10)
+    bounds = Bounds(3, 2, "lossy", ("reboot",))
+    alone, shared = (explore(Swarm(bounds), most_bytes=8e9, most_s=60, cores=cores) for cores in (1, 2))
+    assert shared.crew_steps > 0
+    assert shared.ended == alone.ended == "complete"
+    assert shared.parents == alone.parents
+    assert shared.quiet == alone.quiet
+    assert shared.crossing == alone.crossing
+    assert shared.transitions == alone.transitions
+    names = [
+        [[graph.swarm.local.known[local].anonymous for local in state[AGENTS:]] for state in graph.states]
+        for graph in (alone, shared)
+    ]
+    assert names[0] == names[1]
+
+
 @pytest.mark.parametrize(("agents", "blocks", "loss"), [(2, 3, 0.4), (3, 2, 0.4), (3, 2, 0.0)])
 def test_whatever_agents_do_by_chance_is_among_it(agents: int, blocks: int, loss: float) -> None:
     seen = all_seen(explored(agents, blocks, "lossy" if loss else "lossless"))

@@ -1,12 +1,19 @@
 """What is found, that the simulation plays it again, and what the command says."""
 
 import json
+import multiprocessing
+import signal
+import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
-from harness.prove import INCOMPLETE, Bounds, BoundsError, Limits, in_words, prove
-from tests.harness.command import harness, sentences
+from harness.errors import INTERRUPTED
+from harness.prove import INCOMPLETE, Bounds, BoundsError, Limits, Progress, in_words, prove
+from harness.prove.explore import LOOK_EVERY, explore
+from harness.prove.swarm import Swarm
+from tests.harness.command import COMMAND, harness, sentences
 
 
 def test_the_livelock_in_step_is_found_without_being_told(tmp_path: Path) -> None:
@@ -86,6 +93,34 @@ def test_the_command(tmp_path: Path) -> None:
     wrong = harness("prove", "--settings", "vote_timeout_s=-1", cwd=tmp_path)
     assert wrong.returncode == 2
     assert [sentence.split()[0] for sentence in sentences(wrong.stderr)] == ["vote_timeout_s"]
+
+
+def test_ctrl_c_says_how_far_it_is(tmp_path: Path) -> None:
+    scenario = tmp_path / "begun" / "proof.yaml"
+    command = [*COMMAND, "prove", "--agents", "5", "--blocks", "5", "--json", "--out", str(scenario)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not scenario.parent.exists():
+            time.sleep(0.05)
+        time.sleep(0.5)  # it goes on for minutes
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    proof = json.loads(out)
+    assert process.returncode == INTERRUPTED
+    assert (proof["complete"], proof["ended"], proof["without_a_way_to_one_chain"]) == (False, "interrupted", None)
+    assert sentences(err) == ["interrupted"]
+    assert not scenario.exists()
+
+
+def test_nobody_goes_on_who_was_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(progress: Progress) -> None:
+        assert multiprocessing.active_children()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("harness.prove.explore.WORTH_A_CREW", 10)
+    graph = explore(Swarm(Bounds(3, 3, "lossy")), most_bytes=8e9, most_s=60, cores=2, watch=interrupt)
+    assert graph.ended == "interrupted"
+    assert graph.looked_at == LOOK_EVERY
+    assert not multiprocessing.active_children()
 
 
 def test_each_agent_by_itself_against_all_that_could_be_said(tmp_path: Path) -> None:
