@@ -10,6 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -102,7 +103,7 @@ class Export(BaseModel):
         top = self.chain[-1].chain_hash if self.chain else None
         return top or self.inception.chain_hash
 
-    @property
+    @cached_property
     def chain_of_block_hashes(self) -> tuple[str, ...]:
         """The chain without the inception block, oldest first."""
         return tuple(block.block_hash for block in self.chain)

@@ -149,8 +149,9 @@ class Evidence:
             of_agent: Sendings = defaultdict(dict)
             for run in trace.runs:
                 for message in run.sent:
-                    of_type = of_agent[message.message]
-                    of_type[message.seq] = (*of_type.get(message.seq, ()), (run.t, message))
+                    of_type, sending = of_agent[message.message], (run.t, message)
+                    earlier = of_type.get(message.seq)
+                    of_type[message.seq] = (sending,) if earlier is None else (*earlier, sending)
             sendings[agent_id] = dict(of_agent)
         return sendings
 

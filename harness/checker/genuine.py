@@ -1,9 +1,9 @@
 """Characteristic 4: every block was made by the agent of the mission that it names, and is as it was made."""
 
 import base64
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
-from harness.archive.exports import Export
+from harness.archive.exports import Export, ExportedBlock
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
@@ -11,8 +11,36 @@ from ucp.block import Block, InceptionBlock, next_chain_hash
 
 NAME = "genuine"
 
-_Content = tuple[int, int, str]
-"""Agent, timestamp and event data of a block, as exported."""
+_Content = tuple[int, int, str, str]
+"""Agent, timestamp, event data and block hash of a block, as exported."""
+_Link = tuple[str, str, str | None]
+"""Of a block in a chain: the chain hash below it, its block hash, and its chain hash."""
+
+
+@dataclass
+class _Recomputed:
+    """Hashes that are right: of what many agents hold they are worked out once."""
+
+    blocks: set[_Content] = field(default_factory=set)
+    links: set[_Link] = field(default_factory=set)
+
+    def is_block(self, block: ExportedBlock) -> bool:
+        """Whether it hashes to its block hash."""
+        content = block.agent_id, block.timestamp_us, block.event_data, block.block_hash
+        if content not in self.blocks:
+            if Block(block.agent_id, block.timestamp_us, block.event_bytes).block_hash.hex() != block.block_hash:
+                return False
+            self.blocks.add(content)
+        return True
+
+    def is_link(self, link: _Link) -> bool:
+        """Whether the chain hash is that of the two others (eq. 3.2)."""
+        if link not in self.links:
+            below, block_hash, chain_hash = link
+            if next_chain_hash(bytes.fromhex(below), bytes.fromhex(block_hash)).hex() != chain_hash:
+                return False
+            self.links.add(link)
+        return True
 
 
 def check(evidence: Evidence) -> Judgement:
@@ -27,7 +55,7 @@ def check(evidence: Evidence) -> Judgement:
     known -= evidence.not_told_completed()
     unknown: set[int] = set()
     blocks = 0
-    recomputed: dict[_Content, str] = {}
+    recomputed = _Recomputed()
     for agent_id, export in evidence.exports.items():
         findings += _hashes_that_do_not_recompute(agent_id, export, evidence, recomputed)
         for block in export.blocks():
@@ -72,9 +100,8 @@ def _since(trace: Trace | None, block_hash: str) -> str:
 
 
 def _hashes_that_do_not_recompute(
-    agent_id: int, export: Export, evidence: Evidence, recomputed: dict[_Content, str]
+    agent_id: int, export: Export, evidence: Evidence, recomputed: _Recomputed
 ) -> list[Finding]:
-    """`recomputed` has block hashes by content: of a block that many agents hold it is worked out once."""
     findings = []
     inception = InceptionBlock(base64.b64decode(export.inception.block_data))
     if (inception.block_hash.hex(), inception.chain_hash.hex()) != (
@@ -82,21 +109,17 @@ def _hashes_that_do_not_recompute(
         export.inception.chain_hash,
     ):
         findings.append(Finding(agent_id, "the inception block's hashes do not recompute: the export was edited"))
-    chain_hash = bytes.fromhex(export.inception.chain_hash)
     for block in export.blocks():
-        content = block.agent_id, block.timestamp_us, block.event_data
-        if content not in recomputed:
-            recomputed[content] = Block(block.agent_id, block.timestamp_us, block.event_bytes).block_hash.hex()
-        if recomputed[content] != block.block_hash:
+        if not recomputed.is_block(block):
             name = evidence.name(block.block_hash)
             findings.append(
                 Finding(
                     agent_id, f"block {name} does not hash to its block hash: it was edited", name, block.block_hash
                 )
             )
+    below = export.inception.chain_hash
     for block in export.chain:
-        chain_hash = next_chain_hash(chain_hash, bytes.fromhex(block.block_hash))
-        if block.chain_hash != chain_hash.hex():
+        if not recomputed.is_link((below, block.block_hash, block.chain_hash)):
             name = evidence.name(block.block_hash)
             findings.append(
                 Finding(
@@ -107,4 +130,5 @@ def _hashes_that_do_not_recompute(
                 )
             )
             break  # every chain hash above depends on this one
+        below = block.chain_hash or ""
     return findings

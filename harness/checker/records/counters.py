@@ -102,7 +102,7 @@ def _counted(
 
 
 def _bytes_sent(trace: Trace) -> int:
-    return sum(_bytes(message.datagram) for run in trace.runs for message in run.sent if message.datagram is not None)
+    return sum([_bytes(message.datagram) for run in trace.runs for message in run.sent if message.datagram is not None])
 
 
 def _bytes(datagram: Recorded) -> int:

@@ -27,7 +27,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                 if sent is None:
                     continue  # what nobody sent is characteristic 1's to say
                 first_s, message = sent[0]
-                if run.input == message.datagram is not None and run.t >= first_s - slack and not run.changes:
+                told = message.datagram
+                as_it_went = told is not None and (run.input is told or run.input == told)
+                if as_it_went and run.t >= first_s - slack and not run.changes:
                     continue  # most are like this
                 if not evidence.injected.may_be(trigger):
                     for sight, touches in _unlike(line, run, sent, first_s - slack):

@@ -48,7 +48,7 @@ class Tells(NamedTuple):
 
     @classmethod
     def of(cls, trace: Trace) -> "Tells":
-        tallying = frozenset(run.handler for run in trace.runs if run.tally is not None)
+        tallying = frozenset({run.handler for run in trace.runs if run.tally is not None})
         return cls(tallying, timers=any(run.started for run in trace.runs))
 
 
@@ -99,11 +99,12 @@ class Follower:
             self._triggered(line, run, local)
         core.now = now = self._header.local(run.t)
         if local is None:
-            self._ran.clear()
+            self._ran = {run.handler: (line, run.t)}
             self._adopted = False
             if self._none_ends_before < now - self._header.late_s:
                 self._overdue(line, run.t, now)
-        self._ran[run.handler] = line, run.t
+        else:
+            self._ran[run.handler] = line, run.t
         heard = "message" in trigger
         may_touch_timers = not heard or run.handler in TOUCH_A_TIMER
         before = core.before(run) if may_touch_timers else None
@@ -237,7 +238,12 @@ class Follower:
         return f"; Algorithm 18, {PAUSES}, paused it in line {line}"
 
     def _soonest_end(self) -> float:
-        return min((timer.deadline for timer in self._core.timers if timer.deadline is not None), default=math.inf)
+        soonest = math.inf
+        for timer in self._core.timers:
+            deadline = timer.deadline
+            if deadline is not None and deadline < soonest:
+                soonest = deadline
+        return soonest
 
     # What came
 

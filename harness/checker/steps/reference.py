@@ -83,12 +83,13 @@ class ReferenceCore(Core):
         """Whether these are the messages that the step has sent."""
         if len(sent) != len(self.outbox):
             return False
-        for told, (sequence, message, _) in zip(sent, self.outbox, strict=True):
+        for number, told in enumerate(sent):
+            sequence, message, _ = self.outbox[number]
             try:
                 datagram = decoded(told.datagram)
             except MalformedDatagramError:
                 return False
-            if datagram != (self.agent_id, sequence, message):
+            if datagram.message != message or datagram.sequence != sequence or datagram.sender != self.agent_id:
                 return False
             about = block_named(message)
             if told.message != message.NAME or told.seq != sequence or told.block != (about.hex() if about else None):

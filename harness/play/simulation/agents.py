@@ -1,6 +1,6 @@
 """An agent as the simulation drives it: the harness's own, in this process, or one behind standard input and output."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 from harness.play.control import Status
@@ -56,7 +56,7 @@ class VirtualAgent(Protocol):
 
     def answers_nobody_until(self) -> float | None: ...
 
-    def outgoing(self) -> Iterable[Outgoing]:
+    def outgoing(self) -> Sequence[Outgoing]:
         """What it broadcasts since it was last asked, in order."""
 
     def trace(self) -> list[Entry]: ...
@@ -99,7 +99,7 @@ class OwnAgent(Agent):
     def chain_changed_at(self) -> float:
         return self.state.chain_changed_at
 
-    def outgoing(self) -> Iterable[Outgoing]:
+    def outgoing(self) -> Sequence[Outgoing]:
         return self._taken_from_outbox()
 
     def status(self) -> Status:

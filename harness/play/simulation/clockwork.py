@@ -266,13 +266,15 @@ class Clockwork:
 
     def _take_down(self, life: Incarnation, mission_s: float) -> None:
         """Write what the agent has done into its trace."""
-        entries = life.agent.trace()
+        agent_id, entries = life.agent.agent_id, life.agent.trace()
+        somebody_looks = self._at_once is not None or self._sought is not None
         for entry in entries:
             entry.t = mission_s
             if isinstance(entry, HandlerRun):
                 life.handler_runs += 1
-                self._look(life.agent.agent_id, entry)
-        self._recorder.write(life.agent.agent_id, entries)
+                if somebody_looks:
+                    self._look(agent_id, entry)
+        self._recorder.write(agent_id, entries)
 
     def _look(self, agent_id: int, run: HandlerRun) -> None:
         """Whether it is what somebody waits for, or will wait for in a moment."""
@@ -308,12 +310,13 @@ class Clockwork:
         self._expect_event(number, life)
 
     def _own_agent(self, agent_id: int, seed: int) -> OwnAgent:
+        quirks = self.scenario.quirks_of(agent_id)
         return OwnAgent(
             agent_id,
             self.roster,
             self._initial_data,
             self.scenario.settings_of(agent_id),
-            handlers=wrong_handlers(self.scenario.quirks_of(agent_id), Random(seed)),
+            handlers=wrong_handlers(quirks, Random(seed)) if quirks else (),
             tracing=self._tracing,
         )
 

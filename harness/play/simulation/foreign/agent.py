@@ -6,7 +6,7 @@ own questions, and no part of the mission: what the agent's trace says of them i
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -153,7 +153,7 @@ class ForeignAgent:
         """Nobody knows."""
         return None
 
-    def outgoing(self) -> Iterable[Outgoing]:
+    def outgoing(self) -> Sequence[Outgoing]:
         sent, self._sent = self._sent, []
         outgoing: list[Outgoing] = []
         for _, datagram in sent:
