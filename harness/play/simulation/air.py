@@ -53,28 +53,28 @@ About = Literal["vote", "reconcile"]
 
 @dataclass(slots=True, eq=False)
 class _Topic:
-    """What anybody says to one question, in the order in which it was sent, and who waits for that, by number."""
+    """What anybody says to one question, by sender in the order in which it was sent, and the numbers of who asks."""
 
-    answers: list[InFlight] = field(default_factory=list)
-    askers: dict[int, "_Asked"] = field(default_factory=dict)
+    answers: dict[int, list[InFlight]] = field(default_factory=dict)
+    askers: set[int] = field(default_factory=set)
+    answer_count: int = 0
+    """How many answers there are."""
     quiet_at: float = 0.0
     """None of the answers arrives later."""
 
 
-Arrival = tuple[float, int, InFlight]
-"""(mission seconds, rank, what arrives)."""
-
-
 @dataclass(slots=True, eq=False)
 class _Asked:
-    """What an agent waits to hear, and since when."""
+    """What an agent waits to hear, since when, and from whom it has heard it."""
 
     question: Question
     topic: _Topic
     since: "Happening"
-    only_counted: bool
-    coming: list[Arrival] = field(default_factory=list)
-    """A heap of the answers that it has not been told of, where they are only counted."""
+    heard: set[int] = field(default_factory=set)
+    heard_of: int = 0
+    """How many answers there were when it was last told of them."""
+    next_at: float = 0.0
+    """When the next of these comes."""
     first: tuple[float, int] = (NEVER, 0)
     """When the first answer of all arrives, and its rank, where no other is wanted."""
 
@@ -193,7 +193,7 @@ class VirtualAir:
         if answered is None:
             self._deliver(flight)
         else:
-            self._answer(answered(message), flight)
+            self._answer(answered(message), flight, number)
 
     def _deliver(self, flight: InFlight) -> None:
         """Let it arrive at everybody but those who will certainly not answer."""
@@ -206,14 +206,29 @@ class VirtualAir:
 
     # Answers, to whom they matter
 
-    def hear(self, number: int) -> list[Arrival]:
-        """The answers that the agent tallies and has not been told of, in order: those that have come by now."""
+    def hear(self, number: int) -> list[tuple[float, int, InFlight]]:
+        """(mission seconds, rank, answer) of the answers that the agent tallies and has not been told of, in order.
+
+        Those that have come since it asked: of each agent the first.
+        """
         heard = []
         now, rank, _, _ = self.place
         for asked in self.asked_by[number].values():
-            coming = asked.coming
-            while coming and (coming[0][0] < now or (coming[0][0] == now and coming[0][1] < rank)):
-                heard.append(heappop(coming))
+            topic = asked.topic
+            if asked.question[0] not in ONLY_COUNTED or (topic.answer_count == asked.heard_of and now < asked.next_at):
+                continue
+            asked.heard_of, asked.next_at = topic.answer_count, NEVER
+            for sender, flights in topic.answers.items():
+                if sender in asked.heard:
+                    continue
+                first = self._first(flights, number, asked.since)
+                if first is None:
+                    continue
+                if first[0] < now or (first[0] == now and first[1] < rank):
+                    asked.heard.add(sender)
+                    heard.append(first)
+                elif first[0] < asked.next_at:
+                    asked.next_at = first[0]
         heard.sort()
         return heard
 
@@ -223,12 +238,12 @@ class VirtualAir:
         for about, asked in list(asked_by.items()):
             if not STILL_ASKED[asked.question[0]](state):
                 del asked_by[about]
-                del asked.topic.askers[number]
+                asked.topic.askers.remove(number)
 
     def is_gone(self, number: int) -> None:
         """The agent has been killed."""
         for asked in self.asked_by[number].values():
-            del asked.topic.askers[number]
+            asked.topic.askers.remove(number)
         self.asked_by[number].clear()
         self.paused_at.pop(number, None)
         self.busy_until[number] = 0.0
@@ -239,39 +254,57 @@ class VirtualAir:
         about: About = "vote" if question[0] is BlockAddResponse else "reconcile"
         before = asked_by.get(about)
         if before is not None:
-            del before.topic.askers[number]
+            before.topic.askers.remove(number)
         topic = self._topics[question]
-        asked = asked_by[about] = topic.askers[number] = _Asked(
-            question, topic, self.place, question[0] in ONLY_COUNTED
-        )
-        latest, since_s, born_at = self._medium.latest, self.place[0], self.born_at[number]
-        for flight in topic.answers:
-            if flight.sent_at >= born_at and flight.sent_at + latest >= since_s:
-                self._expect_answer(flight, number, asked)
+        topic.askers.add(number)
+        asked = asked_by[about] = _Asked(question, topic, self.place)
+        if question[0] not in ONLY_COUNTED:
+            for flights in topic.answers.values():
+                self._arrive_first(flights, number, asked)
 
-    def _answer(self, question: Question, flight: InFlight) -> None:
+    def _answer(self, question: Question, flight: InFlight, sender: int) -> None:
         """Keep an answer for those who ask, or will before it arrives."""
         topic = self._topics[question]
+        topic.answer_count += 1
         topic.quiet_at = self.quiet_at
-        topic.answers.append(flight)
-        for receiver, asked in topic.askers.items():
-            self._expect_answer(flight, receiver, asked)
+        flights = topic.answers.get(sender)
+        if flights is None:
+            topic.answers[sender] = [flight]
+        else:
+            flights.append(flight)
+        if question[0] not in ONLY_COUNTED:
+            for receiver in topic.askers:
+                self._arrive_first((flight,), receiver, self.asked_by[receiver]["reconcile"])
         if flight.rank - self._swept_at > SWEEP_EVERY:
             self._sweep(flight)
 
-    def _expect_answer(self, flight: InFlight, receiver: int, asked: _Asked) -> None:
-        """Let the answer reach whoever asks for it, if it comes after the question was asked, and is wanted then."""
-        since_s, since_rank, _, _ = asked.since
-        rank = flight.rank
-        for delay in flight.lots.copies_to(receiver):
-            at = flight.sent_at + delay
-            if at < since_s or (at == since_s and rank <= since_rank):
+    def _arrive_first(self, flights: Iterable[InFlight], receiver: int, asked: _Asked) -> None:
+        """Let that answer arrive that comes first, unless another comes before it."""
+        first = self._first(flights, receiver, asked.since)
+        if first is not None and first[:2] < asked.first:
+            at, rank, flight = first
+            asked.first = at, rank
+            heappush(self._coming, (at, rank, receiver, flight))
+
+    def _first(
+        self, flights: Iterable[InFlight], receiver: int, since: Happening
+    ) -> tuple[float, int, InFlight] | None:
+        """(mission seconds, rank, flight) of the flight that arrives first after `since`."""
+        since_s, since_rank, _, _ = since
+        born_at = self.born_at[receiver]
+        soonest, latest = self._medium.soonest, self._medium.latest
+        first_at, first = NEVER, None
+        for flight in flights:
+            sent_at = flight.sent_at
+            if sent_at + soonest >= first_at:
+                break
+            if sent_at + latest < since_s or sent_at < born_at:
                 continue
-            if asked.only_counted:
-                heappush(asked.coming, (at, rank, flight))
-            elif (at, rank) < asked.first:
-                asked.first = at, rank
-                heappush(self._coming, (at, rank, receiver, flight))
+            for delay in flight.lots.copies_to(receiver):
+                at = sent_at + delay
+                if at < first_at and (at > since_s or (at == since_s and flight.rank > since_rank)):
+                    first_at, first = at, flight
+        return None if first is None else (first_at, first.rank, first)
 
     def _sweep(self, latest: InFlight) -> None:
         """Forget the answers that have arrived everywhere and that nobody waits for."""
