@@ -8,9 +8,9 @@ import typer
 from harness import matrix
 from harness.archive.directory import default_path
 from harness.backend_names import BackendName
-from harness.commands.terminal import complain, end_sweep
+from harness.commands.terminal import complain, end_sweep, print_lines
 from harness.matrix import nights as nights_of_matrix
-from harness.matrix import outputs, results, table
+from harness.matrix import outputs, results, summary, table
 from harness.matrix.baseline import load_baseline
 from harness.matrix.run import compared, on_cluster, on_cores
 from harness.run.sweep import cores
@@ -34,6 +34,9 @@ def matrix_command(
     against: Annotated[
         Path | None, typer.Option(metavar="BASELINE", help="An earlier matrix.json: exit 1 if a figure is worse.")
     ] = None,
+    coverage: Annotated[
+        bool, typer.Option("--coverage", help="Also say how much of the protocol the runs have tried; takes longer.")
+    ] = False,
     nights: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Keep this night there, and draw the trend of those that are there."),
@@ -49,7 +52,7 @@ def matrix_command(
     else:
         spread = on_cluster(request, scheduler, shown=True)
     with results.opened(directory, request) as ended:
-        finished = matrix.run_matrix(request, ended, spread)
+        finished = matrix.run_matrix(request, ended, spread, covers=coverage)
     if baseline is not None:
         finished = compared(finished, baseline, str(against))
     earlier = None
@@ -61,4 +64,6 @@ def matrix_command(
     outputs.write(finished, directory, earlier)
     if finished.record.outcome == "interrupted":
         complain(f"the same command with --out {directory} goes on from here")
+    if finished.record.tried is not None and not as_json:
+        print_lines(summary.tried_in_words(finished.record.tried))
     end_sweep(finished.record, None if as_json else table.render(finished.record), directory / "report.html")

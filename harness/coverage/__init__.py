@@ -3,6 +3,7 @@
 reached.py   what agents came to in runs: local states, with inputs, and branches
 existing.py  what there is within bounds, by `harness.prove`
 share.py     the one of the other: as JSON, and in words
+simulated.py a run in virtual time that is watched while it is judged
 """
 
 from harness.coverage.existing import Existing, existing

@@ -2,8 +2,9 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
 from harness.matrix.estimate import Estimate, estimate_share
@@ -37,6 +38,8 @@ class Run(Placed):
     verdicts: dict[str, Verdict] = {}
     failed: str | None = None
     unsupported: str | None = None
+    reached: Annotated[Any, Field(exclude=True)] = None
+    """Of a run that was just played, and watched: a `harness.coverage.Reached`. It is not written."""
 
     @property
     def judged(self) -> bool:

@@ -5,7 +5,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness.checker import Result
+from harness.archive.archive import RunArchive
+from harness.checker import Result, gather
+from harness.coverage import Reached, Watcher, reached_in
+from harness.coverage.simulated import simulate_watched
 from harness.errors import VIOLATED, HarnessError, InterruptedRunError, UnsupportedError
 from harness.gc_pause import gc_paused
 from harness.matrix.cell import Run
@@ -33,6 +36,15 @@ def simulated(scenario: Scenario, seed: int) -> Result:
     return simulate(scenario, seed, tracing=True).result
 
 
+@gc_paused()
+def watched(scenario: Scenario, seed: int, reached: Reached) -> Result:
+    """As `simulated`, and adds to what was reached."""
+    watcher = Watcher()
+    result = simulate_watched(scenario, seed, watcher.step).result
+    reached.add(watcher.reached)
+    return result
+
+
 def _same_twice(scenario: Scenario, seed: int) -> None:
     from harness.run.simulate import same_twice
 
@@ -46,6 +58,8 @@ class Player:
     matrix: Matrix
     directory: Path
     judge: Judge = simulated
+    covers: bool = False
+    """Whether to watch what runs reach. Of virtual time these are judged by no other `judge`."""
 
     def __call__(self, task: Task) -> Run:
         scenario = self.matrix.scenario_at(task.point)
@@ -53,18 +67,24 @@ class Player:
         try:
             if in_memory and scenario.foreign and task.seed == self.matrix.seed_list[0]:
                 _same_twice(scenario, task.seed)
-            result = self.judge(scenario, task.seed) if in_memory else self._for_real(scenario, task)
+            reached = Reached() if self.covers else None
+            if not in_memory:
+                result = self._for_real(scenario, task, reached)
+            elif reached is not None:
+                result = watched(scenario, task.seed, reached)
+            else:
+                result = self.judge(scenario, task.seed)
         except UnsupportedError as error:
             return Run(**task.point._asdict(), seed=task.seed, unsupported=str(error))
         verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}
-        return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts)
+        return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts, reached=reached)
 
     def refuse(self, points: Iterable[Point]) -> None:
         """Raises HarnessError if a backend, or this machine, cannot play these: before hours of others have gone by."""
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
-    def _for_real(self, scenario: Scenario, task: Task) -> Result:
+    def _for_real(self, scenario: Scenario, task: Task, reached: Reached | None) -> Result:
         """Raises UnsupportedError, or RunFailedError, which names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # of a run that was broken off
@@ -78,6 +98,8 @@ class Player:
             raise UnsupportedError(finished.played.outcome_detail)
         if finished.played.outcome == "failed":
             raise RunFailedError(f"{finished.played.outcome_detail}; see {directory}")
+        if reached is not None:
+            reached.add(reached_in(gather(RunArchive(directory))))
         if not finished.result.bad and self.matrix.keep == "violated":
             shutil.rmtree(directory)
         return finished.result

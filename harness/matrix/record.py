@@ -9,6 +9,7 @@ from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED
 from harness.matrix.cell import Cell, Placed
 from harness.matrix.comparison import Comparison
 from harness.matrix.model import Matrix
+from harness.matrix.tried import Tried
 
 SCHEMA = "ucp-matrix/1"
 
@@ -41,6 +42,8 @@ class MatrixRecord(BaseModel):
     unsupported: list[RunWithoutResult] = []
     """Those in which an agent said that it lacks what they need."""
     against: Comparison | None = None
+    tried: Tried | None = None
+    """How much of the protocol the runs have tried, if that was asked for."""
 
     @property
     def runs(self) -> int:

@@ -15,6 +15,7 @@ from harness.matrix.model import Matrix, Point, Task
 from harness.matrix.play import Judge, Player, simulated
 from harness.matrix.record import MatrixRecord, RunWithoutResult
 from harness.matrix.results import Results
+from harness.matrix.tried import Tally
 from harness.run.run import versions
 from harness.run.sweep import Failed, cores, sweep
 
@@ -48,20 +49,25 @@ def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
     return partial(cluster, address=address, what="runs" if shown else None)
 
 
-def run_matrix(matrix: Matrix, results: Results, spread: Spread, judge: Judge = simulated) -> Finished:
+def run_matrix(
+    matrix: Matrix, results: Results, spread: Spread, judge: Judge = simulated, *, covers: bool = False
+) -> Finished:
     """Play what `results` has not, add it there, and sum up all. Ctrl-C ends it early, with all that had ended.
 
-    Raises HarnessError if it cannot be played. `judge` plays what virtual time is asked for.
+    Raises HarnessError if it cannot be played. `judge` plays what virtual time is asked for. `covers`: how much of the
+    protocol runs try is told, too.
     """
     started = time.monotonic()
-    play = Player(matrix, results.directory / "runs", judge)
+    play = Player(matrix, results.directory / "runs", judge, covers)
     tasks = [task for task in matrix.tasks if task not in results.runs]
     play.refuse(dict.fromkeys(task.point for task in tasks))
-    interrupted = False
+    interrupted, tally = False, Tally() if covers else None
     try:
         with spread(tasks, play) as outcomes:
             for task, run in outcomes:
                 results.add(_failed(task, run.reason) if isinstance(run, Failed) else run)
+                if tally is not None and isinstance(run, Run) and run.reached is not None:
+                    tally.add(task.point, run.reached)
     except (KeyboardInterrupt, InterruptedRunError):
         interrupted = True
     runs = [results.runs[task] for task in matrix.tasks if task in results.runs]
@@ -78,6 +84,7 @@ def run_matrix(matrix: Matrix, results: Results, spread: Spread, judge: Judge = 
         cells=[sum_up(point, its_runs) for point, its_runs in by_point.items()],
         failed=[_without_result(run, run.failed) for run in runs if run.failed is not None],
         unsupported=[_without_result(run, run.unsupported) for run in runs if run.unsupported is not None],
+        tried=None if tally is None else tally.tried(matrix, len(runs)),
     )
     return Finished(record, runs)
 

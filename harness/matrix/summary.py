@@ -17,6 +17,7 @@ from harness.matrix.table import (
     unsupported_of_all,
     violated,
 )
+from harness.matrix.tried import Tried
 from harness.present import words
 from harness.present.markdown import escaped, row
 from harness.report.programs import asked_for, in_sentence
@@ -27,11 +28,31 @@ def to_markdown(record: MatrixRecord) -> str:
     lines += [explanation(record) + unjudged(record), ""]
     if findings := [*troubles_of_all(record), *unsupported_of_all(record), *improvements(record)]:
         lines += [*(f"- {escaped(sentence)}" for sentence in findings), ""]
+    if record.tried is not None:
+        lines += [*map(escaped, tried_in_words(record.tried)), ""]
     if ran := in_sentence(asked_for(record.matrix.scenario_at(record.matrix.points[-1]))):
         lines += [escaped(ran), ""]
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     lines += [f"<sub>Begun {words.started(record.started_at)}; {versions}</sub>"]
     return "\n".join(lines) + "\n"
+
+
+def tried_in_words(tried: Tried) -> Iterator[str]:
+    """How much of the protocol the runs have tried."""
+    every, branches = tried.all_cells, tried.all_cells["branches"]
+    yield (
+        f"Tried by {words.value(tried.runs)} runs: {words.value(every['local_states'])} local states, "
+        f"{words.value(every['pairs'])} pairs of one with an input, "
+        f"{branches['taken']} of {branches['exist']} branches of the handlers."
+    )
+    within = every["within"]
+    states, pairs = within["local_states"], within["pairs"]
+    yield (
+        f"Of what exists within {within['agents']} agents, {within['blocks']} blocks, network {within['network']}: "
+        f"{states['reached']} of {states['exist']} local states, {pairs['reached']} of {pairs['exist']} pairs."
+    )
+    if every["untold"]:
+        yield f"Not everything is known: {every['untold']}."
 
 
 def verdict(record: MatrixRecord) -> str:

@@ -9,18 +9,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from harness.archive.record import Cycle
-from harness.checker import Evidence, Result
+from harness.checker import Result
 from harness.checker.evidence import Watch
 from harness.coverage import Reached, Watcher
+from harness.coverage.simulated import simulate_watched
 from harness.explore.document import Document, at, cut_after, document_of, timeline, with_key
 from harness.explore.guided.change import AFTER_LAST_S, FEW_BLOCKS, Limits, with_events
 from harness.explore.guided.identity import Identity, identities
 from harness.explore.recording import Logged, record
 from harness.gc_pause import gc_paused
-from harness.play.simulation.backend import Simulation
 from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.run.finding import ended_by
-from harness.run.simulate import InMemory, simulate_in_memory
 from harness.scenario import Scenario
 from ucp.events import EVENT_HEADER_BYTES
 from ucp.settings import Settings
@@ -60,21 +59,10 @@ def found_in(scenario: Scenario, seed: int) -> tuple[Identity, ...]:
 
 def _played(scenario: Scenario, seed: int, watch: Watch) -> tuple[Result, Cycle | None]:
     try:
-        simulated = simulate_in_memory(_Watched(watch), scenario, seed, deliver_all=True)
+        simulated = simulate_watched(scenario, seed, watch)
     except AgentFailedError as error:
         return ended_by(error), None
     return simulated.result, simulated.evidence.cycle
-
-
-class _Watched(InMemory):
-    def __init__(self, watch: Watch) -> None:
-        super().__init__(tracing=True)
-        self._watch = watch
-
-    def evidence(self, simulation: Simulation) -> Evidence:
-        evidence = super().evidence(simulation)
-        evidence.watch = self._watch
-        return evidence
 
 
 def with_liveness_phase(document: Document) -> Document:

@@ -11,7 +11,7 @@ from harness.matrix.record import MatrixRecord
 from harness.matrix.report import figures, heatmap, trend
 from harness.matrix.report.drilldown import drilldown
 from harness.matrix.run import Finished
-from harness.matrix.summary import verdict
+from harness.matrix.summary import tried_in_words, verdict
 from harness.matrix.table import explanation, improvements, name_of, troubles, unjudged
 from harness.present import svg, words
 from harness.report import html
@@ -44,6 +44,9 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
         shades=range(heatmap.SHADES),
         cells=drilldown(finished, directory),
         judged=JUDGED,
+        tried=list(tried_in_words(record.tried)) if record.tried else [],
+        tried_cells=[(name_of(record.matrix, cell.point), cell) for cell in record.tried.cells] if record.tried else [],
+        not_taken=record.tried.all_cells["branches"]["not_taken"] if record.tried else [],
         nights=nights,
         drawn=drawn,
         trends=[(figure, trend.trend(drawn, record, figure)) for figure in shown] if len(drawn) > 1 else [],

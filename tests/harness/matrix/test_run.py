@@ -12,8 +12,10 @@ from rich.console import Console
 
 from harness.checker import Result
 from harness.errors import MachineError
-from harness.matrix import MatrixRecord, outputs, table
+from harness.matrix import MatrixRecord, outputs, results, run_matrix, table
 from harness.matrix.picture import PANELS, draw
+from harness.matrix.run import on_cores
+from harness.matrix.summary import to_markdown
 from harness.matrix.thesis import BEGIN, END, OBSERVED, PAGE, put_between_markers
 from harness.matrix.thesis import table as thesis_table
 from harness.scenario import Scenario
@@ -168,3 +170,20 @@ def test_the_thesis_page_has_a_place_for_the_table_and_every_rate() -> None:
     rows = page.split(BEGIN)[1].split(END)[0].splitlines()
     assert len(rows) == 2 + len(OBSERVED)
     assert all(row.count("|") == rows[0].count("|") for row in rows)
+
+
+def test_how_much_was_tried_is_told_if_asked_for_and_of_what_was_played_only(tmp_path: Path) -> None:
+    asked = matrix(loss=(0.0, 1.0), seeds=2, scenario={"duration_s": 60, "agents": 2})
+    with results.opened(tmp_path / "out", asked) as ended:
+        record = run_matrix(asked, ended, on_cores(asked, 1), covers=True).record
+    assert record.tried is not None
+    assert record.tried.runs == 4
+    assert record.tried.all_cells["untold"] is None
+    assert [cell.loss for cell in record.tried.cells] == [0.0, 1.0]
+    assert MatrixRecord.model_validate(record.to_json()) == record
+    assert "Tried by 4 runs" in to_markdown(record)
+    assert "reached" not in (tmp_path / "out" / results.FILE).read_text()
+    with results.opened(tmp_path / "out", asked) as ended:
+        again = run_matrix(asked, ended, on_cores(asked, 1), covers=True).record
+    assert again.tried is not None
+    assert again.tried.all_cells["untold"] == "4 of 4 runs were played before, and not looked at"

@@ -1,0 +1,101 @@
+"""New local states for the same processor time, of a hunt beside seeds alone: `python -m benchmarks.explore`.
+
+Each round gives both the same processor time on one core, first the one, then the other, then the other way round, with
+seeds of its own. Both are played, followed and judged by the same code, with a final reconcile where chains differ.
+`small` is three agents that complete about three blocks, of which `prove` knows all local states that there are where
+messages may be lost; `five` a mission of five agents with about eight.
+"""
+
+import argparse
+import statistics
+import sys
+import time
+from random import Random
+
+from harness.coverage import Existing, Reached, existing
+from harness.explore.guided.hunt import Candidate, Hunt
+from harness.explore.guided.trial import beginnings, tried
+from harness.prove import Bounds
+from harness.scenario import Scenario
+
+LOSS = {"network": {"loss": 0.15}}
+SCENARIOS = {
+    "small": {
+        "name": "small",
+        "agents": 3,
+        "duration_s": 90,
+        "settings": {"max_block_bytes": 267},
+        "events": {"source": "random", "mean_s": 90},
+        **LOSS,
+    },
+    "five": {"name": "five", "agents": 5, "duration_s": 200, **LOSS},
+}
+SEEDS_OF_ROUND = 1_000_000
+
+
+def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
+    """How many runs, and what they reached."""
+    reached, runs, ends_s = Reached(), 0, time.process_time() + budget_s
+    while time.process_time() < ends_s:
+        reached.add(tried(scenario, first_seed + runs).reached)
+        runs += 1
+    return runs, reached
+
+
+def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
+    """How many runs, and what they reached; what it takes to begin is in the budget."""
+    ends_s = time.process_time() + budget_s
+    limits, begun = beginnings(scenario, range(first_seed, first_seed + 4))
+    hunt = Hunt(limits, Random(first_seed))
+    playing = hunt.begin([Candidate(*each) for each in begun], 1)
+    while time.process_time() < ends_s:
+        if next(playing, None) is None:
+            playing = hunt.round(1)
+    return hunt.runs, hunt.reached
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=60.0, help="processor time for each of the two in a round")
+    parser.add_argument("--scenario", nargs="+", choices=SCENARIOS, default=list(SCENARIOS))
+    arguments = parser.parse_args()
+    for name in arguments.scenario:
+        compare(Scenario.model_validate(SCENARIOS[name]), arguments.rounds, arguments.seconds)
+
+
+def compare(scenario: Scenario, rounds: int, seconds: float) -> None:
+    there = existing(Bounds(3, 3)) if scenario.name == "small" else None
+    print_row(scenario.name, "seeds: runs", "local states", "hunt: runs", "local states", "ratio")
+    ratios = []
+    for number in range(rounds):
+        first_seed = number * SEEDS_OF_ROUND
+        ways = [seeds_alone, hunted] if number % 2 == 0 else [hunted, seeds_alone]
+        came_to = {way: way(scenario, first_seed, seconds) for way in ways}
+        (seeds_runs, by_seeds), (hunt_runs, by_hunt) = came_to[seeds_alone], came_to[hunted]
+        ratios.append(len(by_hunt.states) / len(by_seeds.states))
+        print_row(
+            str(number + 1),
+            str(seeds_runs),
+            of(by_seeds, there),
+            str(hunt_runs),
+            of(by_hunt, there),
+            f"{ratios[-1]:.1f}",
+        )
+    print_row("median", "", "", "", "", f"{statistics.median(ratios):.1f} ({min(ratios):.1f}..{max(ratios):.1f})")
+
+
+def of(reached: Reached, there: Existing | None) -> str:
+    """How many local states, and how many of those that exist within the bounds."""
+    if there is None:
+        return str(len(reached.states))
+    return f"{len(reached.states)} ({len(reached.states & there.states)} of {len(there.states)})"
+
+
+def print_row(*cells: str) -> None:
+    sys.stdout.write("".join(f"{cell:>24}" for cell in cells) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
