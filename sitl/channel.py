@@ -24,7 +24,8 @@ NO_POSITION = (
     | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
     | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
 )
-TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # the one parameter that it has
+TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # the one parameter that can be set, of a plane
+SYSTEM_ID = "SYSID_THISMAV"
 
 
 class Channel:
@@ -57,6 +58,10 @@ class Channel:
                 self._position_target(message)
             elif kind == "PARAM_SET":
                 self._set_parameter(message)
+            elif kind in ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ"):
+                self._tell_parameters(message)
+            elif kind == "REQUEST_DATA_STREAM":
+                self._set_rate(message)
             elif kind.startswith("MISSION_"):
                 for answer in self._mission.receive(kind, message):
                     self.send(answer)
@@ -155,11 +160,36 @@ class Channel:
             return
         if 0 < message.param_value <= MAX_ALTITUDE_M:
             vehicle.take_off_altitude_m = message.param_value
-        self.send(
-            mavlink.MAVLink_param_value_message(
-                TAKE_OFF_ALTITUDE.encode(), vehicle.take_off_altitude_m, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0
-            )
-        )
+        self.send(self._parameters()[TAKE_OFF_ALTITUDE])
+
+    def _parameters(self) -> dict[str, Any]:
+        """PARAM_VALUE of each: a ground station asks for all before it shows a vehicle."""
+        values: dict[str, float] = {SYSTEM_ID: self._autopilot.sysid}
+        if self._autopilot.vehicle_type == "plane":
+            values[TAKE_OFF_ALTITUDE] = self._autopilot.take_off_altitude_m
+        kind = mavlink.MAV_PARAM_TYPE_REAL32
+        return {
+            name: mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(values), at)
+            for at, (name, value) in enumerate(values.items())
+        }
+
+    def _tell_parameters(self, message: Any) -> None:
+        parameters = self._parameters()
+        wanted = set(parameters)
+        if message.get_type() == "PARAM_REQUEST_READ":
+            by_index = dict(enumerate(parameters))
+            index: int = message.param_index
+            wanted = {by_index.get(index, "") if index >= 0 else str(message.param_id)}
+        for name, value in parameters.items():
+            if name in wanted:
+                self.send(value)
+
+    def _set_rate(self, message: Any) -> None:
+        """REQUEST_DATA_STREAM, as older ground stations ask: of all messages but the heartbeat, so many a second."""
+        rate = message.req_message_rate if message.start_stop else 0
+        for message_id in STREAMS:
+            if message_id != mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+                self._set_interval(message_id, 1e6 / rate if rate else -1)
 
     def _set_interval(self, message_id: float, interval_us: float) -> int:
         """MAV_CMD_SET_MESSAGE_INTERVAL: microseconds; 0 is the default interval, -1 is never."""

@@ -2,7 +2,7 @@
 
     python -m sitl.embedded --type plane --sysid 3 --home -35.363262,149.165237,584,270 --speedup 20
 
-A small process (one thread, standard library and a MAVLink dialect) that listens on 127.0.0.1 on ArduPilot SITL's two
+A small process (one thread, standard library and a MAVLink dialect) that listens on 127.0.0.1 on ArduPilot SITL's three
 ports and answers like one, so that the same pilot flies both. Its clock runs `speedup` times as fast as ours; what it
 sends in a second of ours is bounded all the same. SIGTERM ends it with exit status 0.
 """
@@ -24,6 +24,7 @@ from sitl.port import Port
 from sitl.vehicle import (
     AGENT_PORT,
     PILOT_PORT,
+    STATION_PORT,
     VEHICLE_TYPES,
     Home,
     Launch,
@@ -73,6 +74,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--speedup", type=float, default=1.0, help="simulated seconds per second")
     parser.add_argument("--pilot-port", type=int, default=PILOT_PORT)
     parser.add_argument("--agent-port", type=int, default=AGENT_PORT)
+    parser.add_argument("--station-port", type=int, default=STATION_PORT)
     # `--home -35.3,...` reads like an option to argparse; join the two words
     words = list(sys.argv[1:] if argv is None else argv)
     for at in reversed(range(len(words) - 1)):
@@ -95,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     autopilot = Autopilot(arguments.sysid, arguments.home, time.time_ns() // 1000, arguments.type)
     selector = selectors.DefaultSelector()
     ports = []
-    for number in (arguments.pilot_port, arguments.agent_port):
+    for number in (arguments.pilot_port, arguments.agent_port, arguments.station_port):
         try:
             ports.append(Port(number, autopilot, selector))
         except (OSError, OverflowError) as error:

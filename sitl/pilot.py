@@ -53,7 +53,7 @@ class Pilot:
         self.link = Link(sysid, sock, tlog, speedup, home)
         self.vehicle_type: VehicleType = vehicle_type
         self.vehicle_id = sysid if vehicle_id is None else vehicle_id
-        self._terminated = False
+        self._terminated = self._handed_over = False
 
     @property
     def state(self) -> VehicleState:
@@ -102,6 +102,10 @@ class Pilot:
         self._terminated = True
         await self._pursue(Termination(self.link))
 
+    def hand_over(self) -> None:
+        """Somebody else flies it from now on: whatever this pilot was about ends, without an error."""
+        self._handed_over = True
+
     async def stay_in_touch(self) -> None:
         """Raises FlightError when the vehicle falls silent or leaves; ends when its flight is terminated."""
         await self._pursue(_Listening())
@@ -111,7 +115,7 @@ class Pilot:
         clocks = _StepClocks(self.link)
         asked: tuple[Step, int] | None = None
         while (step := self._next_step(procedure)) is not None:
-            if self._terminated and not isinstance(procedure, Termination):
+            if self._is_over(procedure):
                 return
             if problem := clocks.problem(step):
                 raise self._failed(procedure, step.name, problem)
@@ -127,11 +131,17 @@ class Pilot:
             except TimeoutError:
                 continue
 
+    def _is_over(self, procedure: Procedure) -> bool:
+        """Whether nobody wants it any more: a flight that ended by force, or that somebody else flies."""
+        if isinstance(procedure, Termination):
+            return False
+        return self._terminated or (self._handed_over and not isinstance(procedure, _Listening))
+
     def _next_step(self, procedure: Procedure) -> Step | None:
         try:
             return procedure.next_step()
         except HopelessError as error:
-            if self._terminated:
+            if self._is_over(procedure):
                 return None
             raise self._failed(procedure, "the next leg", str(error)) from None
 

@@ -1,7 +1,8 @@
-"""What a vehicle is: a program that speaks MAVLink on two TCP ports, and how it is started.
+"""What a vehicle is: a program that speaks MAVLink on three TCP ports, and how it is started.
 
-A vehicle lives in a network namespace of its own, so every vehicle listens on the same two ports: the ones that
-ArduPilot SITL uses for its first two serial ports. The pilot (the orchestrator) has the first, the agent the second.
+A vehicle lives in a network namespace of its own, so every vehicle listens on the same ports: the ones that ArduPilot
+SITL uses for its first three serial ports. The pilot (the orchestrator) has the first, the agent the second, and a
+ground station the third.
 Which program it is, real ArduPilot or the embedded vehicle, is a `VehicleKind`; nothing else needs to know.
 """
 
@@ -18,6 +19,7 @@ VEHICLE_TYPES: tuple[VehicleType, ...] = get_args(VehicleType)
 
 PILOT_PORT = 5760  # ArduPilot SITL: serial0
 AGENT_PORT = 5762  # ArduPilot SITL: serial1
+STATION_PORT = 5763  # ArduPilot SITL: serial2
 
 METRES_PER_DEGREE = 111_319.5  # of latitude; ArduPilot's own scale (WGS 84 equatorial radius)
 SPACING_M = 5.0
@@ -98,6 +100,7 @@ class Launch:
     argv: list[str]
     pilot_port: int = PILOT_PORT
     agent_port: int = AGENT_PORT
+    station_port: int = STATION_PORT
     env: Mapping[str, str] = field(default_factory=dict)  # to be set on top of the orchestrator's own
 
 

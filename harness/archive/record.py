@@ -316,6 +316,31 @@ class JudgedRecord(_Model):
         return self.switched_off.get(agent_id, self.mission_s)
 
 
+class OperatorCommand(_Model):
+    """What an operator sent at `at_s`, `times` times in a row until `until_s`; `values` are the message's fields."""
+
+    at_s: float
+    until_s: float
+    times: int = 1
+    vehicles: list[int]
+    message: str
+    command: str | None = None
+    """The MAV_CMD of a COMMAND_LONG or COMMAND_INT."""
+    values: dict[str, Any] = {}
+
+
+class GroundStationRecord(_Model):
+    """What passed between the vehicles and a ground station, in datagrams; `dropped` ones were too many, or damaged."""
+
+    address: str
+    sent: int = 0
+    received: int = 0
+    dropped: int = 0
+    commands: list[OperatorCommand] = []
+    commands_left_out: int = 0
+    """Of which there were more than are kept."""
+
+
 class RunRecord(JudgedRecord):
     """All of a record. Times are mission seconds except `wall_s`; what is not known, or not yet, is null or empty."""
 
@@ -334,6 +359,8 @@ class RunRecord(JudgedRecord):
     """A sentence for each scripted fate that decided nothing, and each injection that sent nothing."""
     capture: dict[AgentKey, CapturedFrames] | None = None
     """Of each vehicle, if captures were asked for and came to their end."""
+    ground_station: GroundStationRecord | None = None
+    """If the run had one."""
     characteristics: dict[str, CharacteristicRecord] = {}
     steps: JudgementRecord | None = None
     """Whether every agent did at every step what the algorithms say."""

@@ -47,6 +47,10 @@ def run_command(
     backend: Annotated[
         BackendName, typer.Option(help="Real processes in a private network, the same in containers, or virtual time.")
     ] = "process",
+    gcs: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="A ground station, by UDP, that sees and commands all vehicles."),
+    ] = None,
     capture: Annotated[
         bool, typer.Option("--capture", help="Keep each frame that a vehicle sent or got, in capture/<ID>.pcapng.")
     ] = False,
@@ -64,7 +68,7 @@ def run_command(
     """Play a scenario, check the six characteristics, write a report."""
     console = Console()
     asked, own_seed = scenario_of(scenario)
-    request = _with_options(asked, speedup, vehicles, capture, image_from_host)
+    request = _with_options(asked, speedup, vehicles, gcs, capture, image_from_host)
     directory = (out or default_path(request.name)).absolute()
     seed = own_seed if seed is None else seed
     chosen_seed = secrets.randbelow(2**32) if seed is None else seed
@@ -74,6 +78,8 @@ def run_command(
     if kernel is Kernel.uml:
         if why := BACKENDS[backend].not_in_uml:
             raise HarnessError(why)
+        if request.gcs:
+            raise ScenarioError("no ground station reaches into User Mode Linux: leave out --kernel uml, or --gcs")
         options = {"--seed": chosen_seed, "--out": directory, "--speedup": speedup, "--vehicles": vehicles}
         given = [f"{option}={value}" for option, value in options.items() if value is not None]
         given += ["--capture"] if capture else []
@@ -108,7 +114,12 @@ def _emit_compose(console: Console, scenario: Scenario, seed: int, file: Path) -
 
 
 def _with_options(
-    scenario: Scenario, speedup: float | None, vehicles: Vehicles | None, capture: bool, image_from_host: bool
+    scenario: Scenario,
+    speedup: float | None,
+    vehicles: Vehicles | None,
+    gcs: str | None,
+    capture: bool,
+    image_from_host: bool,
 ) -> Scenario:
     """The scenario as resolved: the command line's word comes before the file's."""
     document: dict[str, Any] = scenario.model_dump()
@@ -118,6 +129,8 @@ def _with_options(
         document["speedup"] = speedup
     if vehicles is not None:
         document["vehicles"]["kind"] = vehicles.value
+    if gcs is not None:
+        document["gcs"] = gcs
     document["capture"] |= capture
     if image_from_host:
         document["docker"]["image_from_host"] = True

@@ -38,6 +38,7 @@ class RunOutcome:
     capture: dict[str, dict[str, int]] | None = None
     agents: dict[str, Any] = field(default_factory=dict)
     vehicles: dict[str, Any] = field(default_factory=dict)
+    ground_station: dict[str, Any] | None = None
     unmatched_fates: list[str] = field(default_factory=list)
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:

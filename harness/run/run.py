@@ -121,6 +121,7 @@ class Recording:
             unmatched_fates=played.unmatched_fates,
             counters=played.counters,
             capture=played.capture,
+            ground_station=played.ground_station,
         )
 
     def end(self, played: RunOutcome) -> Run:

@@ -28,7 +28,9 @@ from harness.scenario.timeline import TimelineEntry
 from harness.scenario.vehicles import Vehicles
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError
+from sitl.address import Address
 from sitl.plan import PlanError
+from sitl.vehicle import VehicleError
 from ucp.block import MAX_AGENT_ID
 from ucp.events import EVENT_HEADER_BYTES
 from ucp.quirks import Quirks, in_force
@@ -112,8 +114,18 @@ class Scenario(Model):
     """At the end clear all conditions, and let one agent after another reconcile."""
     capture: bool = False
     """Keep every frame that a vehicle sent, and every one that reached it, in capture/<ID>.pcapng."""
+    gcs: Annotated[str, Field(max_length=300)] | None = None
+    """HOST:PORT of a ground station, by UDP, that sees all vehicles and may command them; usually 127.0.0.1:14550."""
     expect: Expect | None = None
     """For pytest, which collects the file as tests if it has this."""
+
+    @field_validator("gcs")
+    @classmethod
+    def _is_an_address(cls, gcs: str | None) -> str | None:
+        try:
+            return gcs and str(Address.parse(gcs))
+        except VehicleError as error:
+            raise ValueError(str(error)) from None
 
     @property
     def roster(self) -> tuple[int, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import socket
 import subprocess
 import sys
@@ -56,20 +57,21 @@ def embedded_argv(*extra: str, sysid: int = 3, home: str = str(HOME), speedup: f
 
 @dataclass
 class Vehicle:
-    """A running embedded vehicle and its two ports."""
+    """A running embedded vehicle and its ports."""
 
     process: subprocess.Popen[bytes]
     pilot_port: int
     agent_port: int
+    station_port: int
 
 
 @contextlib.contextmanager
 def embedded(sysid: int = 3, speedup: float = 100.0, vehicle_type: VehicleType = "copter") -> Iterator[Vehicle]:
-    pilot_port, agent_port = free_ports(2)
-    ports = ("--pilot-port", str(pilot_port), "--agent-port", str(agent_port))
-    process = subprocess.Popen(embedded_argv("--type", vehicle_type, *ports, sysid=sysid, speedup=speedup))
+    ports = free_ports(3)
+    options = itertools.chain(*zip(("--pilot-port", "--agent-port", "--station-port"), map(str, ports), strict=True))
+    process = subprocess.Popen(embedded_argv("--type", vehicle_type, *options, sysid=sysid, speedup=speedup))
     try:
-        yield Vehicle(process, pilot_port, agent_port)
+        yield Vehicle(process, *ports)
     finally:
         process.kill()
         process.wait()

@@ -234,7 +234,7 @@ def refusal(*argv: str) -> str:
 def test_a_port_in_use_is_one_sentence_and_status_2() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        sentence = refusal(*embedded_argv("--pilot-port", port, "--agent-port", "0"))
+        sentence = refusal(*embedded_argv("--pilot-port", port, "--agent-port", "0", "--station-port", "0"))
     assert f"127.0.0.1:{port}" in sentence and "in use" in sentence
 
 
@@ -252,7 +252,9 @@ def test_a_port_in_use_is_one_sentence_and_status_2() -> None:
     ],
 )
 def test_a_bad_argument_is_one_sentence_and_status_2(option: str, value: str, problem: str) -> None:
-    assert problem in refusal(*embedded_argv("--pilot-port", "0", "--agent-port", "0", option, value))
+    assert problem in refusal(
+        *embedded_argv("--pilot-port", "0", "--agent-port", "0", "--station-port", "0", option, value)
+    )
 
 
 def test_who_asks_again_and_again_postpones_nothing() -> None:

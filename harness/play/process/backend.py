@@ -32,7 +32,9 @@ from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import CaptureError, LabUnavailable, NetemError
-from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
+from sitl.address import Address
+from sitl.ground_station import GroundStation
+from sitl.vehicle import Home, VehicleError, VehicleKind, VehicleType, home_in_field
 from ucp.clock import MICROSECONDS, MissionClock
 
 POLL_S = 0.25
@@ -83,6 +85,7 @@ class ProcessRun:
             AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now) for agent_id in scenario.roster
         ]
         self._capture: LiveCapture | None = None
+        self._station: GroundStation | None = None
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()
         self._watchers = Watchers()
@@ -181,17 +184,32 @@ class ProcessRun:
         await asyncio.gather(
             *(vehicle.start(lab, self._home(number), speedup) for number, vehicle in enumerate(self.vehicles))
         )
+        if self.scenario.gcs:
+            self._station = await self._open_station(Address.parse(self.scenario.gcs))
         for vehicle in self.vehicles:
-            self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
-            self._prepare(vehicle)
+            await self._take_charge_of(vehicle)
         readied = [self._watchers.task(vehicle.get_ready()) for vehicle in self.vehicles]
         for ready, next_one in enumerate(asyncio.as_completed(readied)):
             self._show(f"vehicles get ready, {ready} of {len(readied)} are")
             await next_one
 
-    def _prepare(self, vehicle: VehicleProcess) -> None:
+    async def _open_station(self, address: Address) -> GroundStation:
+        try:
+            return await GroundStation.open(address, self.clock.now, self._hand_over)
+        except VehicleError as error:
+            raise ScenarioError(str(error)) from None
+
+    def _hand_over(self, vehicle_ids: Sequence[int]) -> None:
+        for vehicle_id in vehicle_ids:
+            self.vehicles[self._number(vehicle_id)].hand_over()
+
+    async def _take_charge_of(self, vehicle: VehicleProcess) -> None:
+        """Of one that has just been started."""
+        self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
         flight = self.scenario.flight_of(vehicle.vehicle_id)
         vehicle.prepare(flight, self.scenario.vehicles.takeoff_altitude_m)
+        if self._station is not None:
+            await vehicle.join(self._station, self._lab)
 
     async def _start_agents(self, lab: MissionLab) -> None:
         self._show("starting agents")
@@ -292,8 +310,7 @@ class ProcessRun:
             vehicle = self._vehicle(agent.agent_id, life)
             self.vehicles[number] = vehicle
             await vehicle.start(self._lab, self._home(number), self.scenario.speedup)
-            self._watchers.start(vehicle.watch(), of=f"vehicle {agent.agent_id}")
-            self._prepare(vehicle)
+            await self._take_charge_of(vehicle)
             self._fly(vehicle)
         await self._start_agent(agent, self._lab)
 
@@ -418,6 +435,9 @@ class ProcessRun:
             if error is not None and self.played.outcome == "completed":
                 self._ended_early(error)
         self.played.vehicles = {str(vehicle.vehicle_id): vehicle.to_json() for vehicle in self.vehicles}
+        if self._station is not None:
+            self.played.ground_station = self._station.to_json()
+            self._station.close()
         try:
             if self._rogue is not None:
                 await self._stop_rogue(self._rogue)

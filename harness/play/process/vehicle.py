@@ -13,9 +13,10 @@ from harness.errors import HarnessError
 from harness.play.process.lab import MissionLab, Program
 from harness.scenario.flight import Flight
 from netem.radio import Place
+from sitl.ground_station import GroundStation
 from sitl.pilot import Pilot
 from sitl.procedure import Procedure
-from sitl.vehicle import MAX_SYSID, Home, Launch, VehicleError, VehicleKind
+from sitl.vehicle import MAX_SYSID, STATION_PORT, Home, Launch, VehicleError, VehicleKind
 
 LISTEN_LIMIT_S = 20.0
 CONNECT_LIMIT_S = 2.0
@@ -53,6 +54,7 @@ class VehicleProcess:
         self._directory = rundir.vehicle(vehicle_id, life)
         self._process: Program | None = None
         self._flight: Procedure | None = None
+        self._station_port = STATION_PORT
 
     @property
     def _output(self) -> Path:
@@ -78,6 +80,7 @@ class VehicleProcess:
 
     async def _connect(self, lab: MissionLab, launch: Launch, speedup: float) -> None:
         assert self._process is not None
+        self._station_port = launch.station_port
         deadline = asyncio.get_running_loop().time() + LISTEN_LIMIT_S
         while True:
             try:
@@ -95,6 +98,22 @@ class VehicleProcess:
         tlog = self._directory / "telemetry.tlog"
         self.pilot = Pilot(self.sysid, sock, tlog, speedup, self._home, self.kind.vehicle_type, self.vehicle_id)
         await self.pilot.start()
+
+    async def join(self, station: GroundStation, lab: MissionLab) -> None:
+        """Be seen at a ground station, and listen to it. Raises VehicleFailedError."""
+        try:
+            sock = await lab.connect(self.vehicle_id, self._station_port, timeout_s=CONNECT_LIMIT_S)
+        except (ConnectionError, TimeoutError):
+            raise VehicleFailedError(
+                f"vehicle {self.vehicle_id} ({self.kind.name}) does not listen on port {self._station_port} for a "
+                "ground station: leave out --gcs"
+            ) from None
+        await station.attach(self.vehicle_id, self.sysid, sock)
+
+    def hand_over(self) -> None:
+        """An operator flies it from now on."""
+        assert self.pilot is not None
+        self.pilot.hand_over()
 
     def place(self, field: Home) -> Place:
         """Where it last said that it is, as seen from the middle of the field; at its home until it knows."""

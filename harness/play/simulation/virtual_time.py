@@ -30,6 +30,7 @@ class VirtualTime(Backend):
         asked = {
             "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
             "vehicles.binary": scenario.vehicles.binary is not None,
+            "gcs": scenario.gcs is not None,
         }
         keys = [f"`{key}`" for key, needed in asked.items() if needed]
         if keys:

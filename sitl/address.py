@@ -1,0 +1,42 @@
+"""Where a ground station listens, in words."""
+
+from __future__ import annotations
+
+import ipaddress
+from dataclasses import dataclass
+from typing import Self
+
+from sitl.vehicle import VehicleError
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a ground station listens."""
+
+    host: str
+    port: int
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """HOST:PORT, of IPv6 [HOST]:PORT. Raises VehicleError."""
+        host, _, port = text.rpartition(":")
+        bracketed = host.startswith("[") and host.endswith("]")
+        host = host[1:-1] if bracketed else host
+        odd = ":" in host and not bracketed  # whose end is the port?
+        if not host or odd or bracketed != _is_ipv6(host) or not (port.isascii() and port.isdigit()):
+            raise VehicleError(f"a ground station is HOST:PORT, for example 127.0.0.1:14550, not {text!r:.80}")
+        if len(host) > 253 or any(not letter.isprintable() or letter.isspace() for letter in host):
+            raise VehicleError(f"{host!r:.80} is no host: name one, for example 127.0.0.1:14550")
+        if not 1 <= int(port[:6]) <= 65535:
+            raise VehicleError(f"a ground station's port is 1 to 65535, usually 14550, not {port:.20}")
+        return cls(host, int(port))
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def _is_ipv6(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host.partition("%")[0]).version == 6
+    except ValueError:
+        return False

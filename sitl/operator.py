@@ -1,0 +1,100 @@
+"""What an operator at a ground station commanded, in a few words each, and no more than fit."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+MOST_COMMANDS = 1000
+"""So many are kept; of those that follow it is said how many they were."""
+
+_ASKS_ONLY = re.compile(r"MAV_CMD_(REQUEST_|GET_|SET_MESSAGE_INTERVAL$|RUN_PREARM_CHECKS$|DO_SEND_BANNER$)")
+"""Commands that make a vehicle answer, and do nothing else: a ground station sends them by itself."""
+
+_AT_THE_STICKS = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})
+"""Sent many times a second: one entry for as long as nothing else comes."""
+
+_COMMANDS = frozenset(
+    {
+        *_AT_THE_STICKS,
+        "COMMAND_INT",
+        "COMMAND_LONG",
+        "MISSION_CLEAR_ALL",
+        "MISSION_COUNT",
+        "MISSION_SET_CURRENT",
+        "MISSION_WRITE_PARTIAL_LIST",
+        "SET_ATTITUDE_TARGET",
+        "SET_HOME_POSITION",
+        "SET_MODE",
+        "SET_POSITION_TARGET_GLOBAL_INT",
+        "SET_POSITION_TARGET_LOCAL_NED",
+    }
+)
+_SETTINGS = frozenset({"PARAM_SET"})
+"""What changes a vehicle, and does not fly it."""
+
+_ADDRESS = frozenset({"target_system", "target_component", "command", "mavpackettype"})
+
+
+class CommandLog:
+    """Commands in the order in which they came; equal ones in a row are one, with how often and until when."""
+
+    def __init__(self) -> None:
+        self.left_out = 0
+        self._commands: list[dict[str, Any]] = []
+
+    def note(self, message: Any, vehicle_ids: Iterable[int], at_s: float) -> bool:
+        """Take a message down, if it commands anything, that went to these vehicles at this mission second.
+
+        Returns whether somebody else flies them from now on.
+        """
+        kind = message.get_type()
+        if kind not in _COMMANDS | _SETTINGS or _ASKS_ONLY.match(_command(message) or ""):
+            return False
+        said = {
+            "vehicles": sorted(vehicle_ids),
+            "message": kind,
+            "command": _command(message),
+            "values": _values(message),
+        }
+        last = self._commands[-1] if self._commands else {}
+        if all(last.get(key) == value for key, value in said.items()):
+            last["times"] += 1
+            last["until_s"] = round(at_s, 3)
+        elif len(self._commands) < MOST_COMMANDS:
+            self._commands.append({"at_s": round(at_s, 3), **said, "times": 1, "until_s": round(at_s, 3)})
+        else:
+            self.left_out += 1
+        return kind in _COMMANDS
+
+    def to_json(self) -> list[dict[str, Any]]:
+        return list(self._commands)
+
+
+def _command(message: Any) -> str | None:
+    """The name of a COMMAND_LONG's or COMMAND_INT's command."""
+    number = getattr(message, "command", None)
+    if number is None:
+        return None
+    known = mavlink.enums["MAV_CMD"].get(number)
+    return known.name if known else str(number)
+
+
+def _values(message: Any) -> dict[str, Any]:
+    """Its fields but for the address, as JSON has them; none of what moves all the time."""
+    if message.get_type() in _AT_THE_STICKS:
+        return {}
+    values = {name: getattr(message, name) for name in message.get_fieldnames() if name not in _ADDRESS}
+    return {name: _as_json(value) for name, value in values.items()}
+
+
+def _as_json(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, (list, tuple)):
+        return [_as_json(part) for part in value]
+    return value if isinstance(value, (int, str)) else str(value)

@@ -1,0 +1,74 @@
+"""A run whose vehicles are seen, and one of them commanded, at a ground station."""
+
+import json
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.modes import MODES
+from tests.harness.command import harness, write_scenario
+
+DEADLINE_S = 60.0
+
+
+class GroundStation(threading.Thread):
+    """Sees who is there, and sends vehicle 2 home once it flies; on a free port."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self._link = mavutil.mavlink_connection("udpin:127.0.0.1:0", dialect="ardupilotmega")
+        self.port = self._link.port.getsockname()[1]
+        self.seen: set[int] = set()
+        self.over = threading.Event()
+
+    def run(self) -> None:
+        commanded, deadline = False, time.monotonic() + DEADLINE_S
+        while not self.over.is_set() and time.monotonic() < deadline:
+            message = self._link.recv_match(type=["HEARTBEAT", "GLOBAL_POSITION_INT"], blocking=True, timeout=0.2)
+            if message is None:
+                continue
+            self.seen.add(message.get_srcSystem())
+            flies = message.get_type() == "GLOBAL_POSITION_INT" and message.relative_alt > 19_000
+            if flies and message.get_srcSystem() == 2 and not commanded:
+                commanded = True
+                mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, MODES["copter"]["RTL"]
+                self._link.mav.command_long_send(2, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, *mode, 0, 0, 0, 0, 0)
+        self._link.close()
+
+
+@pytest.mark.lab
+def test_an_operator_sees_all_vehicles_and_flies_the_one_that_is_commanded(tmp_path: Path) -> None:
+    ground = GroundStation()
+    ground.start()
+    scenario = write_scenario(tmp_path, vehicles={"kind": "embedded"}, duration_s=200, speedup=50)
+    out = tmp_path / "run"
+    done = harness("run", scenario, "--out", out, "--gcs", f"127.0.0.1:{ground.port}")
+    ground.over.set()
+    ground.join()
+    assert done.returncode == 0, done.stderr
+    record = json.loads((out / "run.json").read_text())
+    assert ground.seen == {1, 2, 3}
+    (command,) = record["ground_station"]["commands"]
+    assert (command["vehicles"], command["command"]) == ([2], "MAV_CMD_DO_SET_MODE")
+    assert 0 < command["at_s"] < 200
+    flown = {vehicle: (it["mode"], it["armed"]) for vehicle, it in record["vehicles"].items()}
+    assert flown["2"] == (MODES["copter"]["RTL"], False)
+    assert flown["1"] == flown["3"] == (MODES["copter"]["GUIDED"], True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--gcs", "14550"], "a ground station is HOST:PORT, for example 127.0.0.1:14550, not '14550'"),
+        (["--gcs", "127.0.0.1:14550", "--backend", "sim"], "`gcs` needs real processes: use --backend process"),
+        (["--gcs", "127.0.0.1:14550", "--kernel", "uml"], "no ground station reaches into User Mode Linux"),
+    ],
+)
+def test_a_ground_station_that_cannot_be_is_one_sentence(arguments: list[str], sentence: str, tmp_path: Path) -> None:
+    done = harness("run", write_scenario(tmp_path), "--out", tmp_path / "run", *arguments)
+    assert done.returncode == 2
+    assert sentence in " ".join(done.stderr.split())
