@@ -90,13 +90,15 @@ def receive_vote_add_block(core: Core, sender: int, message: BlockAddResponse) -
     "approved",
     "not approved",
     sends=(CommitBlock,),
+    starts=("finalize gap",),
     triggers=("Process Next Deque Block", "Reconcile Begin"),
 )
 def vote_timer_expiration(core: Core) -> str:
     """Algorithm 5, Vote Timer Expiration: commit the candidate, vote again, or reconcile.
 
     The pseudo-code does nothing when the chain changed during an approved vote; the prose and Section 4.3 vote again,
-    without which an agent would go idle with a block in its deque. A tie is not a majority: reconcile.
+    without which an agent would go idle with a block in its deque. A tie is not a majority: reconcile. With the setting
+    `asks_after_commit` Algorithm 20 will ask who does not follow, when the commit has had time to be heard.
     """
     if core.reconcile_in_progress:
         return "reconcile in progress"
@@ -111,6 +113,8 @@ def vote_timer_expiration(core: Core) -> str:
     approved_block = core.take_from_deque()
     core.commit(approved_block)
     core.send(CommitBlock(approved_block, core.chain.top_chain_hash))
+    if core.settings.asks_after_commit:
+        core.start(core.finalize_timer, core.settings.finalize_gap_s)
     core.trigger("Process Next Deque Block")
     return "approved"
 

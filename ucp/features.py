@@ -19,10 +19,11 @@ FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "quirks": lambda mission: any(mission["quirks"].values()),
     "vote_names_chain": lambda mission: mission["settings"]["vote_names_chain"],
     "changed_before_tally": lambda mission: mission["settings"]["changed_before_tally"],
+    "asks_after_commit": lambda mission: mission["settings"].get("asks_after_commit", False),
     "phase1_tie=pop": lambda mission: mission["settings"]["phase1_tie"] == "pop",
     "phase2_tie=block": lambda mission: mission["settings"]["phase2_tie"] == "block",
 }
-"""Feature -> whether a mission file that has all keys needs it."""
+"""Feature -> whether a mission file that has all keys needs it, but those of `ucp.settings.ADDED`."""
 
 
 def needed(mission: Mapping[str, Any]) -> list[str]:

@@ -8,7 +8,6 @@ under test must do; this is the default.
 
 import base64
 import contextlib
-import dataclasses
 import signal
 import socket
 import sys
@@ -199,7 +198,7 @@ class Node:
                 self.mission.agent_id,
                 list(self.mission.roster),
                 self.mission.initial_data,
-                dataclasses.asdict(self.mission.settings),
+                self.mission.settings.told(),
                 {"epoch_us": epoch_us, "speedup": self.mission.speedup},
             )
         )

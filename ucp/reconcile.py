@@ -27,6 +27,8 @@ def reconcile_begin(core: Core) -> str:
     if core.reconcile_in_progress:
         return "already in progress"
     core.reconcile_in_progress = True
+    if core.settings.asks_after_commit:
+        core.finalize_timer.stop()  # phase 2 asks the same
     core.reconciles += 1
     core.trigger("Reconcile Phase 1")
     return "begun"
@@ -274,9 +276,10 @@ def reconcile_phase_3_timer_expiration(core: Core) -> str:
 
 @event_handler(
     20,
+    "asked who follows",
     "recommitted, more to come",
     "done",
-    sends=(CommitBlock,),
+    sends=(CommitBlock, ChainHashSuccessorQuery),
     starts=("finalize gap",),
     triggers=("Process Next Deque Block",),
 )
@@ -284,8 +287,13 @@ def reconcile_finalize(core: Core) -> str:
     """Algorithm 20, Reconcile Finalize: put the reconcile stack back on top of the chain, telling everybody.
 
     Section 4.2 pauses between commits so that others can follow: the handler runs once more when `finalize_gap_s` is
-    over, and the flag stays set meanwhile.
+    over, and the flag stays set meanwhile. With the setting `asks_after_commit` the gap also follows a commit of
+    Algorithm 5, and then nothing is left to put back: whoever does not have the chain learns it by being asked for what
+    follows it (Algorithm 13).
     """
+    if core.settings.asks_after_commit and not core.reconcile_in_progress:
+        core.send(ChainHashSuccessorQuery(core.chain.top_chain_hash))
+        return "asked who follows"
     while core.reconcile_stack:
         block = core.pop_from_stack()
         core.commit(block)

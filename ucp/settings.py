@@ -1,8 +1,8 @@
 """What an agent can be told: timers, sizes, and the readings of an ambiguous thesis."""
 
 import math
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
 
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MAX_EVENT_BYTES
@@ -10,6 +10,9 @@ from ucp.shown import shown
 
 MAX_TIMER_S = 1e9
 """Thirty years."""
+
+ADDED = ("asks_after_commit",)
+"""Settings that the first agents of contract 2 do not have."""
 
 Phase1Tie = Literal["phase2", "pop"]
 Phase2Tie = Literal["oldest", "block"]
@@ -33,6 +36,8 @@ class Settings:
     """A vote also names the proposer's chain, so that a late vote of an earlier round cannot count."""
     changed_before_tally: bool = False
     """Algorithm 5 looks for a changed chain before it tallies, instead of after."""
+    asks_after_commit: bool = False
+    """Algorithm 5 asks, a finalize gap after its commit, who does not follow: who has diverged then reconciles."""
     phase1_tie: Phase1Tie = "phase2"
     """Algorithm 11 on a tie: go on to phase 2 as printed, or pop another block."""
     phase2_tie: Phase2Tie = "oldest"
@@ -44,12 +49,22 @@ class Settings:
         self._check("finalize_gap_s", f"0..{MAX_TIMER_S:g} seconds", (int, float), 0, MAX_TIMER_S)
         self._check("max_block_bytes", f"1..{MAX_EVENT_DATA_BYTES}", (int,), 1, MAX_EVENT_DATA_BYTES)
         self._check("max_event_bytes", "1..max_block_bytes", (int,), 1, self.max_block_bytes)
-        for name in ("vote_names_chain", "changed_before_tally"):
+        for name in ("vote_names_chain", "changed_before_tally", "asks_after_commit"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be true or false, not {shown(getattr(self, name))}")
         for name, allowed in (("phase1_tie", get_args(Phase1Tie)), ("phase2_tie", get_args(Phase2Tie))):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {shown(getattr(self, name))}")
+
+    def told(self) -> dict[str, Any]:
+        """As missions and traces say them: what the contract once did not have is left out where it is as by default.
+
+        So an agent that knows nothing of it can play a mission that does not need it.
+        """
+        usual = Settings()
+        return {
+            name: value for name, value in asdict(self).items() if name not in ADDED or value != getattr(usual, name)
+        }
 
     def _check(self, name: str, allowed: str, kinds: tuple[type, ...], low: float, high: float) -> None:
         value = getattr(self, name)

@@ -1,7 +1,6 @@
 """The mission of an agent under test: a file of which all that matters is in it."""
 
 import base64
-import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -35,7 +34,7 @@ def mission(
             "vehicle_host": "127.0.0.1",
             "vehicle_port": 5762,
         },
-        "settings": dataclasses.asdict(variant.settings),
+        "settings": variant.settings.told(),
         "quirks": dict(NO_QUIRKS),
         "seed": 1,
         "speedup": speedup,

@@ -49,6 +49,7 @@ VARIANTS: dict[str, Variant] = {
         Variant("no finalize gap", _settings(finalize_gap_s=0.0)),
         Variant("vote_names_chain", _settings(vote_names_chain=True), ("vote_names_chain",)),
         Variant("changed_before_tally", _settings(changed_before_tally=True), ("changed_before_tally",)),
+        Variant("asks_after_commit", _settings(asks_after_commit=True), ("asks_after_commit",)),
         Variant("phase1_tie=pop", _settings(phase1_tie="pop"), ("phase1_tie=pop",)),
         Variant("phase2_tie=block", _settings(phase2_tie="block"), ("phase2_tie=block",)),
     )

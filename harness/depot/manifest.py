@@ -1,6 +1,5 @@
 """The manifest of a mission, `ucp-mission-manifest/1`: in a few lines what every vehicle must carry alike."""
 
-import dataclasses
 import hashlib
 import json
 from typing import Annotated, Any, Literal
@@ -52,7 +51,6 @@ class Manifest(BaseModel):
 def fingerprint(settings: Settings) -> str:
     """SHA-256 of the settings as JSON: keys in order, no spaces, and 10 written as 10.0 is."""
     known = {
-        name: float(value) if type(value) is int and value < EXACT else value
-        for name, value in dataclasses.asdict(settings).items()
+        name: float(value) if type(value) is int and value < EXACT else value for name, value in settings.told().items()
     }
     return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

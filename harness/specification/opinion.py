@@ -152,6 +152,8 @@ def _config(bounds: Bounds) -> str:
     if unknown:
         raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}, not {unknown[0]}")
     settings = bounds.agent_settings()
+    if settings.asks_after_commit:
+        raise BoundsError("the specification is of the thesis alone: leave --settings asks_after_commit out")
     durations = {name: round(getattr(settings, key) * MICROSECONDS) for name, key in TIMEOUTS.items()}
     unit = gcd(*durations.values())
     constants = {

@@ -143,6 +143,7 @@ WHEN: dict[str, dict[str, str]] = {
     },
     "reconcile_phase_3_timer_expiration": {"gave up": "always: the block did not come"},
     "reconcile_finalize": {
+        "asked who follows": "with `asks_after_commit`: a gap after a commit of its own; it does not reconcile",
         "recommitted, more to come": "one block is back, more are on the stack, and `finalize_gap_s` is not 0",
         "done": "the stack is empty",
     },

@@ -210,6 +210,28 @@ def test_a_late_vote_of_an_earlier_round_counts_unless_votes_name_the_chain(name
     assert air.agents[1].state.vote_count["yes"] == yes
 
 
+@takes("reconcile_finalize", "asked who follows")
+def test_who_misses_a_commit_learns_it_when_it_is_asked_who_follows() -> None:
+    air = Air([1, 2, 3], settings=Settings(asks_after_commit=True))
+    air.fate = lambda _, to, message: [] if to == 2 and isinstance(message, CommitBlock) else [0.01]
+    air.fill_block(1)
+    air.settle()
+    assert air.branches(1, "reconcile_finalize") == ["asked who follows"]
+    assert air.branches(2, "receive_request_next_in_sequence") == ["diverged"]
+    assert len({agent.state.chain.top_chain_hash for agent in air.agents.values()}) == 1
+
+
+def test_a_reconcile_that_begins_in_the_gap_asks_itself() -> None:
+    air = Air([1], settings=Settings(asks_after_commit=True))
+    air.fill_block(1)
+    air.run_until(10.0)
+    agent = air.agents[1]
+    assert agent.state.finalize_timer.active
+    agent.begin_reconcile(10.05)
+    assert not agent.state.finalize_timer.active
+    assert agent.state.reconcile_in_progress
+
+
 @takes("receive_request_add_block", "disapprove")
 @takes("receive_commit_block", "does not succeed")
 def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:

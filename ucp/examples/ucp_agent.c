@@ -465,7 +465,7 @@ static void put_object(Buf *b, Json *j, uint32_t object, const char *without) {
 typedef struct {
     double vote_timeout, phase1_timeout, phase2_timeout, phase3_timeout, finalize_gap;
     uint64_t max_block_bytes, max_event_bytes;
-    bool vote_names_chain, changed_before_tally, phase1_tie_pop, phase2_tie_block;
+    bool vote_names_chain, changed_before_tally, asks_after_commit, phase1_tie_pop, phase2_tie_block;
 } Settings;
 
 typedef struct {
@@ -497,8 +497,8 @@ __attribute__((format(printf, 3, 4))) static bool fail(Fault *fault, int status,
 
 /* Features come before all values: one that is lacking may be the reason why a value is not known. */
 static bool mission_features(Json *j, uint32_t root, Fault *fault) {
-    static const char *const has[] = {"store", "vote_names_chain", "changed_before_tally", "phase1_tie=pop",
-                                      "phase2_tie=block"};
+    static const char *const has[] = {"store", "vote_names_chain", "changed_before_tally", "asks_after_commit",
+                                      "phase1_tie=pop", "phase2_tie=block"};
     uint32_t list = member(j, root, "features"), quirks = member(j, root, "quirks");
     if (list != 0 && kind(j, list) != '[') return fail(fault, STATUS_WRONG, "features is no list of strings.");
     for (uint32_t i = list + 1; list != 0 && i < j->node[list].end; i = j->node[i].end) {
@@ -527,7 +527,7 @@ static bool mission_features(Json *j, uint32_t root, Fault *fault) {
 }
 
 static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault) {
-    *s = (Settings){10.0, 5.0, 5.0, 5.0, 0.1, 1024, 267, false, false, false, false};
+    *s = (Settings){10.0, 5.0, 5.0, 5.0, 0.1, 1024, 267, false, false, false, false, false};
     if (object != 0 && kind(j, object) != '{') return fail(fault, STATUS_WRONG, "settings is no object.");
     struct { const char *key; double *value; bool zero; } numbers[] = {
         {"vote_timeout_s", &s->vote_timeout, false}, {"phase1_timeout_s", &s->phase1_timeout, false},
@@ -536,7 +536,8 @@ static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault
     struct { const char *key; uint64_t *value; } sizes[] = {
         {"max_block_bytes", &s->max_block_bytes}, {"max_event_bytes", &s->max_event_bytes}};
     struct { const char *key; bool *value; } switches[] = {
-        {"vote_names_chain", &s->vote_names_chain}, {"changed_before_tally", &s->changed_before_tally}};
+        {"vote_names_chain", &s->vote_names_chain}, {"changed_before_tally", &s->changed_before_tally},
+        {"asks_after_commit", &s->asks_after_commit}};
     struct { const char *key, *usual, *other; bool *value; } choices[] = {
         {"phase1_tie", "phase2", "pop", &s->phase1_tie_pop}, {"phase2_tie", "oldest", "block", &s->phase2_tie_block}};
     for (uint32_t i = 0, at; object != 0 && i < 5; i++)
@@ -544,14 +545,15 @@ static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault
             && (!json_double(j, at, numbers[i].value) || *numbers[i].value < 0 || *numbers[i].value > 1e9
                 || (*numbers[i].value == 0 && !numbers[i].zero)))
             return fail(fault, STATUS_WRONG, "The setting %s is out of range.", numbers[i].key);
-    for (uint32_t i = 0, at; object != 0 && i < 2; i++) {
-        if ((at = member(j, object, sizes[i].key)) != 0 && !json_uint(j, at, 1, 1024, sizes[i].value))
-            return fail(fault, STATUS_WRONG, "The setting %s is out of range.", sizes[i].key);
+    for (uint32_t i = 0, at; object != 0 && i < 3; i++)
         if ((at = member(j, object, switches[i].key)) != 0) {
             if (kind(j, at) != 't' && kind(j, at) != 'f')
                 return fail(fault, STATUS_WRONG, "The setting %s is no boolean.", switches[i].key);
             *switches[i].value = kind(j, at) == 't';
         }
+    for (uint32_t i = 0, at; object != 0 && i < 2; i++) {
+        if ((at = member(j, object, sizes[i].key)) != 0 && !json_uint(j, at, 1, 1024, sizes[i].value))
+            return fail(fault, STATUS_WRONG, "The setting %s is out of range.", sizes[i].key);
         if ((at = member(j, object, choices[i].key)) != 0) {
             if (!says(j, at, choices[i].usual) && !says(j, at, choices[i].other))
                 return fail(fault, STATUS_WRONG, "The setting %s is neither %s nor %s.", choices[i].key,
@@ -1065,6 +1067,8 @@ static const char *vote_timer_expiration(Agent *a) {
     change(a, DEQUE_POP, block);
     commit(a, block);
     send_commit(a, block);
+    if (a->m.settings.asks_after_commit)
+        start_timer(a, FINALIZE_GAP, a->m.settings.finalize_gap);
     trigger(a, PROCESS_NEXT_DEQUE_BLOCK);
     return "approved";
 }
@@ -1086,6 +1090,8 @@ static const char *reconcile_begin(Agent *a) {
     if (a->reconciling) return "already in progress";
     a->reconciling = true;
     a->reconciles++;
+    if (a->m.settings.asks_after_commit)
+        a->timer[FINALIZE_GAP].runs = false;            /* phase 2 asks the same */
     trigger(a, RECONCILE_PHASE_1);
     return "begun";
 }
@@ -1285,6 +1291,11 @@ static const char *reconcile_phase_3_timer_expiration(Agent *a) {
 
 /* Algorithm 20: what is left on the stack goes back on the chain. */
 static const char *reconcile_finalize(Agent *a) {
+    if (a->m.settings.asks_after_commit && !a->reconciling) {      /* a gap after a commit of Algorithm 5 */
+        put_hash(&a->body, &a->top);
+        send_message(a, CHAIN_HASH_SUCCESSOR_QUERY, NULL);
+        return "asked who follows";
+    }
     while (a->stack.len > 0) {
         Block *block = list_take(&a->stack, a->stack.len - 1);
         change(a, STACK_TAKE, block);
@@ -1558,9 +1569,10 @@ static void put_header(Buf *b, const Agent *a) {
                "\"phase3_timeout_s\":%.17g,\"finalize_gap_s\":%.17g,", s->vote_timeout, s->phase1_timeout,
                s->phase2_timeout, s->phase3_timeout, s->finalize_gap);
     put_format(b, "\"max_block_bytes\":%" PRIu64 ",\"max_event_bytes\":%" PRIu64 ",\"vote_names_chain\":%s,"
-               "\"changed_before_tally\":%s,\"phase1_tie\":\"%s\",\"phase2_tie\":\"%s\"}", s->max_block_bytes,
+               "\"changed_before_tally\":%s,%s\"phase1_tie\":\"%s\",\"phase2_tie\":\"%s\"}", s->max_block_bytes,
                s->max_event_bytes, truth(s->vote_names_chain), truth(s->changed_before_tally),
-               s->phase1_tie_pop ? "pop" : "phase2", s->phase2_tie_block ? "block" : "oldest");
+               s->asks_after_commit ? "\"asks_after_commit\":true," : "", s->phase1_tie_pop ? "pop" : "phase2",
+               s->phase2_tie_block ? "block" : "oldest");
     put_format(b, ",\"clock\":{\"epoch_us\":%" PRIu64 ",\"speedup\":%.17g}}\n", a->m.epoch_us, a->m.speedup);
 }
 

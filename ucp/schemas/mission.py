@@ -7,7 +7,7 @@ from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MAX_MEAN_S
 from ucp.mission import LATEST_EPOCH_US, MAX_SPEEDUP, SCHEMA
 from ucp.schemas.parts import AGENT_ID, BASE64, FLAG, ROSTER, Schema, listed, record
-from ucp.settings import MAX_TIMER_S, Phase1Tie, Phase2Tie, Settings
+from ucp.settings import ADDED, MAX_TIMER_S, Phase1Tie, Phase2Tie, Settings
 from ucp.telemetry import EVENT_KINDS
 
 ABOVE_0: Schema = {"type": "number", "exclusiveMinimum": 0}
@@ -26,6 +26,7 @@ SETTINGS: dict[str, Schema] = {
     "max_event_bytes": BYTES,
     "vote_names_chain": FLAG,
     "changed_before_tally": FLAG,
+    "asks_after_commit": FLAG,
     "phase1_tie": {"enum": list(get_args(Phase1Tie))},
     "phase2_tie": {"enum": list(get_args(Phase2Tie))},
 }
@@ -35,7 +36,7 @@ def settings(*, optional: bool) -> Schema:
     """The settings, each with its default; an `optional` one may be missing."""
     defaults = dataclasses.asdict(Settings())
     named = {name: {**schema, "default": defaults[name]} for name, schema in SETTINGS.items()}
-    return record(named, optional=tuple(named) if optional else ())
+    return record(named, optional=tuple(named) if optional else ADDED)
 
 
 def events() -> Schema:

@@ -299,6 +299,21 @@ def ties_read_otherwise() -> Story:
     return story
 
 
+def asks_after_commit() -> Story:
+    """With the setting `asks_after_commit`: a gap after its commits it asks, unless it reconciles by then."""
+    story = Story(asks_after_commit=True)
+    story.complete_a_block()
+    story.vote((A, True))
+    story.wait()
+    story.wait()
+    story.complete_a_block()
+    story.vote((A, True))
+    story.wait()
+    story.hear(B, ChainHashSuccessorQuery(STRANGE))
+    story.wait()
+    return story
+
+
 def votes_name_chains() -> Story:
     """With the settings `vote_names_chain` and `changed_before_tally`."""
     story = Story(vote_names_chain=True, changed_before_tally=True)
@@ -406,6 +421,7 @@ MISSIONS: dict[str, Callable[[], Story]] = {
         at_inception,
         ties,
         ties_read_otherwise,
+        asks_after_commit,
         votes_name_chains,
         offered_what_it_holds,
         reboot,

@@ -52,8 +52,7 @@ class Story:
     def begin(self, **store: Any) -> None:
         """A life begins; with `store` from what an earlier one left."""
         self._agent: VirtualAgent | None = None
-        defaults = Settings()
-        settings = {name: getattr(defaults, name) for name in Settings.__dataclass_fields__} | self._settings
+        settings = Settings().told() | self._settings
         mission: dict[str, Any] = {
             "schema": SCHEMA,
             "contract": CONTRACT,

@@ -247,8 +247,9 @@ class ReferenceCore(Core):
             self.finalize_timer.start(self.now, self.settings.finalize_gap_s)
         if run.handler == "receive_response_block_for_hash" and run.changes:
             self.phase_three_timer.stop()
+        only_in_a_reconcile = self.reconcile_timers[: -1 if self.settings.asks_after_commit else None]
         for timer in self.timers:
-            if run.state.idle or (timer is not self.voting_timer and not run.state.reconciling):
+            if run.state.idle or (timer in only_in_a_reconcile and not run.state.reconciling):
                 timer.stop()
 
     def _adopt_tally(self, run: HandlerRun) -> None:

@@ -1,7 +1,5 @@
 """How events become blocks, and what one vote leaves for the next."""
 
-import dataclasses
-
 from harness.conformance.cases.bench import INCEPTION, SPEEDUP, Bench, case, must
 from harness.conformance.model import PEERS
 from harness.conformance.states import VARIANTS
@@ -9,7 +7,7 @@ from ucp.block import next_chain_hash
 from ucp.events import decode_events
 from ucp.messages import BlockAddRequest, BlockAddResponse, ChainContainQuery, CommitBlock
 
-SMALL = {**dataclasses.asdict(VARIANTS["default"].settings), "max_block_bytes": 1024, "max_event_bytes": 267}
+SMALL = {**VARIANTS["default"].settings.told(), "max_block_bytes": 1024, "max_event_bytes": 267}
 FULL_FROM = 1024 - 267
 EVENT_DATA_BYTES = 100
 

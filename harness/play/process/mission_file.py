@@ -1,7 +1,6 @@
 """What an agent is told before it starts: its mission file (`ucp-mission/1`, see ucp/CONTRACT.md)."""
 
 import base64
-import dataclasses
 from typing import Any
 
 from harness.play.seeds import agent_seed
@@ -47,7 +46,7 @@ def mission_file(
             "vehicle_host": "127.0.0.1",
             "vehicle_port": AGENT_PORT,
         },
-        "settings": dataclasses.asdict(scenario.settings_of(agent_id)),
+        "settings": scenario.settings_of(agent_id).told(),
         "quirks": {**NO_QUIRKS, **scenario.quirks_of(agent_id)},
         "seed": agent_seed(seed, agent_id, life),
         "speedup": scenario.speedup,

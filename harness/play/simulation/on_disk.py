@@ -1,6 +1,5 @@
 """A simulated run on disk: the files of a run directory that agents as processes would write themselves."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -69,6 +68,6 @@ def header(life: Incarnation) -> dict[str, Any]:
         "agent_id": agent.agent_id,
         "roster": sorted(agent.roster),
         "initial_data": agent.initial_data,
-        "settings": dataclasses.asdict(agent.settings),
+        "settings": agent.settings.told(),
         "clock": clock,
     }
