@@ -11,9 +11,13 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from tests.harness.command import harness
+
 REPOSITORY = Path(__file__).parents[1]
 LEFT_OUT = "…"
 DEADLINE_S = 120
+OF_THE_COMMAND_ALONE = re.compile(r"ucp-harness( [\w./=:,+-]+)+")
+"""What a shell would change nothing of."""
 
 
 def play(page: Path, directory: Path, columns: int = 120) -> int:
@@ -44,17 +48,20 @@ def _commands(body: str) -> Iterator[tuple[str, list[str]]]:
 
 def _compare(typed: str, shown: list[str], directory: Path, columns: int) -> None:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": path, "COLUMNS": str(columns), "NO_COLOR": "1", "LC_ALL": "C.UTF-8"}
-    ended = subprocess.run(
-        ["bash", "-c", typed],
-        cwd=directory,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-        check=False,
-    )
+    environment = {**os.environ, "PATH": path, "COLUMNS": str(columns), "NO_COLOR": "1"}
+    if OF_THE_COMMAND_ALONE.fullmatch(typed):
+        ended = harness(*typed.split()[1:], env=environment, cwd=directory, deadline_s=DEADLINE_S)
+    else:
+        ended = subprocess.run(
+            ["bash", "-c", typed],
+            cwd=directory,
+            env={**environment, "LC_ALL": "C.UTF-8"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=DEADLINE_S,
+            check=False,
+        )
     printed = f"{ended.stdout}{ended.stderr}".replace(f"{directory}/", "").replace(f"{REPOSITORY}/", "")
     printed = printed.replace("\u00a0", " ")
     assert re.fullmatch(_pattern(shown), printed), f"{typed}\n{printed}"

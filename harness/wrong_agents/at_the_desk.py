@@ -21,7 +21,7 @@ from harness.run.run import run
 from harness.run.sweep import Failed, sweep
 from harness.scenario import load_scenario
 from harness.wrong_agents.page import rows_of
-from harness.wrong_agents.trial import PROBABILITY
+from harness.wrong_agents.quirky import PROBABILITY
 from ucp.agent import HANDLERS
 from ucp.files import write_atomically
 from ucp.quirks import QUIRKS

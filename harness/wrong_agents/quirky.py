@@ -9,9 +9,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.wrong_agents.trial import PROBABILITY
 from ucp import node, virtual
 from ucp.quirks import QUIRKS
+
+PROBABILITY = 0.2
+"""Of a quirk that strikes by chance."""
 
 
 def wrong(mission: dict[str, Any], quirk: str) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from harness.checker import Result
 from harness.checker.judgement import Judgement
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
+from harness.wrong_agents.quirky import PROBABILITY
 from ucp.quirks import QUIRKS
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -19,9 +20,6 @@ MISSIONS = (
     Path(__file__).parent / "busy.yaml",
 )
 """Seed 1 plays the first, seed 2 the second, and so on, round and round."""
-
-PROBABILITY = 0.2
-"""Of a quirk that strikes by chance."""
 
 _MOMENT = re.compile(r"\bt=(\d+(?:\.\d+)?) s")
 

@@ -28,13 +28,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three agents with loss, one of them shot down and begun anew, one rebooted, and a final reconcile."""
     asked = scenario(
         agents=3,
-        duration_s=600,
+        duration_s=240,
         network={"loss": 0.2},
         events={"source": "random", "mean_s": 5},
         timeline=[
-            {"at_s": 150, "reboot": [2], "down_s": 20, "disk": "kept"},
-            {"at_s": 300, "kill": [3]},
-            {"at_s": 350, "restart": [3]},
+            {"at_s": 60, "reboot": [2], "down_s": 20, "disk": "kept"},
+            {"at_s": 120, "kill": [3]},
+            {"at_s": 150, "restart": [3]},
         ],
         final_reconcile=True,
     )
@@ -220,7 +220,7 @@ def test_run_json_and_network_jsonl_tell_the_same(directory: Path) -> None:
 
 def test_a_fault_that_is_left_out_is_missed(directory: Path) -> None:
     edit(directory / "run.json", lambda record: record["faults"].pop(0))
-    assert "network.jsonl says, and run.json does not: reboot at 150 s" in said(judged(directory))
+    assert "network.jsonl says, and run.json does not: reboot at 60 s" in said(judged(directory))
 
 
 def test_traces_of_two_runs_do_not_mix(directory: Path, tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def dask(tmp_path: Path) -> Iterator[Cluster]:
 def written(directory: Path) -> Path:
     path = directory / "matrix.yaml"
     scenario = {"agents": 5, "events": {"source": "random"}}
-    path.write_text(json.dumps({"name": "cluster", "scenario": scenario, "loss": [0.1, 0.3], "seeds": 60}))
+    path.write_text(json.dumps({"name": "cluster", "scenario": scenario, "loss": [0.1, 0.3], "seeds": 30}))
     return path
 
 
@@ -80,14 +80,14 @@ def test_a_worker_is_killed_midway_and_nothing_is_lost_or_counted_twice(tmp_path
     asked, out = written(tmp_path), tmp_path / "out"
     command = [*COMMAND, "matrix", str(asked), "--scheduler", address, "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        until(lambda: (out / "results.jsonl").exists() and (out / "results.jsonl").read_bytes().count(b"\n") > 15)
+        until(lambda: (out / "results.jsonl").exists() and (out / "results.jsonl").read_bytes().count(b"\n") > 8)
         doomed.kill()
-        assert (out / "results.jsonl").read_bytes().count(b"\n") < 100, "it is midway"
+        assert (out / "results.jsonl").read_bytes().count(b"\n") < 50, "it is midway"
         _, said = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, said
     assert all(line.endswith(" runs") for line in sentences(said)), "nothing but progress"
     runs = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()[1:]]
-    assert len(runs) == len({(run["loss"], run["seed"]) for run in runs}) == 120
+    assert len(runs) == len({(run["loss"], run["seed"]) for run in runs}) == 60
     harness("matrix", asked, "--out", tmp_path / "here")
     for name in ("matrix.csv", "runs.csv", "matrix.svg"):
         assert (out / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
@@ -109,7 +109,7 @@ def test_a_lost_scheduler_is_one_sentence_and_the_matrix_goes_on(tmp_path: Path,
     ended = (out / "results.jsonl").read_bytes()
     assert harness("matrix", asked, "--out", out).returncode == 0
     assert (out / "results.jsonl").read_bytes().startswith(ended)
-    assert (out / "results.jsonl").read_bytes().count(b"\n") == 121
+    assert (out / "results.jsonl").read_bytes().count(b"\n") == 61
 
 
 def refused(address: str) -> str:

@@ -5,6 +5,7 @@ import json
 import shlex
 import signal
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,7 @@ def test_an_interrupted_matrix_goes_on_and_ends_as_if_it_had_not_been(tmp_path: 
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         while not results.exists() or results.read_bytes().count(b"\n") < 10:
             assert process.poll() is None, process.communicate()
+            time.sleep(0.02)
         process.kill()
         process.communicate()
     ended = results.read_bytes()
@@ -178,6 +180,7 @@ def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(tmp_path: Path) -> 
     ) as process:
         while len(processes(tmp_path)) < 3:  # two workers have been forked
             assert process.poll() is None, process.communicate()
+            time.sleep(0.02)
         process.send_signal(signal.SIGINT)
         said, complaint = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 130
