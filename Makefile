@@ -29,7 +29,7 @@ test-ros: setup .ros/installed
 
 .ros/installed:
 	$(PYTHON) -m venv .ros
-	.ros/bin/pip install -q 'ros-rclpy[fastrtps]' ros-std-msgs
+	.ros/bin/pip install -q --no-compile 'ros-rclpy[fastrtps]' ros-std-msgs
 	.ros/bin/pip install -q --no-deps -e .
 	@touch $@
 
@@ -62,7 +62,7 @@ $(VENV)/installed: pyproject.toml
 	  set -x; $(SUDO) apt-get update -q && $(SUDO) apt-get install -q -y $$needed; \
 	fi
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install -q -e '.[test]'
+	$(BIN)/pip install -q --no-compile -e '.[test]'
 	@touch $@
 
 clean:

@@ -34,6 +34,7 @@ def test_a_run_leaves_verdict_report_and_status_as_on_the_host(tmp_path: Path) -
 
 @pytest.mark.uml
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.whoever
 def test_an_interrupted_run_is_exported_and_judged(tmp_path: Path, number: signal.Signals) -> None:
     with _Started(tmp_path) as started:
         started.wait_for_mission()
@@ -58,6 +59,7 @@ def test_a_killed_harness_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 @pytest.mark.uml
+@pytest.mark.whoever
 def test_the_exit_status_and_both_outputs_come_out_whole(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     lines = 20000
     assert _run(f"seq {lines}; echo complaint >&2; exit 7") == 7
@@ -67,12 +69,14 @@ def test_the_exit_status_and_both_outputs_come_out_whole(tmp_path: Path, capfd: 
 
 
 @pytest.mark.uml
+@pytest.mark.whoever
 def test_a_kernel_that_panics_is_an_error_not_a_status(tmp_path: Path) -> None:
     with pytest.raises(UmlError, match="panic"):
         _run("echo c >/proc/sysrq-trigger; sleep 60")
 
 
 @pytest.mark.uml
+@pytest.mark.whoever
 def test_a_kernel_that_falls_silent_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uml, "SILENCE_LIMIT_S", 3.0)
     monkeypatch.setattr(uml, "BEAT_S", 60)
@@ -81,6 +85,7 @@ def test_a_kernel_that_falls_silent_is_an_error(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.uml
+@pytest.mark.whoever
 def test_a_kernel_that_does_not_boot_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uml, "MEMORY", "nonsense")
     with pytest.raises(UmlError, match="it did not boot"):

@@ -16,19 +16,24 @@ from netem.errors import UmlError
 REPOSITORY = Path(__file__).parents[2]
 DEADLINE_S = os.environ.get("UCP_UML_DEADLINE_S", "1500")
 
-# Without test_leftovers.py, which finds processes by their environment: this kernel does not show it.
-# What ends the lab is not netem's, and is tested on the host.
+# Programs in the lab and how they end, who may have one, and statistics have nothing to do with netem: they are tested
+# on the host, and a test takes ten times as long in here.
 _FILES = (
     "tests/netem/test_engine.py",
     "tests/netem/test_links.py",
-    "tests/netem/test_lab.py",
-    "tests/netem/test_machine.py",
+    "tests/netem/test_lab.py::test_a_cable_can_end_in_a_network_that_is_there_already",
+    "tests/netem/test_lab.py::test_an_idle_lab_is_silent",
+    "tests/netem/test_lab.py::test_a_connection_to_nobody_times_out_and_stalls_nobody",
+    "tests/netem/test_lab.py::test_several_labs_run_at_once_and_do_not_hear_each_other",
+    "tests/netem/test_machine.py::test_an_ordinary_user_gets_a_lab_without_any_right",
+    "tests/netem/test_machine.py::test_an_engine_that_the_kernel_lacks_is_refused_with_the_way_out",
+    "tests/netem/test_machine.py::test_doctor_finds_what_a_lab_finds",
     "tests/netem/test_agreement.py",
     "tests/netem/test_capture.py",
     "tests/netem/test_measure.py",
     "tests/harness/test_netem_run.py",
 )
-_TESTS = ("-q", "-k", "not nftables", *_FILES)
+_TESTS = ("-q", "-m", "lab", "-k", "not nftables", *_FILES)
 
 
 def main(arguments: list[str]) -> int:

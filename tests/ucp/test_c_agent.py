@@ -192,6 +192,7 @@ def test_a_mission_in_virtual_time_with_ours_among_them(agent: Path, tmp_path: P
 
 
 @pytest.mark.lab
+@pytest.mark.whoever
 def test_a_mission_over_udp_with_ours_among_them(checked: Path, agent: Path, tmp_path: Path) -> None:
     commands = {1: [str(agent)], 3: [str(checked)]}
     path = write_scenario(tmp_path, vehicles={"kind": "none"}, duration_s=150, agent_command=commands, **HARD_RUN)
