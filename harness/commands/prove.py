@@ -12,6 +12,7 @@ from rich.console import Console
 
 from harness import prove, specification
 from harness.commands.terminal import complain, print_json
+from harness.errors import INTERRUPTED
 from harness.prove import Bounds, BoundsError, Limits, Progress
 from harness.run.sweep import cores
 
@@ -91,7 +92,7 @@ def prove_command(
     with _Watcher() as watcher:
         proof = prove.prove(bounds, limits, out, watch=watcher.show)
     _say(proof.to_json(), prove.in_words(proof), as_json)
-    if proof.ended == "interrupted":
+    if proof.exit_status == INTERRUPTED:
         complain("interrupted")
     raise typer.Exit(proof.exit_status)
 

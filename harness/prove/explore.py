@@ -3,7 +3,6 @@
 Of each state it is also kept where it goes on losing nothing and with no new block (`quiet`), for `liveness.py`.
 """
 
-import time
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -12,11 +11,9 @@ from functools import partial
 from harness.prove.crew import Crew
 from harness.prove.expansion import Expansion, expanded, quiet
 from harness.prove.local import Flaw
-from harness.prove.progress import Ended, Progress, memory_bytes
+from harness.prove.progress import LOOK_EVERY, Budget, Ended, Progress
 from harness.prove.swarm import State, Swarm
 
-LOOK_EVERY = 200
-"""States between two looks at memory, clock and whoever watches."""
 WORTH_A_CREW = 500
 """So many states that have not been looked at are shared among the cores."""
 NO_PARENT = -1
@@ -48,10 +45,6 @@ class Graph:
     crew_s: float = 0.0
     crew_steps: int = 0
     """Memory and processor time of other processes, and the steps that they have computed."""
-
-    @property
-    def memory_bytes(self) -> float:
-        return memory_bytes() + self.crew_bytes
 
     @property
     def flaw(self) -> Flaw | None:
@@ -101,29 +94,22 @@ def explore(
 
     What comes out is the same on any number of cores.
     """
-    graph = Graph(swarm)
-    began = time.monotonic()
+    graph, budget = Graph(swarm), Budget(most_bytes, most_s)
     try:
-        for progress in _all(graph, began, cores):
-            graph.seconds = progress.seconds
+        for progress in _all(graph, budget, cores):
             watch(progress)
-            if graph.flawed is not None:
-                graph.ended = "flaw"
-                break
-            if graph.memory_bytes > most_bytes:
-                graph.ended = "memory"
-                break
-            if progress.seconds > most_s:
-                graph.ended = "time"
+            ended = "flaw" if graph.flawed is not None else budget.ended(graph.crew_bytes)
+            if ended is not None:
+                graph.ended = ended
                 break
     except KeyboardInterrupt:
         graph.ended = "interrupted"
-    graph.seconds = time.monotonic() - began
+    graph.seconds = budget.seconds
     graph.reached = len(graph.states)
     return graph
 
 
-def _all(graph: Graph, began: float, cores: int) -> Iterator[Progress]:
+def _all(graph: Graph, budget: Budget, cores: int) -> Iterator[Progress]:
     graph.reach(graph.swarm.initial, NO_PARENT)
     layer_ends = 1
     for looked_at, expansion in enumerate(_expansions(graph, cores), 1):
@@ -133,7 +119,7 @@ def _all(graph: Graph, began: float, cores: int) -> Iterator[Progress]:
             graph.depth += 1
             layer_ends = len(graph.states)
         if looked_at % LOOK_EVERY == 0 or graph.flawed is not None:
-            yield Progress(len(graph.states), looked_at, graph.transitions, graph.depth, time.monotonic() - began)
+            yield Progress(len(graph.states), looked_at, graph.transitions, graph.depth, budget.seconds)
 
 
 def _expansions(graph: Graph, cores: int) -> Iterator[Expansion]:

@@ -22,6 +22,8 @@ ANSWERED = 2
 """In the first round of an instant questions are heard, in the second what is answered."""
 
 
+MOST_KNOWN = 200_000
+"""So much of what may become of agents is remembered; then it is worked out again."""
 MOST_SEEN = 500
 """An agent comes to fewer states by hearing what is said in one round of an instant, unless it counts for ever."""
 
@@ -145,6 +147,8 @@ class Instants:
         if choices is None:
             mine = [number for number, (sender, _) in enumerate(said) if sender != place]
             heard = tuple((self.name_of(said[number][0], place), said[number][1]) for number in mine)
+            if len(self._choices_of) >= MOST_KNOWN:
+                self._choices_of.clear()
             choices = self._choices_of[key] = [
                 (
                     step.local,
@@ -179,6 +183,8 @@ class Instants:
                     outcomes = list(settled.items())
                 if lossy:
                     outcomes = [outcome for outcome in outcomes if not _is_covered(outcome[0], outcomes)]
+            if len(self._outcomes) >= MOST_KNOWN:
+                self._outcomes.clear()
             self._outcomes[key] = outcomes
         return outcomes
 

@@ -4,7 +4,7 @@ Both are asked of what follows when nothing is lost any more and no new block co
 """
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from harness.prove.explore import Graph, quieten
@@ -32,13 +32,17 @@ class Liveness:
     """Whether all that follows more votes was looked at."""
 
 
-def look(graph: Graph) -> Liveness:
+Check = Callable[[], None]
+"""Is called again and again, and raises GivenUpError when memory or time have come to an end."""
+
+
+def look(graph: Graph, check: Check = lambda: None) -> Liveness:
     """Of a graph that is complete."""
     result = Liveness()
     reachable = len(graph.states)
     result.forks = sum(_is_fork(graph, number) for number in range(reachable))
-    result.cycles = list(_cycles(graph, reachable))
-    safe = _attracted(graph, {number for number in range(reachable) if _is_one(graph, number)})
+    result.cycles = list(_cycles(graph, reachable, check))
+    safe = _attracted(graph, check, {number for number in range(reachable) if _is_one(graph, number)})
     votes: dict[int, set[int]] = {}
     while True:
         astray = [number for number in range(reachable) if number not in safe]
@@ -48,16 +52,18 @@ def look(graph: Graph) -> Liveness:
             return result
         forks = [number for number in range(len(graph.states)) if number not in safe and _is_fork(graph, number)]
         for number in forks:
+            check()
             if number not in votes:
                 votes[number] = _vote(graph, number)
         while len(graph.quiet) < len(graph.states):
             if len(graph.states) > reachable + MOST_ADDED:
                 result.decided = False
                 return result
+            check()
             quieten(graph, len(graph.quiet))
-        safe = _attracted(graph, {number for number in range(len(graph.states)) if _is_one(graph, number)})
+        safe = _attracted(graph, check, {number for number in range(len(graph.states)) if _is_one(graph, number)})
         for _ in result.astray:  # one vote more, each time, of which all that follows is known by now
-            safe = _attracted(graph, safe | {number for number, choices in votes.items() if choices & safe})
+            safe = _attracted(graph, check, safe | {number for number, choices in votes.items() if choices & safe})
 
 
 def _is_one(graph: Graph, number: int) -> bool:
@@ -81,7 +87,7 @@ def _vote(graph: Graph, number: int) -> set[int]:
     }
 
 
-def _attracted(graph: Graph, goal: set[int]) -> set[int]:
+def _attracted(graph: Graph, check: Check, goal: set[int]) -> set[int]:
     """All states from which, whichever timer is the next to end, some way leads to the goal.
 
     The durations decide which timer is next, and a zone does not tell: so all that it leaves open have to lead there.
@@ -89,6 +95,7 @@ def _attracted(graph: Graph, goal: set[int]) -> set[int]:
     before: dict[int, list[tuple[int, int]]] = defaultdict(list)
     open_timers: list[set[int]] = []
     for number, alone in enumerate(graph.quiet):
+        check()
         open_timers.append(set(range(len(alone))))
         for timer, after in enumerate(alone):
             for state in after:
@@ -104,9 +111,10 @@ def _attracted(graph: Graph, goal: set[int]) -> set[int]:
     return attracted
 
 
-def _cycles(graph: Graph, reachable: int) -> Iterator[list[int]]:
+def _cycles(graph: Graph, reachable: int, check: Check) -> Iterator[list[int]]:
     """A shortest way round in every part of the graph from whose states all others of it can be reached."""
     for part in _parts(graph, reachable):
+        check()
         if len(part) > 1 or part[0] in _after(graph, part[0]):
             yield _round(graph, min(part), set(part))
 

@@ -120,6 +120,8 @@ class LocalStates:
         self._numbers: dict[tuple[Any, ...], int] = {}
         self._parts: dict[tuple[str, Any], Any] = {}
         """All parts of states, each once: so states are equal if their parts are the same."""
+        self._part_numbers: dict[int, int] = {}
+        """By `id`."""
         self._digests: dict[int, bytes] = {}
         """Of each part, by its `id`: the same on any machine."""
         self._hashes: dict[int, bytes] = {}
@@ -360,11 +362,13 @@ class LocalStates:
         key = name, keyed(value, self._name)
         part = self._parts.setdefault(key, value)
         if part is value:
+            self._part_numbers.setdefault(id(part), len(self._part_numbers))
             self._digests[id(part)] = blake2b(repr(key[1]).encode(), digest_size=8).digest()
         return part
 
     def _key(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> tuple[Any, ...]:
-        return (agent_id, flaw, *map(id, snapshot.values()))
+        numbers = self._part_numbers
+        return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
 
     def _anonymous(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> int:
         parts = [

@@ -14,6 +14,8 @@ from harness.prove.zones import Zones
 Places = tuple[int, ...]
 """For each place of a state the place at which its agent stood before."""
 
+MOST_KNOWN = 200_000
+"""So many orders are remembered; then they are chosen again."""
 MOST_ORDERS = 120
 """So many orders of agents that look alike are compared; of more, states that are alike may count as several."""
 
@@ -32,6 +34,8 @@ class Order:
         key = locals_, zone
         ordered = self._known.get(key)
         if ordered is None:
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
             ordered = self._known[key] = self._put_in_order(locals_, zone)
         return ordered
 

@@ -2,9 +2,12 @@
 
 import resource
 import sys
+import time
 from dataclasses import dataclass
 from typing import Literal
 
+LOOK_EVERY = 200
+"""States between two looks at memory, clock and whoever watches."""
 Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
 
 
@@ -36,6 +39,40 @@ class Figures:
     depth: int | None
     seconds: float
     processor_s: float
+
+
+class GivenUpError(Exception):
+    """A bound of memory or time was reached."""
+
+    def __init__(self, ended: Ended) -> None:
+        super().__init__(ended)
+        self.ended = ended
+
+
+class Budget:
+    """So much memory, and so much time from now on, in seconds."""
+
+    def __init__(self, most_bytes: float, most_s: float) -> None:
+        self._began = time.monotonic()
+        self._most_bytes = most_bytes
+        self._most_s = most_s
+        self._calls = 0
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    def ended(self, elsewhere_bytes: float = 0.0) -> Ended | None:
+        """By what it is used up; other processes have taken `elsewhere_bytes`."""
+        if memory_bytes() + elsewhere_bytes > self._most_bytes:
+            return "memory"
+        return "time" if self.seconds > self._most_s else None
+
+    def check(self) -> None:
+        """Raises GivenUpError if it is used up; to be called again and again, for it mostly does not look."""
+        self._calls += 1
+        if self._calls % LOOK_EVERY == 0 and (ended := self.ended()) is not None:
+            raise GivenUpError(ended)
 
 
 def memory_bytes() -> int:

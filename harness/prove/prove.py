@@ -16,7 +16,7 @@ from harness.prove.explore import Graph, explore
 from harness.prove.livelock import Livelock
 from harness.prove.liveness import Liveness
 from harness.prove.local import Flaw, ReductionError
-from harness.prove.progress import Ended, Figures, Progress
+from harness.prove.progress import Budget, Ended, Figures, GivenUpError, Progress
 from harness.prove.script import Script
 from harness.prove.swarm import AGENTS, ZONE, Swarm
 from harness.run.finding import claim
@@ -53,6 +53,8 @@ class Limits:
 class Proof:
     """What came out. `liveness` is None if it was not looked at: not all states are known, or the network is `any`.
 
+    `whole_ended` is how looking at the whole graph ended, if that was begun.
+
     `way` is what an agent did that has a flaw in the network `any`, where nothing shows that all of it fits together.
     """
 
@@ -61,6 +63,7 @@ class Proof:
     ended: Ended
     flaw: Flaw | None
     liveness: Liveness | None = None
+    whole_ended: Ended = "complete"
     example: Example | None = None
     livelocks: list[Livelock] = field(default_factory=list)
     """The first of each form, those that were played."""
@@ -75,9 +78,10 @@ class Proof:
         live = self.liveness
         if self.flaw or (live is not None and (live.cycles or live.lost is not None)):
             return VIOLATED
-        if self.ended == "interrupted":
+        if "interrupted" in (self.ended, self.whole_ended):
             return INTERRUPTED
-        return 0 if self.complete and (live is None or live.decided) else INCOMPLETE
+        whole = self.whole_ended == "complete" and (live is None or live.decided)
+        return 0 if self.complete and whole else INCOMPLETE
 
     def to_json(self) -> dict[str, Any]:
         bounds, live, flaw = self.bounds, self.liveness, self.flaw
@@ -95,6 +99,7 @@ class Proof:
             "steps_judged": bounds.steps,
             "complete": self.complete,
             "ended": self.ended,
+            "whole_ended": self.whole_ended,
             **asdict(self.figures),
             "flaw": None if flaw is None else asdict(flaw),
             "way": self.way,
@@ -161,7 +166,13 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
     )
     proof = Proof(bounds, figures, graph.ended, graph.flaw)
     if proof.complete:
-        proof.liveness = liveness.look(graph)
+        try:
+            budget = Budget(limits.most_bytes, limits.most_s - graph.seconds)
+            proof.liveness = liveness.look(graph, budget.check)
+        except GivenUpError as given_up:
+            proof.whole_ended = given_up.ended
+        except KeyboardInterrupt:
+            proof.whole_ended = "interrupted"
     _show(proof, graph, path, name)
     return proof
 

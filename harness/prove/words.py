@@ -66,6 +66,8 @@ def _of_the_whole(proof: Proof) -> Iterator[str]:
         yield "- not looked at, one chain, livelock: they are about all agents together; see the network lossy"
         return
     if live is None:
+        if proof.whole_ended != "complete":
+            yield f"  of the whole graph: {WHY[proof.whole_ended]}"
         yield "- not decided, one chain: from every state some way without losses leads to rest with one chain"
         yield "- not decided, livelock: the swarm cannot go round for ever"
         return

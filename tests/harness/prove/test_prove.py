@@ -5,6 +5,8 @@ import multiprocessing
 import signal
 import subprocess
 import time
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -121,6 +123,17 @@ def test_nobody_goes_on_who_was_interrupted(monkeypatch: pytest.MonkeyPatch) -> 
     assert graph.ended == "interrupted"
     assert graph.looked_at == LOOK_EVERY
     assert not multiprocessing.active_children()
+
+
+def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.prove.progress.LOOK_EVERY", 1)
+    monkeypatch.setattr(
+        import_module("harness.prove.prove"), "explore", lambda *_, **__: replace(explored, seconds=61.0)
+    )
+    explored = explore(Swarm(Bounds(2, 2, "lossy")), most_bytes=8e9, most_s=60)
+    proof = prove(Bounds(2, 2, "lossy"), Limits(most_bytes=8e9, most_s=60), tmp_path / "none.yaml")
+    assert (proof.ended, proof.whole_ended, proof.exit_status) == ("complete", "time", INCOMPLETE)
+    assert [line[0] for line in in_words(proof) if "one chain" in line or "livelock" in line] == ["-", "-"]
 
 
 def test_each_agent_by_itself_against_all_that_could_be_said(tmp_path: Path) -> None:
