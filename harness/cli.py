@@ -57,6 +57,10 @@ COMMANDS = {
         "harness.commands.chain:chain_command",
         "Print each agent's chain, block by block; or put what the vehicles logged on a map.",
     ),
+    "export": (
+        "harness.commands.export:export_command",
+        "Write tracks, links, chains, handler runs, MAVLink and logs of a run for other tools.",
+    ),
     "packets": (
         "harness.commands.packets:packets_command",
         "Print each datagram, who received it and who lost it, and what was answered to it, from a run's captures.",

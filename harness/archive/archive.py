@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 
-from harness.archive.connectivity import NETWORK_FILE, Connectivity, read_connectivity
+from harness.archive.connectivity import NETWORK_FILE, Connectivity, Link, read_connectivity, read_link_losses
 from harness.archive.directory import ROGUE_FILE
 from harness.archive.exports import (
     BEFORE_FINAL_RECONCILE,
@@ -183,6 +183,10 @@ class RunArchive:
     def network(self, vehicles: Collection[int]) -> Connectivity:
         """Who could reach whom among `vehicles`; nothing is known of exports that came without a run."""
         return read_connectivity(self._in_directory(NETWORK_FILE), vehicles)
+
+    def link_losses(self, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
+        """From when on which links among `vehicles` lose how much, 0..1: first all, then those that changed."""
+        return read_link_losses(self._in_directory(NETWORK_FILE), vehicles)
 
     def tracks(self, vehicles: Collection[int]) -> Tracks:
         """Where the vehicles were."""

@@ -6,7 +6,7 @@ over the radio changed. A pair is cut while either loses everything.
 """
 
 from bisect import bisect_right
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -25,6 +25,8 @@ NETWORK_FILE = "network.jsonl"
 
 Pair = tuple[int, int]
 """Two vehicles, the lower ID first."""
+Link = tuple[int, int]
+"""From a sender to a receiver."""
 Components = tuple[frozenset[int], ...]
 
 
@@ -124,14 +126,25 @@ class _Network:
 
     def losses(self, at_s: float) -> Losses:
         """What the links lose now."""
-        lost = [
-            1 - (1 - asked) * (1 - self._over_the_radio.get(pair, 0.0))
-            for pair, directions in self._asked.items()
-            if pair not in self.cut and not self.lost & {*pair}
-            for asked in directions
-        ]
+        lost = [loss for pair in self._asked if self._is_up(pair) for loss in self._directions(pair)]
         mean = sum(lost) / len(lost) if lost else 0.0
         return Losses(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
+
+    def by_link(self) -> dict[Link, float]:
+        """What each link loses now, in either direction: everything where there is none."""
+        losses: dict[Link, float] = {}
+        for low, high in self._asked:
+            there, back = self._directions((low, high)) if self._is_up((low, high)) else (1.0, 1.0)
+            losses |= {(low, high): there, (high, low): back}
+        return losses
+
+    def _is_up(self, pair: Pair) -> bool:
+        return pair not in self._out_of_range and pair not in self._cut_off and not self.lost & {*pair}
+
+    def _directions(self, pair: Pair) -> tuple[float, float]:
+        over_the_radio = self._over_the_radio.get(pair, 0.0)
+        there, back = self._asked[pair]
+        return 1 - (1 - there) * (1 - over_the_radio), 1 - (1 - back) * (1 - over_the_radio)
 
     def components(self) -> Components:
         left = set(self.vehicles) - self.lost
@@ -188,6 +201,28 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
         if switched or fallen or not states:
             _enter(states, Topology(now_s, line.what, network.components()))
     return Connectivity(network.vehicles, states, losses, reboots, lines.problems(), cut, lost)
+
+
+def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
+    """From when on which links lose how much, 0..1: first all, then those that changed; what means nothing is left out.
+
+    A link that is cut, out of range, or of a vehicle that is lost, loses everything.
+    """
+    network = _Network(vehicles)
+    before: dict[Link, float] = {}
+    now_s = 0.0
+    for line in JsonLines(path, _Line):
+        if not before and line.asked is None:
+            continue
+        try:
+            network.play(line)
+        except (ValueError, TypeError, AttributeError, KeyError):
+            continue
+        now_s = max(now_s, line.at_s)
+        losses = network.by_link()
+        if changed := dict(losses.items() - before.items()):
+            yield now_s, {link: losses[link] for link in losses if link in changed}
+        before = losses
 
 
 def _enter(states: list[Topology], state: Topology) -> None:

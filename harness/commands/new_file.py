@@ -1,7 +1,8 @@
 """Writing a file that a user names, and that must not be there yet."""
 
 import contextlib
-from collections.abc import Iterable
+import shutil
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from harness.errors import MachineError, RunDirectoryError
@@ -29,3 +30,26 @@ def write_new(path: Path, parts: Iterable[str]) -> None:
         with contextlib.suppress(OSError):
             path.unlink()
         raise MachineError(f"{path} cannot be written: {error.strerror}") from None
+
+
+@contextlib.contextmanager
+def newly(path: Path) -> Iterator[None]:
+    """Whatever makes the file or directory makes it whole: of half of it nothing is left.
+
+    Raises RunDirectoryError if it is there already or cannot be made, MachineError if the disk refuses.
+    """
+    refuse_existing([path])
+    if not path.absolute().parent.is_dir():
+        raise RunDirectoryError(f"{path} cannot be made: its directory is not there; choose another file")
+    try:
+        yield
+    except FileExistsError:
+        raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten") from None
+    except BaseException as error:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise MachineError(f"{path} cannot be written: {error.strerror}") from None
+        raise

@@ -1,0 +1,9 @@
+"""What a run left as files for the tools that people use: MCAP for Foxglove, Lichtblick and PlotJuggler.
+
+`Recording` opens the run, and `samples` are all that happened in it, in order of time; each format is one file that
+writes them down.
+"""
+
+from harness.export.recording import Recording
+
+__all__ = ["Recording"]
