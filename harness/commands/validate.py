@@ -1,5 +1,6 @@
 """`ucp-harness validate`: recorded runs, held against the specification in TLA+."""
 
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,7 @@ def validate_command(
         typer.Argument(metavar="RUN...", help="Run directories, directories of what agents left, or traces."),
     ] = None,
     scenario: Annotated[
-        Path | None, typer.Option(help="In their place: a scenario to play in virtual time, a file or its name,")
+        Path | None, typer.Option(help="And a scenario to be played in virtual time, a file or its name,")
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="with so many seeds.")] = 1000,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -28,12 +29,13 @@ def validate_command(
 
     2: something could not be looked at. 3: TLC is not here.
     """
-    if runs and scenario is None:
-        count, those = len(runs), specification.recorded(runs)
-    elif scenario is not None and not runs:
-        count, those = seeds, specification.simulated(load_scenario(scenario), range(seeds))
-    else:
+    if not runs and scenario is None:
         raise typer.BadParameter("name runs, or a --scenario to play")
+    those = specification.recorded(runs or ())
+    count = len(runs or ())
+    if scenario is not None:
+        those = chain(those, specification.simulated(load_scenario(scenario), range(seeds)))
+        count += seeds
     console = Console(stderr=True)
 
     def show(validation: Validation) -> None:

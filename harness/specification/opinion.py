@@ -5,16 +5,16 @@ from dataclasses import asdict, dataclass, replace
 from math import gcd
 from typing import Any
 
-from harness.errors import VIOLATED
+from harness.errors import INTERRUPTED, VIOLATED
 from harness.prove.bounds import Bounds, BoundsError
 from harness.prove.explore import explore
 from harness.prove.progress import Ended, Progress
 from harness.prove.prove import INCOMPLETE, Limits
 from harness.prove.swarm import Swarm
 from harness.specification import states
-from harness.specification.tlc import checked, command
+from harness.specification.settings import readings
+from harness.specification.tlc import checked, command, in_tla
 from ucp.clock import MICROSECONDS
-from ucp.settings import Settings
 
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
@@ -60,7 +60,7 @@ class Opinion:
     @property
     def exit_status(self) -> int:
         if not self.decided:
-            return INCOMPLETE
+            return INTERRUPTED if self.ended == "interrupted" else INCOMPLETE
         return 0 if self.agrees and self.flaw is None else VIOLATED
 
     def to_json(self) -> dict[str, Any]:
@@ -167,17 +167,3 @@ def _config(bounds: Bounds) -> str:
     }
     assigned = (f"  {name} = {in_tla(value)}" for name, value in constants.items())
     return "\n".join(["SPECIFICATION Spec", "CONSTANTS", *assigned, "INVARIANTS", *INVARIANTS, ""])
-
-
-def readings(settings: Settings) -> dict[str, bool]:
-    """The constants of the specification that are readings of the thesis with a setting."""
-    return {
-        "VoteNamesChain": settings.vote_names_chain,
-        "ChangedBeforeTally": settings.changed_before_tally,
-        "Phase1TiePops": settings.phase1_tie == "pop",
-        "Phase2TieTakesBlock": settings.phase2_tie == "block",
-    }
-
-
-def in_tla(value: object) -> str:
-    return str(value).upper() if isinstance(value, bool) else str(value)

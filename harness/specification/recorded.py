@@ -5,11 +5,17 @@ hash becomes its place among all of them, and so does a timestamp; a chain hash 
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import tally_is_known, timer_that_ended, unknown_words
+from harness.archive.vocabulary import (
+    COMPARED_WITHOUT,
+    tally_is_known,
+    timer_that_ended,
+    timers_are_known,
+    unknown_words,
+)
 from harness.checker.steps.follower import COUNTING, Tells
 from harness.checker.steps.header import CheckedHeader
 from harness.checker.steps.inputs import decoded, event_of, stored_blocks
@@ -26,8 +32,7 @@ from ucp.messages import (
     NextInSequenceResponse,
     RequestForBlock,
 )
-from ucp.settings import Settings
-from ucp.trace import HandlerRun
+from ucp.trace import HandlerRun, Sent
 
 INCEPTION = 1
 TOP_OF_CHAIN, NO_HASH, IMPOSSIBLE = 0, -1, -7
@@ -40,23 +45,9 @@ NO_HANDLER = 0
 ANOTHER_DURATION = 9
 NOT_TOLD = (0,)
 VOTES, ANSWERS, CANDIDATES, MAJORITY = range(1, 5)
-
-SPECIFIED = frozenset(
-    (
-        *("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s"),
-        *("max_block_bytes", "max_event_bytes"),
-        *("vote_names_chain", "changed_before_tally", "phase1_tie", "phase2_tie"),
-    )
-)
-"""Settings that the specification has."""
-
-
-def unspecified(settings: Settings) -> str | None:
-    """A setting that is not as by default, and that the specification does not have."""
-    default = Settings()
-    names = (item.name for item in fields(Settings))
-    changed = (name for name in names if getattr(settings, name) != getattr(default, name))
-    return next((name for name in changed if name not in SPECIFIED), None)
+NO_TALLY = VOTES, IMPOSSIBLE
+NO_MESSAGE = TYPE_CODES[RequestForBlock], IMPOSSIBLE
+"""In the place of what no agent has, or sends."""
 
 
 class UnreadableError(Exception):
@@ -106,13 +97,16 @@ class Chains:
         return known[block_hash]
 
 
-def lives(trace: Trace, header: CheckedHeader, chains: Chains) -> Iterator[Life]:
-    """All that the trace has of each life, up to what cannot be read."""
+def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -> Iterator[Life]:
+    """All that the trace has of each life, up to what cannot be read.
+
+    `ended`: the agent came to the end of its mission, so that nothing is missing at the end of its last life.
+    """
     tells = Tells.of(trace)
     count = len(trace.starts) + 1
     for number, runs in enumerate(trace.lives(), 1):
         is_last = number == count
-        life = Life(header.agent_id, number, whole=is_last and not trace.cut_off and trace.problem is None)
+        life = Life(header.agent_id, number, whole=ended and is_last and not trace.cut_off and trace.problem is None)
         if is_last:
             life.unread = trace.problem
         writer = _Writer(header, tells, chains)
@@ -150,7 +144,7 @@ class _Writer:
 
     def step(self, run: HandlerRun) -> Item:
         """Raises UnreadableError."""
-        unknown = {kind: word for kind, word in unknown_words([run]).items() if kind not in ("branch", "tally")}
+        unknown = {kind: word for kind, word in unknown_words([run]).items() if kind not in COMPARED_WITHOUT}
         if unknown:
             raise UnreadableError(next(iter(unknown.values())))
         algorithm = HANDLERS[run.handler].algorithm
@@ -159,14 +153,16 @@ class _Writer:
         try:
             came, is_for_nobody = self._came(run)
             changes = self._changes(run)
+            sent = tuple(map(self._sent, run.sent))
+            top = self._chain(_digest(run.state.top))
         except ValueError as error:
-            raise UnreadableError(f"what came with it, or changed, cannot be read ({str(error)[:100]})") from None
+            raise UnreadableError(f"it cannot be read ({str(error)[:100]})") from None
         state = run.state
         return (
             NO_HANDLER if is_for_nobody else algorithm,
             came,
             changes,
-            tuple(self._sent(run)),
+            sent,
             self._started(run),
             self._tally(run),
             (
@@ -175,7 +171,7 @@ class _Writer:
                 state.stack,
                 int(state.reconciling),
                 int(state.idle),
-                self._chain(_digest(state.top)),
+                top,
             ),
         )
 
@@ -268,19 +264,15 @@ class _Writer:
             return code, chain_number, successor, Stamp(message.timestamp_us)
         return code, chain_number
 
-    def _sent(self, run: HandlerRun) -> Iterator[Item]:
-        for sent in run.sent:
-            try:
-                sender, _, message = decoded(sent.datagram)
-            except ValueError:
-                sender, message = IMPOSSIBLE, RequestForBlock(b"")
-            if sender == self._header.agent_id:
-                yield self._message(message)
-            else:
-                yield TYPE_CODES[RequestForBlock], IMPOSSIBLE
+    def _sent(self, sent: Sent) -> Item:
+        try:
+            sender, _, message = decoded(sent.datagram)
+        except ValueError:
+            return NO_MESSAGE
+        return self._message(message) if sender == self._header.agent_id else NO_MESSAGE
 
     def _started(self, run: HandlerRun) -> Item:
-        if not self._tells.timers:
+        if not self._tells.timers or not timers_are_known(run):
             return NOT_TOLD
         return tuple(
             TIMERS[name] if self._durations.get(name) == duration_s else ANOTHER_DURATION
@@ -292,17 +284,18 @@ class _Writer:
         if tally is None or run.branch not in COUNTING or not tally_is_known(run):
             return ()
         counted = HANDLERS[run.handler].tally
-        if counted in ("vote_count", "reconcile_vote_count"):
-            return (VOTES if counted == "vote_count" else ANSWERS, tally.get("yes", 0), tally.get("no", 0))
         try:
             if counted == "majority_response_block_hash":
                 return (MAJORITY, *(map(_digest, tally) if tally else (NO_HASH,)))
+            if counted != "reconcile_response_dictionary":
+                kind = VOTES if counted == "vote_count" else ANSWERS
+                return kind, int(tally.get("yes", 0)), int(tally.get("no", 0))
             items: list[Item] = [CANDIDATES]
             for name, (count, timestamp_us) in tally.items():
                 items += (_digest(name) if name else TOP_OF_CHAIN, count, Stamp(timestamp_us))
             return tuple(items)
         except (TypeError, ValueError):
-            return (IMPOSSIBLE,)
+            return NO_TALLY
 
 
 def _block(block: Block) -> tuple[Item, ...]:

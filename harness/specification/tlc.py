@@ -108,3 +108,8 @@ def _read(told: str, states: Path) -> Checked:
         raise CheckerError(f"TLC could not look at everything: {why[:MOST_SHOWN]}")
     generated, distinct, _ = map(int, counts[-1])
     return Checked(generated, distinct, violated and violated[1], told, states)
+
+
+def in_tla(value: object) -> str:
+    """A truth value or a number, as TLA+ has it."""
+    return str(value).upper() if isinstance(value, bool) else str(value)

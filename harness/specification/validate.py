@@ -4,7 +4,7 @@ Many lives of agents are given to one TLC, as it takes longer to start than to l
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, c
 from harness.errors import VIOLATED, WRONG_REQUEST
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.specification.opinion import in_tla, readings
-from harness.specification.recorded import Chains, Life, lives, module, unspecified
-from harness.specification.tlc import CheckerError, command
+from harness.specification.recorded import Chains, Life, lives, module
+from harness.specification.settings import readings, unspecified
+from harness.specification.tlc import CheckerError, command, in_tla
 from harness.specification.tlc import checked as looked_at
 from ucp.agent import HANDLERS
 
@@ -26,6 +26,9 @@ STEPS_AT_ONCE = 20_000
 MEMORY_MB = 2048
 
 Constants = tuple[tuple[str, object], ...]
+
+AT_END = "what it triggered has yet to run"
+"""Of a life as a whole, not of a step of it."""
 
 _REJECTED = re.compile(r'<<\s*"rejected",\s*(\d+),\s*(\d+),\s*\{([^}]*)\}\s*>>')
 _WHAT = re.compile(r'"([^"]*)"')
@@ -95,10 +98,11 @@ class _Batch:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A run: what it is called, its traces, and what is missing or damaged about them."""
+    """A run: what it is called, its traces, whose agents came to its end, and what is missing or damaged."""
 
     name: str
     traces: Sequence[Trace]
+    ended: Collection[int] = ()
     problems: Sequence[str] = ()
 
 
@@ -107,20 +111,21 @@ def recorded(paths: Iterable[Path]) -> Iterator[Recorded]:
     for path in paths:
         if path.is_file():
             trace = read_trace(path)
-            yield Recorded(str(path), [], [why_none(path)]) if trace is None else Recorded(str(path), [trace])
+            yield Recorded(str(path), [trace] if trace else [], problems=[] if trace else [why_none(path)])
             continue
         archive = RunArchive(path)
         traces = archive.traces
         missing = sorted(set(archive.roster) - set(traces)) if traces else []
         problems = [*archive.problems, *(f"there is no trace of agent {agent_id}" for agent_id in missing)]
-        yield Recorded(str(path), list(traces.values()), problems if traces else [*problems, "there are no traces"])
+        problems += [] if traces else ["there are no traces"]
+        yield Recorded(str(path), list(traces.values()), archive.exports.by_agent.keys(), problems)
 
 
 def simulated(scenario: Scenario, seeds: Iterable[int]) -> Iterator[Recorded]:
     """The scenario played in virtual time. Raises HarnessError."""
     for seed in seeds:
         evidence = simulate(scenario, seed, tracing=True).evidence
-        yield Recorded(f"seed {seed}", list(evidence.traces.values()))
+        yield Recorded(f"seed {seed}", list(evidence.traces.values()), evidence.exports.keys())
 
 
 def validate(runs: Iterable[Recorded], *, watch: Callable[[Validation], None] = lambda validation: None) -> Validation:
@@ -138,7 +143,7 @@ def validate(runs: Iterable[Recorded], *, watch: Callable[[Validation], None] = 
                 validation.unread.append(f"{run.name}: agent {trace.header.agent_id}: {error}")
                 continue
             batch = batches.setdefault(constants, _Batch())
-            for life in lives(trace, header, batch.chains):
+            for life in lives(trace, header, batch.chains, ended=header.agent_id in run.ended):
                 batch.lives.append(life)
                 batch.names.append(run.name)
                 batch.steps += len(life.steps)
@@ -177,7 +182,30 @@ def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
 
 
 def _look(constants: Constants, batch: _Batch, validation: Validation) -> None:
-    """Let TLC look at these lives."""
+    """Let TLC look at these lives; at halves of them where it can not, so that only what it cannot look at is left."""
+    try:
+        rejected = _rejected(constants, batch)
+    except CheckerError as error:
+        if len(batch.lives) == 1:
+            validation.unread.append(f"{batch.names[0]}: agent {batch.lives[0].agent_id}: {error}")
+            return
+        middle = len(batch.lives) // 2
+        for half in (slice(middle), slice(middle, None)):
+            _look(constants, _Batch(batch.chains, batch.lives[half], batch.names[half]), validation)
+        return
+    for number, (life, name) in enumerate(zip(batch.lives, batch.names, strict=True), 1):
+        validation.lives += 1
+        if number not in rejected:
+            validation.steps += len(life.steps)
+            continue
+        step, what = rejected[number]
+        validation.steps += step
+        line, handler = life.lines[step - 1], life.handlers[step - 1]
+        validation.rejected.append(Rejected(name, life.agent_id, life.number, line, handler, what))
+
+
+def _rejected(constants: Constants, batch: _Batch) -> dict[int, tuple[int, tuple[str, ...]]]:
+    """Of which lives, counting from 1, which step is not as specified, and what of it. Raises CheckerError."""
     assigned = (f"  {name} = {in_tla(value)}" for name, value in constants)
     config = "\n".join(["SPECIFICATION Spec", "VIEW Position", "CONSTANTS", *assigned, ""])
     records = {"Lives": module(batch.lives, batch.chains)}
@@ -187,17 +215,9 @@ def _look(constants: Constants, batch: _Batch, validation: Validation) -> None:
             for number, step, what in _REJECTED.findall(said.told)
         }
     positions = 1
-    for number, (life, name) in enumerate(zip(batch.lives, batch.names, strict=True), 1):
-        validation.lives += 1
-        if number not in rejected:
-            positions += len(life.steps) + 1
-            validation.steps += len(life.steps)
-            continue
-        step, what = rejected[number]
-        at_end = "what it triggered has yet to run" in what
-        positions += step + at_end
-        validation.steps += step
-        line, handler = life.lines[step - 1], life.handlers[step - 1]
-        validation.rejected.append(Rejected(name, life.agent_id, life.number, line, handler, what))
+    for number, life in enumerate(batch.lives, 1):
+        step, what = rejected.get(number, (len(life.steps), (AT_END,)))
+        positions += step + (AT_END in what)
     if positions != said.distinct:
-        raise CheckerError(f"TLC has looked at {said.distinct} steps of {positions}")
+        raise CheckerError(f"TLC has looked at {said.distinct} positions of {positions}")
+    return rejected

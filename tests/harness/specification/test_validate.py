@@ -23,7 +23,7 @@ def _tlc() -> None:
 
 def of(name: str, **keys: Any) -> Recorded:
     [run] = simulated(parse({"name": name, **SHORT, **keys}), [2])
-    return Recorded(name, run.traces)
+    return Recorded(name, run.traces, run.ended)
 
 
 @pytest.fixture(scope="module")
