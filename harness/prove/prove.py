@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ CLAIMS = {
     "steps": "every step is that of a right agent",
 }
 """What is looked at in every state; "steps" where it is asked for."""
+RUN_LOOKED_FOR_S = 60.0
+"""For so long, at most, a run is looked for that has the flaw that an agent by itself has."""
 PLAYED = {"2": "2", "3": "3", "4": "4", "hang": "liveness", "crash": "liveness", "steps": "steps"}
 """Kinds of flaws, and by what a simulated run shows them."""
 
@@ -47,6 +49,10 @@ class Limits:
     def __post_init__(self) -> None:
         if self.cores < 1:
             raise BoundsError(f"--cores must be 1 or more, not {self.cores}")
+
+    @property
+    def of_exploring(self) -> dict[str, Any]:
+        return {"most_bytes": self.most_bytes, "most_s": self.most_s, "cores": self.cores}
 
 
 @dataclass
@@ -124,13 +130,14 @@ def prove(
     """
     try:
         if bounds.network == "any":
-            return _alone(bounds, limits, watch)
+            return _alone(bounds, limits, out, watch)
         return _together(bounds, limits, out, watch)
     except ReductionError as error:
         raise HarnessError(f"{error}") from None
 
 
-def _alone(bounds: Bounds, limits: Limits, watch: Callable[[Progress], None]) -> Proof:
+def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:
+    name, path = _claimed(bounds, out)
     began_s = time.process_time()
     found = collect(bounds, most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
     figures = Figures(
@@ -144,15 +151,31 @@ def _alone(bounds: Bounds, limits: Limits, watch: Callable[[Progress], None]) ->
         round(found.seconds, 3),
         round(time.process_time() - began_s, 3),
     )
-    return Proof(bounds, figures, found.ended, found.flaw, way=found.way)
+    proof = Proof(bounds, figures, found.ended, found.flaw, way=found.way)
+    if found.flaw is not None:
+        limits = replace(limits, most_s=min(RUN_LOOKED_FOR_S, limits.most_s - found.seconds))
+        graph = explore(Swarm(_with_instants(bounds)), **limits.of_exploring, watch=watch)
+        if graph.flawed is not None and graph.flaw is not None and graph.flaw.kind == found.flaw.kind:
+            proof.example = _example(graph, graph.flawed, graph.flaw.sentence, path, name)
+    return proof
+
+
+def _with_instants(bounds: Bounds) -> Bounds:
+    """Where messages are lost and heard twice, each in its instant: what is found there is a run."""
+    return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
+
+
+def _claimed(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
+    """Name and file of a scenario."""
+    name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
+    return name, claim(out or default_path(name).with_suffix(".yaml"), name)
 
 
 def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:
-    name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
-    path = claim(out or default_path(name).with_suffix(".yaml"), name)
+    name, path = _claimed(bounds, out)
     began_s = time.process_time()
     swarm = Swarm(bounds)
-    graph = explore(swarm, most_bytes=limits.most_bytes, most_s=limits.most_s, cores=limits.cores, watch=watch)
+    graph = explore(swarm, **limits.of_exploring, watch=watch)
     figures = Figures(
         graph.reached,
         graph.looked_at,

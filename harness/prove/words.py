@@ -56,7 +56,7 @@ def _name(kind: str) -> str:
 
 def _mark(proof: Proof, kind: str) -> str:
     if proof.flaw is not None and proof.flaw.kind == kind:
-        return "✘ not shown," if proof.bounds.network == "any" else "✘ violated,"
+        return "✘ not shown," if proof.bounds.network == "any" and proof.example is None else "✘ violated,"
     return "✔ holds," if proof.complete else "- not decided,"
 
 

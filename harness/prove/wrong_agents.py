@@ -27,7 +27,7 @@ TRIED = (
     Bounds(3, 2, "lossless", reduced=False),
     Bounds(3, 2, "lossy", reduced=False),
     Bounds(2, 3, "lossy", reduced=False),
-    Bounds(3, 3, "lossless", reduced=False),
+    Bounds(4, 2, "lossy", reduced=False),
     Bounds(3, 3, "lossy", reduced=False),
 )
 """Where a wrong step is looked for, one after the other."""

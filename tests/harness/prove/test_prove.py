@@ -137,10 +137,12 @@ def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: py
 
 
 def test_each_agent_by_itself_against_all_that_could_be_said(tmp_path: Path) -> None:
-    proof = prove(Bounds(2, 2, "any", ("reboot",)))
+    proof = prove(Bounds(2, 2, "any", ("reboot",)), out=tmp_path / "none.yaml")
     assert proof.exit_status == 0
     assert any("not looked at" in line for line in in_words(proof))
-    wrong = prove(Bounds(2, 2, "any", quirks={"commit_others_twice": True}, reduced=False))
+    wrong = prove(Bounds(2, 2, "any", quirks={"commit_others_twice": True}, reduced=False), out=tmp_path / "wrong.yaml")
     assert wrong.flaw is not None
     assert wrong.flaw.kind == "3"
     assert wrong.way[-1].startswith("it hears a Commit Block")
+    assert wrong.example is not None
+    assert wrong.example.judged["3"].verdict == "violated"
