@@ -33,6 +33,10 @@ COMMANDS = {
         "harness.commands.runs:runs_command",
         "List what was run, the newest first, with its verdict; or open a report in the browser.",
     ),
+    "shell": (
+        "harness.commands.shell:shell_command",
+        "Open a shell in the network of a vehicle whose run goes on; or list what runs.",
+    ),
     "check": (
         "harness.commands.check:check_command",
         "Decide the six characteristics from exported chains, and from traces beside them.",

@@ -1,0 +1,56 @@
+"""`ucp-harness shell`: a shell in a vehicle's network, while a run goes on."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from harness.commands.terminal import complain
+from harness.errors import MachineError, RunDirectoryError
+from harness.machine.running import running, way_into
+
+
+def shell_command(
+    run: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="A run directory whose run goes on.")] = None,
+    vehicle: Annotated[int | None, typer.Argument(metavar="[VEHICLE]", min=1, help="Whose network.")] = None,
+    command: Annotated[
+        list[str] | None, typer.Argument(metavar="[-- COMMAND...]", help="Run this instead of a shell.")
+    ] = None,
+) -> None:
+    """Open a shell in the network of a vehicle whose run goes on (ping, tcpdump, ip); without one, list what runs."""
+    runs = running()
+    if run is None:
+        for path, vehicles in runs.items():
+            typer.echo(f"{path}: vehicles {_listed(vehicles)}")
+        if not runs:
+            complain("no run goes on that can be seen from here")
+        return
+    directory = run.resolve()
+    if directory not in runs:
+        raise RunDirectoryError(
+            f"nobody of {run} is to be seen here: its run is over, has not begun, or goes on in User Mode Linux, where "
+            f"no shell reaches; {_what_runs(list(runs))}"
+        )
+    vehicles = runs[directory]
+    if vehicle is None:
+        typer.echo(f"{directory}: vehicles {_listed(vehicles)}")
+        return
+    if vehicle not in vehicles:
+        raise RunDirectoryError(f"nobody is in vehicle {vehicle} of {run}: there are {_listed(vehicles)}")
+    if shutil.which("nsenter") is None:
+        raise MachineError("there is no nsenter here: install util-linux (apt install util-linux)")
+    argv = command or [os.environ.get("SHELL", "/bin/sh")]
+    if not command:
+        complain(f"in the network of vehicle {vehicle}; `exit` leaves it, and the run goes on")
+    way = way_into(vehicles[vehicle])
+    os.execvp(way[0], [*way, *argv])  # noqa: S606 (Ctrl-C is the shell's, and so is the exit status)
+
+
+def _listed(vehicles: dict[int, int]) -> str:
+    return ", ".join(map(str, vehicles))
+
+
+def _what_runs(runs: list[Path]) -> str:
+    return "no other does" if not runs else f"there goes on {', '.join(map(str, runs))}"

@@ -1,0 +1,55 @@
+"""A shell in a vehicle's network, while its run goes on."""
+
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.harness.command import COMMAND, harness, sentences, write_scenario
+
+DEADLINE_S = 60.0
+
+
+@contextmanager
+def going_on(tmp_path: Path) -> Iterator[Path]:
+    """A run whose agents all live, until the end of the block."""
+    out = tmp_path / "run"
+    scenario = write_scenario(tmp_path, duration_s=100_000)
+    with subprocess.Popen(
+        [*COMMAND, "run", str(scenario), "--out", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            deadline = time.monotonic() + DEADLINE_S
+            while harness("shell", out).stdout != f"{out}: vehicles 1, 2, 3\n":
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.1)
+            yield out
+        finally:
+            process.terminate()
+
+
+@pytest.mark.lab
+def test_a_command_is_run_in_the_network_of_a_vehicle(tmp_path: Path) -> None:
+    with going_on(tmp_path) as out:
+        assert f"{out}: vehicles 1, 2, 3\n" in harness("shell").stdout
+        inside = harness("shell", out, 2, "--", "ip", "-brief", "address")
+        assert "10.77.0.2/14" in inside.stdout
+        assert harness("shell", out, 2, "--", "sh", "-c", "exit 7").returncode == 7
+        nobody = harness("shell", out, 9)
+        assert (nobody.returncode, sentences(nobody.stderr)) == (
+            2,
+            [f"nobody is in vehicle 9 of {out}: there are 1, 2, 3"],
+        )
+        (out / "agents/9").mkdir()
+        with subprocess.Popen(["sleep", "60"], cwd=out / "agents/9") as visitor:  # looks into a directory, from outside
+            assert harness("shell", out).stdout == f"{out}: vehicles 1, 2, 3\n"
+            visitor.kill()
+
+
+def test_a_run_that_does_not_go_on_is_one_sentence(tmp_path: Path) -> None:
+    done = harness("shell", tmp_path)
+    assert done.returncode == 2
+    assert f"nobody of {tmp_path} is to be seen here: its run is over, has not begun, or" in sentences(done.stderr)[0]
