@@ -97,13 +97,14 @@ class Tie:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A broadcast, and the handler runs that it triggered: (agent, mission second)."""
+    """A broadcast, numbered by its sender, and the handler runs that it triggered: (agent, mission second)."""
 
     sender: int
     at_s: float
     name: str
     block: str | None
     receipts: list[tuple[int, float]] = field(default_factory=list)
+    seq: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +221,8 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
         for run in trace.runs:
             if in_time(run):
                 for broadcast in run.sent:
-                    sent[agent, broadcast.seq].append(Message(agent, run.t, broadcast.message, broadcast.block))
+                    message = Message(agent, run.t, broadcast.message, broadcast.block, seq=broadcast.seq)
+                    sent[agent, broadcast.seq].append(message)
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
             of_this_number = sent.get((run.trigger.get("from"), run.trigger.get("seq")))

@@ -1,7 +1,8 @@
 """`ucp-harness export`: a run as files for the tools that people use."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import IO, Annotated
 
 import typer
 from rich.console import Console
@@ -11,30 +12,53 @@ from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.export import Recording
 
+Write = Callable[[Recording, IO[bytes], Callable[[float], None]], int]
+
 
 def export_command(
     run: Annotated[Path, typer.Argument(help="A run directory, or one that `import` made.")],
     mcap: Annotated[
         Path | None, typer.Option(metavar="FILE", help="For Foxglove, Lichtblick and PlotJuggler; must be new.")
     ] = None,
+    perfetto: Annotated[Path | None, typer.Option(metavar="FILE", help="For ui.perfetto.dev; must be new.")] = None,
 ) -> None:
     """Write tracks, links, chains, handler runs, MAVLink and logs of a run for other tools.
 
-    What could not be read is said here, and in the file.
+    What could not be read is said here, and in the files.
     """
-    if mcap is None:
-        raise ExportError("say what to write: --mcap FILE")
-    refuse_existing([mcap])
+    asked = [
+        (path, counted, writer)
+        for path, counted, writer in ((mcap, "messages", _mcap), (perfetto, "events", _perfetto))
+        if path is not None
+    ]
+    if not asked:
+        raise ExportError("say what to write: --mcap FILE or --perfetto FILE")
+    refuse_existing([path for path, _, _ in asked])
+    writers = [(path, counted, writer()) for path, counted, writer in asked]
     recording = Recording(run)
     with Console(stderr=True).status(f"reading {run}") as status:
+        for path, counted, write in writers:
 
-        def progress(mission_s: float) -> None:
-            status.update(f"{mission_s:.0f} s of {recording.end_s:.0f} s")
+            def progress(mission_s: float, path: Path = path) -> None:
+                status.update(f"{path}: {mission_s:.0f} s of {recording.end_s:.0f} s")
 
-        with newly(mcap), mcap.open("xb") as file:
-            from harness.export.mcap import write_mcap
-
-            messages = write_mcap(recording, file, progress)
+            with newly(path), path.open("xb") as file:
+                written = write(recording, file, progress)
+            print_lines([f"{written} {counted}: {path}"])
     for sentence in recording.problems:
         complain(sentence)
-    print_lines([f"{messages} messages: {mcap}"])
+
+
+# A format's packages are loaded, or missed, before anything is written
+
+
+def _mcap() -> Write:
+    from harness.export.mcap import write_mcap
+
+    return write_mcap
+
+
+def _perfetto() -> Write:
+    from harness.export.perfetto import write_perfetto
+
+    return write_perfetto

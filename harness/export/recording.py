@@ -116,6 +116,10 @@ class Recording:
         sentences = [*archive.problems, *archive.gaps, *self.tracks.problems, *self.network.problems, *self._problems]
         return list(dict.fromkeys(map(archive.within, sentences)))
 
+    def add_problem(self, sentence: str) -> None:
+        """Something more that cannot be exported."""
+        self._problems.append(sentence)
+
     @cached_property
     def _telemetry(self) -> list[tuple[int, Path]]:
         return telemetry_logs(self.directory)

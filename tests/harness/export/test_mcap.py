@@ -13,17 +13,9 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from harness.archive.archive import RunArchive
 from tests.harness.command import harness, sentences
-from tests.harness.export.runs import add_telemetry, play
 from ucp.trace import HandlerRun
 
 Messages = dict[str, list[tuple[int, Any]]]
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = play(tmp_path_factory.mktemp("mcap"))
-    add_telemetry(run)
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +175,7 @@ def test_what_cannot_be_is_one_sentence(copy: Path, tmp_path: Path) -> None:
     there.write_text("mine")
     (empty := tmp_path / "empty").mkdir()
     for arguments, words in (
-        ((copy,), "say what to write: --mcap FILE"),
+        ((copy,), "say what to write: --mcap FILE or"),
         ((copy, "--mcap", there), "exists: choose another file, nothing is overwritten"),
         ((copy, "--mcap", tmp_path / "no" / "where.mcap"), "its directory is not there"),
         ((empty, "--mcap", tmp_path / "new.mcap"), "neither a run directory nor"),
