@@ -1,5 +1,7 @@
 """The table of wrong agents is true: each is found, and a part of it made again is the same."""
 
+from functools import cache
+
 import pytest
 
 from harness.checker import Result
@@ -9,6 +11,12 @@ from harness.wrong_agents.trial import MISSIONS, Trial, judged, play
 from ucp.quirks import QUIRKS
 
 ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
+
+
+@cache
+def right(seed: int) -> Trial:
+    """The same mission with the right agent; most quirks are found by one of the first seeds."""
+    return play(None, seed)
 
 
 def cells(quirk: str) -> list[str]:
@@ -27,7 +35,7 @@ def test_nothing_goes_unnoticed() -> None:
 def test_what_found_a_quirk_first_finds_it_again(quirk: str) -> None:
     first = cells(quirk)[-1]
     seed = int(first.removeprefix("seed ").split(":")[0])
-    assert first_found(seed, findings_of(play(quirk, seed), play(None, seed))) == first
+    assert first_found(seed, findings_of(play(quirk, seed), right(seed))) == first
 
 
 def test_what_the_right_agent_is_charged_with_is_no_finding() -> None:
@@ -36,7 +44,7 @@ def test_what_the_right_agent_is_charged_with_is_no_finding() -> None:
 
 def test_a_row_says_what_found_it_how_often_how_soon_and_whether_the_right_handler_was_named() -> None:
     good, other = "vote_timer_expiration", "receive_commit_block"
-    right = {seed: Trial({}, None) for seed in (1, 2, 3, 4)}
+    unharmed = {seed: Trial({}, None) for seed in (1, 2, 3, 4)}
     wrong = {
         1: Trial({}, None),
         2: Trial({"steps": 60.0, "2": None}, good),
@@ -44,11 +52,11 @@ def test_a_row_says_what_found_it_how_often_how_soon_and_whether_the_right_handl
         4: Trial({"steps": 600.0}, other),
     }
     sentence = QUIRKS["hide_commits"].sentence
-    assert row("hide_commits", wrong, right) == (
+    assert row("hide_commits", wrong, unharmed) == (
         f"| `hide_commits` | 5 | {sentence} | steps (3), 1 (1), 2 (1) | 3 | 2.0 | `{good}` | 2 of 3 "
         "| seed 2: steps, 2 |\n"
     )
-    assert NOTHING in row("hide_commits", right, right)
+    assert NOTHING in row("hide_commits", unharmed, unharmed)
 
 
 def test_a_trial_has_the_time_of_the_earliest_evidence_and_the_handler_that_it_names() -> None:

@@ -71,7 +71,7 @@ def test_a_partition_heals_at_the_end_of_its_block(pytester: pytest.Pytester) ->
 @pytest.mark.lab
 def test_the_same_story_is_told_to_processes(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(STORY)
-    run(pytester, "--ucp-backend", "process", "--ucp-speedup", "100").assert_outcomes(passed=1)
+    run(pytester, "--ucp-backend", "process", "--ucp-speedup", "50").assert_outcomes(passed=1)
     assert not run_directories(pytester)
 
 

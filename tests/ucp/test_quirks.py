@@ -29,7 +29,7 @@ def value(quirk: str) -> float | bool:
 def traces(seed: int, quirk: str | None) -> dict[int, Trace]:
     """Of a swarm to which everything happens: loss, copies, parted chains, deques of many blocks."""
     hard = scenario(
-        duration_s=700,
+        duration_s=450,
         network={"loss": 0.25, "duplicate": 0.2},
         events={"source": "random", "mean_s": 15},
         timeline=[{"at_s": 100, "partition": [[1, 2], [3, 4, 5]]}, {"at_s": 250, "heal": True}],
