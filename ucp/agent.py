@@ -40,7 +40,7 @@ Whatever the radio delivers, the agent counts what is not a well-formed message 
 
 import math
 from collections import Counter
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
 from ucp import commit, reconcile
@@ -123,7 +123,7 @@ class Agent:
         initial_data: bytes,
         settings: Settings | None = None,
         *,
-        handlers: Iterable[EventHandler[Any]] = (),
+        handlers: Sequence[EventHandler[Any]] = (),
         tracing: bool = True,
     ) -> None:
         self.agent_id = agent_id
@@ -140,7 +140,9 @@ class Agent:
         self._tracing = tracing
         self._trace: list[Entry] = []
         self._traced_state = self._state_now()
-        self.replace_handlers(handlers)
+        self._on_message, self._on_timer, self._on_local_event = ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT
+        if handlers:
+            self.replace_handlers(handlers)
 
     def replace_handlers(self, wrong: Iterable[EventHandler[Any]]) -> None:
         """From now on run these handlers in the place of those of the same name, and otherwise the good ones."""

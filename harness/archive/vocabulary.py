@@ -65,17 +65,18 @@ def unknown_words(runs: Iterable[HandlerRun]) -> Unknown:
             unknown.setdefault("branch", f"unknown branch {_shown(branch)} of {handler}")
     for run in runs:
         trigger = run.trigger
-        if trigger and TRIGGERS.isdisjoint(trigger):
-            unknown.setdefault("trigger", f"unknown trigger {_shown(next(iter(trigger)))}")
-        elif "message" in trigger:
+        if "message" in trigger:
             if trigger["message"] not in MESSAGES:
                 unknown.setdefault("message", f"unknown message name {_shown(trigger['message'])}")
         elif "timer" in trigger:
             if trigger["timer"] not in TIMERS:
                 kind: Kind = "timer" if run.handler in _TIMER_OF else "trigger"
                 unknown.setdefault(kind, f"unknown timer name {_shown(trigger['timer'])}")
-        elif "local" in trigger and trigger["local"] not in HANDLERS:
-            unknown.setdefault("handler", f"unknown handler name {_shown(trigger['local'])}")
+        elif "local" in trigger:
+            if trigger["local"] not in HANDLERS:
+                unknown.setdefault("handler", f"unknown handler name {_shown(trigger['local'])}")
+        elif trigger and TRIGGERS.isdisjoint(trigger):
+            unknown.setdefault("trigger", f"unknown trigger {_shown(next(iter(trigger)))}")
         for operation, _ in run.changes:
             if operation not in OPERATIONS:
                 unknown.setdefault("operation", f"unknown operation {_shown(operation)}")

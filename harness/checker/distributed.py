@@ -17,6 +17,7 @@ NAME = "distributed"
 
 _OF_MESSAGE = {message.NAME: handler.name for message, handler in ON_MESSAGE.items()}
 _OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
+_OF_EVENT = ON_LOCAL_EVENT["Build Data Block"].name
 _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 
 
@@ -68,7 +69,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
-    """Whether its own timer, a handler that ran, or a message that was sent by whom it names triggered the run."""
+    """Whether its own timer, an event, a handler that ran, or a message that its sender sent triggered the run."""
     trigger, handler = run.trigger, run.handler
     if "seq" in trigger:
         name = trigger.get("message")
@@ -79,6 +80,8 @@ def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings])
         return False
     if "local" in trigger:
         return handler in _LOCAL and trigger["local"] in ran
+    if "event" in trigger:
+        return handler == _OF_EVENT
     return _OF_TIMER.get(trigger.get("timer")) == handler  # type: ignore[arg-type]
 
 
@@ -110,7 +113,7 @@ def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) ->
             if run.handler not in _LOCAL or by not in ran:
                 return f"was triggered by {by}, which had not run"
         case {"event": _}:
-            if run.handler != "build_data_block":
+            if run.handler != _OF_EVENT:
                 return "was triggered by a logged event, which is Build Data Block's"
         case {"operator": _}:
             if run.handler != "reconcile_begin":

@@ -112,8 +112,10 @@ class Evidence:
     watch: Watch | None = None
     """Is shown each step that the step judge follows."""
 
-    def __post_init__(self) -> None:
-        self.names = name_blocks(self.exports)
+    @cached_property
+    def names(self) -> dict[str, str]:
+        """Block hash -> the block's name for people."""
+        return name_blocks(self.exports)
 
     def name(self, block_hash: str) -> str:
         """The block's name for people, such as 4.11, or the beginning of its hash."""
