@@ -6,7 +6,7 @@ looked at once, when it gets its number.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from random import Random
@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 from harness.prove.bounds import Bounds
 from harness.prove.reference import Give, Reference
 from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, dead, keyed, put_back, take
-from ucp.agent import Agent
+from ucp.agent import HANDLERS, Agent
 from ucp.block import Block, next_chain_hash
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
+from ucp.handler import EventHandler
 from ucp.messages import Message
 from ucp.quirks import wrong_handlers
 from ucp.state import AgentState
@@ -138,9 +139,12 @@ class LocalStates:
         self._renamed: dict[tuple[int, tuple[int, ...]], int] = {}
         self.initial = {agent_id: self._intern(agent) for agent_id, agent in self._agents.items()}
 
-    def _agent(self, agent_id: int, right: bool = False, tracing: bool = False) -> Agent:
+    def _agent(self, agent_id: int, right: bool = False, after_each: Callable[[], None] | None = None) -> Agent:
+        """A new one; it traces its handler runs if `after_each` is to be called after each."""
         handlers = [] if right else wrong_handlers(self.bounds.quirks, Random(0))
-        settings = self.bounds.agent_settings(agent_id)
+        if after_each is not None:
+            handlers = [_calling(handler, after_each) for handler in handlers or HANDLERS.values()]
+        settings, tracing = self.bounds.agent_settings(agent_id), after_each is not None
         return Agent(agent_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
 
     # Steps
@@ -255,7 +259,7 @@ class LocalStates:
 
     def _block_in_words(self, block_hash: str) -> str:
         ordinals = sorted(self._ordinals.get(bytes.fromhex(block_hash), ()))
-        return f"block {ordinals[-1]}" if ordinals else block_hash[:12]
+        return f"#{ordinals[-1]}" if ordinals else block_hash[:12]
 
     def _message(self, message: Message) -> int:
         number = self._message_numbers.setdefault(message, len(self.messages))
@@ -410,6 +414,17 @@ class LocalStates:
         held.update(before["chain"].parts["_block_of_hash"])
         if not all(state.holds(block_hash) for block_hash in held):
             raise ReductionError("a block that an agent held is gone: try again with --whole")
+
+
+def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:
+    """The handler, after which `after` is called."""
+
+    def run(*inputs: Any) -> str:
+        branch = handler.run(*inputs)
+        after()
+        return branch
+
+    return replace(handler, run=run)
 
 
 def _log(agent: Agent, ordinal: int) -> None:

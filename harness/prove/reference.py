@@ -4,9 +4,8 @@ The right agent is put into whatever state the wrong one has come to, so each st
 wrong and of which nothing comes.
 """
 
-from collections.abc import Callable
-from itertools import zip_longest
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 from harness.checker.steps.deviation import differences
 from harness.prove.snapshot import Snapshot, dead, key_of, put_back, take
@@ -15,8 +14,15 @@ from ucp.trace import HandlerRun
 
 Give = Callable[[Agent], None]
 """Gives an input to an agent."""
-Make = Callable[[int, bool, bool], Agent]
-"""A new agent: its ID, whether it is right, whether it traces what it does."""
+Make = Callable[[int, bool, Callable[[], None] | None], Agent]
+"""A new agent: its ID, whether it is right, and what to call after each handler run, if it is to trace them."""
+
+
+class _Run(NamedTuple):
+    """One handler's, and what it left behind."""
+
+    run: HandlerRun
+    left: tuple[Any, ...]
 
 
 class Reference:
@@ -36,7 +42,7 @@ class Reference:
         """
         agent_id = agent.agent_id
         if before is None or agent_id not in self._right:
-            self._right[agent_id] = self._make(agent_id, True, False)
+            self._right[agent_id] = self._make(agent_id, True, None)
         right = self._right[agent_id]
         error = _give(right, before, give)
         outcome = _outcome(right)
@@ -48,10 +54,13 @@ class Reference:
         did, should = (self._traced(agent_id, is_right, before, give) for is_right in (False, True))
         return _first_difference(did, should, name_of)
 
-    def _traced(self, agent_id: int, is_right: bool, before: Snapshot | None, give: Give) -> list[HandlerRun]:
-        agent = self._make(agent_id, is_right, True)
+    def _traced(self, agent_id: int, is_right: bool, before: Snapshot | None, give: Give) -> list[_Run]:
+        """The handlers that run, and what each leaves behind."""
+        left: list[tuple[Any, ...]] = []
+        agent = self._make(agent_id, is_right, lambda: left.append(_outcome(agent)))
         _give(agent, before, give)
-        return [entry for entry in agent.trace() if isinstance(entry, HandlerRun)]
+        runs = [entry for entry in agent.trace() if isinstance(entry, HandlerRun)]
+        return [_Run(run, after) for run, after in zip(runs, left, strict=False)]  # a crash leaves nothing behind
 
 
 def _give(agent: Agent, before: Snapshot | None, give: Give) -> Exception | None:
@@ -73,28 +82,25 @@ def _outcome(agent: Agent) -> tuple[Any, ...]:
     )
 
 
-def _first_difference(
-    did: list[HandlerRun], should: list[HandlerRun], name_of: Callable[[str], str]
-) -> tuple[str, str]:
-    before = None
-    for run, expected in zip_longest(did, should):
-        if run is None or expected is None or run.handler != expected.handler:
+def _first_difference(did: Sequence[_Run], should: Sequence[_Run], name_of: Callable[[str], str]) -> tuple[str, str]:
+    alike = 0
+    for (run, left), (expected, should_leave) in zip(did, should, strict=False):
+        if run.handler != expected.handler:
             break
+        alike += 1
         words = [f"it {done}; it should have {right}" for done, right in differences(run, expected, name_of)]
         if words:
             return run.handler, f"{_title(run)}: {'; '.join(words)}"
-        before = run
-    else:
-        run = expected = None
-    what = f"what follows it is {_names(run)}; it should be {_names(expected)}" if run or expected else "its state"
-    whose = before or run or expected
-    assert whose is not None, "an input is a handler's"
-    return whose.handler, f"{_title(whose)}: {what}"
+        if left != should_leave and _handler(did, alike) == _handler(should, alike):
+            return run.handler, f"{_title(run)}: its state, or a timer, is not what it should be after it"
+    whose = (did or should)[max(alike - 1, 0)].run
+    follows, should_follow = _handler(did, alike), _handler(should, alike)
+    return whose.handler, f"{_title(whose)}: what follows it is {follows}; it should be {should_follow}"
+
+
+def _handler(runs: Sequence[_Run], number: int) -> str:
+    return runs[number].run.handler if number < len(runs) else "nothing"
 
 
 def _title(run: HandlerRun) -> str:
     return f"Algorithm {HANDLERS[run.handler].algorithm}, {run.handler}"
-
-
-def _names(run: HandlerRun | None) -> str:
-    return "nothing" if run is None else run.handler

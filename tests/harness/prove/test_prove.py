@@ -57,17 +57,26 @@ def test_a_wrong_agent_is_found_and_its_scenario_shows_it(tmp_path: Path, quirk:
         ("hasty_vote", "process_next_deque_block"),
         ("approve_everything", "receive_request_add_block"),
         ("hide_commits", "vote_timer_expiration"),
-        ("youngest_on_tie", "reconcile_phase_2_timer_expiration"),
+        ("skip_phase2", "reconcile_phase_1_timer_expiration"),
     ],
 )
 def test_a_wrong_step_is_found_also_if_nothing_comes_of_it(tmp_path: Path, quirk: str, handler: str) -> None:
-    bounds = Bounds(2 if quirk != "youngest_on_tie" else 3, 2, "lossy", quirks={quirk: True}, reduced=False, steps=True)
+    bounds = Bounds(2, 2, "lossy", quirks={quirk: True}, reduced=False, steps=True)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
     assert (proof.flaw.kind, proof.flaw.handler) == ("steps", handler)
     assert proof.example is not None
     assert proof.example.judged["steps"].verdict == "deviates"
     assert handler in proof.example.judged["steps"].reason
+
+
+def test_what_no_record_shows_is_not_shown_by_playing(tmp_path: Path) -> None:
+    """That a timer was not stopped is in the agent, and in no line of its trace."""
+    bounds = Bounds(2, 2, "lossy", quirks={"phase3_timer_runs_on": True}, reduced=False, steps=True)
+    proof = prove(bounds, out=tmp_path / "wrong.yaml")
+    assert proof.flaw is not None
+    assert proof.flaw.handler == "receive_response_block_for_hash"
+    assert any("not shown by playing" in line for line in in_words(proof))
 
 
 def test_every_step_of_right_agents_is_right() -> None:
