@@ -1,6 +1,7 @@
 """`ucp-harness sitl` as a user runs it, against a firmware server on loopback."""
 
 import json
+import os
 import platform
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.harness import forks
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.sitl.firmware_server import BINARY, RELEASE, FirmwareServer, serving
 
@@ -24,9 +26,11 @@ def server() -> Iterator[FirmwareServer]:
 
 @pytest.fixture
 def environ(server: FirmwareServer, tmp_path: Path) -> dict[str, str]:
-    """An environment with a cache of its own and nothing but this server."""
+    """An environment with a cache of its own and nothing but this server, for an interpreter like ours."""
+    ours = {name: value for name, value in os.environ.items() if name.startswith(forks.READ_AT_START)}
     cache = str(tmp_path / "cache")
-    return {"XDG_CACHE_HOME": cache, "PATH": "/usr/bin:/bin", "UCP_SITL_URL": server.url, "no_proxy": "127.0.0.1"}
+    place = {"XDG_CACHE_HOME": cache, "PATH": "/usr/bin:/bin", "UCP_SITL_URL": server.url, "no_proxy": "127.0.0.1"}
+    return {**ours, **place}
 
 
 def test_install_path_list_and_install_again(environ: dict[str, str], tmp_path: Path) -> None:
