@@ -274,6 +274,10 @@ class Evidence:
 
     def completed_blocks(self) -> dict[str, int]:
         """Hash -> agent of every block known to have been completed."""
+        return self._completed_blocks
+
+    @cached_property
+    def _completed_blocks(self) -> dict[str, int]:
         owners = {block: agent_id for agent_id, export in self.exports.items() for block in export.completed}
         for name, agent in self.record.agents.items() if self.record else ():
             owners.update(dict.fromkeys(agent.completed_before, int(name)))

@@ -87,7 +87,7 @@ def _counted(
     if sent_bytes is not None and recorded.bytes_sent is not None and recorded.bytes_sent > sent_bytes:
         yield of_agent(agent_id, f"by run.json it sent {recorded.bytes_sent} bytes, and by its trace {sent_bytes}", "1")
     if recorded.reconciles is not None and not evidence.unknown_word("handler", "branch", agent_id=agent_id):
-        begun = sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in trace.runs)
+        begun = sum([run.handler == "reconcile_begin" and run.branch == "begun" for run in trace.runs])
         if recorded.reconciles != begun:
             detail = f"by run.json it began {_count(recorded.reconciles, 'reconcile')}, and by its trace {begun}"
             yield of_agent(agent_id, detail)

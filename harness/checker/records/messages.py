@@ -38,17 +38,21 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 
 def _unlike(line: int, run: HandlerRun, sent: Sending, earliest_s: float) -> Iterator[tuple[Sight, str]]:
     """What was heard otherwise than it was sent, and the characteristic that it touches."""
-    heard = "{message} number {seq} of agent {from}".format(**run.trigger)
     if run.t < earliest_s:
-        yield Sight(line, run, f"heard {heard}, which was sent at {sent[0][0]:g} s"), "1"
+        yield Sight(line, run, f"heard {_named(run)}, which was sent at {sent[0][0]:g} s"), "1"
     if run.input is not None and not _as_it_went(run.input, sent):
-        yield Sight(line, run, f"heard {heard} with another content than it was sent with"), "1"
+        yield Sight(line, run, f"heard {_named(run)} with another content than it was sent with"), "1"
     elif run.changes and (other := _another_block(run, sent)):
-        yield Sight(line, run, f"took this block from {heard}, which carried another", other), "4"
+        yield Sight(line, run, f"took this block from {_named(run)}, which carried another", other), "4"
+
+
+def _named(run: HandlerRun) -> str:
+    return "{message} number {seq} of agent {from}".format(**run.trigger)
 
 
 def _as_it_went(datagram: Recorded, sent: Sending) -> bool:
-    return any(message.datagram in (None, datagram) for _, message in sent)
+    told = [message.datagram for _, message in sent]
+    return None in told or datagram in told
 
 
 def _another_block(run: HandlerRun, sent: Sending) -> str | None:
