@@ -54,23 +54,27 @@ def test_a_wrong_agent_is_rejected_with_line_and_handler(validation: Validation)
     assert validation.exit_status == 1
 
 
-def test_what_cannot_be_looked_at_is_not_as_specified(tmp_path: Path) -> None:
+def test_what_cannot_be_looked_at_is_told_beside_what_is_not_as_specified(tmp_path: Path) -> None:
     [run] = simulated(parse({"name": "short", **SHORT}), [1])
     trace = run.traces[0]
-    path = tmp_path / "1.trace.jsonl"
     header = {"schema": "ucp-trace/2", **trace.header.model_dump(exclude={"schema_"})}
     lines = [json.dumps(header) + "\n", *(entry.to_line() for entry in trace.runs)]
-    path.write_text("".join(lines[:20]) + '{"t": "soon"}\n' + "".join(lines[20:]))
-    done = harness("validate", path, "--json")
-    document = json.loads(done.stdout)
-    assert done.returncode == 2
-    assert document["steps"] == 19
-    assert document["unread"] == [f"{path}: agent 1: line 21 is damaged"]
-    path.write_text("".join([*lines[:20], lines[20].replace('"chain":', '"chain":9'), *lines[21:]]))
-    done = harness("validate", path)
+    damaged, wrong = tmp_path / "damaged.jsonl", tmp_path / "wrong.jsonl"
+    damaged.write_text("".join([*lines[:20], '{"t": "soon"}\n', *lines[20:]]))
+    wrong.write_text("".join([*lines[:20], lines[20].replace('"chain":', '"chain":9'), *lines[21:]]))
+    done = harness("validate", damaged, wrong, "--json")
     assert done.returncode == 1
-    assert f"{path}: agent 1, line 21, Algorithm " in done.stdout
-    assert "the state after it" in done.stdout
+    document = json.loads(done.stdout)
+    assert document["unread"] == [f"{damaged}: agent 1: line 21 is damaged"]
+    [rejected] = document["rejected"]
+    assert (rejected["run"], rejected["agent_id"], rejected["line"]) == (str(wrong), 1, 21)
+    assert rejected["what"] == ["the state after it"]
+    assert document["steps"] == 19 + 20
+
+
+def test_what_is_not_all_looked_at_does_not_hold() -> None:
+    assert Validation(1, 1, 19, unread=["1.trace.jsonl: agent 1: line 21 is damaged"]).exit_status == 2
+    assert Validation(1).exit_status == 2
 
 
 @pytest.mark.lab
