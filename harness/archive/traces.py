@@ -6,7 +6,7 @@ is told in `problem`, and what came before it still counts.
 
 import json
 import re
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,6 +23,7 @@ MAX_LINE_BYTES = 16 * 1024 * 1024
 LARGEST = 2**64
 """No whole number in a header is as large; larger ones are none that a float can hold."""
 PLACES = ("chain", "deque", "stack")
+_HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clock")
 
 
 Version = Literal["ucp-trace/1", "ucp-trace/2"]
@@ -49,6 +50,12 @@ class Header(BaseModel):
         ):
             raise ValueError("a number is larger than any setting or clock can be")
         return self
+
+    def to_line(self) -> str:
+        """The line that it is in a trace."""
+        said = self.model_dump(by_alias=True)
+        in_order = {name: said[name] for name in _HEADER_KEYS if said[name] is not None}
+        return json.dumps(in_order, separators=(",", ":")) + "\n"
 
     @property
     def has_inputs(self) -> bool:
@@ -145,6 +152,22 @@ class Trace:
                 self.runs.append(entry)
             else:
                 self.asides.append((len(self.runs), entry))
+
+    def entries(self) -> Iterator[Header | Gap | Entry]:
+        """What its lines say, in order: the header again with each life, and where some are lost, a gap."""
+        starts = Counter([0, *self.starts])
+        gaps = {gap.position: gap for gap in self.gaps}
+        positions = [position for position, _ in self.asides]
+        next_aside = 0
+        for position in range(len(self.runs) + 1):
+            yield from [self.header] * starts[position]
+            if position in gaps:
+                yield gaps[position]
+            until = bisect_left(positions, position + 1, next_aside)
+            yield from (aside for _, aside in self.asides[next_aside:until])
+            next_aside = until
+            if position < len(self.runs):
+                yield self.runs[position]
 
     def skimmed(self) -> "Trace":
         """The trace without the handler runs that only took a message in; lines are then not counted by `lives`."""

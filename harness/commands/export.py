@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -12,7 +12,7 @@ from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.export import Recording
 
-Write = Callable[[Recording, IO[bytes], Callable[[float], None]], int]
+Write = Callable[[Recording, Path, Callable[[float], None]], int]
 
 
 def export_command(
@@ -21,18 +21,18 @@ def export_command(
         Path | None, typer.Option(metavar="FILE", help="For Foxglove, Lichtblick and PlotJuggler; must be new.")
     ] = None,
     perfetto: Annotated[Path | None, typer.Option(metavar="FILE", help="For ui.perfetto.dev; must be new.")] = None,
+    rosbag: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="A bag for ROS 2, which `import` reads again; must be new.")
+    ] = None,
 ) -> None:
     """Write tracks, links, chains, handler runs, MAVLink and logs of a run for other tools.
 
     What could not be read is said here, and in the files.
     """
-    asked = [
-        (path, counted, writer)
-        for path, counted, writer in ((mcap, "messages", _mcap), (perfetto, "events", _perfetto))
-        if path is not None
-    ]
+    formats = ((mcap, "messages", _mcap), (perfetto, "events", _perfetto), (rosbag, "messages", _rosbag))
+    asked = [(path, counted, writer) for path, counted, writer in formats if path is not None]
     if not asked:
-        raise ExportError("say what to write: --mcap FILE or --perfetto FILE")
+        raise ExportError("say what to write: --mcap FILE, --perfetto FILE or --rosbag DIR")
     refuse_existing([path for path, _, _ in asked])
     writers = [(path, counted, writer()) for path, counted, writer in asked]
     recording = Recording(run)
@@ -42,8 +42,8 @@ def export_command(
             def progress(mission_s: float, path: Path = path) -> None:
                 status.update(f"{path}: {mission_s:.0f} s of {recording.end_s:.0f} s")
 
-            with newly(path), path.open("xb") as file:
-                written = write(recording, file, progress)
+            with newly(path):
+                written = write(recording, path, progress)
             print_lines([f"{written} {counted}: {path}"])
     for sentence in recording.problems:
         complain(sentence)
@@ -62,3 +62,9 @@ def _perfetto() -> Write:
     from harness.export.perfetto import write_perfetto
 
     return write_perfetto
+
+
+def _rosbag() -> Write:
+    from harness.export.rosbag import write_rosbag
+
+    return write_rosbag

@@ -13,7 +13,7 @@ from harness.archive.history import LATEST_S
 from harness.archive.record import RunRecord
 from harness.archive.traces import Header
 
-MAX_EPOCH_S = 2**31 - round(LATEST_S)
+MAX_EPOCH_S = 2**31 - 1 - round(LATEST_S)
 """A later mission would end when ROS has no times left, in 2038."""
 MAX_SPEEDUP = 1000.0
 _NS = 1_000_000_000

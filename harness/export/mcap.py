@@ -7,6 +7,7 @@ the JSON topics of `topics`. run.json and the chain exports are attached as they
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import IO, Any
 
 from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
@@ -32,9 +33,16 @@ _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO
 """Of MAV_SEVERITY, from emergency to debug."""
 
 
-def write_mcap(recording: Recording, file: IO[bytes], progress: Callable[[float], None]) -> int:
-    """How many messages were written. `progress` is told the mission second, now and then. Raises OSError."""
-    writer = _Writer(file)
+def write_mcap(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+    """How many messages were written into a new file. `progress` is told the mission second, now and then.
+
+    Raises OSError.
+    """
+    with path.open("xb") as file:
+        return _write(recording, _Writer(file), progress)
+
+
+def _write(recording: Recording, writer: "_Writer", progress: Callable[[float], None]) -> int:
     colours = colours_of(recording.agents)
     topics, scene = Topics(recording), Scene(recording.archive.record, colours)
     for sample in recording.samples():
@@ -45,7 +53,7 @@ def write_mcap(recording: Recording, file: IO[bytes], progress: Callable[[float]
                 for update in scene.moved(sample):
                     writer.message("/scene", at_ns, update)
             case LossesChanged(losses=losses):
-                scene.losses |= losses
+                scene.links.losses |= losses
             case Said(level=level, source=source, text=text):
                 writer.log(at_ns, _LEVELS[level], source, text)
             case Telemetry(vehicle=vehicle, message=message) if message.get_type() == "STATUSTEXT":

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from heapq import merge
 from itertools import count
 from operator import itemgetter
+from pathlib import Path
 from typing import IO, Any
 
 from harness.archive.history import Message
@@ -41,8 +42,16 @@ Event = tuple[int, int, Any]
 """Time, 1 for what a message triggered and else 0, and the packet: what was sent comes before what was received."""
 
 
-def write_perfetto(recording: Recording, file: IO[bytes], progress: Callable[[float], None]) -> int:
-    """How many events were written. `progress` is told the mission second, now and then. Raises OSError."""
+def write_perfetto(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+    """How many events were written into a new file. `progress` is told the mission second, now and then.
+
+    Raises OSError.
+    """
+    with path.open("xb") as file:
+        return _write(recording, file, progress)
+
+
+def _write(recording: Recording, file: IO[bytes], progress: Callable[[float], None]) -> int:
     trace = _Trace(recording)
     builder = StreamingTraceProtoBuilder(file)
     if recording.time.epoch_ns:

@@ -12,6 +12,10 @@ from ucp.trace import HandlerRun
 Level = Literal["info", "warning", "error"]
 
 
+Metres = tuple[float, float, float]
+"""East, north and up."""
+
+
 class Place(NamedTuple):
     """Degrees, and metres above mean sea level."""
 
@@ -22,11 +26,11 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where a vehicle was, in metres east, north and up from the middle of the field; `place` is None if unknown."""
+    """Where a vehicle was, seen from the middle of the field; `place` is None if unknown."""
 
     at_ns: int
     vehicle: int
-    metres: tuple[float, float, float]
+    metres: Metres
     place: Place | None
 
 

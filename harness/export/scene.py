@@ -1,25 +1,22 @@
 """The swarm in Foxglove's 3D view: a shape for each vehicle, and a line for each link, coloured by what it loses.
 
-A vehicle is drawn once, in a frame of its own that moves. Links are drawn anew whenever vehicles have moved or losses
-have changed, at most once a mission second, and of many vehicles more seldom: there are as many as pairs.
+A vehicle is drawn once, in a frame of its own that moves; links are drawn anew as it moves.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import combinations
 from typing import Any
 
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from harness.archive.connectivity import Link
 from harness.archive.record import RunRecord
+from harness.export.links import Line, Links
 from harness.export.samples import Position
 from harness.present.colours import inks
 
 FIELD = "field"
 """The frame of the field: x is east, y north, z up, in metres from its middle."""
-PAIRS_A_SECOND = 100
 _SIZE_M = 2.0
 _TEXT_PX = 14.0
 _LINK_PX = 2.0
@@ -41,30 +38,20 @@ def _colour(fill: str) -> Any:
 
 
 class Scene:
-    """The scene along time; `losses` are those of the links as they are now."""
+    """The scene along time; `links` knows what they lose now."""
 
     def __init__(self, record: RunRecord, colours: Mapping[int, Any]) -> None:
-        self.losses: dict[Link, float] = {}
+        self.links = Links()
         self._record, self._colours = record, colours
-        self._places: dict[int, tuple[float, float, float]] = {}
-        self._drawn_ns: int | None = None
-        self._moved_ns = -1
+        self._drawn: set[int] = set()
 
     def moved(self, position: Position) -> Iterator[Any]:
         """SceneUpdates, if any are due."""
-        at_ns = position.at_ns
-        if at_ns > self._moved_ns and self._links_are_due(at_ns):  # all that moved at once have
-            self._drawn_ns = at_ns
-            yield self._links(at_ns)
-        if position.vehicle not in self._places:
+        if (lines := self.links.moved(position)) is not None:
+            yield _drawn_links(position.at_ns, lines)
+        if position.vehicle not in self._drawn:
+            self._drawn.add(position.vehicle)
             yield self._vehicle(position)
-        self._places[position.vehicle] = position.metres
-        self._moved_ns = at_ns
-
-    def _links_are_due(self, at_ns: int) -> bool:
-        pairs = len(self._places) * (len(self._places) - 1) // 2
-        every_ns = max(1.0, pairs / PAIRS_A_SECOND) * 1e9
-        return bool(self.losses and pairs) and (self._drawn_ns is None or at_ns - self._drawn_ns >= every_ns)
 
     def _vehicle(self, position: Position) -> Any:
         told = self._record.vehicles.get(str(position.vehicle), {})
@@ -85,18 +72,16 @@ class Scene:
         name.pose.orientation.w = 1.0
         return update
 
-    def _links(self, at_ns: int) -> Any:
-        """A link is as good as the worse of its directions; one that loses everything is not there."""
-        update = SceneUpdate()
-        entity = update.entities.add(id="links", frame_id=FIELD)
-        entity.timestamp.FromNanoseconds(at_ns)
-        lines = entity.lines.add(type=LinePrimitive.LINE_LIST, thickness=_LINK_PX, scale_invariant=True)
-        lines.pose.orientation.w = 1.0
-        for low, high in combinations(sorted(self._places), 2):
-            loss = max(self.losses.get((low, high), 1.0), self.losses.get((high, low), 1.0))
-            if loss < 1.0:
-                for vehicle in (low, high):
-                    x, y, z = self._places[vehicle]
-                    lines.points.add(x=x, y=y, z=z)
-                    lines.colors.add(r=loss, g=1.0 - loss, b=0.1, a=1.0 - 0.7 * loss)
-        return update
+
+def _drawn_links(at_ns: int, links: Iterable[Line]) -> Any:
+    """From green, which loses nothing, to red."""
+    update = SceneUpdate()
+    entity = update.entities.add(id="links", frame_id=FIELD)
+    entity.timestamp.FromNanoseconds(at_ns)
+    lines = entity.lines.add(type=LinePrimitive.LINE_LIST, thickness=_LINK_PX, scale_invariant=True)
+    lines.pose.orientation.w = 1.0
+    for link in links:
+        for x, y, z in (link.low, link.high):
+            lines.points.add(x=x, y=y, z=z)
+            lines.colors.add(r=link.loss, g=1.0 - link.loss, b=0.1, a=1.0 - 0.7 * link.loss)
+    return update

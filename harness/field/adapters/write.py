@@ -1,7 +1,6 @@
 """Writes what came home as the house's own files: of each flight its traces, exports and captures, by agent ID."""
 
 import json
-from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
 from harness.archive.exports import Export
 from harness.archive.opened import Opened
 from harness.archive.traces import SUFFIX as TRACE_SUFFIX
-from harness.archive.traces import Gap, Header, Trace, gap_line
+from harness.archive.traces import Gap, Trace, gap_line
 from harness.checker.records.clocks import ROUNDED_S, mission_s
 from harness.errors import RunDirectoryError
 from harness.field.adapters.record import FILE, ImportedAgent, ImportedFlight, ImportRecord, ImportRemark
@@ -23,7 +22,6 @@ from harness.packets.pcap import PCAPNG_MAGIC
 AGENTS = "agents"
 CUT_OFF = '{"lost_lines":'
 """Half a line, as a trace ends that was cut off."""
-_HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clock")
 _COPIED_AT_ONCE = 1024 * 1024
 
 
@@ -105,29 +103,10 @@ def _lines(trace: Trace, *, lived_on: bool) -> Iterator[str]:
 
     An agent whose trace ends in half a line may have been killed over it, unless it `lived_on` and left an export.
     """
-    starts = {0: 1}
-    for start in trace.starts:
-        starts[start] = starts.get(start, 0) + 1
-    gaps = {gap.position: gap for gap in trace.gaps}
-    asides = [position for position, _ in trace.asides]
-    header, next_aside = _header_line(trace.header), 0
-    for position in range(len(trace.runs) + 1):
-        yield from [header] * starts.get(position, 0)
-        if position in gaps:
-            yield gap_line(gaps[position])
-        until = bisect_left(asides, position + 1, next_aside)
-        yield from (aside.to_line() for _, aside in trace.asides[next_aside:until])
-        next_aside = until
-        if position < len(trace.runs):
-            yield trace.runs[position].to_line()
+    for entry in trace.entries():
+        yield gap_line(entry) if isinstance(entry, Gap) else entry.to_line()
     if trace.cut_off:
         yield gap_line(Gap(len(trace.runs), 1, 0)) if lived_on else CUT_OFF
-
-
-def _header_line(header: Header) -> str:
-    said = header.model_dump(by_alias=True)
-    in_order = {name: said[name] for name in _HEADER_KEYS if said[name] is not None}
-    return json.dumps(in_order, separators=(",", ":")) + "\n"
 
 
 def _copied(capture: Path, directory: Path, name: str) -> str:

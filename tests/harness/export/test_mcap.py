@@ -175,7 +175,7 @@ def test_what_cannot_be_is_one_sentence(copy: Path, tmp_path: Path) -> None:
     there.write_text("mine")
     (empty := tmp_path / "empty").mkdir()
     for arguments, words in (
-        ((copy,), "say what to write: --mcap FILE or"),
+        ((copy,), "say what to write: --mcap FILE,"),
         ((copy, "--mcap", there), "exists: choose another file, nothing is overwritten"),
         ((copy, "--mcap", tmp_path / "no" / "where.mcap"), "its directory is not there"),
         ((empty, "--mcap", tmp_path / "new.mcap"), "neither a run directory nor"),
