@@ -70,12 +70,22 @@ def test_a_wrong_step_is_found_also_if_nothing_comes_of_it(tmp_path: Path, quirk
     assert handler in proof.example.judged["steps"].reason
 
 
-def test_what_no_record_shows_is_not_shown_by_playing(tmp_path: Path) -> None:
-    """That a timer was not stopped is in the agent, and in no line of its trace."""
+def test_a_timer_that_was_not_stopped_is_told_before_it_ends(tmp_path: Path) -> None:
+    """A run's record shows it only when it has ended."""
     bounds = Bounds(2, 2, "lossy", quirks={"phase3_timer_runs_on": True}, reduced=False, steps=True)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
     assert proof.flaw.handler == "receive_response_block_for_hash"
+    assert proof.example is not None
+    assert "reconcile_phase_3_timer_expiration" in proof.example.judged["steps"].reason
+
+
+def test_what_playing_does_not_show_is_said(tmp_path: Path) -> None:
+    bounds = Bounds(2, 2, "lossy", quirks={"forget_stack": True}, reduced=False)
+    proof = prove(bounds, out=tmp_path / "wrong.yaml")
+    assert proof.example is not None
+    assert not any("not shown by playing" in line for line in in_words(proof))
+    proof.example = replace(proof.example, judged={})
     assert any("not shown by playing" in line for line in in_words(proof))
 
 
