@@ -1,7 +1,7 @@
 """New local states for the same processor time, of a hunt beside seeds alone: `python -m benchmarks.explore`.
 
 Each round gives both the same processor time on one core, first the one, then the other, then the other way round, with
-seeds of its own. Both are played, followed and judged by the same code, with a final reconcile where chains differ.
+seeds of its own. Both are played, followed and judged by the same code.
 `small` is three agents that complete about three blocks, of which `prove` knows all local states that there are where
 messages may be lost; `five` a mission of five agents with about eight.
 """

@@ -56,14 +56,14 @@ class Limits(NamedTuple):
 
 
 def changed(document: Document, other: Document, limits: Limits, lots: Random) -> Document:
-    """One to four changes; now and then some of another document before them, or other agents of the roster."""
+    """One to eight changes; now and then some of another document before them, or other agents of the roster."""
     if lots.random() < 0.1:
         document = _spliced(document, other, lots)
     if lots.random() < 0.05:
         document = _others_there(document, limits.roster, lots)
-    for _ in range(min(4, 1 + int(lots.expovariate(1.2)))):
+    for _ in range(min(8, 1 + int(lots.expovariate(0.5)))):
         document = lots.choices(_CHANGES, _WEIGHTS)[0](document, lots)
-    few = lots.random() < 0.2
+    few = lots.random() < 0.1
     return _within(document, limits._replace(blocks=min(FEW_BLOCKS, limits.blocks)) if few else limits)
 
 

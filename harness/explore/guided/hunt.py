@@ -7,6 +7,7 @@ anything was, so that it is the same however many processes play.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from random import Random
 from typing import NamedTuple
 
@@ -14,10 +15,10 @@ from pydantic import ValidationError
 
 from harness.coverage import Reached
 from harness.errors import ScenarioError, UnsupportedError
-from harness.explore.document import Document
+from harness.explore.document import Document, with_key
 from harness.explore.guided.change import Limits, changed
 from harness.explore.guided.identity import Identity
-from harness.explore.guided.trial import Tried, tried, with_liveness_phase
+from harness.explore.guided.trial import Apart, Tried, tried, with_liveness_phase
 from harness.run.sweep import Failed, sweep
 from harness.scenario import Scenario
 
@@ -61,6 +62,7 @@ class News:
 
     reached: Reached
     found: tuple[Identity, ...]
+    apart: Apart | None
 
     @classmethod
     def of(cls, run: Tried, known: Reached) -> "News":
@@ -71,7 +73,7 @@ class News:
             run.reached.steps,
             run.reached.untold,
         )
-        return cls(new, run.found)
+        return cls(new, run.found, run.apart)
 
 
 @dataclass
@@ -90,6 +92,9 @@ class Hunt:
     failed: list[tuple[Candidate, str]] = field(default_factory=list)
     """Runs without a verdict, and why."""
     _dropped: list[Candidate] = field(default_factory=list)
+    _apart: set[Apart] = field(default_factory=set)
+    """How chains differed at rest: of each way the first is played again, with a final reconcile."""
+    _to_reconcile: list[Candidate] = field(default_factory=list)
 
     def begin(self, candidates: Iterable[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
         """Play these as they are; each run that was played, and whether it is kept."""
@@ -97,7 +102,9 @@ class Hunt:
 
     def round(self, jobs: int) -> Iterator[tuple[Candidate, bool]]:
         """Change what is kept, and play it; each run that was played, and whether it is kept."""
-        yield from self._play([self._next() for _ in range(ROUND)], jobs)
+        to_reconcile, self._to_reconcile = self._to_reconcile, []
+        worth = list(accumulate(kept.worth for kept in self.kept))
+        yield from self._play([*to_reconcile, *(self._next(worth) for _ in range(ROUND))], jobs)
 
     def dropped(self) -> list[Candidate]:
         """What is no longer kept, since it was last asked for."""
@@ -129,6 +136,10 @@ class Hunt:
         for identity in news.found:
             self.shown[identity] += 1
             self.found.setdefault(identity, candidate)
+        if news.apart is not None and news.apart not in self._apart:
+            self._apart.add(news.apart)
+            document = with_key(candidate.document, "final_reconcile", True)
+            self._to_reconcile.append(candidate._replace(document=document))
         before = len(self.reached.states), len(self.reached.pairs)
         branches = any(branch not in self.reached.branches for branch in news.reached.branches)
         self.reached.add(news.reached)
@@ -142,15 +153,15 @@ class Hunt:
             self._dropped.append(least.candidate)
         return True
 
-    def _next(self) -> Candidate:
-        lots, kept = self.lots, self._pick()
+    def _next(self, worth: Sequence[float]) -> Candidate:
+        lots, kept = self.lots, self._pick(worth)
         kept.picked += 1
         other = lots.choice(self.kept).candidate.document
-        document = changed(kept.candidate.document, other, self.limits, lots)
+        document = with_key(changed(kept.candidate.document, other, self.limits, lots), "final_reconcile", None)
         return Candidate(document, kept.candidate.seed if lots.random() < 0.8 else lots.randrange(SEEDS))
 
-    def _pick(self) -> Kept:
-        """One of the newest as often as any of the others, which are picked by their worth."""
+    def _pick(self, worth: Sequence[float]) -> Kept:
+        """One of the newest as often as any of the others, which are picked by their worth, here summed up."""
         if self.lots.random() < 0.5:
             return self.lots.choice(self.kept[-NEWEST:])
-        return self.lots.choices(self.kept, [kept.worth for kept in self.kept])[0]
+        return self.lots.choices(self.kept, cum_weights=worth)[0]

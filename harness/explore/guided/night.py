@@ -15,7 +15,7 @@ from typing import Any, Literal
 from harness.coverage import Existing, existing
 from harness.coverage import to_json as coverage_to_json
 from harness.errors import INTERRUPTED, VIOLATED, HarnessError
-from harness.explore.document import Document, with_key
+from harness.explore.document import Document
 from harness.explore.guided.change import Limits
 from harness.explore.guided.corpus import Corpus, Finding, opened
 from harness.explore.guided.hunt import Candidate, Hunt
@@ -244,7 +244,6 @@ class _Nightwatch:
                 return
 
     def _take_down(self, identity: Identity, candidate: Candidate) -> None:
-        document = _that_shows(identity, candidate)
         finding = Finding(
             **vars(identity),
             seed=candidate.seed,
@@ -252,7 +251,7 @@ class _Nightwatch:
             last=self._night.began,
         )
         self._new[identity] = finding
-        self._write(finding, document, "as it was found")
+        self._write(finding, with_liveness_phase(candidate.document), "as it was found")
         self._watcher.on_event(f"found: {identity}")
 
     def _write(self, finding: Finding, document: Document, words: str) -> None:
@@ -269,7 +268,7 @@ class _Nightwatch:
     def _shrink(self) -> None:
         """Make what is new small."""
         for identity, finding in self._new.items():
-            document = _that_shows(identity, self._night.hunt.found[identity])
+            document = with_liveness_phase(self._night.hunt.found[identity].document)
             self._watcher.on_event(f"shrinking: {identity}")
 
             def still(scenario: Scenario, identity: Identity = identity, seed: int = finding.seed) -> bool:
@@ -311,14 +310,6 @@ class _Nightwatch:
         night.left_out = corpus.left_out
         document = night.to_json()
         night.report = corpus.write_night(night.began, document, lambda nights: to_html(document, nights))
-
-
-def _that_shows(identity: Identity, candidate: Candidate) -> Document:
-    """The document, with a final reconcile if it takes that to show it."""
-    document = with_liveness_phase(candidate.document)
-    if identity in found_in(scenario_of(document), candidate.seed):
-        return document
-    return with_key(document, "final_reconcile", True)
 
 
 def _processor_s() -> float:

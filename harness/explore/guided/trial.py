@@ -1,16 +1,18 @@
 """One run of a hunt: a document, played with a liveness phase at its end, and what it reached and showed.
 
-In the liveness phase all conditions are cleared and no more events are logged; the swarm must become idle. If it then
-has several chains, it is played again with a final reconcile, after which there must be one.
+In the liveness phase all conditions are cleared and no more events are logged; the swarm must become idle. Where it
+then has several chains, whoever plays it may play it again with a final reconcile, after which there must be one.
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from harness.archive.record import Cycle
 from harness.checker import Result
 from harness.checker.evidence import Watch
+from harness.checker.uniform_chain import common_prefix
 from harness.coverage import Reached, Watcher
 from harness.coverage.simulated import simulate_watched
 from harness.explore.document import Document, at, cut_after, document_of, timeline, with_key
@@ -24,12 +26,18 @@ from harness.scenario import Scenario
 from ucp.events import EVENT_HEADER_BYTES
 from ucp.settings import Settings
 
-MOST_BLOCKS = 8
+MOST_BLOCKS = 12
 """Runs have no more: states of many blocks are new in every run, and tell nothing."""
+LAST_S = 240.0
+"""Up to when blocks are completed, at least."""
 CLEARED_S = 0.001
 """So long before the end of a mission the conditions are cleared."""
 LONGEST_GAP_S = 40.0
 """Between two events: a round of votes and reconciles is over."""
+
+
+Apart = tuple[tuple[int, int], ...]
+"""Of each chain how many agents hold it, and how many of its blocks are not in all chains; in order."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,8 @@ class Tried:
 
     reached: Reached
     found: tuple[Identity, ...]
+    apart: Apart | None = None
+    """How chains differ at rest, where nobody has been told to reconcile finally."""
 
 
 @gc_paused()
@@ -45,10 +55,16 @@ def tried(scenario: Scenario, seed: int) -> Tried:
     """Play it. Raises HarnessError if it cannot be played."""
     watcher = Watcher()
     result, cycle = _played(scenario, seed, watcher.step)
-    if not result.bad and len(set(result.chains.values())) > 1:
-        scenario = scenario.model_copy(update={"final_reconcile": True})
-        result, cycle = _played(scenario, seed, watcher.step)
-    return Tried(watcher.reached, identities(result, cycle, scenario))
+    apart = None if scenario.final_reconcile or result.bad else _apart(result)
+    return Tried(watcher.reached, identities(result, cycle, scenario), apart)
+
+
+def _apart(result: Result) -> Apart | None:
+    holders = Counter(result.chains.values())
+    if len(holders) < 2:
+        return None
+    mutual = common_prefix([*holders])
+    return tuple(sorted((agents, len(chain) - mutual) for chain, agents in holders.items()))
 
 
 def found_in(scenario: Scenario, seed: int) -> tuple[Identity, ...]:
@@ -104,16 +120,14 @@ def _until(fate: Document, ends_s: float) -> Document:
 
 
 def beginnings(scenario: Scenario, seeds: Iterable[int]) -> tuple[Limits, list[tuple[Document, int]]]:
-    """Short documents to begin with, and how far changes of them may go: no further than runs of the scenario."""
-    begun = []
-    most, last_s = 1, 0.0
+    """Short documents to begin with, and how far changes of them may go."""
+    begun, last_s = [], LAST_S
     for seed in seeds:
         completing = [event for event in record(scenario, seed).logged if event.completes]
         documents = [_as_json(_beginning(scenario, completing[:blocks])) for blocks in (FEW_BLOCKS, MOST_BLOCKS)]
         begun += [(document, seed) for document in documents]
-        most = max(most, min(len(completing), MOST_BLOCKS))
         last_s = max(last_s, documents[-1]["duration_s"])
-    return Limits(scenario.roster, most, last_s), begun
+    return Limits(scenario.roster, MOST_BLOCKS, last_s), begun
 
 
 def _as_json(document: Document) -> Document:
