@@ -16,9 +16,9 @@ from netem.errors import UmlError
 REPOSITORY = Path(__file__).parents[2]
 DEADLINE_S = os.environ.get("UCP_UML_DEADLINE_S", "1500")
 
-# Programs in the lab and how they end, who may have one, and statistics have nothing to do with netem: they are tested
-# on the host, and a test takes ten times as long in here.
-_FILES = (
+# Programs in the lab and how they end, who may have one, taps and statistics have nothing to do with netem: they are
+# tested on the host, and a test takes ten times as long in here.
+_OF_NETEM = (
     "tests/netem/test_engine.py",
     "tests/netem/test_links.py",
     "tests/netem/test_lab.py::test_a_cable_can_end_in_a_network_that_is_there_already",
@@ -29,11 +29,14 @@ _FILES = (
     "tests/netem/test_machine.py::test_an_engine_that_the_kernel_lacks_is_refused_with_the_way_out",
     "tests/netem/test_machine.py::test_doctor_finds_what_a_lab_finds",
     "tests/netem/test_agreement.py",
-    "tests/netem/test_capture.py",
-    "tests/netem/test_measure.py",
+    "tests/netem/test_capture.py::test_what_is_lost_or_cut_off_on_its_way_is_in_its_senders_file_alone",
+    "tests/netem/test_capture.py::test_a_frame_is_there_as_often_and_as_late_as_its_receiver_got_it",
+    "tests/netem/test_measure.py::test_real_packets_fare_as_asked",
+    "tests/netem/test_measure.py::test_a_network_that_loses_more_than_asked_is_found",
+    "tests/netem/test_measure.py::test_a_network_that_delays_longer_than_asked_is_found",
     "tests/harness/test_netem_run.py",
 )
-_TESTS = ("-q", "-m", "lab", "-k", "not nftables", *_FILES)
+_TESTS = ("-q", "-k", "not nftables", *_OF_NETEM)
 
 
 def main(arguments: list[str]) -> int:
