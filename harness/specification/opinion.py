@@ -6,6 +6,7 @@ from math import gcd
 from typing import Any
 
 from harness.errors import INTERRUPTED, VIOLATED
+from harness.prove import liveness
 from harness.prove.bounds import Bounds, BoundsError
 from harness.prove.explore import explore
 from harness.prove.progress import Ended, Progress
@@ -47,6 +48,9 @@ class Opinion:
     distinct: int | None = None
     only_real: int | None = None
     only_specified: int | None = None
+    livelock: bool | None = None
+    specified_livelock: bool | None = None
+    """Whether one can go round for ever though nothing is lost; None on a network that loses."""
 
     @property
     def decided(self) -> bool:
@@ -55,13 +59,14 @@ class Opinion:
     @property
     def agrees(self) -> bool:
         """Whether both say the same, and have found the same states if nothing is wrong about them."""
-        return self.decided and self.flaw == self.violated and not self.only_real and not self.only_specified
+        same = not self.only_real and not self.only_specified and self.livelock == self.specified_livelock
+        return self.decided and self.flaw == self.violated and same
 
     @property
     def exit_status(self) -> int:
         if not self.decided:
             return INTERRUPTED if self.ended == "interrupted" else INCOMPLETE
-        return 0 if self.agrees and self.flaw is None else VIOLATED
+        return 0 if self.agrees and self.flaw is None and not self.livelock else VIOLATED
 
     def to_json(self) -> dict[str, Any]:
         bounds = asdict(self.bounds)
@@ -75,12 +80,18 @@ class Opinion:
             "quirks": dict(self.bounds.quirks),
             "ended": self.ended,
             "agree": self.agrees,
-            "prove": {"states": self.states, "flaw": self.flaw, "only_here": self.only_real},
+            "prove": {
+                "states": self.states,
+                "flaw": self.flaw,
+                "only_here": self.only_real,
+                "livelock": self.livelock,
+            },
             "tlc": {
                 "states": self.specified,
                 "distinct": self.distinct,
                 "violated": self.violated,
                 "only_here": self.only_specified,
+                "livelock": self.specified_livelock,
             },
         }
 
@@ -92,10 +103,14 @@ class Opinion:
         if self.flaw is None and self.violated is None:
             yield "✔ both hold: characteristics 2, 3 and 4, and nobody hangs"
             yield f"  states: {self.states:,} of the agent, {self.specified:,} of the specification"
-            if self.agrees:
+            if not self.only_real and not self.only_specified:
                 yield "✔ they are the same states"
             else:
                 yield f"✘ {self.only_real:,} states only the agent has, {self.only_specified:,} only the specification"
+            if self.livelock != self.specified_livelock:
+                yield f"✘ only the {'agent' if self.livelock else 'specification'} can go round for ever"
+            elif self.livelock is not None:
+                yield "✘ both can go round for ever" if self.livelock else "✔ neither can go round for ever"
             return
         yield f"{'✔ both violate' if self.agrees else '✘ they differ'}: the agent {_word(self.flaw)}, the " + (
             f"specification {_word(self.violated)}"
@@ -124,6 +139,7 @@ def second_opinion(
             violated = said.violated and INVARIANTS[said.violated]
             if flaw or violated:
                 return Opinion(bounds, "flaw", flaw, violated)
+            lossless = bounds.network == "lossless"
             real, specified = set(states.real(graph)), set(states.specified(said.states))
             return Opinion(
                 bounds,
@@ -135,6 +151,8 @@ def second_opinion(
                 said.distinct,
                 len(real - specified),
                 len(specified - real),
+                bool(liveness.look(graph).cycles) if lossless else None,
+                states.goes_round(said.states) if lossless else None,
             )
     except TimeoutError:
         return Opinion(bounds, "time", flaw, None)

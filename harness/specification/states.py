@@ -5,8 +5,8 @@ Blocks are called 1, 2, ... in the order in which they were completed; a chain h
 
 import json
 import re
+from collections import Counter, defaultdict
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +23,35 @@ NO_HASH = -1
 TOP_OF_CHAIN = 0
 _SIGNS = str.maketrans({"{": "\1", "}": "\2", "[": "{", "]": "}", "(": "{", ")": "}"})
 _WORDS = {"<<": "[", ">>": "]", "\1": "[", "\2": "]", " @@": ",", ":>": ":", "TRUE": "true", "FALSE": "false"}
+_NODE = re.compile(r'-?\d+ \[label="((?:[^"\\]|\\.)*)"')
+_EDGE = re.compile(r"(-?\d+) -> (-?\d+)")
 _FIELD = re.compile(r"(\w+) \|->")
 
 
-def specified(dump: Path) -> Iterator[Plain]:
+def specified(graph: Path) -> Iterator[Plain]:
     """All states that TLC has found."""
-    with dump.open() as lines:
-        state: list[str] = []
-        for line in chain(lines, ["State"]):
-            if line.startswith("State") and state:
-                yield tuple(map(_of_record, _value("".join(state).partition("=")[2])))
-                state = []
-            elif not line.startswith("State"):
-                state.append(line)
+    with graph.open() as lines:
+        for line in lines:
+            if node := _NODE.match(line):
+                text = node[1].replace("\\n", " ").replace('\\"', '"').replace("\\\\", "\\")
+                yield tuple(map(_of_record, _value(text.partition("=")[2])))
+
+
+def goes_round(graph: Path) -> bool:
+    """Whether a way through the states that TLC has found leads back to where it was."""
+    after: dict[str, set[str]] = defaultdict(set)
+    with graph.open() as lines:
+        for line in lines:
+            if edge := _EDGE.match(line):
+                after[edge[1]].add(edge[2])
+    ways_in = Counter(other for others in after.values() for other in others)
+    waiting = [state for state in after if not ways_in[state]]
+    while waiting:
+        for other in after.pop(waiting.pop(), ()):
+            ways_in[other] -= 1
+            if not ways_in[other]:
+                waiting.append(other)
+    return bool(after)
 
 
 def _value(text: str) -> Any:

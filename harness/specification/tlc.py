@@ -39,7 +39,7 @@ class CheckerError(MachineError):
 class Checked:
     """What TLC says. `violated` is an invariant, and then not everything was looked at. `told` is all that it printed.
 
-    `states` is the file with all distinct states, if it was asked for.
+    `states` is the file with all distinct states, and how one leads to others, if it was asked for.
     """
 
     generated: int
@@ -82,7 +82,7 @@ def checked(
         for title, text in (others or {}).items():
             (folder / f"{title}.tla").write_text(text)
         (folder / f"{module}.cfg").write_text(config)
-        call += ["-dump", "all"] if dump else []
+        call += ["-dump", "dot", "all"] if dump else []
         try:
             done = subprocess.run(
                 [*call, module],
@@ -96,7 +96,7 @@ def checked(
             )
         except subprocess.TimeoutExpired:
             raise TimeoutError from None
-        yield _read(done.stdout, folder / "all.dump")
+        yield _read(done.stdout, folder / "all.dot")
 
 
 def _read(told: str, states: Path) -> Checked:
