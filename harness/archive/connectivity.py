@@ -9,6 +9,7 @@ from bisect import bisect_right
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -51,6 +52,23 @@ class Losses:
     worst: float
 
 
+QUALITY_LIMITS = (0.05, 0.25, 0.6, 1.0)
+"""A link that loses less than the first of these is of quality 0; who loses everything, of quality 4, has none."""
+
+
+SAME_LOSS = 0.05
+"""Losses of a pair that differ by less are one."""
+
+
+def quality(loss: float) -> int:
+    """Of a link that loses this share of messages."""
+    return bisect_right(QUALITY_LIMITS, loss)
+
+
+def _is_another(loss: float, before: float) -> bool:
+    return abs(loss - before) >= SAME_LOSS or quality(loss) != quality(before)
+
+
 @dataclass(frozen=True)
 class Connectivity:
     """The states of the network, no two in a row alike; none if there is no record of it."""
@@ -62,6 +80,9 @@ class Connectivity:
     reboots: list[tuple[float, int]]
     """When an agent went down, while its vehicle flew on."""
     problems: list[str]
+    pair_losses: dict[Pair, list[tuple[float, float]]]
+    """From when on each pair of vehicles loses which share of messages, both ways together, to a twentieth. 1.0 is no
+    link, or a vehicle that is lost."""
     _cut: dict[Pair, list[float]]
     """When each pair was cut, joined, cut again, and so on."""
     _lost: dict[int, list[float]]
@@ -71,6 +92,12 @@ class Connectivity:
         """The links between living vehicles."""
         living = [vehicle for vehicle in self.vehicles if not _switched(self._lost.get(vehicle, ()), at_s)]
         return [pair for pair in combinations(living, 2) if not _switched(self._cut.get(pair, ()), at_s)]
+
+    def loss(self, pair: Pair, at_s: float) -> float:
+        """What a pair loses then, to a twentieth."""
+        losses = self.pair_losses.get(pair, [])
+        at = bisect_right(losses, at_s, key=itemgetter(0))
+        return losses[at - 1][1] if at else 1.0
 
     def lives(self, vehicle: int, end_s: float) -> list[tuple[float, float, bool]]:
         """From when to when the vehicle was in the air, and whether it was then lost; nothing goes beyond `end_s`."""
@@ -138,6 +165,10 @@ class _Network:
             losses |= {(low, high): there, (high, low): back}
         return losses
 
+    def by_pair(self) -> dict[Pair, float]:
+        """What each pair loses now, both ways together."""
+        return {pair: sum(self._directions(pair)) / 2 if self._is_up(pair) else 1.0 for pair in self._asked}
+
     def _is_up(self, pair: Pair) -> bool:
         return pair not in self._out_of_range and pair not in self._cut_off and not self.lost & {*pair}
 
@@ -179,6 +210,7 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
     reboots: list[tuple[float, int]] = []
     cut: dict[Pair, list[float]] = {}
     lost: dict[int, list[float]] = {}
+    pair_losses: dict[Pair, list[tuple[float, float]]] = {}
     now_s = 0.0
     for line in lines:
         cut_before, lost_before = network.cut, set(network.lost)
@@ -198,9 +230,13 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
         lost_now = network.losses(now_s)
         if not losses or (lost_now.mean, lost_now.worst) != (losses[-1].mean, losses[-1].worst):
             losses.append(lost_now)
+        for pair, loss in network.by_pair().items():
+            history = pair_losses.setdefault(pair, [])
+            if not history or _is_another(loss, history[-1][1]):
+                history.append((now_s, round(loss, 3)))
         if switched or fallen or not states:
             _enter(states, Topology(now_s, line.what, network.components()))
-    return Connectivity(network.vehicles, states, losses, reboots, lines.problems(), cut, lost)
+    return Connectivity(network.vehicles, states, losses, reboots, lines.problems(), pair_losses, cut, lost)
 
 
 def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:

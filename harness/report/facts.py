@@ -6,6 +6,7 @@ from harness.play.backends import in_virtual_time
 from harness.present import words
 from harness.report.programs import programs
 from harness.scenario.quirks import in_words
+from sitl.vehicle import VehicleType
 
 FIGURES = {
     "blocks": "blocks completed",
@@ -20,6 +21,13 @@ FIGURES = {
     "mutual_chain_before_final_reconcile": "blocks in the mutual chain before the final reconcile",
     "distinct_chains_before_final_reconcile": "distinct chains before the final reconcile",
 }
+
+
+def vehicle_types(record: RunRecord) -> dict[int, VehicleType]:
+    """Of each vehicle, as the scenario has them."""
+    if record.scenario is None:
+        return {}
+    return {vehicle: record.scenario.vehicles.type_of(vehicle) for vehicle in record.scenario.roster}
 
 
 def title(record: RunRecord) -> str:

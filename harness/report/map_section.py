@@ -1,11 +1,11 @@
 """Where the vehicles flew, and who could reach whom: a map of the tracks, and the swarm at telling moments."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.archive.connectivity import Connectivity
+from harness.archive.connectivity import QUALITY_LIMITS, Connectivity, quality
 from harness.archive.tracks import Tracks
 from harness.present import words
 from harness.present.colours import Ink
@@ -13,6 +13,7 @@ from harness.report import map_svg
 from harness.report.map_geometry import Extent, extent
 from harness.report.map_parts import MAX_STRETCHES, Division, Life, divisions, letter, lives, longest
 from harness.scenario.changes import RANGE
+from sitl.vehicle import VehicleType
 
 MOVES_M = 1.0
 """A vehicle that stays within so many metres stands."""
@@ -40,11 +41,16 @@ class Section:
     notes: list[str]
 
 
-def section(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink]) -> Section | None:
-    """None if no vehicle of the run is known to have moved, and nothing was wrong with what was read."""
+def section(
+    tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types: Mapping[int, VehicleType]
+) -> Section | None:
+    """None if no vehicle of the run is known to have moved, and nothing was wrong with what was read.
+
+    `types` are the vehicles', as far as they are known.
+    """
     if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
         return Section(None, [], [], tracks.problems) if tracks.problems else None
-    return _drawn(tracks, network, ink)
+    return _drawn(tracks, network, ink, types)
 
 
 def _moved(tracks: Tracks, vehicle: int) -> bool:
@@ -55,7 +61,7 @@ def _moved(tracks: Tracks, vehicle: int) -> bool:
     )
 
 
-def _drawn(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink]) -> Section:
+def _drawn(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types: Mapping[int, VehicleType]) -> Section:
     end_s = max(fixes[-1].at_s for fixes in tracks.by_vehicle.values())
     known = [division for division in divisions(network.states) if division.at_s <= end_s]
     kept = longest(known, end_s, max(MAX_STRETCHES // len(tracks.by_vehicle), 2))
@@ -63,7 +69,8 @@ def _drawn(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink]) -> Sec
     land = extent([fix for fixes in tracks.by_vehicle.values() for fix in fixes])
     reboots = [(tracks.at(vehicle, at_s), vehicle) for at_s, vehicle in network.reboots if at_s <= end_s]
     moments = [
-        _moment(at_s, division, tracks, network, flown, land, ink) for at_s, division in _telling(known, tracks, end_s)
+        _moment(at_s, division, tracks, network, flown, land, ink, types)
+        for at_s, division in _telling(known, network, tracks, end_s)
     ]
     notes = [*tracks.problems, *network.problems]
     if not known:
@@ -72,14 +79,19 @@ def _drawn(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink]) -> Sec
         notes.append(f"network.jsonl: of {len(known) - 1} changes the map has the {len(kept) - 1} that lasted longest")
     return Section(
         map_svg.draw_tracks(flown, reboots, land, ink, _description(tracks, land, moments)),
-        _legend(flown, rebooted=bool(reboots)),
+        [*_legend(flown, rebooted=bool(reboots)), *_legend_of_moments(moments, set(types.values()))],
         moments,
         notes,
     )
 
 
-def _telling(known: Sequence[Division], tracks: Tracks, end_s: float) -> list[tuple[float, Division | None]]:
-    """Begin, end, and the changes between that did most to most vehicles for longest, with what was then in force."""
+def _telling(
+    known: Sequence[Division], network: Connectivity, tracks: Tracks, end_s: float
+) -> list[tuple[float, Division | None]]:
+    """Begin, end, the changes between that did most to most vehicles for longest, and when links lost most.
+
+    With what was then in force.
+    """
     begin_s = min(fixes[0].at_s for fixes in tracks.by_vehicle.values())
     ends = [*(division.at_s for division in known[1:]), end_s]
     weights = {}
@@ -87,7 +99,9 @@ def _telling(known: Sequence[Division], tracks: Tracks, end_s: float) -> list[tu
         if division.at_s > begin_s:
             weights[division.at_s] = division.changed_since(before) * (until_s - division.at_s)
     changes = sorted(weights, key=lambda at_s: -weights[at_s])[: MOMENTS - 2]
-    moments = sorted({begin_s, *changes, end_s})
+    lossy = max(network.losses, key=lambda losses: losses.mean, default=None)
+    worst = [lossy.at_s] if lossy and quality(lossy.mean) and begin_s < lossy.at_s < end_s else []
+    moments = sorted({begin_s, *changes, *worst, end_s})
     return [(at_s, next((division for division in reversed(known) if division.at_s <= at_s), None)) for at_s in moments]
 
 
@@ -99,6 +113,7 @@ def _moment(
     flown: Sequence[Life],
     land: Extent,
     ink: Mapping[int, Ink],
+    types: Mapping[int, VehicleType],
 ) -> Moment:
     living = set(ink) if division is None else division.living
     seen = {vehicle: tracks.at(vehicle, at_s) for vehicle in sorted(living) if vehicle in tracks.by_vehicle}
@@ -106,14 +121,18 @@ def _moment(
     lost = [life.end for life in flown if life.lost and life.end.at_s <= at_s and life.vehicle not in living]
     what = division.what if division and division.at_s == at_s and division.what not in (RANGE, "start") else ""
     state = "the network is not on record" if division is None else division.in_words()
+    losses = {pair: network.loss(pair, at_s) for pair in links if pair[0] in seen and pair[1] in seen}
+    if lossy := _in_words(losses.values()):
+        state += f", {lossy}"
     at = words.duration(round(at_s, 1))
     picture = map_svg.draw_moment(
         seen,
         lost,
-        [(vehicle, fellow) for vehicle, fellow in links if vehicle in seen and fellow in seen],
+        losses,
         division,
         land,
         ink,
+        types,
         f"The swarm at {at}: {state}",
     )
     return Moment(at, what, state, picture)
@@ -138,6 +157,31 @@ def _legend(flown: Sequence[Life], *, rebooted: bool) -> list[tuple[Markup, str]
     entries += [("lost", "lost")] if any(life.lost for life in flown) else []
     entries += [("reboot", "agent reboots")] if rebooted else []
     return [(map_svg.sample(which), meaning) for which, meaning in entries]
+
+
+def _in_words(losses: Collection[float]) -> str:
+    """What links lose; nothing if that is next to nothing."""
+    least, most = min(losses, default=0.0), max(losses, default=0.0)
+    if not quality(most):
+        return ""
+    low, high = words.percent(least), words.percent(most)
+    return f"links lose {high}" if low == high else f"links lose {low} to {high}"
+
+
+def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
+    """What the small maps show beside that: links that lose messages; of several types of vehicles, which is which."""
+    drawn = "".join(moment.picture for moment in moments)
+    limits = [0.0, *QUALITY_LIMITS]
+    entries = [
+        (
+            map_svg.sample(f"q{which}"),
+            f"link that loses {words.percent(limits[which])} to {words.percent(limits[which + 1])}",
+        )
+        for which in range(1, len(QUALITY_LIMITS))
+        if f" q{which}" in drawn
+    ]
+    shapes = sorted(types) if len(types) > 1 else []
+    return entries + [(map_svg.sample(vehicle_type), vehicle_type) for vehicle_type in shapes]
 
 
 def _description(tracks: Tracks, land: Extent, moments: Sequence[Moment]) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from harness.archive.connectivity import quality
 from harness.archive.tracks import Fix
 from harness.present import words
 from harness.present.colours import Ink
@@ -17,6 +18,7 @@ from harness.present.svg import FONT, n
 from harness.report.map_geometry import Extent, Point, Projection, thinned
 from harness.report.map_parts import Division, Life, Stretch, letter, listed
 from harness.report.map_tags import tags
+from sitl.vehicle import VehicleType
 
 STYLE = (Path(__file__).parent / "map.css").read_text(encoding="utf-8")
 
@@ -72,16 +74,17 @@ def draw_tracks(
 def draw_moment(
     swarm: Mapping[int, Fix],
     lost: Sequence[Fix],
-    links: Sequence[tuple[int, int]],
+    links: Mapping[tuple[int, int], float],
     division: Division | None,
     land: Extent,
     ink: Mapping[int, Ink],
+    types: Mapping[int, VehicleType],
     description: str,
 ) -> Markup:
-    """The living vehicles of the `swarm`, and where others were `lost`."""
+    """The living vehicles of the `swarm`, what their `links` lose, and where others were `lost`."""
     to_px = Projection(land, 1, 1, _MOMENT_WIDTH, _MOMENT_HEIGHT)
     at = {vehicle: to_px(fix) for vehicle, fix in swarm.items()}
-    dots = (_dot(vehicle, place, division, ink[vehicle]) for vehicle, place in at.items())
+    dots = (_dot(vehicle, place, division, ink[vehicle], types.get(vehicle, "copter")) for vehicle, place in at.items())
     tagged = list(at.items()) if len(at) <= MOST_TAGGED_AT_A_MOMENT else []
     return Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
@@ -101,29 +104,41 @@ def draw_moment(
     )
 
 
-def _links(at: Mapping[int, Point], links: Sequence[tuple[int, int]], division: Division | None) -> Markup:
-    drawn: dict[str, list[str]] = {}
+def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], division: Division | None) -> Markup:
+    """Those that lose most below: what can be relied on is seen first."""
+    drawn: dict[tuple[int, str], list[str]] = {}
     shortest = sorted(links, key=lambda pair: math.dist(at[pair[0]], at[pair[1]]))
     for vehicle, fellow in shortest[:MAX_LINKS]:
         (x1, y1), (x2, y2) = at[vehicle], at[fellow]
-        drawn.setdefault(look(division, vehicle), []).append(f"M{n(x1)} {n(y1)}L{n(x2)} {n(y2)}")
+        which = quality(links[vehicle, fellow]), look(division, vehicle)
+        drawn.setdefault(which, []).append(f"M{n(x1)} {n(y1)}L{n(x2)} {n(y2)}")
     return Markup("").join(
-        Markup('<path class="link {}" d="{}"/>').format(which, "".join(lines)) for which, lines in drawn.items()
+        Markup('<path class="link {} q{}" d="{}"/>').format(which, grade, "".join(lines))
+        for (grade, which), lines in sorted(drawn.items(), key=lambda links: (-links[0][0], links[0][1]))
     )
 
 
-def _dot(vehicle: int, place: Point, division: Division | None, ink: Ink) -> Markup:
-    return Markup('<circle class="dot {}" cx="{}" cy="{}" r="4.5" fill="{}"><title>{}</title></circle>').format(
-        look(division, vehicle),
-        n(place[0]),
-        n(place[1]),
-        ink.fill,
-        f"vehicle {vehicle}: {_whereabouts(division, vehicle)}",
+def _dot(vehicle: int, place: Point, division: Division | None, ink: Ink, vehicle_type: VehicleType) -> Markup:
+    told = f"vehicle {vehicle}, a {vehicle_type}: {_whereabouts(division, vehicle)}"
+    return Markup('<path class="dot {}" d="{}" fill="{}"><title>{}</title></path>').format(
+        look(division, vehicle), _shape(vehicle_type, place), ink.fill, told
     )
+
+
+def _shape(vehicle_type: VehicleType, place: Point) -> str:
+    """A copter is a circle, a plane a triangle, a rover a square."""
+    x, y = place
+    match vehicle_type:
+        case "copter":
+            return f"M{n(x - 4.5)} {n(y)}a4.5 4.5 0 1 1 9 0a4.5 4.5 0 1 1-9 0z"
+        case "plane":
+            return f"M{n(x)} {n(y - 6)}l5.5 10h-11z"
+        case "rover":
+            return f"M{n(x - 4)} {n(y - 4)}h8v8h-8z"
 
 
 def sample(which: str) -> Markup:
-    """For a legend: one of LOOKS, or start, end, lost, reboot."""
+    """For a legend: one of LOOKS, start, end, lost, reboot, the quality of a link as q1, or a type of vehicles."""
     place = (17.0, 8.0)
     match which:
         case "start":
@@ -134,6 +149,10 @@ def sample(which: str) -> Markup:
             shape = _cross(place, "lost")
         case "reboot":
             shape = _diamond(place, "reboot")
+        case "copter" | "plane" | "rover":
+            shape = Markup('<path d="{}" fill="currentColor"/>').format(_shape(which, place))
+        case _ if which.startswith("q"):
+            shape = Markup('<path class="link whole {}" d="M1 8h32"/>').format(which)
         case _:
             shape = Markup('<path class="way {}" d="M1 8h32"/>').format(which)
     return Markup('<svg width="34" height="16" aria-hidden="true">{}</svg>').format(shape)

@@ -1,17 +1,31 @@
 """What the network was set to, what it did, and what happened to it, as it is on record."""
 
+from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.archive.connectivity import Connectivity, Losses
+from harness.archive.connectivity import Connectivity, Losses, Pair, quality
 from harness.archive.record import FaultRecord, NetworkState
 from harness.present import words
 from harness.report import network_strip
 from harness.report.map_parts import divisions
 
+MOST_PAIRS = 10
+"""Lanes of pairs; of more only those that lost most."""
+NAMED_PAIRS = 3
 
-def strip(network: Connectivity, faults: Sequence[FaultRecord], end_s: float) -> Markup | None:
+
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """Lanes along mission time, from top to bottom, and what they are called."""
+
+    names: list[str]
+    picture: Markup
+
+
+def strip(network: Connectivity, faults: Sequence[FaultRecord], end_s: float) -> Strip | None:
     """What the network did up to `end_s`, as it is on record; None if it is not."""
     if not network.states:
         return None
@@ -23,9 +37,34 @@ def strip(network: Connectivity, faults: Sequence[FaultRecord], end_s: float) ->
     lanes = [
         ("partition", network_strip.steps(partitions, end_s)),
         ("loss", network_strip.steps(losses, end_s)),
+        *_pairs(network, end_s),
     ]
     ticks = [(fault.at_s, f"{words.duration(fault.at_s)}: {fault.what}") for fault in faults]
-    return network_strip.draw(lanes, ticks, end_s)
+    return Strip([name for name, _ in lanes], network_strip.draw(lanes, ticks, end_s))
+
+
+def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[network_strip.Span]]]:
+    """A lane for the pairs whose links were alike all along, those that lost most first; none if all were alike."""
+    alike: defaultdict[tuple[tuple[float, float], ...], list[Pair]] = defaultdict(list)
+    for pair, history in network.pair_losses.items():
+        alike[tuple(history)].append(pair)
+    if len(alike) < 2:
+        return []
+    lanes = []
+    for states, pairs in alike.items():
+        spans = network_strip.steps([(at_s, _lost(loss), loss) for at_s, loss in states], end_s)
+        lanes.append((sum(span.level * (span.to_s - span.from_s) for span in spans), _named(pairs), spans))
+    lanes.sort(key=lambda lane: -lane[0])
+    return [(name, spans) for _, name, spans in lanes[:MOST_PAIRS]]
+
+
+def _lost(loss: float) -> str:
+    return "no link" if loss == 1.0 else words.percent(round(loss, 2)) if quality(loss) else ""
+
+
+def _named(pairs: Sequence[Pair]) -> str:
+    names = ", ".join(f"{low}\u2013{high}" for low, high in pairs[:NAMED_PAIRS])
+    return f"{names} and {len(pairs) - NAMED_PAIRS} more" if len(pairs) > NAMED_PAIRS else names
 
 
 def _in_words(losses: Losses) -> str:

@@ -53,7 +53,7 @@ def draw(left: ReportSource) -> str:
         network=network.start(record.network),
         faults=network.faults(record.faults),
         rogue=rogue.section(record.rogue),
-        flight=map_section.section(left.archive.tracks(ink), left.network, ink),
+        flight=map_section.section(left.archive.tracks(ink), left.network, ink, facts.vehicle_types(record)),
         agents=swarm.agents_table(left.archive, ink),
         versions=record.versions,
         evidence_shown=EVIDENCE_SHOWN,

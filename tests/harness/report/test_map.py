@@ -16,6 +16,7 @@ from harness.report import map_section, write_report
 from harness.report.map_parts import divisions, letter, longest
 from harness.report.map_section import Section
 from harness.scenario import Scenario
+from sitl.vehicle import VehicleType
 from tests.harness.report.flights import Way, split_and_rejoin, still, write_flight, write_lines
 from tests.harness.report.runs import write_run
 from tests.harness.report.test_page import Reader
@@ -26,7 +27,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 def scenario(range_m: float = 250.0, **more: Any) -> Scenario:
     network = {"radio": {"hard_range": {"range_m": range_m}}}
-    return Scenario.model_validate({"name": "split", "duration_s": 1200, "network": network, **more})
+    return Scenario.model_validate({"name": "split", "duration_s": 1200, "network": network} | more)
 
 
 def drawn(run_dir: Path, seconds: int = 600, ways: dict[int, Way] | None = None, **more: Any) -> Section:
@@ -39,7 +40,7 @@ def drawn(run_dir: Path, seconds: int = 600, ways: dict[int, Way] | None = None,
 
 def section_of(run_dir: Path, ink: dict[int, Ink]) -> Section | None:
     network = read_connectivity(run_dir / NETWORK_FILE, ink)
-    return map_section.section(read_tracks(run_dir / TRACKS_FILE, ink), network, ink)
+    return map_section.section(read_tracks(run_dir / TRACKS_FILE, ink), network, ink, {})
 
 
 def paths(section: Section) -> list[tuple[str, str, list[tuple[float, float]]]]:
@@ -78,8 +79,28 @@ def test_the_moments_are_begin_changes_and_end_with_the_live_links(tmp_path: Pat
     assert apart.endswith("s A 1\u20133; B 4, 5")
     assert together.endswith("s all 5 connected")
     assert end == "600 s all 5 connected"
-    links = [re.findall('class="link ([a-z0-9]+)"', one.picture) for one in section.moments]
+    links = [re.findall('class="link ([a-z0-9]+) q0"', one.picture) for one in section.moments]
     assert links == [["whole"], ["part0", "part1"], ["whole"], ["whole"]]
+
+
+def test_links_are_drawn_by_what_they_lose_and_it_is_said(tmp_path: Path) -> None:
+    """All are connected, and hardly hear each other."""
+    section = drawn(tmp_path, network={"loss": 0.98, "radio": {"hard_range": {"range_m": 2000}}})
+    assert said(section)[0] == "0 s all 5 connected, links lose 98 %"
+    assert 'class="link whole q3"' in section.moments[0].picture
+    assert "link that loses 60\u00a0% to 100\u00a0%" in [meaning for _, meaning in section.legend]
+
+
+def test_each_type_of_vehicle_has_its_shape(tmp_path: Path) -> None:
+    drawn(tmp_path)
+    ink, network = inks(FIVE), read_connectivity(tmp_path / NETWORK_FILE, FIVE)
+    types: dict[int, VehicleType] = {1: "copter", 2: "plane", 3: "rover", 4: "copter", 5: "copter"}
+    section = map_section.section(read_tracks(tmp_path / TRACKS_FILE, ink), network, ink, types)
+    assert section is not None
+    assert [meaning for _, meaning in section.legend][-3:] == ["copter", "plane", "rover"]
+    shapes = re.findall(r'class="dot whole" d="(.*?)".*?<title>vehicle (\d)', section.moments[0].picture)
+    kinds = {int(vehicle): re.sub(r"[\d. -]", "", shape) for shape, vehicle in shapes}
+    assert kinds[1] == kinds[4] and len(set(kinds.values())) == 3
 
 
 def test_a_known_track_gives_the_known_path(tmp_path: Path) -> None:

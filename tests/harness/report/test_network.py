@@ -11,8 +11,9 @@ from harness.report.network import strip
 
 def drawn(path: Path, *lines: dict[str, Any]) -> list[str]:
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    picture = str(strip(read_connectivity(path, (1, 2, 3)), [], 600.0)).replace("\u00a0", " ")
-    return re.findall(r"<title>((?:loss|partition): .*?)</title>", picture)
+    lanes = strip(read_connectivity(path, (1, 2, 3)), [], 600.0)
+    assert lanes is not None
+    return re.findall(r"<title>([^<]*: .*?)</title>", lanes.picture.replace("\u00a0", " "))
 
 
 def asked(at_s: float, loss: float, *groups: list[int]) -> dict[str, Any]:
@@ -27,7 +28,17 @@ def test_partitions_and_loss_are_those_on_record(tmp_path: Path) -> None:
         "partition: alone 1\u20133, 180 s to 240 s",
         "loss: 10 %, 0 s to 60 s",
         "loss: 20 %, 60 s to 180 s",
+        "1\u20133, 2\u20133: 10 %, 0 s to 60 s",
+        "1\u20133, 2\u20133: 20 %, 60 s to 120 s",
+        "1\u20133, 2\u20133: no link, 120 s to 240 s",
+        "1\u20132: 10 %, 0 s to 60 s",
+        "1\u20132: 20 %, 60 s to 180 s",
+        "1\u20132: no link, 180 s to 240 s",
     ]
+
+
+def test_pairs_that_are_all_alike_have_no_lanes(tmp_path: Path) -> None:
+    assert drawn(tmp_path / "network.jsonl", asked(0, 0.98)) == ["loss: 98 %, 0 s to 600 s"]
 
 
 def test_what_distance_loses_is_added_and_what_is_out_of_range_is_a_partition(tmp_path: Path) -> None:
@@ -44,6 +55,12 @@ def test_what_distance_loses_is_added_and_what_is_out_of_range_is_a_partition(tm
         "loss: 10 %, 0 s to 100 s",
         "loss: 25 %, the worst link 55 %, 100 s to 200 s",
         "loss: 10 %, 200 s to 600 s",
+        "1\u20132: 10 %, 0 s to 100 s",
+        "1\u20132: 55 %, 100 s to 200 s",
+        "1\u20132: no link, 200 s to 600 s",
+        "1\u20133: 10 %, 0 s to 200 s",
+        "1\u20133: no link, 200 s to 600 s",
+        "2\u20133: 10 %, 0 s to 600 s",
     ]
 
 
