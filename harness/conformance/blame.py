@@ -9,10 +9,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from harness.conformance.alphabet import INPUTS, TIMER
 from harness.conformance.model import Run
+from harness.conformance.seen import Seen
+from harness.conformance.states import Pair
 from harness.conformance.suite import Failure, Tally
-from ucp.agent import HANDLERS
+from ucp.agent import HANDLERS, ON_LOCAL_EVENT
+from ucp.handler import LocalEvent
 from ucp.messages import Message
+
+HELD = {"chain", "deque", "stack", "completed", "top_chain_hash"}
+"""Keys of the status: what the agent has."""
 
 Branch = tuple[str, str]
 """Handler and branch."""
@@ -27,6 +34,9 @@ ENDS = {
 """What runs when a timer has ended -> what began the count that it decides by."""
 
 
+_EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
+_BEGINS = {"Reconcile Begin", "Reconcile Phase 1"}
+"""What only leads on."""
 STARTING = {"proposed", "asked", "recommitted, more to come"}
 """Branches in which a handler starts its timer."""
 
@@ -54,10 +64,12 @@ class Evidence:
         self._passed: Counter[Branch] = Counter()
         self._failed: Counter[Branch] = Counter()
         self._led_on: set[tuple[Branch, Branch]] = set()
+        self._pairs: set[tuple[str, Pair]] = set()
         for tally in tallies:
             for failure in tally.failures:
                 self._failed.update({_branch(run) for run in failure.seen.outcome.runs})
             for pair in tally.passed:
+                self._pairs.add((tally.vectors.variant.name, pair))
                 step = tally.vectors.by_pair.get(pair)
                 if step is not None:
                     branches = [_branch(run) for run in step.outcome.runs]
@@ -68,19 +80,22 @@ class Evidence:
         seen, runs = failure.seen, failure.seen.outcome.runs
         if seen.mistimed in STARTS:
             return self._starter(failure)
-        if seen.hidden is not None:
+        if seen.hidden is not None and not self._fails_without(failure):
             return Blamed(seen.hidden.handler, seen.hidden.branch)
         if not runs:
             sends = [handler for handler in HANDLERS.values() if _names(handler.sends) & set(seen.unexpected)]
             return Blamed(sends[0].name if sends else "build_data_block", "")
-        if set(seen.missing) == set(seen.unexpected):  # another content of the same messages
-            for run in runs:
-                if {message.NAME for message in run.sent} & set(seen.missing):
-                    return Blamed(run.handler, run.branch)
         if self._began_wrongly(failure):
             return Blamed(ENDS[runs[0].handler], "")
-        run = self._suspect(runs, failure)
+        run = _decided_otherwise(seen) or _of_another_content(seen) or self._suspect(runs, failure)
         return Blamed(run.handler, run.branch)
+
+    def _fails_without(self, failure: Failure) -> bool:
+        """Whether the end of the timer fails also without the answer before it that must not count."""
+        pair = failure.seen.pair
+        if INPUTS[pair.input].first is None:
+            return False
+        return (failure.variant, Pair(*failure.seen.before, TIMER)) not in self._pairs
 
     def _began_wrongly(self, failure: Failure) -> bool:
         """Whether the count was wrong from its beginning: it decides rightly where anything was counted."""
@@ -105,17 +120,47 @@ class Evidence:
             return runs[0]
         never = [run for run in runs if not self._passed[_branch(run)]]
         if never:  # what is wrong about all of them is wrong first
-            return max(never, key=lambda run: self._failed[_branch(run)])
+            return max(
+                never, key=lambda run: (self._failed[_branch(run)], STARTS.get(str(seen.started)) == run.handler)
+            )
         sends = [run for run in runs if _names(HANDLERS[run.handler].sends) & set(seen.unexpected)]
         if sends:
             return sends[0]
         for run, then in reversed(list(pairwise(runs))):
             if (_branch(run), _branch(then)) not in self._led_on:
                 return run
+        if runs[0].handler in ENDS:
+            return runs[0]
         missing = [run for run in runs if {message.NAME for message in run.sent} & set(seen.missing)]
         if missing:
             return missing[0]
         return min(runs, key=lambda run: self._passed[_branch(run)])
+
+
+def _decided_otherwise(seen: Seen) -> Run | None:
+    """Who decides at the end of a timer, if what came is what comes of another decision."""
+    first, *then = seen.outcome.runs
+    if first.handler not in ENDS or not seen.unexpected:
+        return None
+    others = set(HANDLERS[first.handler].triggers) - {_EVENT_OF.get(run.handler) for run in then[:1]}
+    sends = _names(HANDLERS[first.handler].sends).union(*[_sends_after(event) for event in others])
+    sends -= {message.NAME for message in seen.outcome.sent}
+    return first if set(seen.unexpected) <= sends else None
+
+
+def _sends_after(event: LocalEvent) -> set[str]:
+    """What may be sent when this was triggered."""
+    handler = ON_LOCAL_EVENT[event]
+    return _names(handler.sends).union(*[_sends_after(then) for then in handler.triggers if then in _BEGINS])
+
+
+def _of_another_content(seen: Seen) -> Run | None:
+    """Who does another thing in his place: holds what he should not, or says something else."""
+    if HELD & set(seen.misstated):
+        return next((run for run in seen.outcome.runs if run.changes), None)
+    if set(seen.missing) != set(seen.unexpected):
+        return None
+    return next((run for run in seen.outcome.runs if {message.NAME for message in run.sent} & set(seen.missing)), None)
 
 
 def _branch(run: Run) -> Branch:

@@ -64,6 +64,8 @@ class Run:
     handler: str
     branch: str
     sent: tuple[Message, ...]
+    changes: bool = False
+    """Whether it changes what the agent holds."""
 
 
 @dataclass(frozen=True)
@@ -152,4 +154,4 @@ class Model:
 
 def _run(entry: HandlerRun) -> Run:
     sent = tuple(announced.datagram.content.message for announced in entry.sent)  # type: ignore[union-attr]
-    return Run(entry.algorithm, entry.handler, entry.branch, sent)
+    return Run(entry.algorithm, entry.handler, entry.branch, sent, bool(entry.changes))

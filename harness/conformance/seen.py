@@ -44,10 +44,14 @@ class Seen:
     unexpected: tuple[str, ...] = ()
     """Names of messages that should not have come."""
     missing: tuple[str, ...] = ()
+    misstated: tuple[str, ...] = ()
+    """Keys of the status that are wrong."""
     mistimed: str | None = None
     """The timer that ended, or would end, at another time than it should."""
+    started: str | None = None
+    """The timer that runs as it should, where that can be seen."""
     hidden: Run | None = None
-    """What should have changed nothing, just before."""
+    """What should have changed nothing, just before; or should have stopped a timer."""
 
 
 def compare(
@@ -81,9 +85,8 @@ def compare(
         if not missing and not unexpected:
             sentences.append("it sent its messages in another order, or one of them more than once")
     should = model.status()
-    for key in COMPARED:
-        if key in status and status[key] != should[key]:
-            sentences.append(f"its status says {key} {status[key]!r}, not {should[key]!r}")
+    misstated = tuple(key for key in COMPARED if key in status and status[key] != should[key])
+    sentences += [f"its status says {key} {status[key]!r}, not {should[key]!r}" for key in misstated]
     mistimed = _as_if_ended(model, outcome.sent, came, status) if sentences else None
     if mistimed is not None:
         sentences.append(f"that is as if its timer {mistimed} had ended already")
@@ -97,6 +100,7 @@ def compare(
         before,
         unexpected=tuple(message.NAME for message in unexpected),
         missing=tuple(message.NAME for message in missing),
+        misstated=misstated,
         mistimed=mistimed,
     )
 

@@ -238,11 +238,13 @@ class Suite:
         for way in _tails(variant, suspicion.way):
             outcome = await self._repeated(variant, way)
             if isinstance(outcome, Failure):
-                yield await self._what_counted(variant, way, outcome)
+                yield await self._what_counted(variant, way, outcome, of_an_earlier_round=step is not None)
                 return
             yield outcome
 
-    async def _what_counted(self, variant: Variant, way: Sequence[str], failure: Failure) -> Failure:
+    async def _what_counted(
+        self, variant: Variant, way: Sequence[str], failure: Failure, *, of_an_earlier_round: bool
+    ) -> Failure:
         """The failure with what should not have counted on its way, without which it does not fail."""
         counted = _uncounted(variant, way)
         for handler in dict.fromkeys(run.handler for run in counted.values()):
@@ -252,7 +254,7 @@ class Suite:
             if await self._repeated(variant, others) is RIGHT:
                 run = next(run for run in reversed(counted.values()) if run.handler == handler)
                 return replace(failure, seen=replace(failure.seen, hidden=run))
-        return replace(failure, of_an_earlier_round=True)
+        return replace(failure, of_an_earlier_round=of_an_earlier_round)
 
     async def _repeated(self, variant: Variant, way: Sequence[str]) -> Outcome:
         """Right if it is so once; a failure if it fails each time; too late if nothing else came."""

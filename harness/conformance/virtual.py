@@ -23,7 +23,7 @@ from harness.conformance.air import (
 )
 from harness.conformance.alphabet import Input
 from harness.conformance.lines import given_line, virtual_mission
-from harness.conformance.model import Expire
+from harness.conformance.model import Expire, Model, Run
 from harness.conformance.seen import Exchange, Seen, compare
 from harness.conformance.states import STEP_S, Variant, ends_next, state_of
 from harness.conformance.subject import Start, Subject
@@ -93,7 +93,8 @@ class InVirtualTime(Subject):
         self._idle = idle
         self._now = 0.0
         self._record: list[Exchange] = []
-        self._failed = False
+        self._stopped: dict[float, Run] = {}
+        """When timers would have ended, and what stopped them."""
 
     @classmethod
     async def start(cls, variant: Variant, program: Program, idle: list[Program]) -> "InVirtualTime":
@@ -127,7 +128,10 @@ class InVirtualTime(Subject):
             return None
         self._now = deadline if isinstance(action, Expire) and deadline is not None else self._now + STEP_S
         timestamp_us = round(self._now * MICROSECONDS)
+        running = _deadlines(model)
         outcome = model.feed(action, self._now, timestamp_us)
+        if not isinstance(action, Expire):
+            self._stopped |= dict.fromkeys(running - _deadlines(model), outcome.runs[0]) if outcome.runs else {}
         line = given_line(action, self._now, timestamp_us)
         wrong, sent, status = list[str](), list[bytes](), dict[str, Any]()
         ends, should = model.agent.next_timer(), model.agent.next_timer()
@@ -149,10 +153,18 @@ class InVirtualTime(Subject):
         timer = ends_next(model)
         seen = compare(model, given, before, outcome, sent, status, wrong)
         if _same_instant(ends, should):
-            return seen
-        mistimed = None if seen.wrong else timer or "none"  # what does something else starts other timers
+            return replace(seen, started=timer)
         sentence = f"it says that its next timer ends at {ends} s, not at {should} s"
-        return replace(seen, wrong=(*seen.wrong, sentence), mistimed=mistimed or seen.mistimed)
+        told = replace(seen, wrong=(*seen.wrong, sentence))
+        if seen.wrong or should == deadline:  # what does something else starts other timers
+            return told
+        if isinstance(ends, float) and ends in self._stopped:
+            return replace(told, hidden=self._stopped[ends])
+        return replace(told, mistimed=timer or "none")
+
+
+def _deadlines(model: Model) -> set[float]:
+    return {timer.deadline for timer in model.state.timers if timer.deadline is not None}
 
 
 def _same_instant(ends: Any, should: float | None) -> bool:
