@@ -85,9 +85,10 @@ class Evidence:
         if not runs:
             sends = [handler for handler in HANDLERS.values() if _names(handler.sends) & set(seen.unexpected)]
             return Blamed(sends[0].name if sends else "build_data_block", "")
-        if self._began_wrongly(failure):
+        run = _says_otherwise(seen)
+        if run is None and self._began_wrongly(failure):
             return Blamed(ENDS[runs[0].handler], "")
-        run = _decided_otherwise(seen) or _of_another_content(seen) or self._suspect(runs, failure)
+        run = run or _decided_otherwise(seen) or _holds_otherwise(seen) or self._suspect(runs, failure)
         return Blamed(run.handler, run.branch)
 
     def _fails_without(self, failure: Failure) -> bool:
@@ -154,13 +155,16 @@ def _sends_after(event: LocalEvent) -> set[str]:
     return _names(handler.sends).union(*[_sends_after(then) for then in handler.triggers if then in _BEGINS])
 
 
-def _of_another_content(seen: Seen) -> Run | None:
-    """Who does another thing in his place: holds what he should not, or says something else."""
-    if HELD & set(seen.misstated):
-        return next((run for run in seen.outcome.runs if run.changes), None)
-    if set(seen.missing) != set(seen.unexpected):
+def _says_otherwise(seen: Seen) -> Run | None:
+    """Who sends the same messages with another content, if all is held that should be."""
+    if HELD & set(seen.misstated) or set(seen.missing) != set(seen.unexpected):
         return None
     return next((run for run in seen.outcome.runs if {message.NAME for message in run.sent} & set(seen.missing)), None)
+
+
+def _holds_otherwise(seen: Seen) -> Run | None:
+    """Who changes what is held, if that is not as it should be."""
+    return next((run for run in seen.outcome.runs if run.changes), None) if HELD & set(seen.misstated) else None
 
 
 def _branch(run: Run) -> Branch:

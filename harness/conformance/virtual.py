@@ -156,11 +156,12 @@ class InVirtualTime(Subject):
             return replace(seen, started=timer)
         sentence = f"it says that its next timer ends at {ends} s, not at {should} s"
         told = replace(seen, wrong=(*seen.wrong, sentence))
-        if seen.wrong or should == deadline:  # what does something else starts other timers
+        if seen.wrong:  # what does something else starts other timers
             return told
         if isinstance(ends, float) and ends in self._stopped:
             return replace(told, hidden=self._stopped[ends])
-        return replace(told, mistimed=timer or "none")
+        begun = (each.name for each in model.state.timers if each.deadline and each.deadline not in running)
+        return replace(told, mistimed=next(begun, None))
 
 
 def _deadlines(model: Model) -> set[float]:

@@ -27,8 +27,6 @@ from ucp.quirks import QUIRKS
 PAGE = Path(__file__).parents[2] / "docs" / "conformance.md"
 HEADER = "| quirk | Algorithm | what the agent does wrong | named | failed | tried |\n|---|--:|---|---|--:|--:|\n"
 NOTHING = "**nothing**"
-HIDDEN: dict[str, str] = {}
-"""Quirk -> why nobody can see it from outside."""
 ALIKE = {
     "count_no_votes": "commit_whatever_the_vote",
 }
@@ -62,8 +60,6 @@ def row(quirk: str, results: Results) -> str:
     about = QUIRKS[quirk]
     named = Counter(case.algorithm for case in results.failures)
     words = ", ".join(f"{algorithm or 'program'} ({count})" for algorithm, count in named.most_common())
-    if quirk in HIDDEN:
-        words = words or f"{NOTHING}: {HIDDEN[quirk]}"
     if quirk in ALIKE:
         words += f": as `{ALIKE[quirk]}`"
     cells = [

@@ -53,11 +53,22 @@ def test_what_was_not_tried_has_not_passed(phase_one: list[Vectors], tmp_path: P
     assert "vectors not tried" in to_junit(results)
 
 
-def test_in_virtual_time_a_timer_that_is_too_short_is_named(phase_one: list[Vectors], tmp_path: Path) -> None:
-    command = (sys.executable, "-P", "-m", quirky.__name__, "hasty_phase1")
+@pytest.mark.parametrize(
+    ("quirk", "algorithm", "says"),
+    [
+        ("hasty_phase1", 8, "its next timer ends at"),
+        ("never_ask_phase2", 12, "it did not send Chain Hash Successor Query"),
+        ("skip_phase2", 11, "it did not send Chain Hash Successor Query"),
+        ("lose_popped_block", 11, "its status says stack 0, not 1"),
+    ],
+)
+def test_in_virtual_time_the_algorithm_is_named(
+    quirk: str, algorithm: int, says: str, phase_one: list[Vectors], tmp_path: Path
+) -> None:
+    command = (sys.executable, "-P", "-m", quirky.__name__, quirk)
     results = conform(Asked(command, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one)
-    assert {case.algorithm for case in results.failures} == {8}
-    assert any("its next timer ends at" in sentence for case in results.failures for sentence in case.wrong)
+    assert {case.algorithm for case in results.failures} == {algorithm}
+    assert any(says in sentence for case in results.failures for sentence in case.wrong)
 
 
 def test_a_program_that_does_not_answer_is_no_agent(phase_one: list[Vectors], tmp_path: Path) -> None:

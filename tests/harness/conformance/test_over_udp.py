@@ -1,13 +1,18 @@
 """Over UDP: a right agent passes; wrong ones fail, and the right Algorithm is named."""
 
+import asyncio
 import dataclasses
 import sys
 from pathlib import Path
 
 import pytest
 
+from harness.conformance.air import Air
+from harness.conformance.alphabet import INPUTS, LOG
+from harness.conformance.over_udp import BESIDE_OTHERS, OverUdp
 from harness.conformance.results import Results
 from harness.conformance.run import Asked, conform
+from harness.conformance.seen import Seen
 from harness.conformance.states import VARIANTS, explore
 from harness.conformance.table import to_junit
 from harness.conformance.vectors import Vectors
@@ -42,7 +47,7 @@ def test_a_right_agent_passes_all(idle: list[Vectors], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("quirk", "algorithm"), [("approve_everything", 3), ("commit_without_succession", 6), ("diverged_and_unmoved", 13)]
+    ("quirk", "algorithm"), [("complete_and_wait", 1), ("commit_without_succession", 6), ("diverged_and_unmoved", 13)]
 )
 @pytest.mark.whoever
 def test_of_a_wrong_agent_the_algorithm_is_named(
@@ -54,7 +59,8 @@ def test_of_a_wrong_agent_the_algorithm_is_named(
     assert {case.algorithm for case in results.failures} == {algorithm}
     first = results.failures[0]
     assert first.directory is not None
-    assert {path.name for path in Path(first.directory).iterdir()} == {"failure.txt", "vector.jsonl", "air.pcapng"}
+    kept = {"failure.txt", "vector.jsonl", *(["air.pcapng"] if first.exchanges else [])}
+    assert {path.name for path in Path(first.directory).iterdir()} == kept
     assert to_junit(results).count("<failure") == len(results.failures)
 
 
@@ -64,3 +70,30 @@ def test_an_agent_that_lacks_what_the_settings_need_is_not_applicable(tmp_path: 
     results = results_of([dataclasses.replace(idle[0], variant=variant)], tmp_path / "lab", *OURS)
     assert sum(row.not_applicable for row in results.rows()) == len(idle[0].wanted)
     assert results.exit_status == 0 and "a feature that nobody has" in results.notes[0]
+
+
+async def _late(place: Path) -> tuple[Seen | None, bool, Seen | None]:
+    """What is seen of an agent that is stopped while its vote ends; whether it is still followed; what comes then."""
+    async with Air(place, OURS, 1) as air:
+        subject = await OverUdp.start(air, VARIANTS["default"], BESIDE_OTHERS)
+        try:
+            assert await subject.step(INPUTS[LOG]) is not None
+            await subject.process.process.pause()
+            resuming = asyncio.get_running_loop().create_task(_resume(subject, 0.7))
+            late = await subject.step(INPUTS["Block Add Request on an unknown chain"])
+            await resuming
+            return late, subject.in_step, await subject.step(INPUTS["Chain Contain Query about the top"])
+        finally:
+            await subject.close()
+
+
+async def _resume(subject: OverUdp, after_s: float) -> None:
+    await asyncio.sleep(after_s)
+    await subject.process.process.resume()
+
+
+def test_of_a_late_machine_nothing_is_said_and_the_agent_is_followed(tmp_path: Path) -> None:
+    late, in_step, then = asyncio.run(_late(tmp_path))
+    assert late is not None and then is not None
+    assert late.late or not late.wrong
+    assert in_step and not then.wrong, (late.wrong, then.wrong)

@@ -1,0 +1,54 @@
+"""What the table of wrong agents in docs/conformance.md says of them."""
+
+import re
+from random import Random
+
+import pytest
+
+from harness.conformance.alphabet import INPUTS, LOG, TIMER
+from harness.conformance.model import Model
+from harness.conformance.states import STEP_S, VARIANTS
+from harness.wrong_agents.conformance import ALIKE, PAGE
+from harness.wrong_agents.page import rows_of
+from ucp.quirks import QUIRKS, wrong_handlers
+
+WAY = (LOG, "vote no", "vote no", TIMER, LOG, "vote yes", "vote no", LOG, TIMER, LOG, "vote no", TIMER, TIMER)
+
+
+def test_every_wrong_agent_was_tried_and_found() -> None:
+    rows = rows_of(PAGE.read_text(encoding="utf-8"))
+    assert rows.keys() == QUIRKS.keys()
+    assert not [quirk for quirk, row in rows.items() if int(row.split("|")[5]) == 0]
+
+
+def test_of_most_the_right_algorithm_is_named_first() -> None:
+    rows = rows_of(PAGE.read_text(encoding="utf-8"))
+    named = {quirk: re.findall(r"\d+|program", row.split("|")[4])[0] for quirk, row in rows.items()}
+    wrongly = {quirk for quirk, first in named.items() if first not in map(str, QUIRKS[quirk].algorithms)}
+    assert len(wrongly) <= 2 and ALIKE.keys() <= wrongly, wrongly
+
+
+@pytest.mark.parametrize(("quirk", "other"), ALIKE.items())
+def test_two_that_are_alike_do_the_same_to_the_outside(quirk: str, other: str) -> None:
+    settings = VARIANTS["default"].settings
+    right, wrong = Model(settings), [Model(settings), Model(settings)]
+    for model, name in zip(wrong, (quirk, other), strict=True):
+        model.agent.replace_handlers(wrong_handlers({name: True}, Random(0)))
+    now, said = 0.0, 0
+    for name in WAY:
+        action = INPUTS[name].make(right)
+        if action is None:
+            continue
+        deadlines = {model.agent.next_timer() for model in wrong}
+        assert len(deadlines) == 1
+        ends = max(filter(None, (*deadlines, right.agent.next_timer())), default=now)
+        now = ends if name == TIMER else now + STEP_S
+        right.feed(action, now, round(now * 1e6))
+        first, second = (
+            (model.feed(action, now, round(now * 1e6)), model.datagrams, model.status(), model.handled)[1:3]
+            for model in wrong
+        )
+        assert first[0] == second[0]
+        assert {**first[1], "handled": 0} == {**second[1], "handled": 0}
+        said += len(first[0])
+    assert said > 3
