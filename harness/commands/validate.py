@@ -8,8 +8,7 @@ import typer
 from rich.console import Console
 
 from harness import specification
-from harness.commands.terminal import print_json
-from harness.errors import InterruptedRunError
+from harness.commands.terminal import complain, print_json
 from harness.scenario import load_scenario
 from harness.specification import Validation
 
@@ -27,7 +26,7 @@ def validate_command(
 ) -> None:
     """Hold recorded runs against the specification in TLA+, step by step: exit status 1 if an agent did anything else.
 
-    2: something could not be looked at. 3: TLC is not here.
+    2: something could not be looked at. 3: TLC is not here. 130: interrupted, and what is said is of what came before.
     """
     if not runs and scenario is None:
         raise typer.BadParameter("name runs, or a --scenario to play")
@@ -41,15 +40,14 @@ def validate_command(
     def show(validation: Validation) -> None:
         status.update(f"{validation.runs:,} of {count:,} runs, {validation.steps:,} handler runs")
 
-    try:
-        with console.status("begins") as status:
-            validation = specification.validate(those, watch=show)
-    except KeyboardInterrupt:
-        raise InterruptedRunError("interrupted") from None
+    with console.status("begins") as status:
+        validation = specification.validate(those, watch=show)
     if as_json:
         print_json(validation.to_json())
     else:
         paper = Console()
         for line in validation.in_words():
             paper.print(line, highlight=False, soft_wrap=True, markup=False)
+    if validation.interrupted:
+        complain("interrupted")
     raise typer.Exit(validation.exit_status)

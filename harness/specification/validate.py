@@ -12,7 +12,7 @@ from typing import Any
 from harness.archive.archive import RunArchive
 from harness.archive.traces import Trace, read_trace, why_none
 from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, checked
-from harness.errors import VIOLATED, WRONG_REQUEST
+from harness.errors import INTERRUPTED, VIOLATED, WRONG_REQUEST
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.specification.recorded import Chains, Life, lives, module
@@ -56,16 +56,22 @@ class Rejected:
 
 @dataclass
 class Validation:
-    """`steps` are the handler runs that were looked at, of `lives` lives; `unread` says what could not be, and why."""
+    """`steps` are the handler runs that were looked at, of `lives` lives; `unread` says what could not be, and why.
+
+    `interrupted`: what came after these was not looked at.
+    """
 
     runs: int = 0
     lives: int = 0
     steps: int = 0
     rejected: list[Rejected] = field(default_factory=list)
     unread: list[str] = field(default_factory=list)
+    interrupted: bool = False
 
     @property
     def exit_status(self) -> int:
+        if self.interrupted and not self.rejected:
+            return INTERRUPTED
         return VIOLATED if self.rejected else WRONG_REQUEST if self.unread or not self.steps else 0
 
     def to_json(self) -> dict[str, Any]:
@@ -132,6 +138,16 @@ def validate(runs: Iterable[Recorded], *, watch: Callable[[Validation], None] = 
     """Hold runs against the specification. Raises NoCheckerError without TLC, and whatever `runs` raise."""
     command()
     validation = Validation()
+    try:
+        for constants, batch in _batches(runs, validation):
+            _look(constants, batch, validation)
+            watch(validation)
+    except KeyboardInterrupt:
+        validation.interrupted = True
+    return validation
+
+
+def _batches(runs: Iterable[Recorded], validation: Validation) -> Iterator[tuple[Constants, _Batch]]:
     batches: dict[Constants, _Batch] = {}
     for run in runs:
         validation.runs += 1
@@ -150,12 +166,8 @@ def validate(runs: Iterable[Recorded], *, watch: Callable[[Validation], None] = 
                 if life.unread is not None:
                     validation.unread.append(f"{run.name}: agent {life.agent_id}: {life.unread}")
             if batch.steps >= STEPS_AT_ONCE:
-                _look(constants, batches.pop(constants), validation)
-                watch(validation)
-    for constants, batch in batches.items():
-        _look(constants, batch, validation)
-        watch(validation)
-    return validation
+                yield constants, batches.pop(constants)
+    yield from batches.items()
 
 
 class _OutsideError(Exception):

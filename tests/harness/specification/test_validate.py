@@ -1,6 +1,7 @@
 """Recorded runs held against the specification: of right agents all is allowed, of wrong ones not."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,17 @@ def test_what_cannot_be_looked_at_is_told_beside_what_is_not_as_specified(tmp_pa
 def test_what_is_not_all_looked_at_does_not_hold() -> None:
     assert Validation(1, 1, 19, unread=["1.trace.jsonl: agent 1: line 21 is damaged"]).exit_status == 2
     assert Validation(1).exit_status == 2
+
+
+def test_an_interrupt_leaves_what_came_before() -> None:
+    def runs() -> Iterator[Recorded]:
+        yield Recorded("first", [], problems=["there are no traces"])
+        raise KeyboardInterrupt
+
+    validation = validate(runs())
+    assert validation.interrupted
+    assert validation.unread == ["first: there are no traces"]
+    assert validation.exit_status == 130
 
 
 @pytest.mark.lab
