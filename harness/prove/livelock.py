@@ -31,12 +31,13 @@ _Form = tuple[object, ...]
 class Livelock:
     """`ways` parts of the graph go round in this form. `completions` are when blocks may be completed to come there.
 
-    `coincidences`: so many moments have to be the same by chance on the way, to within the time that a message takes.
+    `coincidences`: so many moments have to be the same by chance on the way, to within the time that a message takes;
+    None if timers end in any order, which leaves that open.
     `cycle` is what the simulation was found to go round in when it played the example; None if it went another way.
     """
 
     ways: int
-    coincidences: int
+    coincidences: int | None
     completions: tuple[Completion, ...]
     example: Example
     cycle: Cycle | None
@@ -52,6 +53,8 @@ class Livelock:
 
     def in_words(self) -> str:
         """What it takes to get there."""
+        if self.coincidences is None:
+            return "if timers can end like that, and one of them may wait for ever"
         if not self.coincidences:
             return "it takes no coincidence"
         moments = "two moments have" if self.coincidences == 1 else f"{self.coincidences} times two moments have"
@@ -109,4 +112,5 @@ def _shown(graph: Graph, alike: Sequence[list[int]], path: Path, name: str) -> L
     completions = () if bounds.timers_any else tuple(several.completions())
     sentence = f"The swarm can go round in circles for ever: {len(begin) - 1} instants after the beginning."
     example = keep(played, path, bounds, len(begin) - 1 + len(cycle), [sentence])
-    return Livelock(len(alike), coincidences, completions, example, played.cycle)
+    known = None if bounds.timers_any else coincidences
+    return Livelock(len(alike), known, completions, example, played.cycle)

@@ -87,6 +87,8 @@ def _of_the_whole(proof: Proof) -> Iterator[str]:
         yield f"    states that cannot yet, by how many more votes there are: {counts}"
     yield f"    {live.forks:,} states are at rest with several chains, and stay so until somebody votes"
     if live.cycles:
-        yield f"✘ violated, livelock: there are {len(live.cycles)} ways to go round for ever, though nothing is lost"
+        count = len(live.cycles)
+        ways = "is 1 way" if count == 1 else f"are {count} ways"
+        yield f"✘ violated, livelock: there {ways} to go round for ever, though nothing is lost"
     else:
         yield "✔ holds, livelock: the swarm cannot go round for ever if nothing is lost and no new block comes"

@@ -32,6 +32,12 @@ def test_blocks_may_come_when_they_like_but_for_one(tmp_path: Path) -> None:
     assert max(completion.latest_s for completion in completions) == 10.0
 
 
+def test_of_timers_in_any_order_nothing_is_said_of_coincidence(tmp_path: Path) -> None:
+    proof = prove(Bounds(2, 4, "lossless", timers_any=True), out=tmp_path / "any.yaml")
+    assert proof.livelocks[0].coincidences is None
+    assert any("one of them may wait for ever" in line for line in in_words(proof))
+
+
 def test_nothing_goes_round_if_nothing_is_at_once_by_chance(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 4, "lossless", apart=True), out=tmp_path / "none.yaml")
     assert proof.exit_status == 0
