@@ -1,22 +1,19 @@
 """`ucp-harness prove`: look at everything that can happen within bounds."""
 
-import time
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import typer
 import yaml
 from rich.console import Console
 
 from harness import prove, specification
-from harness.commands.terminal import complain, print_json
+from harness.commands.terminal import Watcher, complain, print_json
 from harness.errors import INTERRUPTED
 from harness.prove import Bounds, BoundsError, Limits, Progress
 from harness.run.sweep import cores
 
-LINE_EVERY_S = 10.0
 GIGABYTE = 1e9
 TIMERS = ("duration", "apart", "any")
 
@@ -85,12 +82,14 @@ def prove_command(
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:
-        with _Watcher() as watcher:
-            opinion = specification.second_opinion(bounds, limits, watch=watcher.show)
+        with Watcher() as watcher:
+            opinion = specification.second_opinion(
+                bounds, limits, watch=lambda progress: watcher.show(_how_far(progress))
+            )
         _say(opinion.to_json(), opinion.in_words(), as_json)
         raise typer.Exit(opinion.exit_status)
-    with _Watcher() as watcher:
-        proof = prove.prove(bounds, limits, out, watch=watcher.show)
+    with Watcher() as watcher:
+        proof = prove.prove(bounds, limits, out, watch=lambda progress: watcher.show(_how_far(progress)))
     _say(proof.to_json(), prove.in_words(proof), as_json)
     if proof.exit_status == INTERRUPTED:
         complain("interrupted")
@@ -119,32 +118,7 @@ def _pairs(option: str, texts: list[str] | None) -> dict[str, Any]:
     return pairs
 
 
-class _Watcher:
-    """Says on standard error how far it is: in place on a terminal, and now and then a line elsewhere."""
-
-    def __init__(self) -> None:
-        self._console = Console(stderr=True)
-        self._status = self._console.status("begins")
-        self._last_s = time.monotonic()
-
-    def __enter__(self) -> Self:
-        if self._console.is_terminal:
-            self._status.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None:
-        self._status.stop()
-
-    def show(self, progress: Progress) -> None:
-        frontier = progress.states - progress.looked_at
-        rate = progress.transitions / max(progress.seconds, 0.001)
-        words = (
-            f"{progress.states:,} states, {frontier:,} of them not looked at, {progress.depth} instants, {rate:,.0f}/s"
-        )
-        if self._console.is_terminal:
-            self._status.update(words)
-        elif time.monotonic() - self._last_s > LINE_EVERY_S:
-            self._last_s = time.monotonic()
-            self._console.print(words, highlight=False)
+def _how_far(progress: Progress) -> str:
+    frontier = progress.states - progress.looked_at
+    rate = progress.transitions / max(progress.seconds, 0.001)
+    return f"{progress.states:,} states, {frontier:,} of them not looked at, {progress.depth} instants, {rate:,.0f}/s"

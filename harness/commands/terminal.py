@@ -4,9 +4,11 @@ import io
 import json
 import os
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import typer
 from rich.console import Console, RenderableType
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 STYLES: dict[Kind, str] = {"good": "green", "bad": "bold red", "unknown": "yellow"}
 MARKS: dict[Kind, str] = {"good": "✔", "bad": "✘", "unknown": "-"}
 EVIDENCE_SHOWN = 5
+LINE_EVERY_S = 10.0
 
 
 def show_result(console: Console, result: checker.Result) -> None:
@@ -93,3 +96,29 @@ def print_json(document: Any) -> None:
 
 def complain(sentence: str) -> None:
     Console(stderr=True).print(Text(f"ucp-harness: {sentence}", style="red"), soft_wrap=True)
+
+
+class Watcher:
+    """Says on standard error how far it is: in place on a terminal, and now and then a line elsewhere."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._status = self._console.status("begins")
+        self._last_s = time.monotonic()
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._status.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        self._status.stop()
+
+    def show(self, words: str) -> None:
+        if self._console.is_terminal:
+            self._status.update(words)
+        elif time.monotonic() - self._last_s > LINE_EVERY_S:
+            self._last_s = time.monotonic()
+            self._console.print(words, highlight=False)

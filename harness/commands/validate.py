@@ -5,12 +5,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from harness import specification
-from harness.commands.terminal import complain, print_json
+from harness.commands.terminal import Watcher, complain, print_json, print_lines
 from harness.scenario import load_scenario
-from harness.specification import Validation
 
 
 def validate_command(
@@ -35,19 +33,15 @@ def validate_command(
     if scenario is not None:
         those = chain(those, specification.simulated(load_scenario(scenario), range(seeds)))
         count += seeds
-    console = Console(stderr=True)
-
-    def show(validation: Validation) -> None:
-        status.update(f"{validation.runs:,} of {count:,} runs, {validation.steps:,} handler runs")
-
-    with console.status("begins") as status:
-        validation = specification.validate(those, watch=show)
+    with Watcher() as watcher:
+        validation = specification.validate(
+            those,
+            watch=lambda done: watcher.show(f"{done.runs:,} of {count:,} runs, {done.steps:,} handler runs looked at"),
+        )
     if as_json:
         print_json(validation.to_json())
     else:
-        paper = Console()
-        for line in validation.in_words():
-            paper.print(line, highlight=False, soft_wrap=True, markup=False)
+        print_lines(validation.in_words())
     if validation.interrupted:
         complain("interrupted")
     raise typer.Exit(validation.exit_status)

@@ -13,7 +13,7 @@ from harness.prove.progress import Ended, Progress
 from harness.prove.prove import INCOMPLETE, Limits
 from harness.prove.swarm import Swarm
 from harness.specification import states
-from harness.specification.settings import readings
+from harness.specification.settings import readings, unspecified
 from harness.specification.tlc import checked, command, in_tla
 from ucp.clock import MICROSECONDS
 
@@ -164,14 +164,16 @@ def _config(bounds: Bounds) -> str:
         raise BoundsError("the specification is of --network lossless and lossy: any is looked at in another way")
     if bounds.faults:
         raise BoundsError("the specification has no faults: leave --faults out")
+    if bounds.apart:
+        raise BoundsError("the specification lets things happen at once by chance: it has no --timers apart")
     if bounds.stagger:
         raise BoundsError("the specification has one duration for all agents: leave --stagger out")
     unknown = [name for name in bounds.quirks if name not in AS_PRINTED]
     if unknown:
         raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}, not {unknown[0]}")
     settings = bounds.agent_settings()
-    if settings.asks_after_commit:
-        raise BoundsError("the specification is of the thesis alone: leave --settings asks_after_commit out")
+    if (name := unspecified(settings)) is not None:
+        raise BoundsError(f"the specification is of the thesis alone: leave --settings {name} out")
     durations = {name: round(getattr(settings, key) * MICROSECONDS) for name, key in TIMEOUTS.items()}
     unit = gcd(*durations.values())
     constants = {
