@@ -113,3 +113,28 @@ def test_an_agent_that_hangs_is_a_standstill() -> None:
         assert "period_s" not in cycle
         busy = [agent_id for agent_id, export in run.evidence.exports.items() if not export.idle]
         assert cycle["agents"] == busy
+
+
+def test_who_is_looked_at_twice_in_the_same_wait_has_not_come_again() -> None:
+    """A hunt found that: it was said to go round every 0 s, and was done 15 s later."""
+    script = [(1, 1), (1, 3), (7, 2), (11, 3), (12, 1), (27, 2), (32, 3)]
+    run = simulate(
+        scenario(
+            agents=3,
+            duration_s=33,
+            network={"delay": 0.02},
+            clocks={1: {"offset_s": 300}},
+            settings={"max_block_bytes": 267},
+            timeline=[{"at_s": 2, "partition": [[2], [1, 3]], "for_s": 18}],
+            events={"source": "scripted", "script": [{"at_s": at_s, "agent": agent} for at_s, agent in script]},
+            fates=[
+                {"message": "Chain Contain Response", "sender": 2, "receiver": 1, "count": 2, "drop": True},
+                {"message": "Block Response", "sender": 2, "receiver": 3, "count": 1, "drop": True},
+                {"message": "Chain Contain Query", "sender": 2, "receiver": 3, "count": 2, "drop": True},
+            ],
+        ),
+        seed=34692,
+        tracing=True,
+    )
+    assert run.played.cycle is None
+    assert run.result.judgements["liveness"].verdict == "finished"

@@ -81,7 +81,8 @@ class Recurrence:
         self._next_s = wakes[0]
         state = (*map(_state, swarm), *order, fates)
         delays_matter = not self._all_alike and (self._delays_matter or fate_at >= self._kept_at)
-        if state == self._kept and self._told_apart and not delays_matter:
+        time_has_passed = self._next_s > self._kept_at  # who looks twice in the same wait sees the same
+        if state == self._kept and time_has_passed and self._told_apart and not delays_matter:
             return True
         self._looks_left -= 1
         if not self._looks_left:
