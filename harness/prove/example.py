@@ -27,6 +27,8 @@ class Example:
     path: Path
     instants: int
     judged: dict[str, Judgement]
+    chains: int
+    """How many there were in the end."""
 
     @property
     def replay(self) -> str:
@@ -34,7 +36,13 @@ class Example:
 
     def to_json(self) -> dict[str, Any]:
         judged = {key: judgement.verdict for key, judgement in self.judged.items()}
-        return {"path": str(self.path), "instants": self.instants, "replay": self.replay, "judged": judged}
+        return {
+            "path": str(self.path),
+            "instants": self.instants,
+            "replay": self.replay,
+            "judged": judged,
+            "chains": self.chains,
+        }
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,7 @@ class Played:
     document: Document
     judged: dict[str, Judgement]
     cycle: Cycle | None
+    chains: int
 
 
 def play(document: Document) -> Played:
@@ -52,7 +61,7 @@ def play(document: Document) -> Played:
         result, cycle = simulated.result, simulated.evidence.cycle
     except AgentFailedError as error:
         result, cycle = ended_by(error), None
-    return Played(document, _bad(result), cycle)
+    return Played(document, _bad(result), cycle, len({*result.chains.values()}))
 
 
 def _bad(result: Result) -> dict[str, Judgement]:
@@ -67,4 +76,4 @@ def keep(played: Played, path: Path, bounds: Bounds, instants: int, sentences: S
         *evidence_lines(played.judged),
         f"  ucp-harness run {path} --backend sim --seed {SEED}",
     ]
-    return Example(write(path, to_yaml(played.document, comment)), instants, played.judged)
+    return Example(write(path, to_yaml(played.document, comment)), instants, played.judged, played.chains)

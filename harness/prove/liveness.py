@@ -18,13 +18,15 @@ MOST_ADDED = 200_000
 
 @dataclass
 class Liveness:
-    """`forks`: states at rest with several chains. `cycles`: ways round, each as the states on it, the nearest first.
+    """`forks`: states at rest with several chains, of which `fork` is the nearest. `cycles`: ways round, each as the
+    states on it, the nearest first.
 
     `astray`: how many states have no way to rest with one chain if there are 0, 1, 2, ... more votes, until it is none,
     or there was one vote for each agent. `lost` is the nearest of those that are left then.
     """
 
     forks: int = 0
+    fork: int | None = None
     cycles: list[list[int]] = field(default_factory=list)
     astray: list[int] = field(default_factory=list)
     lost: int | None = None
@@ -40,7 +42,8 @@ def look(graph: Graph, check: Check = lambda: None) -> Liveness:
     """Of a graph that is complete."""
     result = Liveness()
     reachable = len(graph.states)
-    result.forks = sum(_is_fork(graph, number) for number in range(reachable))
+    at_rest = [number for number in range(reachable) if _is_fork(graph, number)]
+    result.forks, result.fork = len(at_rest), at_rest[0] if at_rest else None
     result.cycles = list(_cycles(graph, reachable, check))
     safe = _attracted(graph, check, {number for number in range(reachable) if _is_one(graph, number)})
     votes: dict[int, set[int]] = {}

@@ -71,6 +71,8 @@ class Proof:
     liveness: Liveness | None = None
     whole_ended: Ended = "complete"
     example: Example | None = None
+    fork: Example | None = None
+    """The nearest state at rest with several chains: nothing is violated, and it stays so until somebody votes."""
     livelocks: list[Livelock] = field(default_factory=list)
     """The first of each form, those that were played."""
     way: list[str] = field(default_factory=list)
@@ -110,6 +112,7 @@ class Proof:
             "flaw": None if flaw is None else asdict(flaw),
             "way": self.way,
             "forks_at_rest": None if live is None else live.forks,
+            "fork": None if self.fork is None else self.fork.to_json(),
             "without_a_way_to_one_chain": None if live is None else live.astray,
             "livelocks": None if live is None else len(live.cycles),
             "livelock_forms": [each.to_json() for each in self.livelocks],
@@ -210,6 +213,10 @@ def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
         proof.example = proof.livelocks[0].example
     elif live is not None and live.lost is not None:
         proof.example = _example(graph, live.lost, "no way was found from here to rest with one chain", path, name)
+    if live is not None and live.fork is not None:
+        beside = path.with_stem(f"{path.stem}_fork")
+        sentence = "all are at rest, and chains differ: they will until somebody votes"
+        proof.fork = _example(graph, live.fork, sentence, beside, f"{name} fork")
 
 
 def _example(graph: Graph, number: int, sentence: str, path: Path, name: str) -> Example:

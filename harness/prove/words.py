@@ -86,6 +86,9 @@ def _of_the_whole(proof: Proof) -> Iterator[str]:
         counts = ", ".join(f"{count:,} with {number}" for number, count in enumerate(live.astray[:-1]))
         yield f"    states that cannot yet, by how many more votes there are: {counts}"
     yield f"    {live.forks:,} states are at rest with several chains, and stay so until somebody votes"
+    if proof.fork is not None:
+        fork = proof.fork
+        yield f"    the nearest of them, {fork.instants} instants, {fork.chains} chains when played: {fork.replay}"
     if live.cycles:
         count = len(live.cycles)
         ways = "is 1 way" if count == 1 else f"are {count} ways"

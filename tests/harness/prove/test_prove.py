@@ -33,7 +33,9 @@ def test_fewer_blocks_hold(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 2, "lossy"), out=tmp_path / "none.yaml")
     assert proof.exit_status == 0
     assert proof.example is None
-    assert not [*tmp_path.iterdir()]
+    assert proof.fork is not None
+    assert [*tmp_path.iterdir()] == [proof.fork.path]
+    assert (proof.fork.judged, proof.fork.chains) == ({}, 2)
     assert not [line for line in in_words(proof) if line.startswith(("✘", "-"))]
 
 
