@@ -85,7 +85,8 @@ class Validation:
         runs = f"{self.runs:,} run{'s' if self.runs != 1 else ''}"
         looked = f"{runs}, {self.lives:,} lives of agents, {self.steps:,} handler runs"
         if self.rejected:
-            yield f"✘ {looked}: {len(self.rejected):,} of the lives are not as specified"
+            count = len(self.rejected)
+            yield f"✘ {looked}: {count:,} {'life' if count == 1 else 'lives'} not as specified"
         elif self.exit_status == 0:
             yield f"✔ {looked}: all as specified"
         else:
