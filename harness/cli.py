@@ -35,7 +35,7 @@ COMMANDS = {
     ),
     "shell": (
         "harness.commands.shell:shell_command",
-        "Open a shell in the network of a vehicle whose run goes on; or list what runs.",
+        "Open a shell in the network of a vehicle whose run goes on (ping, tcpdump, ip); without one, list what runs.",
     ),
     "check": (
         "harness.commands.check:check_command",
@@ -103,7 +103,7 @@ COMMANDS = {
     ),
     "coverage": (
         "harness.commands.coverage:coverage_command",
-        "Say which share of all local states, inputs and branches runs have tried.",
+        "Say which share of all local states, inputs and branches runs have tried, of any agents that leave traces.",
     ),
     "prove": (
         "harness.commands.prove:prove_command",
@@ -111,7 +111,7 @@ COMMANDS = {
     ),
     "validate": (
         "harness.commands.validate:validate_command",
-        "Hold recorded runs against the specification in TLA+, step by step: exit status 1 if an agent did else.",
+        "Hold recorded runs against the specification in TLA+, step by step: exit status 1 if an agent did otherwise.",
     ),
     "scale": (
         "harness.commands.scale:scale_command",

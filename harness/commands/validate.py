@@ -22,7 +22,7 @@ def validate_command(
     seeds: Annotated[int, typer.Option(min=1, help="with so many seeds.")] = 1000,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Hold recorded runs against the specification in TLA+, step by step: exit status 1 if an agent did anything else.
+    """Hold recorded runs against the specification in TLA+, step by step: exit status 1 if an agent did otherwise.
 
     2: something could not be looked at. 3: TLC is not here. 130: interrupted, and what is said is of what came before.
     """
