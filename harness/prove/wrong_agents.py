@@ -10,8 +10,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from harness.prove import liveness
+from harness.prove.alone import collect
 from harness.prove.bounds import Bounds
 from harness.prove.explore import explore
+from harness.prove.local import Flaw
+from harness.prove.progress import Ended
 from harness.prove.swarm import Swarm
 from ucp.agent import HANDLERS
 from ucp.quirks import QUIRKS
@@ -24,17 +27,19 @@ TRIED = (
     SMALL,
     replace(SMALL, faults=("duplicate",)),
     replace(SMALL, blocks=1, settings={"max_block_bytes": 535}),
-    Bounds(3, 2, "lossless", reduced=False),
-    Bounds(3, 2, "lossy", reduced=False),
-    Bounds(2, 3, "lossy", reduced=False),
-    Bounds(4, 2, "lossy", reduced=False),
-    Bounds(3, 3, "lossy", reduced=False),
+    replace(SMALL, network="any"),
+    replace(SMALL, agents=3),
+    replace(SMALL, blocks=3),
+    replace(SMALL, agents=4),
 )
 """Where a wrong step is looked for, one after the other."""
 
 
 class Told(NamedTuple):
-    """Of a wrong step: which handler's it is, within which bounds, how many instants after the beginning."""
+    """Of a wrong step: which handler's it is, within which bounds, how many instants after the beginning.
+
+    In the network any, how many inputs of the agent's.
+    """
 
     handler: str
     bounds: Bounds
@@ -45,12 +50,22 @@ def wrong_step(quirk: str, most_s: float = MOST_S) -> Told | str:
     """The nearest; or in a few words why there is none."""
     undecided = []
     for bounds in TRIED:
-        graph = explore(Swarm(_with(quirk, replace(bounds, steps=True))), most_bytes=MOST_BYTES, most_s=most_s)
-        if graph.flaw is not None and graph.flaw.handler is not None and graph.flawed is not None:
-            return Told(graph.flaw.handler, bounds, len(graph.path(graph.flawed)) - 1)
-        if graph.ended != "complete":
+        flaw, instants, ended = _first_flaw(_with(quirk, replace(bounds, steps=True)), most_s)
+        if flaw is not None and flaw.handler is not None:
+            return Told(flaw.handler, bounds, instants)
+        if ended != "complete":
             undecided.append(bounds)
     return "not decided" if undecided else "none"
+
+
+def _first_flaw(bounds: Bounds, most_s: float) -> tuple[Flaw | None, int, Ended]:
+    """The nearest, and how many instants it takes, or in the network any, inputs of one agent."""
+    if bounds.network == "any":
+        collected = collect(bounds, most_bytes=MOST_BYTES, most_s=most_s)
+        return collected.flaw, len(collected.way), collected.ended
+    graph = explore(Swarm(bounds), most_bytes=MOST_BYTES, most_s=most_s)
+    instants = 0 if graph.flawed is None else len(graph.path(graph.flawed)) - 1
+    return graph.flaw, instants, graph.ended
 
 
 def consequence(quirk: str, most_s: float = MOST_S) -> str:

@@ -13,6 +13,7 @@ import pytest
 
 from harness.errors import INTERRUPTED
 from harness.prove import INCOMPLETE, Bounds, BoundsError, Limits, Progress, in_words, prove
+from harness.prove.alone import collect
 from harness.prove.explore import LOOK_EVERY, explore
 from harness.prove.swarm import Swarm
 from tests.harness.command import COMMAND, harness, sentences
@@ -80,6 +81,14 @@ def test_a_timer_that_was_not_stopped_is_told_before_it_ends(tmp_path: Path) -> 
     assert proof.flaw.handler == "receive_response_block_for_hash"
     assert proof.example is not None
     assert "reconcile_phase_3_timer_expiration" in proof.example.judged["steps"].reason
+
+
+def test_a_wrong_step_may_take_a_message_that_comes_late() -> None:
+    bounds = Bounds(2, 2, "any", quirks={"pause_without_resume": True}, reduced=False, steps=True)
+    collected = collect(bounds, most_bytes=8e9, most_s=60)
+    assert collected.flaw is not None
+    assert collected.flaw.handler == "receive_response_block_for_hash"
+    assert collected.way[-1] == "it hears a Block Response from agent 1"
 
 
 def test_what_playing_does_not_show_is_said(tmp_path: Path) -> None:
