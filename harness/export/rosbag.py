@@ -5,6 +5,7 @@ on the topics that the adapter for bags reads (`harness.field.adapters.rosbag`):
 directory of the bag again. Storage is SQLite, which every ROS 2 from Humble on opens.
 """
 
+import sqlite3
 from collections.abc import Callable, Iterator
 from heapq import merge
 from operator import itemgetter
@@ -41,8 +42,15 @@ _NS = 1_000_000_000
 def write_rosbag(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
     """How many messages were written into a new directory. `progress` is told the mission second, now and then.
 
-    Raises OSError.
+    Raises OSError, and MachineError where the disk refuses.
     """
+    try:
+        return _write(recording, path, progress)
+    except sqlite3.Error as error:
+        raise MachineError(f"{path} cannot be written: {error}") from None
+
+
+def _write(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
     bag = _Messages(recording)
     written = 0
     with Writer(path, version=METADATA_VERSION, storage_plugin=StoragePlugin.SQLITE3) as writer:

@@ -20,7 +20,7 @@ def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
     """The logs of a run's vehicles, each with its vehicle; of a later life in its own directory."""
     logs = []
     for path in islice((directory / "vehicles").glob(f"*/{NAME}"), MAX_FILES):
-        if (named := _LIFE.fullmatch(path.parent.name)) and path.is_file():
+        if named := _LIFE.fullmatch(path.parent.name):
             logs.append((int(named[1]), int(named[2] or 1), path))
     return [(vehicle, path) for vehicle, _, path in sorted(logs)]
 
@@ -28,6 +28,9 @@ def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
 def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[str]) -> Iterator[Telemetry]:
     """The messages of a log; a sentence on what in it was none is added to `problems` at its end."""
     damaged = untimed = 0
+    if not path.is_file():
+        problems.append(f"{path}: cannot be read: it is not a file")
+        return
     try:
         if path.stat().st_size > MAX_BYTES:
             problems.append(f"{path}: larger than {MAX_BYTES // 1024**2} MiB, which no flight's log is; it is left out")

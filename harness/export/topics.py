@@ -84,7 +84,7 @@ class Topics:
     def of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
         """Topic, name of its schema, and object, of each that a sample gives."""
         for topic, name, told in self._of(sample):
-            known = {key: value for key, value in told.items() if value is not None}
+            known = {key: value for key, value in told.items() if _can_be_told(value)}
             yield topic, name, {"mission_s": round(self._recording.time.mission_s(sample.at_ns), 6), **known}
 
     def _of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
@@ -171,6 +171,11 @@ class Topics:
         return {"block": self._recording.block(block_hash), "block_hash": block_hash} if block_hash else {}
 
 
+def _can_be_told(value: Any) -> bool:
+    """Whether it is known, and in JSON."""
+    return math.isfinite(value) if isinstance(value, float) else value is not None
+
+
 def _state(run: HandlerRun) -> Object:
     state = run.state
     return {
@@ -214,13 +219,10 @@ def _field_schema(kind: str, length: int) -> Schema:
 
 
 def _mavlink(message: Any) -> Object:
-    told = ((name, getattr(message, name)) for name in message.fieldnames)
-    return {name: value for name, raw in told if (value := _field(raw)) is not None}
+    return {name: _field(getattr(message, name)) for name in message.fieldnames}
 
 
 def _field(raw: Any) -> Any:
-    if isinstance(raw, float):
-        return raw if math.isfinite(raw) else None
     if isinstance(raw, list | tuple):
         return [0.0 if isinstance(part, float) and not math.isfinite(part) else part for part in raw]
     return raw.decode("utf-8", "replace") if isinstance(raw, bytes) else raw
