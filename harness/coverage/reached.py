@@ -24,7 +24,7 @@ BRANCHES: tuple[Branch, ...] = tuple(
 )
 """All that there are in the contract."""
 
-MOST = 5_000_000
+MOST = 2_000_000
 """More local states, or pairs, than so many are not told apart: they would take all memory."""
 KEPT = 20_000
 """So much that agents held is kept, with what was worked out of it."""

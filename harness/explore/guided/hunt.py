@@ -26,6 +26,7 @@ ROUND = 64
 """Runs that are tried before it is looked at what they reached."""
 MOST_KEPT = 3000
 """Documents that are kept; those that gave least for their length go first."""
+MOST_FAILED = 100
 NEWEST = 24
 SEEDS = 1 << 16
 
@@ -89,8 +90,9 @@ class Hunt:
     """Findings, and the first run that showed each."""
     shown: Counter[Identity] = field(default_factory=Counter)
     """In how many runs."""
+    failures: int = 0
     failed: list[tuple[Candidate, str]] = field(default_factory=list)
-    """Runs without a verdict, and why."""
+    """The first runs without a verdict, and why; `failures` counts all of them."""
     _dropped: list[Candidate] = field(default_factory=list)
     _apart: set[Apart] = field(default_factory=set)
     """How chains differed at rest: of each way the first is played again, with a final reconcile."""
@@ -126,7 +128,9 @@ class Hunt:
                     continue
                 self.runs += 1
                 if isinstance(outcome, Failed):
-                    self.failed.append((candidate, outcome.reason))
+                    self.failures += 1
+                    if len(self.failed) < MOST_FAILED:
+                        self.failed.append((candidate, outcome.reason))
                     yield candidate, False
                 else:
                     yield candidate, self._learn(candidate, outcome)

@@ -100,6 +100,12 @@ class Night:
     there: Existing | None = None
     report: Path | None = None
 
+    def grow(self) -> None:
+        """Take down what is known by now; of a long night every second, fourth, eighth run."""
+        self.growth.append((self.hunt.runs, len(self.hunt.reached.states)))
+        if len(self.growth) > 2 * SAMPLES:
+            del self.growth[1::2]
+
     @property
     def exit_status(self) -> int:
         if self.interrupted:
@@ -108,7 +114,6 @@ class Night:
 
     def to_json(self) -> dict[str, Any]:
         reached = self.hunt.reached
-        every = max(1, len(self.growth) // SAMPLES)
         return {
             "schema": SCHEMA,
             "scenario": self.scenario.name,
@@ -121,9 +126,10 @@ class Night:
             "local_states": len(reached.states),
             "pairs": len(reached.pairs),
             "coverage": coverage_to_json(reached, self.there),
-            "growth": [list(sample) for sample in self.growth[::every]],
+            "growth": [list(sample) for sample in self.growth],
             "findings": [told.to_json() for told in self.told],
-            "failed": [{"seed": candidate.seed, "reason": reason} for candidate, reason in self.hunt.failed[:SAMPLES]],
+            "failed": [{"seed": candidate.seed, "reason": reason} for candidate, reason in self.hunt.failed],
+            "failures": self.hunt.failures,
             "left_out": self.left_out[:SAMPLES],
             "versions": versions(),
         }
@@ -196,7 +202,9 @@ class _Nightwatch:
         """Play what was found before: does it still show, and how often?"""
         for identity, finding in self._known.items():
             document = self._corpus.scenario_of(finding)
-            if document is not None:
+            if document is None:
+                self._corpus.left_out.append(f"{finding.file}: nothing shows {identity} again")
+            else:
                 self._watcher.on_event(f"known, played again: {identity}")
                 self._shown[identity] = self._how_often(identity, document, finding.seed)
 
@@ -233,7 +241,7 @@ class _Nightwatch:
         """Those that reached something are written at once, and so is what is found."""
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
-            night.growth.append((hunt.runs, len(hunt.reached.states)))
+            night.grow()
             if is_kept:
                 self._corpus.keep(candidate)
                 yield candidate

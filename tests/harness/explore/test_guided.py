@@ -3,6 +3,7 @@
 import json
 import signal
 import subprocess
+import sys
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -201,3 +202,12 @@ def test_wrong_options_are_one_sentence(tmp_path: Path, arguments: list[str], sa
     told = harness("explore", path, *arguments)
     assert told.returncode == 2
     assert said in " ".join(" ".join(sentences(told.stderr)).replace("│", " ").split())
+
+
+def test_agents_of_another_make_are_hunted_too(tmp_path: Path) -> None:
+    foreign = ordinary(agent_command=[sys.executable, "-m", "ucp.node"])
+    told = night(tmp_path / "corpus", foreign, runs=4)
+    assert not told.told
+    assert not told.hunt.failed
+    assert told.hunt.reached.steps > 0
+    assert len(told.hunt.reached.states) > 1
