@@ -58,6 +58,8 @@ class Recording:
         self.directory = directory
         self.archive = RunArchive(directory)
         self._problems: list[str] = []
+        if self.archive.recorded and self.archive.record.outcome == "running":
+            self.add_problem("the run has not recorded its end: it is still going on, or it was killed")
         headers = {agent: trace.header for agent, trace in self.archive.traces.items()}
         self.time: MissionTime = mission_time(headers, self.archive.record, self._problems)
         if not any((self.agents, self._telemetry, self._logs)):
