@@ -10,7 +10,14 @@ from typing import NamedTuple
 from harness.archive.connectivity import Link
 from harness.export.samples import Metres, Position
 
+FIELD = "field"
+"""The frame of the field: x is east, y north, z up, in metres from its middle."""
 PAIRS_A_SECOND = 100
+
+
+def vehicle_frame(vehicle: int) -> str:
+    """The frame in which a vehicle stands still."""
+    return f"vehicle_{vehicle}"
 
 
 class Line(NamedTuple):
@@ -19,6 +26,11 @@ class Line(NamedTuple):
     low: Metres
     high: Metres
     loss: float
+
+    @property
+    def colour(self) -> dict[str, float]:
+        """From green, which loses nothing, to red, which is fainter; red, green, blue and opacity, 0 to 1."""
+        return {"r": self.loss, "g": 1.0 - self.loss, "b": 0.1, "a": 1.0 - 0.7 * self.loss}
 
 
 class Links:

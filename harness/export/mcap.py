@@ -12,6 +12,7 @@ from typing import IO, Any
 
 from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
 from harness.errors import MachineError
+from harness.export.links import FIELD, vehicle_frame
 from harness.export.recording import Recording
 from harness.export.samples import LossesChanged, Position, Said, Telemetry
 from harness.export.topics import Topics
@@ -24,7 +25,7 @@ try:
     from mcap.writer import Writer
     from mcap_protobuf.schema import register_schema
 
-    from harness.export.scene import FIELD, Scene, colours_of, vehicle_frame
+    from harness.export.scene import Scene, colours_of
 except ImportError:
     raise MachineError("writing MCAP takes further packages: `pip install ucp-harness[export]`") from None
 

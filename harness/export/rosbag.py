@@ -15,7 +15,7 @@ from typing import Any, Literal
 from harness.archive.history import LATEST_S
 from harness.archive.traces import Gap, Header
 from harness.errors import MachineError
-from harness.export.links import Line, Links
+from harness.export.links import FIELD, Line, Links, vehicle_frame
 from harness.export.recording import Recording
 from harness.export.samples import LossesChanged, Metres, NetworkChanged, Position, Said, Sample, Step, Telemetry
 
@@ -29,7 +29,6 @@ except ImportError:
 Timed = tuple[int, str, Any]
 """Time, topic, and message."""
 
-FIELD = "field"
 METADATA_VERSION: Literal[8] = 8
 """Of the bag: Humble and all later ones read it."""
 LEVELS = {"info": 20, "warning": 30, "error": 40}
@@ -164,16 +163,12 @@ def _bytes(data: bytes) -> Any:
     return _made("std_msgs/msg/UInt8MultiArray", layout=layout, data=numpy.frombuffer(data, numpy.uint8))
 
 
-def _frame(vehicle: int) -> str:
-    return f"vehicle_{vehicle}"
-
-
 def _fix(position: Position) -> Any:
     assert position.place is not None
     lat_deg, lon_deg, alt_m = position.place
     return _made(
         "sensor_msgs/msg/NavSatFix",
-        header=_header(position.at_ns, _frame(position.vehicle)),
+        header=_header(position.at_ns, vehicle_frame(position.vehicle)),
         status=_made("sensor_msgs/msg/NavSatStatus", status=0, service=1),
         latitude=lat_deg,
         longitude=lon_deg,
@@ -195,16 +190,12 @@ def _transform(position: Position) -> Any:
     transform = _made(
         "geometry_msgs/msg/TransformStamped",
         header=_header(position.at_ns, FIELD),
-        child_frame_id=_frame(position.vehicle),
+        child_frame_id=vehicle_frame(position.vehicle),
         transform=_made(
             "geometry_msgs/msg/Transform", translation=_vector("Vector3", position.metres), rotation=_quaternion()
         ),
     )
     return _made("tf2_msgs/msg/TFMessage", transforms=[transform])
-
-
-def _colour(loss: float) -> Any:
-    return _made("std_msgs/msg/ColorRGBA", r=loss, g=1.0 - loss, b=0.1, a=1.0 - 0.7 * loss)
 
 
 def _markers(at_ns: int, lines: list[Line]) -> Any:
@@ -219,11 +210,11 @@ def _markers(at_ns: int, lines: list[Line]) -> Any:
         action=marker.ADD if lines else marker.DELETE,
         pose=_made("geometry_msgs/msg/Pose", position=_vector("Point", none), orientation=_quaternion()),
         scale=_vector("Vector3", (1.0, 0.0, 0.0)),
-        color=_colour(0.0),
+        color=_made("std_msgs/msg/ColorRGBA", r=0.0, g=1.0, b=0.0, a=1.0),
         lifetime=_made("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
         frame_locked=False,
         points=[_vector("Point", end) for line in lines for end in (line.low, line.high)],
-        colors=[_colour(line.loss) for line in lines for _ in range(2)],
+        colors=[_made("std_msgs/msg/ColorRGBA", **line.colour) for line in lines for _ in range(2)],
         texture_resource="",
         texture=_made(
             "sensor_msgs/msg/CompressedImage", header=_header(at_ns, FIELD), format="", data=numpy.zeros(0, numpy.uint8)

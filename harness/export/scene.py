@@ -11,20 +11,14 @@ from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from harness.archive.record import RunRecord
-from harness.export.links import Line, Links
+from harness.export.links import FIELD, Line, Links, vehicle_frame
 from harness.export.samples import Position
 from harness.present.colours import inks
 
-FIELD = "field"
-"""The frame of the field: x is east, y north, z up, in metres from its middle."""
 _SIZE_M = 2.0
 _TEXT_PX = 14.0
 _LINK_PX = 2.0
 _TEXT = Color(r=1.0, g=1.0, b=1.0, a=1.0)
-
-
-def vehicle_frame(vehicle: int) -> str:
-    return f"vehicle_{vehicle}"
 
 
 def colours_of(vehicles: Iterable[int]) -> dict[int, Any]:
@@ -74,7 +68,6 @@ class Scene:
 
 
 def _drawn_links(at_ns: int, links: Iterable[Line]) -> Any:
-    """From green, which loses nothing, to red."""
     update = SceneUpdate()
     entity = update.entities.add(id="links", frame_id=FIELD)
     entity.timestamp.FromNanoseconds(at_ns)
@@ -83,5 +76,5 @@ def _drawn_links(at_ns: int, links: Iterable[Line]) -> Any:
     for link in links:
         for x, y, z in (link.low, link.high):
             lines.points.add(x=x, y=y, z=z)
-            lines.colors.add(r=link.loss, g=1.0 - link.loss, b=0.1, a=1.0 - 0.7 * link.loss)
+            lines.colors.add(**link.colour)
     return update
