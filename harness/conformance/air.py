@@ -31,6 +31,8 @@ FIRST_PORT = 14600
 MAX_READ_BYTES = 65536
 START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
 LOOK_AGAIN_S = 0.01
+MAX_OUTPUT_BYTES = 16 * 1024 * 1024
+"""Of an agent that is not yet ready."""
 _SO_TIMESTAMPNS = 35
 """Linux; Python has no name for it."""
 _TIMESPEC = struct.Struct("@qq")
@@ -244,7 +246,10 @@ class Process:
                 if self.process.returncode is not None:
                     self.raise_end()
                 if time.monotonic() > deadline:
-                    raise AgentEndedError(f"it was not ready within {START_LIMIT_S:g} s") from None
+                    reason = f"its control socket did not answer within {START_LIMIT_S:g} s"
+                    raise AgentEndedError(f"{reason}: {last_line(self.output)}") from None
+                if self.output.stat().st_size > MAX_OUTPUT_BYTES:
+                    raise AgentEndedError("it prints and prints, and does not answer its control socket") from None
                 await asyncio.sleep(LOOK_AGAIN_S)
 
     def raise_end(self) -> None:
@@ -293,5 +298,9 @@ def _stamped(ancillary: Sequence[tuple[int, int, bytes]]) -> float:
 
 
 def last_line(path: Path) -> str:
-    lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.exists() else []
+    if not path.exists():
+        return "it said nothing"
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - MAX_READ_BYTES))
+        lines = file.read().decode("utf-8", errors="replace").split("\n")
     return next((line.strip()[:300] for line in reversed(lines) if line.strip()), "it said nothing")

@@ -7,8 +7,11 @@ import asyncio
 import base64
 import json
 import math
+import os
+import signal
 from asyncio.subprocess import PIPE, Process
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,7 +50,13 @@ class Program:
         try:
             with errors.open("ab") as file:
                 process = await asyncio.create_subprocess_exec(
-                    *command, "--virtual", stdin=PIPE, stdout=PIPE, stderr=file, limit=ANSWER_BYTES
+                    *command,
+                    "--virtual",
+                    stdin=PIPE,
+                    stdout=PIPE,
+                    stderr=file,
+                    limit=ANSWER_BYTES,
+                    start_new_session=True,
                 )
         except OSError as error:
             raise NoAgentError(f"the agent could not be started: {error.strerror}") from None
@@ -79,8 +88,9 @@ class Program:
         return answer
 
     async def close(self) -> None:
-        if self._process.returncode is None:
-            self._process.kill()
+        """With all that it has started, which would keep its pipes open."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
         await self._process.wait()
 
 

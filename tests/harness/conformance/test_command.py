@@ -71,7 +71,9 @@ def test_in_virtual_time_the_algorithm_is_named(
     assert any(says in sentence for case in results.failures for sentence in case.wrong)
 
 
-def test_a_program_that_does_not_answer_is_no_agent(phase_one: list[Vectors], tmp_path: Path) -> None:
-    silent = (sys.executable, "-c", "pass")
+@pytest.mark.parametrize("command", [(sys.executable, "-c", "pass"), ("sh", "-c", "yes junk; true")])
+def test_a_program_that_does_not_answer_is_no_agent(
+    command: tuple[str, ...], phase_one: list[Vectors], tmp_path: Path
+) -> None:
     with pytest.raises(NoAgentError, match="the agent does not start"):
-        conform(Asked(silent, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one)
+        conform(Asked(command, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one)
