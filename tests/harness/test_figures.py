@@ -23,6 +23,7 @@ IN_NO_FIGURE = {
     "reconcile_phase_1_timer_expiration": {"at inception"},
     "receive_response_next_in_sequence": {"counted already"},
     "reconcile_phase_3": {"held already"},
+    "reconcile_finalize": {"asked who follows"},
 }
 """Branches that are ours: what the thesis is silent about."""
 
