@@ -83,7 +83,7 @@ def state_of(model: Model) -> State:
     top = "" if not chain else "its own block" if [*state.chain][-1].agent_id == AGENT else "another's block"
     deque_words = ("", "one block waits", "blocks wait")[min(2, len(state.blocks_to_be_committed))]
     voting = state.voting_timer.active
-    if state.reconcile_in_progress:
+    if state.reconcile_in_progress or any(timer.active for timer in state.reconcile_timers):
         waiting = "a vote runs" if voting else "blocks wait" if deque_words else ""
     else:
         waiting = deque_words
