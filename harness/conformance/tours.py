@@ -68,9 +68,9 @@ class Map:
                     self._growing.add(step.pair)
                 self._ways[step.pair[:3]].append((step.pair.input, step.after, costs))
 
-    def unseen_in(self, state: State) -> Pair | None:
-        """Of what is yet to be seen inputs that change nothing come first, then others, the timer, and at last what
-        makes the chain longer."""
+    def unseen_in(self, state: State, misled: Container[Pair] = ()) -> Pair | None:
+        """Of what is yet to be seen, but for what is `misled`: inputs that change nothing come first, then others, the
+        timer, and at last what makes the chain longer."""
         here = self._unseen.get((state.doing, state.holds))
         if not here:
             return None
@@ -78,6 +78,7 @@ class Map:
             pair
             for pair in here
             if pair not in self.claimed
+            and pair not in misled
             and pair.counted in ((), state.counted)
             and pair == pair_of(state, INPUTS[pair.input])
         )
@@ -121,7 +122,7 @@ class Map:
         """Inputs that lead to something to see, the last of which is that.
 
         None are left if it is nearer to begin anew; None if no way leads anywhere. `misled` are steps that have led
-        elsewhere than the map says.
+        elsewhere than the map says, or that there were not.
         """
         queue: list[tuple[float, int, State | Pair, tuple[str, ...]]] = [(0.0, 0, state, ())]
         if state != self.start:
@@ -135,7 +136,7 @@ class Map:
             if at in closed:
                 continue
             closed.add(at)
-            pair = self.unseen_in(at)
+            pair = self.unseen_in(at, misled)
             if pair is not None:
                 number += 1
                 heapq.heappush(
@@ -214,8 +215,8 @@ class Tour:
         if self._subject.hurried:
             self._plan_anew()
             return TIMER
-        pair = self._map.unseen_in(state)
-        if pair is not None and self._map.is_cheap(pair) and pair not in self._misled:
+        pair = self._map.unseen_in(state, self._misled)
+        if pair is not None and self._map.is_cheap(pair):
             return pair.input
         if not self._plan:
             self._plan_anew()
