@@ -26,12 +26,13 @@ def listen() -> None:
     source = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
     source.bind(("eth0", 0))
     counts: dict[str, dict[str, int]] = {}
-    times: dict[str, dict[str, list[int]]] = {}
-    for frame, _ in collect(source, 64):
+    times: dict[str, dict[str, list[tuple[int, int]]]] = {}
+    for frame, came_ns in collect(source, 64):
         sender, kind = frame[6:12].hex(":"), frame[12:14].hex()
         counts.setdefault(sender, {})[kind] = counts.get(sender, {}).get(kind, 0) + 1
-        times.setdefault(sender, {}).setdefault(kind, []).append(struct.unpack_from("!Q", frame, 14)[0])
-    say({"frames": counts, "sent_ns": times})
+        sent_ns = struct.unpack_from("!Q", frame, 14)[0]
+        times.setdefault(sender, {}).setdefault(kind, []).append((sent_ns, came_ns))
+    say({"frames": counts, "times_ns": times})
 
 
 def frames(destinations: str, *kinds: str) -> None:

@@ -142,16 +142,23 @@ def test_a_partition_cuts_every_protocol_in_both_directions_at_once(engine: str,
             await asyncio.sleep(0.2)
         for stream in streams:
             await stream.process.terminate(DEADLINE_S)
-        heard = [(await listener.finish())["sent_ns"] for listener in listeners]
+        heard = [(await listener.finish())["times_ns"] for listener in listeners]
         for receiver, sender in ((1, 2), (2, 1)):
             times = heard[receiver - 1][addresses.mac(sender)]
             assert times.keys() == ETHERTYPES.keys()
-            for sent_ns in times.values():
-                for index, (asked_ns, cut_ns, heal_ns, healed_ns) in enumerate(rounds):
-                    assert not any(cut_ns < at_ns < heal_ns for at_ns in sent_ns), "crossed a partition"
+            for index, (asked_ns, cut_ns, heal_ns, healed_ns) in enumerate(rounds):
+                # a busy machine may stop a sender between the time that it writes down and its sending: one frame's
+                held = [
+                    at_ns for kind in times.values() for at_ns, came_ns in kind if cut_ns < at_ns < heal_ns <= came_ns
+                ]
+                assert len(held) <= 1, "frames were kept until the partition was over"
+                for frames in times.values():
+                    assert not any(cut_ns < at_ns <= came_ns < heal_ns for at_ns, came_ns in frames), (
+                        "crossed a partition"
+                    )
                     end_ns = rounds[index + 1][0] if index + 1 < len(rounds) else healed_ns + 200_000_000
-                    assert any(healed_ns < at_ns < end_ns for at_ns in sent_ns), "nothing came after healing"
-                    before = [at_ns for at_ns in sent_ns if at_ns < heal_ns]
+                    assert any(healed_ns < at_ns < end_ns for at_ns, _ in frames), "nothing came after healing"
+                    before = [at_ns for at_ns, came_ns in frames if came_ns < heal_ns]
                     took_ns.append((index, max(before, default=0) - asked_ns))
 
     in_lab([1, 2], engine, tmp_path, story)
