@@ -6,9 +6,10 @@ finds out. All chance is drawn from the lots that are given: equal lots make equ
 
 from collections.abc import Callable, Sequence
 from random import Random
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from harness.explore.document import Document, at, script, timeline, with_agents, with_key
+from harness.scenario.fates import MessageName
 from harness.scenario.numbered import in_text, numbered
 from ucp.settings import Settings
 
@@ -18,17 +19,7 @@ MOST_ENTRIES = 6
 AFTER_LAST_S = 30.0
 """So long after its last event a changed scenario goes on: a vote and a reconcile are over."""
 FEW_BLOCKS = 4
-MESSAGES = (
-    "Block Add Request",
-    "Block Add Response",
-    "Commit Block",
-    "Chain Contain Query",
-    "Chain Contain Response",
-    "Chain Hash Successor Query",
-    "Next in Sequence Response",
-    "Request for Block",
-    "Block Response",
-)
+MESSAGES = get_args(MessageName)
 READINGS: dict[str, tuple[Any, ...]] = {
     "vote_names_chain": (True,),
     "changed_before_tally": (True,),
