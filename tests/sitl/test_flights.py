@@ -320,3 +320,20 @@ def test_a_vehicle_that_takes_back_that_it_is_ready_is_not(tmp_path: Path) -> No
             assert puppet.vehicle.now_s > sitl.autopilot.READY_S + 30.0 + READY_FOR_S
 
     asyncio.run(fly())
+
+
+def test_who_hands_over_lets_the_operator_fly(tmp_path: Path) -> None:
+    """Else a pilot asks again for the mode that it set."""
+
+    async def fly() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            flying = asyncio.create_task(pilot.fly(pilot.flight(PLAN, "guided")))
+            await until(lambda: puppet.vehicle.motion.up_m > 29)
+            pilot.hand_over()
+            puppet.vehicle.set_mode(MODES["copter"]["RTL"])
+            async with asyncio.timeout(DEADLINE_S):
+                await flying
+            await until(lambda: not puppet.vehicle.armed)
+            assert puppet.vehicle.mode == "RTL"
+
+    asyncio.run(fly())
