@@ -73,6 +73,8 @@ class FaultRecord(_Model):
     agents: list[int] | None = None
     disk: Disk | None = None
     """What a reboot left of it."""
+    by_hand: bool = False
+    """Somebody asked for it while the run went on; the scenario's timeline has it since."""
 
     @property
     def kind(self) -> type[faults.Fault]:

@@ -12,6 +12,7 @@ from typing import ClassVar
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
 from harness.play.mission import Swarm
+from harness.play.pace import Pace
 from harness.play.progress import Progress
 from harness.scenario import Scenario
 
@@ -47,11 +48,13 @@ class Backend(ABC):
         *,
         told: bool = False,
         delivers_all: bool = False,
+        pace: Pace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
         """A swarm, opened, for a scenario that has not been refused; it leaves its files in `rundir`.
 
         Whatever ends the mission early, `interrupted` too, raises inside the block, leaves it, and is on record in
         `played` then, as is everything else. A mission that is `told` while it is played may yet do what the scenario
         says nothing of: so any agent can be rebooted with its disk. With `delivers_all` agents hear, and traces have,
-        also what cannot matter to them, as on any real network. Raises HarnessError if there is no swarm to be had.
+        also what cannot matter to them, as on any real network. Virtual time goes at the `pace`, if there is one; real
+        time heeds none. Raises HarnessError if there is no swarm to be had.
         """

@@ -7,7 +7,6 @@ of the scenario's timeline: it is checked as an entry is, and what was told can 
 
 import asyncio
 import math
-import re
 from collections.abc import Awaitable, Callable, Iterable
 from concurrent.futures import Future
 from typing import Any
@@ -16,15 +15,14 @@ from pydantic import ValidationError
 
 from harness.errors import ScenarioError
 from harness.play import mission
+from harness.play.growing import INSTANT_S, GrowingTimeline
 from harness.play.mission import RunOutcome, Sought
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of
-from harness.scenario.load import explain, parse
+from harness.scenario.load import explain
 from harness.scenario.timeline import TimelineEntry
 from ucp.agent import HANDLERS
 
-INSTANT_S = 0.001
-"""Of two sentences in one instant the second comes a millisecond later."""
 HOLDABLE = ("message", "sender", "receiver", "block", "count")
 """Keys of a fate that say which messages it is about."""
 LOOK_EVERY_S = 5.0
@@ -35,16 +33,13 @@ HANDLER_BRANCHES = {name: handler.branches for name, handler in HANDLERS.items()
 Sentence = Callable[[mission.Swarm], Awaitable[Any]]
 
 
-class Told:
+class Told(GrowingTimeline):
     """Play its `story`, wait until it has `begun`, then let it `hear` what happens, in the thread that plays it."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-        """With everything in its timeline that was told by now."""
+        super().__init__(scenario)
         self.begun: Future[Any] = Future()
         self._sentences: asyncio.Queue[tuple[Sentence, Future[Any]] | None] = asyncio.Queue()
-        self._played_s = 0.0
-        """Until when the timeline has been played."""
         self._holds: dict[int, dict[str, Any]] = {}
         """What is held back, as it was told, by the number of its fate."""
         self._completed: dict[int, int] = {}
@@ -77,12 +72,11 @@ class Told:
 
     async def change(self, swarm: mission.Swarm, **entry: Any) -> float:
         """Make this entry of a timeline happen now; its `at_s`. Raises ScenarioError if it cannot."""
-        now = max(swarm.now(), self._played_s + INSTANT_S)
-        at_s = math.ceil(now * 1000) / 1000
+        at_s = self.next_instant(swarm)
         before, document = self.scenario, self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
         document["duration_s"] = max(self.scenario.duration_s, _entry(at_s, entry).ends_at_s)
-        self._retell(document)
+        self.retell(document)
         try:
             await self.until(swarm, at_s)
         except ScenarioError:  # the backend cannot
@@ -102,7 +96,7 @@ class Told:
         entry["for_s"] = for_s
         document["duration_s"] = max(self.scenario.duration_s, over_s)
         try:
-            self._retell(document)
+            self.retell(document)
         except ScenarioError:
             raise ScenarioError(
                 "the block cannot be undone, for the same was changed in it for longer: give that change a block of "
@@ -121,7 +115,7 @@ class Told:
         document = self.scenario.model_dump()
         document["fates"].append({**which, "from_s": _next_instant(now), **_until(_next_instant(now + INSTANT_S))})
         before = self.scenario
-        self._retell(document)
+        self.retell(document)
         try:
             number = await swarm.hold(self.scenario.fates[-1])
         except ScenarioError:  # the backend cannot
@@ -145,7 +139,7 @@ class Told:
         document = self.scenario.model_dump()
         fate = document["fates"][number]
         fate |= _until(_next_instant(max(swarm.now(), fate["from_s"])))
-        self._retell(document)
+        self.retell(document)
         await swarm.release(number, self.scenario.fates[number])
 
     async def until_run(self, swarm: mission.Swarm, sought: Sought, limit_s: float) -> int | None:
@@ -172,21 +166,6 @@ class Told:
             raise ScenarioError(f"{sought.handler} has no branch {sought.branch!r}: it has {named}")
         if sought.agent is not None and sought.agent not in self.scenario.roster:
             raise ScenarioError(f"there is no agent {sought.agent!r}: there are {_ids(self.scenario.roster)}")
-
-    def _retell(self, document: dict[str, Any]) -> None:
-        """Raises ScenarioError if there can be no such scenario."""
-        try:
-            self.scenario = parse(document)
-        except ScenarioError as error:
-            raise ScenarioError(re.sub(r"(timeline|fates)\.\d+(\.|: )", "", str(error))) from None
-
-    async def until(self, swarm: mission.Swarm, mission_s: float) -> None:
-        """Go on until then, with what the timeline has in between."""
-        for change in [change for change in timeline_of(self.scenario) if self._played_s < change.at_s <= mission_s]:
-            await swarm.until(change.at_s)
-            await swarm.apply(change)
-            self._played_s = change.at_s
-        await swarm.until(mission_s)
 
     async def from_now_until(self, swarm: mission.Swarm, mission_s: float) -> None:
         """As `until`. Raises ScenarioError if that is over, or never comes."""

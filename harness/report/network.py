@@ -84,5 +84,7 @@ def faults(faults: Sequence[FaultRecord]) -> list[tuple[str, str, str]]:
         details = [fault.detail] if fault.detail else []
         if fault.fully_connected is not None:
             details.append(f"fully connected: {words.value(fault.fully_connected)}")
+        if fault.by_hand:
+            details.append("asked for by hand")
         rows.append((words.duration(fault.at_s), fault.what, "; ".join(details)))
     return rows

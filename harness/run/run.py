@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,13 @@ from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, 
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
+from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import Progress
+from harness.run.replay import REPLAY_FILE, replay_of
 from harness.scenario import Scenario
 from netem import uml
+from ucp.files import write_atomically
 
 PACKAGES = ("ucp-harness", "pymavlink", "pyroute2")
 
@@ -58,8 +62,11 @@ def run(
     backend: BackendName = "process",
     *,
     delivers_all: bool = False,
+    interventions: Interventions | None = None,
 ) -> Run:
     """Play `scenario` and judge it, into the new or empty directory `out`. Raises HarnessError if it cannot even begin.
+
+    With `interventions`, which are of this very scenario, somebody may have things happen to it while it goes on.
 
     With `delivers_all` traces have also what cannot matter to who heard it, as those of processes always
     have. Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
@@ -67,9 +74,15 @@ def run(
     chosen = BACKENDS[backend]
     chosen.refuse(scenario)
     recording = Recording(scenario, seed, out, backend)
+    story: mission.Story = mission.play
+    options: dict[str, Any] = {"delivers_all": delivers_all}
+    if interventions is not None:
+        story = interventions.story
+        options |= {"told": True, "pace": interventions.pace}
+        interventions.taken_down = partial(recording.take_down_by_hand, interventions)
     try:
         played = asyncio.run(
-            _until_interrupted(chosen, scenario, seed, recording.directory, progress, delivers_all=delivers_all)
+            _until_interrupted(chosen, scenario, seed, recording.directory, progress, story, **options)
         )
     except HarnessError as error:
         recording.fail(error)
@@ -105,6 +118,16 @@ class Recording:
         """This is what the run plays: the scenario that it began with, and what it was told since."""
         self._scenario = scenario
         self._update(scenario=scenario)
+
+    def take_down_by_hand(self, interventions: Interventions) -> None:
+        """What somebody had happen by now: into the record, and as a scenario that plays it again."""
+        self.tell(interventions.scenario)
+        by_hand_s = [entry.at_s for entry in interventions.by_hand]
+        replay = replay_of(interventions.scenario, by_hand_s, self._record.seed, self._record.backend)
+        try:
+            write_atomically(self.directory.path / REPLAY_FILE, replay)
+        except OSError as error:
+            raise MachineError(f"{self.directory.path / REPLAY_FILE} cannot be written: {error.strerror}") from None
 
     def take_down(self, played: RunOutcome) -> None:
         """What has been played by now."""
@@ -154,7 +177,13 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
 
 
 async def _until_interrupted(
-    backend: Backend, scenario: Scenario, seed: int, directory: RunDirectory, progress: Progress, *, delivers_all: bool
+    backend: Backend,
+    scenario: Scenario,
+    seed: int,
+    directory: RunDirectory,
+    progress: Progress,
+    story: mission.Story,
+    **options: Any,
 ) -> RunOutcome:
     interrupted = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -162,8 +191,8 @@ async def _until_interrupted(
     for number in before:
         loop.add_signal_handler(number, interrupted.set)
     try:
-        opening = backend.open(scenario, seed, directory, progress, interrupted, delivers_all=delivers_all)
-        return await mission.play_on(opening, scenario)
+        opening = backend.open(scenario, seed, directory, progress, interrupted, **options)
+        return await mission.play_on(opening, scenario, story)
     finally:
         for number, handler in before.items():
             loop.remove_signal_handler(number)

@@ -31,6 +31,8 @@ class NetworkChange:
     """From here on distance does not matter either."""
     losses: Mapping[str, float] = field(default_factory=dict)
     """What the radio now loses between two vehicles ("1-2"), where that has changed."""
+    by_hand: bool = False
+    """Somebody asked for it while the mission was played."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         """The record of this change, made at `at_s`."""
@@ -40,6 +42,7 @@ class NetworkChange:
             "detail": self.detail,
             "fully_connected": self.conditions.fully_connected,
             **({"losses": dict(self.losses)} if self.losses else {}),
+            **_hand(self.by_hand),
         }
 
 
@@ -51,6 +54,7 @@ class Injected:
     what: InjectionName
     injection: Injection
     number: int
+    by_hand: bool = False
 
     @property
     def detail(self) -> str:
@@ -58,7 +62,11 @@ class Injected:
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         """The record of this injection, begun at `at_s`."""
-        return {"at_s": at_s, "what": self.what, "detail": self.detail}
+        return {"at_s": at_s, "what": self.what, "detail": self.detail, **_hand(self.by_hand)}
+
+
+def _hand(by_hand: bool) -> dict[str, Any]:
+    return {"by_hand": True} if by_hand else {}
 
 
 Change = NetworkChange | Fault | Injected

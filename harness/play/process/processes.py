@@ -14,6 +14,7 @@ from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
 from harness.play.backend import Backend
 from harness.play.mission import Swarm
+from harness.play.pace import Pace
 from harness.play.progress import Progress
 from harness.scenario import Scenario
 
@@ -57,6 +58,7 @@ class Processes(Backend):
         *,
         told: bool = False,
         delivers_all: bool = False,
+        pace: Pace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
         from harness.play.process.backend import ProcessRun
         from harness.play.process.vehicle_kinds import choose_vehicles

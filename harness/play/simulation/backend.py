@@ -26,8 +26,10 @@ from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, disconnected_until, injected_nothing
 from harness.scenario.fates import Fate
 from netem.radio import Place
+from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
+    from harness.play.pace import Pace
     from harness.play.simulation.foreign.agent import LifeRecord
     from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
     from harness.play.simulation.foreign.programs import Programs
@@ -37,10 +39,19 @@ BREATH_S = 20.0
 """Mission seconds between two looks at whoever watches."""
 
 
+class _AnyRun(Sought):
+    def is_met_by(self, agent_id: int, run: HandlerRun) -> bool:
+        return True
+
+
+ANY_RUN = _AnyRun("any")
+
+
 class Simulation(Clockwork):
     """A swarm in virtual time; see `harness.play.mission.Swarm`, and `Clockwork` for the options.
 
-    `told`: the timeline is told while it is played, and may yet inject. `breathe` is awaited every few mission seconds.
+    `told`: the timeline is told while it is played, and may yet inject. `breathe` is awaited every few mission seconds,
+    and time goes at this `pace`, if there is one.
     """
 
     def __init__(
@@ -52,6 +63,7 @@ class Simulation(Clockwork):
         deliver_all: bool = False,
         told: bool = False,
         breathe: Callable[["Simulation"], Awaitable[None]] | None = None,
+        pace: "Pace | None" = None,
         fate_script: Callable[[Sequence[Fate], Sequence[int], NameOf], FateScript] = FateScript,
         air: Callable[..., VirtualAir] = VirtualAir,
         programs: "Programs | None" = None,
@@ -71,6 +83,7 @@ class Simulation(Clockwork):
         self.stage = "mission"
         self.network = ""
         self._breathe = breathe
+        self._pace = pace
         self._disks: dict[int, Stored] = {}
         """What is on the disk of the agents that reboot with it."""
         self._switched_off: dict[int, Incarnation] = {}
@@ -112,12 +125,30 @@ class Simulation(Clockwork):
         if self._breathe is None and not self._tracks:
             self.run(mission_s)
             return
-        while self._now < mission_s and self._found is None:
-            self.run(min(mission_s, self._now + BREATH_S, self._moves_at))
-            if self._now == self._moves_at:
+        while (self._now < mission_s or self._in_an_instant) and self._found is None:
+            furthest = min(mission_s, self._now + BREATH_S, self._moves_at)
+            if self._pace is None:
+                self.run(furthest)
+            else:
+                await self._run_at(self._pace, furthest)
+            if self._now == self._moves_at and not self._in_an_instant:
                 self._move()
             if self._breathe is not None:
                 await self._breathe(self)
+
+    async def _run_at(self, pace: "Pace", furthest: float) -> None:
+        """As `run`, but no further than the pace allows."""
+        allowed_s = await pace.allows(self._now)
+        if allowed_s is None:
+            return
+        if not pace.wants_run:
+            self.run(min(furthest, allowed_s))
+            return
+        self._sought = ANY_RUN
+        self.run(furthest)
+        if self._found is not None:
+            pace.ran(self._now)
+        self._sought = self._found = None
 
     async def until_run(self, sought: Sought, mission_s: float) -> int | None:
         self._deliver_all = True  # also what does nothing is a handler run

@@ -90,6 +90,8 @@ class Clockwork:
         self._sought: Sought | None = None
         self._found: int | None = None
         """The agent that has run what was sought."""
+        self._in_an_instant = False
+        """Whether it was found before all of its instant had been played."""
         self._at_once: list[tuple[int, HandlerRun]] | None = None
         """What agents have run at the last change; None once time has passed."""
         self._recurrence: Recurrence | None = None
@@ -120,6 +122,7 @@ class Clockwork:
         self._at_once = None
         with gc_paused():
             self._play(until)
+        self._in_an_instant = self._found is not None
         if self._found is None:
             self._now = until
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from harness.archive.directory import RunDirectory
 from harness.errors import InterruptedRunError, MachineError, ScenarioError
 from harness.play.backend import Backend
+from harness.play.pace import Pace
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.backend import Simulation
@@ -55,6 +56,7 @@ class VirtualTime(Backend):
         *,
         told: bool = False,
         delivers_all: bool = False,
+        pace: Pace | None = None,
     ) -> AsyncIterator[Simulation]:
         async def breathe(simulation: Simulation) -> None:
             progress.show(_snapshot(simulation))
@@ -66,7 +68,15 @@ class VirtualTime(Backend):
             capture = _captures(rundir, scenario) if scenario.capture else None
             air = capture.air if capture else VirtualAir
             simulation = Simulation(
-                scenario, seed, files, deliver_all=delivers_all, told=told, breathe=breathe, air=air, programs=programs
+                scenario,
+                seed,
+                files,
+                deliver_all=delivers_all,
+                told=told,
+                breathe=breathe,
+                pace=pace,
+                air=air,
+                programs=programs,
             )
             try:
                 yield simulation

@@ -7,7 +7,7 @@ its own in this directory is a new fault, which everything else then knows.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from pydantic import Field
@@ -67,6 +67,8 @@ class Fault:
 
     at_s: float
     agents: tuple[int, ...]
+    by_hand: bool = field(default=False, kw_only=True)
+    """Somebody asked for it while the mission was played."""
 
     what: ClassVar[str] = ""
     """The key of a timeline entry, the word in records, and the verb in pytest."""
@@ -136,4 +138,5 @@ class Fault:
     def to_json(self, at_s: float) -> dict[str, Any]:
         """The record of this fault, made at `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
-        return record if self.disk_left is None else {**record, "disk": self.disk_left}
+        hand = {"by_hand": True} if self.by_hand else {}
+        return {**record, **({} if self.disk_left is None else {"disk": self.disk_left}), **hand}

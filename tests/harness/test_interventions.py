@@ -1,0 +1,147 @@
+"""Somebody has things happen to a run that goes on."""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import HarnessError, ScenarioError
+from harness.play.interventions import Interventions
+from harness.play.progress import Silent
+from harness.run.run import Run, run
+from harness.scenario import Scenario, load_scenario
+from tests.harness.virtual import scenario
+
+TIMEOUT_S = 60.0
+
+
+def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> Run:
+    """A run in virtual time that stands at second 0 until `do` has it go on."""
+    hand = Interventions(asked, virtual_time=True, paused=True)
+    over = threading.Event()
+
+    def click() -> None:
+        while hand.closed and not over.is_set():
+            over.wait(0.005)
+        try:
+            do(hand)
+        finally:
+            hand.go_on()
+
+    with ThreadPoolExecutor(1) as thread:
+        clicked = thread.submit(click)
+        try:
+            finished = run(asked, 7, out, Silent(), "sim", interventions=hand)
+        finally:
+            over.set()
+        clicked.result(TIMEOUT_S)
+    return finished
+
+
+def files_of(run: Path) -> dict[str, bytes]:
+    """What the agents have left."""
+    return {str(path.relative_to(run)): path.read_bytes() for path in sorted((run / "agents").rglob("*.json*"))}
+
+
+def test_what_was_clicked_can_be_played_again_to_the_last_byte(tmp_path: Path) -> None:
+    asked = scenario(duration_s=600, network={"loss": 0.1}, timeline=[{"at_s": 40, "loss": 0.2}], final_reconcile=True)
+    at_s: list[float] = []
+
+    def click(hand: Interventions) -> None:
+        def ask(**entry: Any) -> None:
+            at_s.append(hand.ask(entry).result(TIMEOUT_S))
+
+        ask(partition=[[1, 2], [3, 4]])
+        assert hand.step(30).result(TIMEOUT_S) == pytest.approx(30.001)
+        hand.step_to_next_run().result(TIMEOUT_S)
+        ask(kill=[2])
+        ask(reboot=[3], down_s=30, disk="kept")
+        hand.step_to_next_run().result(TIMEOUT_S)
+        ask(reboot=[4], down_s=20.5, disk="lost")
+        hand.step(100).result(TIMEOUT_S)
+        ask(heal=True)
+        ask(network={"links": [{"from": 1, "to": 3, "loss": 0.9}]})
+        hand.step(100).result(TIMEOUT_S)
+        ask(loss=0.0)
+
+    finished = played(asked, tmp_path / "run", click)
+    assert finished.record.scenario is not None
+    assert [entry.at_s for entry in finished.record.scenario.timeline] == [40.0, *at_s]
+    marked = {fault.at_s: fault.what for fault in finished.record.faults if fault.by_hand}
+    assert list(marked.values()) == ["partition", "kill", "reboot", "reboot", "heal", "network", "loss"]
+    assert [*marked] == at_s
+    again = run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
+    assert again.record.agents == finished.record.agents
+    assert again.result.to_json() == finished.result.to_json()
+    assert not any(fault.by_hand for fault in again.record.faults)
+
+
+def test_a_run_without_a_click_is_as_ever(tmp_path: Path) -> None:
+    asked = scenario(duration_s=300, network={"loss": 0.1})
+    played(asked, tmp_path / "watched", lambda hand: None)
+    run(asked, 7, tmp_path / "alone", Silent(), "sim")
+    assert files_of(tmp_path / "watched") == files_of(tmp_path / "alone")
+    assert not (tmp_path / "watched/replay.yaml").exists()
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"kill": [2]}, "kill: agent 2 is killed then, not running or paused"),
+    ({"kill": [9]}, "kill names vehicle 9, which does not exist: there are 1, 2, 3, 4, 5"),
+    ({"loss": 1.5}, "`loss` is 1.5: it should be less than or equal to 1"),
+    ({"partition": [[1, 2], [2, 3]]}, "vehicle 2 is in an earlier group too"),
+    ({"lose": 0.5}, "`lose` is unknown: there are"),
+    ({}, "needs exactly one of `loss`"),
+    ({"at_s": 5, "loss": 0.5}, "`at_s` is now: leave it out"),
+    ({"reboot": [1]}, "a reboot needs `down_s`"),
+    ({"reboot": [1], "down_s": 1e6, "disk": "lost"}, "after the mission's end at 300 s"),
+    ({"kill": [3]}, "the timeline's entry at 200 s, kill: agent 3 is killed then, not running or paused"),
+    ({"heal": True}, "changes the partition for good, and the timeline's entry at 50 s until 150 s: which holds when?"),
+]
+
+
+def test_what_cannot_be_is_a_sentence_and_changes_nothing(tmp_path: Path) -> None:
+    timeline = [{"at_s": 50, "partition": [[1, 2]], "for_s": 100}, {"at_s": 200, "kill": [3]}]
+    asked = scenario(duration_s=300, timeline=timeline)
+    wrong: list[str] = []
+
+    def click(hand: Interventions) -> None:
+        hand.step(100).result(TIMEOUT_S)
+        hand.ask({"kill": [2]}).result(TIMEOUT_S)
+        before = hand.scenario
+        for entry, sentence in REFUSED:
+            with pytest.raises(ScenarioError) as refusal:
+                hand.ask(entry).result(TIMEOUT_S)
+            if sentence not in str(refusal.value):
+                wrong.append(str(refusal.value))
+        assert hand.scenario is before
+        for seconds in (0, -1, float("nan"), float("inf")):
+            with pytest.raises(ScenarioError, match="is no step"):
+                hand.step(seconds).result(TIMEOUT_S)
+        with pytest.raises(ScenarioError, match="is not how fast time can go"):
+            hand.set_factor(0).result(TIMEOUT_S)
+
+    played(asked, tmp_path / "run", click)
+    assert wrong == []
+
+
+def test_after_the_end_nothing_happens_and_every_answer_comes(tmp_path: Path) -> None:
+    asked = scenario(duration_s=100)
+    hand = Interventions(asked, virtual_time=True)
+    with pytest.raises(ScenarioError, match="the mission has not begun"):
+        hand.ask({"loss": 0.5}).result(0)
+    run(asked, 7, tmp_path / "run", Silent(), "sim", interventions=hand)
+    with pytest.raises(ScenarioError, match="the run has ended"):
+        hand.ask({"loss": 0.5}).result(0)
+    with pytest.raises(ScenarioError, match="has ended"):
+        hand.pause().result(0)
+
+
+def test_no_more_waits_than_there_is_room_for(tmp_path: Path) -> None:
+    hand = Interventions(scenario(), virtual_time=False)
+    with pytest.raises(ScenarioError, match="real processes cannot stand still"):
+        hand.pause().result(0)
+    assert issubclass(ScenarioError, HarnessError)
