@@ -73,6 +73,10 @@ COMMANDS = {
         "harness.commands.mission:app",
         "Make the mission files of a swarm, and compare those on its vehicles.",
     ),
+    "keys": (
+        "harness.commands.keys:app",
+        "Make the keys of a secure mission, hand out what each vehicle gets, and take it back.",
+    ),
     "consolidate": (
         "harness.commands.consolidate:consolidate_command",
         "Merge what vehicles brought home into one record: every event once, who holds what, what was lost with whom.",

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from harness.commands.roster import roster_of
 from harness.commands.terminal import complain, print_json, print_lines
 from harness.depot.mission_files import MissionFileError, Plan, write
 from harness.depot.same_mission import compare
@@ -99,9 +100,9 @@ def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenar
     if path is None and agents is None:
         raise MissionFileError("whose mission is it? Give the roster by --agents 10,28,32, or a --scenario")
     if path is None:
-        return parse({"name": name or "mission", "agents": _roster(agents or "")})
+        return parse({"name": name or "mission", "agents": roster_of(agents or "")})
     asked = load_scenario(path)
-    roster = {} if agents is None else {"agents": _roster(agents)}
+    roster = {} if agents is None else {"agents": roster_of(agents)}
     chosen = {"name": name or asked.name, "agents": list(asked.roster), **roster}
     kept = {
         "settings": asked.settings,
@@ -110,13 +111,6 @@ def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenar
         "initial_data": asked.initial_data,
     }
     return parse({**chosen, **kept})
-
-
-def _roster(text: str) -> int | list[int]:
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isascii() and part.isdecimal() and len(part) < 10 for part in parts):
-        raise MissionFileError(f"`--agents` is {text!r}: it should be a number of agents, or IDs as 10,28,32")
-    return int(parts[0]) if len(parts) == 1 else [int(part) for part in parts]
 
 
 def _initial_data(text: str | None, asked: Scenario) -> bytes:

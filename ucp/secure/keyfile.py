@@ -28,35 +28,45 @@ def read_key_file(path: Path, schema: str, parse: Callable[[dict[str, Any]], T],
 
     Raises KeyFileError; also if it is `secret`, and others can read it.
     """
+    return read_any_key_file(path, {schema: (secret, parse)})
+
+
+def read_any_key_file(path: Path, kinds: Mapping[str, tuple[bool, Callable[[dict[str, Any]], T]]]) -> T:
+    """As `read_key_file` does, of whichever schema the file is: for each whether it is secret, and how it is parsed."""
     try:
-        return parse(_read(path, schema, secret=secret))
+        document, mode = _read(path)
+        schema = document.get("schema")
+        if not isinstance(schema, str) or schema not in kinds:
+            raise KeyFileError(f"not a file of the schema {' or '.join(kinds)}")
+        secret, parse = kinds[schema]
+        if secret and mode & OTHERS:
+            raise KeyFileError("others can read it, which no secret survives: make new keys, or chmod 600 it")
+        return parse(document)
     except KeyFileError as error:
         raise KeyFileError(f"{path}: {error}") from None
 
 
-def _read(path: Path, schema: str, *, secret: bool) -> dict[str, Any]:
-    """Raises KeyFileError, without the file's name."""
+def _read(path: Path) -> tuple[dict[str, Any], int]:
+    """The JSON object in a file, and the file's mode. Raises KeyFileError, without the file's name."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(descriptor, "rb") as file:
-            status = os.fstat(descriptor)
-            if not stat.S_ISREG(status.st_mode):
-                raise KeyFileError("not a file that holds keys")
-            if secret and status.st_mode & OTHERS:
-                raise KeyFileError("others can read it, which no secret survives: chmod 600 it, or make new keys")
-            data = file.read(MAX_FILE_BYTES + 1)
+            mode = os.fstat(descriptor).st_mode
+            data = file.read(MAX_FILE_BYTES + 1) if stat.S_ISREG(mode) else None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "that is no path"
         raise KeyFileError(f"cannot be read: {reason}") from None
+    if data is None:
+        raise KeyFileError("not a file that holds keys")
     if len(data) > MAX_FILE_BYTES:
         raise KeyFileError(f"larger than {MAX_FILE_BYTES} bytes, which no file of keys is")
     try:
         document = json.loads(data)
     except (ValueError, RecursionError):
         raise KeyFileError("not JSON") from None  # what is there instead may be a key
-    if not isinstance(document, dict) or document.get("schema") != schema:
-        raise KeyFileError(f"not a file of the schema {schema}")
-    return document
+    if not isinstance(document, dict):
+        raise KeyFileError("not a file that holds keys")
+    return document, mode
 
 
 def write_key_file(path: Path, document: Mapping[str, Any], *, secret: bool) -> None:

@@ -1,0 +1,230 @@
+"""The directory of a mission's keys: the authority's, the depot's, the vehicles', and what everybody may know.
+
+The authority's and the depot's keys never leave it. Each is a file of its own, as whoever opens what was sealed to the
+depot need not be able to speak for the authority. Others can neither enter the directory nor read what is secret in it.
+"""
+
+import base64
+import binascii
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from harness.errors import HarnessError, MachineError
+from ucp.secure.bundle import (
+    KEY_BYTES,
+    MISSION_ID_BYTES,
+    PUBLIC_NAME,
+    Bundle,
+    KeySet,
+    PublicKeys,
+    bundle_name,
+    load_public,
+    public_key_of,
+    write_bundle,
+    write_public,
+)
+from ucp.secure.keyfile import KeyFileError, key_in, read_key_file, write_key_file
+from ucp.secure.revocation import LAST_NUMBER, MAX_REVOKED, Revocation, RevocationError
+
+AUTHORITY_NAME, DEPOT_NAME, VEHICLES_NAME = "authority.key", "depot.key", "vehicles.key"
+AUTHORITY_SCHEMA, DEPOT_SCHEMA, VEHICLES_SCHEMA = "ucp-authority-key/1", "ucp-depot-key/1", "ucp-vehicle-keys/1"
+REVOCATION_NAME, REVOCATION_SCHEMA = "revocation.json", "ucp-revocation/1"
+HOME_MODE = 0o700
+MOST_NAMED = 20
+
+T = TypeVar("T")
+
+
+class KeysError(HarnessError):
+    """Keys that cannot be used, or must not be made."""
+
+
+@dataclass(frozen=True)
+class Home:
+    """A directory of keys. All that reads it raises KeysError, all that writes it MachineError."""
+
+    directory: Path
+
+    @classmethod
+    def new(cls, directory: Path, roster: Iterable[int], *, seals: bool, epoch_s: float) -> "Home":
+        """New keys in a new directory; with a depot key if it `seals`."""
+        keys = KeySet.derived(os.urandom(KEY_BYTES), roster, seals=seals, epoch_s=epoch_s)
+        home, mission = cls(directory), keys.public.mission.hex()
+        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+            raise KeysError(
+                f"{directory} is there already: new keys need a new directory, for nothing replaces old ones"
+            )
+        secret: dict[str, dict[str, Any]] = {
+            AUTHORITY_NAME: {"schema": AUTHORITY_SCHEMA, "mission": mission, "private_key": keys.authority.hex()},
+            VEHICLES_NAME: {
+                "schema": VEHICLES_SCHEMA,
+                "mission": mission,
+                "group_secret": keys.group_secret.hex(),
+                "vehicles": {str(agent_id): key.hex() for agent_id, key in keys.vehicles.items()},
+            },
+        }
+        if keys.depot is not None:
+            secret[DEPOT_NAME] = {"schema": DEPOT_SCHEMA, "mission": mission, "private_key": keys.depot.hex()}
+        try:
+            directory.mkdir(mode=HOME_MODE, parents=True, exist_ok=True)
+            directory.chmod(HOME_MODE)
+            for name, document in secret.items():
+                write_key_file(directory / name, document, secret=True)
+            write_public(directory / PUBLIC_NAME, keys.public)
+        except OSError as error:
+            raise _refused(directory, error) from None
+        return home
+
+    def public(self) -> PublicKeys:
+        """What everybody may know."""
+        return _sound(lambda: load_public(self.directory / PUBLIC_NAME))
+
+    def bundle(self, agent_id: int) -> Bundle:
+        """What this vehicle is given, in epoch 0. A revoked one is given nothing."""
+        return self.bundles([agent_id])[agent_id]
+
+    def bundles(self, agents: Sequence[int] | None = None) -> dict[int, Bundle]:
+        """What these vehicles are given, or all that are not revoked."""
+        public, path = self.public(), self.directory / VEHICLES_NAME
+        revocation = self.revocation()
+        revoked = revocation.revoked if revocation else frozenset[int]()
+        wanted = sorted({*public.vehicles} - revoked) if agents is None else agents
+        for agent_id in wanted:
+            if agent_id not in public.vehicles:
+                raise _stranger(agent_id, public)
+            if agent_id in revoked:
+                raise KeysError(
+                    f"agent {agent_id} is revoked, and nobody would hear it: fly another vehicle, or new keys"
+                )
+
+        def parse(document: dict[str, Any]) -> dict[int, Bundle]:
+            _check_mission(document, public)
+            group_secret = key_in(document, "group_secret", KEY_BYTES)
+            private = document.get("vehicles")
+            if not isinstance(private, dict):
+                raise KeyFileError("`vehicles` must be an object with the key of each vehicle")
+            bundles = {}
+            for agent_id in wanted:
+                key = key_in(private, str(agent_id), KEY_BYTES, "vehicles.")
+                if public_key_of(key) != public.vehicles[agent_id]:
+                    raise KeyFileError(f"the key of vehicle {agent_id} is not the one that {PUBLIC_NAME} tells")
+                bundles[agent_id] = Bundle(public, agent_id, key, group_secret)
+            return bundles
+
+        return _sound(lambda: read_key_file(path, VEHICLES_SCHEMA, parse, secret=True))
+
+    def write_bundles(
+        self, directory: Path, agents: Sequence[int] | None = None, *, overwrite: bool = False
+    ) -> list[Path]:
+        """A file for each vehicle, which nobody else can read; which files those are."""
+        bundles = self.bundles(agents)
+        paths = {agent_id: directory / bundle_name(agent_id) for agent_id in bundles}
+        for path in paths.values():
+            if path.exists() and not overwrite:
+                raise KeysError(f"{path} is there already: it may be of a later epoch; --overwrite replaces it")
+        try:
+            directory.mkdir(mode=HOME_MODE, parents=True, exist_ok=True)
+            for agent_id, path in paths.items():
+                write_bundle(path, bundles[agent_id])
+        except OSError as error:
+            raise _refused(directory, error) from None
+        return [*paths.values()]
+
+    def revocation(self) -> Revocation | None:
+        """The last one that was made here; None if nobody is revoked."""
+        path = self.directory / REVOCATION_NAME
+        return load_revocation(path, self.public()) if path.exists() else None
+
+    def revoke(self, agents: Sequence[int]) -> Revocation:
+        """Revoke these, too: a new revocation, one number on, which says all that are revoked so far."""
+        public, last = self.public(), self.revocation()
+        before = last.revoked if last else frozenset[int]()
+        revoked = before.union(agents)
+        strangers = sorted(revoked - {*public.vehicles})
+        if strangers:
+            raise _stranger(strangers[0], public)
+        if revoked == before:
+            raise KeysError(f"{_listed(agents)}: revoked already, as {self.directory / REVOCATION_NAME} says")
+        number = last.number + 1 if last else 1
+        if len(revoked) > MAX_REVOKED or number > LAST_NUMBER:
+            raise KeysError(f"more than {MAX_REVOKED} vehicles fit into no revocation: make new keys for the others")
+        authority = Ed25519PrivateKey.from_private_bytes(self._authority(public))
+        revocation = Revocation.signed(authority, public.mission, number, revoked)
+        try:
+            write_revocation(self.directory / REVOCATION_NAME, revocation, public)
+        except OSError as error:
+            raise _refused(self.directory, error) from None
+        return revocation
+
+    def _authority(self, public: PublicKeys) -> bytes:
+        def parse(document: dict[str, Any]) -> bytes:
+            key = key_in(document, "private_key", KEY_BYTES)
+            if public_key_of(key) != public.authority:
+                raise KeyFileError(f"not the key of the authority that {PUBLIC_NAME} tells")
+            return key
+
+        return _sound(lambda: read_key_file(self.directory / AUTHORITY_NAME, AUTHORITY_SCHEMA, parse, secret=True))
+
+
+def load_depot_key(path: Path) -> bytes:
+    """The depot's private key, from its file or from the directory that it is in. Raises KeysError."""
+    file = path / DEPOT_NAME if path.is_dir() else path
+    return _sound(
+        lambda: read_key_file(
+            file, DEPOT_SCHEMA, lambda document: key_in(document, "private_key", KEY_BYTES), secret=True
+        )
+    )
+
+
+def load_revocation(path: Path, public: PublicKeys) -> Revocation:
+    """The revocation in a file, if the authority of this mission signed it. Raises KeysError."""
+
+    def parse(document: dict[str, Any]) -> Revocation:
+        _check_mission(document, public)
+        try:
+            body = base64.b64decode(str(document.get("message")), validate=True)
+            return Revocation.decode(body, public.authority, public.mission)
+        except (binascii.Error, ValueError) as error:
+            reason = error if isinstance(error, RevocationError) else "not base64"
+            raise KeyFileError(f"`message` is {reason}") from None
+
+    return _sound(lambda: read_key_file(path, REVOCATION_SCHEMA, parse, secret=False))
+
+
+def write_revocation(path: Path, revocation: Revocation, public: PublicKeys) -> None:
+    """Raises OSError."""
+    message = base64.b64encode(revocation.encode()).decode("ascii")
+    document = {"schema": REVOCATION_SCHEMA, "mission": public.mission.hex(), "message": message}
+    write_key_file(path, document, secret=False)
+
+
+def _check_mission(document: Mapping[str, Any], public: PublicKeys) -> None:
+    if key_in(document, "mission", MISSION_ID_BYTES) != public.mission:
+        raise KeyFileError(f"of another mission than {PUBLIC_NAME}")
+
+
+def _sound(read: Callable[[], T]) -> T:
+    """Raises KeysError."""
+    try:
+        return read()
+    except KeyFileError as error:
+        raise KeysError(str(error)) from None
+
+
+def _refused(directory: Path, error: OSError) -> MachineError:
+    return MachineError(f"{directory} cannot be written: {error.strerror}; choose another directory")
+
+
+def _stranger(agent_id: int, public: PublicKeys) -> KeysError:
+    return KeysError(f"agent {agent_id} is not of this mission, which has {_listed(public.vehicles)}")
+
+
+def _listed(agents: Iterable[int]) -> str:
+    first, *others = sorted({*agents})
+    shown = ", ".join(map(str, [first, *others[:MOST_NAMED]])) + (", ..." if len(others) > MOST_NAMED else "")
+    return f"agents {shown}" if others else f"agent {shown}"
