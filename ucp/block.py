@@ -4,11 +4,18 @@ A block is what its agent made and nothing else: the chain hash (eq. 3.2) belong
 the block, so it lives in `ucp.chain`. A block therefore never changes when it is popped and committed again.
 """
 
-import hashlib
-from dataclasses import dataclass, field
 from functools import lru_cache
 
+from ucp.dataclass import dataclass, field
 from ucp.wire import Kind, struct_of
+
+try:  # hashlib brings OpenSSL along, which is a quarter of an agent's memory, for a few hashes a minute
+    from _sha2 import sha256  # type: ignore[import-not-found]
+except ImportError:
+    try:
+        from _sha256 import sha256  # type: ignore[import-not-found]
+    except ImportError:
+        from hashlib import sha256
 
 HASH_BYTES = 32
 MAX_EVENT_DATA_BYTES = 1024
@@ -26,7 +33,8 @@ BLOCK_HEADER = struct_of(BLOCK_FIELDS)
 
 def hash_digest(data: bytes) -> bytes:
     """The protocol's cryptographic hash function H: SHA-256, 32 bytes."""
-    return hashlib.sha256(data).digest()
+    digest: bytes = sha256(data).digest()
+    return digest
 
 
 @lru_cache(CHAIN_HASHES_KEPT)

@@ -4,10 +4,10 @@
 big-endian (Section 4.1).
 """
 
-from dataclasses import dataclass
 from random import Random
 from typing import Literal
 
+from ucp.dataclass import dataclass
 from ucp.wire import Kind, struct_of
 
 EVENT_FIELDS = {"timestamp_us": Kind.U64, "event_id": Kind.U8, "length": Kind.U16}

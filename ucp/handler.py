@@ -6,9 +6,9 @@ local events that it may trigger. `ucp.core` holds it to that, and `ucp.diagram`
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Generic, Literal, ParamSpec
 
+from ucp.dataclass import dataclass
 from ucp.messages import Message
 
 P = ParamSpec("P")

@@ -1,16 +1,15 @@
 """The mission file: all that one agent is told before it starts (schema `ucp-mission/1`, see CONTRACT.md)."""
 
 import base64
-import dataclasses
 import json
 import socket
 import stat
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeGuard, get_args
 
 from ucp.block import MAX_AGENT_ID
+from ucp.dataclass import dataclass
 from ucp.events import DEFAULT_LOG, MAX_MEAN_S, MEAN_TIME_BETWEEN_EVENTS_S, EventKind
 from ucp.features import FEATURES
 from ucp.settings import Settings
@@ -186,7 +185,8 @@ def _network(document: dict[str, Any]) -> Network:
 
 
 def _event_source(document: dict[str, Any]) -> EventSource:
-    document = {**dataclasses.asdict(EventSource()), **_known(document, "events", EventSource)}
+    usual = EventSource()
+    document = {name: getattr(usual, name) for name in usual.__match_args__} | _known(document, "events", EventSource)
     if document["source"] not in ("random", "mavlink", "none"):
         raise MissionError(f"`events.source` must be random, mavlink or none, not {shown(document['source'])}")
     return EventSource(
@@ -237,10 +237,10 @@ def _quirks(document: Any) -> dict[str, bool | float]:
     return document
 
 
-def _known(document: Any, key: str, kind: type) -> dict[str, Any]:
+def _known(document: Any, key: str, kind: type[EventSource] | type[Settings]) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise MissionError(f"`{key}` must be a JSON object")
-    names = [field.name for field in dataclasses.fields(kind)]
+    names = kind.__match_args__
     for name in document:
         if name not in names:
             raise MissionError(f"`{key}.{shown_key(name)}` is unknown: there are {', '.join(names)}")

@@ -1,10 +1,10 @@
 """What an agent can be told: timers, sizes, and the readings of an ambiguous thesis."""
 
 import math
-from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 from ucp.block import MAX_EVENT_DATA_BYTES
+from ucp.dataclass import dataclass
 from ucp.events import MAX_EVENT_BYTES
 from ucp.shown import shown
 
@@ -62,9 +62,8 @@ class Settings:
         So an agent that knows nothing of it can play a mission that does not need it.
         """
         usual = Settings()
-        return {
-            name: value for name, value in asdict(self).items() if name not in ADDED or value != getattr(usual, name)
-        }
+        told = {name: getattr(self, name) for name in self.__match_args__}
+        return {name: value for name, value in told.items() if name not in ADDED or value != getattr(usual, name)}
 
     def _check(self, name: str, allowed: str, kinds: tuple[type, ...], low: float, high: float) -> None:
         value = getattr(self, name)

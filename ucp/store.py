@@ -17,11 +17,11 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from ucp.block import BLOCK_HEADER, Block
+from ucp.dataclass import dataclass, field
 from ucp.messages import decode_block
 from ucp.shown import shown
 from ucp.state import AgentState

@@ -8,9 +8,9 @@ A line has datagrams, events and stores in base64. In memory they stay what they
 
 import base64
 import json
-from dataclasses import dataclass
 from typing import Any, Protocol
 
+from ucp.dataclass import dataclass
 from ucp.messages import Datagram, Message, block_named
 
 SCHEMA = "ucp-trace/2"
