@@ -9,8 +9,9 @@
 
 What is asked is an entry of the scenario's timeline without its `at_s`, which is now: same keys, same check, same
 sentences, made by the same code as one that was scheduled. It then stands in the timeline of run.json and is marked
-`by_hand` among the faults there; `replay.yaml` in the run's directory plays it all again. What cannot be is a
-ScenarioError, one sentence, and changes nothing. Every answer comes, if only that the run has ended.
+`by_hand` among the faults there; `replay.yaml` in the run's directory plays it all again. What was to last for a while,
+and is changed by hand for good, is over by then. What cannot be is a ScenarioError, one sentence, and changes nothing.
+Every answer comes, if only that the run has ended.
 """
 
 import asyncio
@@ -22,6 +23,8 @@ from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
+from pydantic import ValidationError
+
 from harness.errors import ScenarioError
 from harness.play import mission
 from harness.play.growing import GrowingTimeline
@@ -29,6 +32,7 @@ from harness.play.mission import Swarm
 from harness.play.pace import NEXT_RUN, Pace
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, timeline_of
+from harness.scenario.states import changed
 from harness.scenario.timeline import TimelineEntry
 
 MOST_WAITING = 100
@@ -233,6 +237,7 @@ class Interventions(GrowingTimeline):
             raise ScenarioError("`at_s` is now: leave it out")
         at_s, document = self.next_instant(swarm), self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
+        self._end_what_it_takes_the_place_of(document["timeline"])
         self.retell(document)
         self._by_hand[at_s] = self.scenario.timeline[-1]
         try:
@@ -242,6 +247,17 @@ class Interventions(GrowingTimeline):
             del self._by_hand[at_s]
             raise
         return at_s
+
+    def _end_what_it_takes_the_place_of(self, timeline: list[Entry]) -> None:
+        """What is changed for a while, and by the last entry for good, is over now: to heal ends any partition."""
+        try:
+            entry = TimelineEntry.model_validate(timeline[-1])
+        except ValidationError:
+            return  # what is wrong with it is said by whoever checks the scenario
+        for number, earlier in enumerate(self.scenario.timeline):
+            is_under_way = earlier.for_s is not None and earlier.at_s < entry.at_s < earlier.ends_at_s
+            if is_under_way and entry.for_s is None and {*changed(earlier)} <= {*changed(entry)}:
+                timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
     def as_asked(self, change: Change) -> Change:
         entry = self._by_hand.get(change.at_s)

@@ -13,7 +13,8 @@ REPLAY_FILE = "replay.yaml"
 def replay_of(scenario: Scenario, by_hand_s: Collection[float], seed: int | None, backend: BackendName | None) -> str:
     """The file; `by_hand_s` are the seconds of the timeline's entries that were asked for by hand."""
     document = scenario.model_dump(mode="json", exclude_defaults=True)
-    document["timeline"] = sorted(document["timeline"], key=lambda entry: entry["at_s"])
+    timeline = [{"at_s": entry["at_s"], **entry} for entry in document["timeline"]]
+    document["timeline"] = sorted(timeline, key=lambda entry: entry["at_s"])
 
     def remark(entry: dict[str, Any]) -> str | None:
         return "by hand" if entry.get("at_s") in by_hand_s else None

@@ -126,7 +126,7 @@ def refuse_ambiguity(timeline: Sequence[TimelineEntry]) -> None:
     under_way: dict[tuple[Where, str], list[tuple[float, int]]] = defaultdict(list)
     for number, entry in sorted(enumerate(timeline), key=lambda numbered: numbered[1].at_s):
         until_s = math.inf if entry.for_s is None else entry.ends_at_s
-        for where, key in _changed(entry):
+        for where, key in changed(entry):
             earlier = under_way[where, key]
             while earlier and earlier[-1][0] <= entry.at_s:
                 earlier.pop()
@@ -140,7 +140,7 @@ def refuse_ambiguity(timeline: Sequence[TimelineEntry]) -> None:
             earlier.append((until_s, number))
 
 
-def _changed(entry: TimelineEntry) -> Iterator[tuple[Where, str]]:
+def changed(entry: TimelineEntry) -> Iterator[tuple[Where, str]]:
     """Whose keys the entry changes; the partition counts as a key of all."""
     if entry.disturbs in (PARTITION, "heal"):
         yield None, "the partition"

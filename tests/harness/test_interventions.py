@@ -99,13 +99,13 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"reboot": [1]}, "a reboot needs `down_s`"),
     ({"reboot": [1], "down_s": 1e6, "disk": "lost"}, "after the mission's end at 300 s"),
     ({"kill": [3]}, "the timeline's entry at 200 s, kill: agent 3 is killed then, not running or paused"),
-    ({"heal": True}, "changes the partition for good, and the timeline's entry at 50 s until 150 s: which holds when?"),
+    ({"loss": 0.5}, "this changes loss for good, and the timeline's entry at 90 s until 150 s: which holds when?"),
 ]
 
 
 def test_what_cannot_be_is_a_sentence_and_changes_nothing(tmp_path: Path) -> None:
-    timeline = [{"at_s": 50, "partition": [[1, 2]], "for_s": 100}, {"at_s": 200, "kill": [3]}]
-    asked = scenario(duration_s=300, timeline=timeline)
+    strained = {"at_s": 90, "network": {"loss": 0.3, "delay": 0.1}, "for_s": 60}
+    asked = scenario(duration_s=300, timeline=[strained, {"at_s": 200, "kill": [3]}])
     wrong: list[str] = []
 
     def click(hand: Interventions) -> None:
@@ -126,6 +126,42 @@ def test_what_cannot_be_is_a_sentence_and_changes_nothing(tmp_path: Path) -> Non
 
     played(asked, tmp_path / "run", click)
     assert wrong == []
+
+
+def test_what_is_for_a_while_ends_where_somebody_asks_for_other(tmp_path: Path) -> None:
+    timeline = [{"at_s": 50, "partition": [[1, 2]], "for_s": 500}, {"at_s": 60, "loss": 0.5, "for_s": 400}]
+    asked = scenario(duration_s=600, timeline=timeline)
+
+    def click(hand: Interventions) -> None:
+        hand.step(100).result(TIMEOUT_S)
+        hand.ask({"heal": True}).result(TIMEOUT_S)
+        hand.ask({"loss": 0.1}).result(TIMEOUT_S)
+
+    finished = played(asked, tmp_path / "run", click)
+    told = [(fault.at_s, fault.what, fault.detail) for fault in finished.record.faults]
+    assert told[2:] == [(100.0, "heal, undone", "loss 50 %"), (100.001, "loss, undone", "loss 10 %")]
+    run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
+
+
+def test_where_vehicles_fly_it_is_played_again_just_so(tmp_path: Path) -> None:
+    radio = {"hard_range": {"range_m": 100}, "update_s": 1}
+    flight = [{"vehicles": [1], "plan": [{"take_off": 20}, {"go_to": [300, 0]}, {"go_to": [0, 0]}]}]
+    schedule = [{"nemesis": "halves", "every_s": 50, "for_s": 20}]
+    network, events = {"radio": radio}, {"mean_s": 2}
+    asked = scenario(duration_s=300, agents=3, network=network, flight=flight, schedule=schedule, events=events)
+
+    def click(hand: Interventions) -> None:
+        for number in range(40):
+            hand.step_to_next_run().result(TIMEOUT_S)
+            if number % 10 == 9:
+                hand.step(0.5).result(TIMEOUT_S)
+                hand.ask({"loss": number / 100}).result(TIMEOUT_S)
+
+    played(asked, tmp_path / "run", click)
+    run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
+    assert (tmp_path / "again/tracks.jsonl").read_bytes() == (tmp_path / "run/tracks.jsonl").read_bytes()
 
 
 def test_after_the_end_nothing_happens_and_every_answer_comes(tmp_path: Path) -> None:
