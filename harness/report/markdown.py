@@ -28,7 +28,8 @@ def to_markdown(left: ReportSource) -> str:
         lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]
     if survived := survival.section(record.survival, left.ink):
         lines += _listed(survived.sentences)
-    lines += _faults(network.faults(record.faults))
+    lines += _happened(network.happened(record))
+    lines += _listed([station] if (station := network.ground_station(record)) else [])
     lines += _listed(rogue.sentences(record.rogue))
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     return "\n".join([*lines, f"<sub>{_short(versions)}</sub>"]) + "\n"
@@ -50,15 +51,15 @@ def _evidence(judged: Sequence[Verdict]) -> list[str]:
     )
 
 
-def _faults(faults: Sequence[tuple[str, str, str]]) -> Iterator[str]:
-    if not faults:
+def _happened(happened: Sequence[tuple[str, str, str]]) -> Iterator[str]:
+    if not happened:
         return
     yield row(["mission time", "fault", ""])
     yield row(["--:", "---", "---"])
-    yield from (row(map(_short, fault)) for fault in faults[:FAULTS_SHOWN])
+    yield from (row(map(_short, thing)) for thing in happened[:FAULTS_SHOWN])
     yield ""
-    if len(faults) > FAULTS_SHOWN:
-        yield f"{len(faults) - FAULTS_SHOWN} more are in report.html."
+    if len(happened) > FAULTS_SHOWN:
+        yield f"{len(happened) - FAULTS_SHOWN} more are in report.html."
         yield ""
 
 

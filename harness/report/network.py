@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from harness.archive.connectivity import Connectivity, Losses, Pair, quality
-from harness.archive.record import FaultRecord, NetworkState
+from harness.archive.record import FaultRecord, NetworkState, OperatorCommand, RunRecord
 from harness.present import words
 from harness.report import network_strip
 from harness.report.map_parts import divisions
@@ -77,14 +77,43 @@ def start(states: Sequence[NetworkState]) -> str | None:
     return states[0].detail if states else None
 
 
-def faults(faults: Sequence[FaultRecord]) -> list[tuple[str, str, str]]:
-    """When, what, and everything else that is known of each fault."""
-    rows = []
-    for fault in faults:
-        details = [fault.detail] if fault.detail else []
-        if fault.fully_connected is not None:
-            details.append(f"fully connected: {words.value(fault.fully_connected)}")
-        if fault.by_hand:
-            details.append("asked for by hand")
-        rows.append((words.duration(fault.at_s), fault.what, "; ".join(details)))
-    return rows
+def happened(record: RunRecord) -> list[tuple[str, str, str]]:
+    """When, what, and everything else that is known of each fault, and of each command of an operator, in order."""
+    rows = [(fault.at_s, fault.what, _of_fault(fault)) for fault in record.faults]
+    if (station := record.ground_station) is not None:
+        rows += [(command.at_s, "operator", _of_command(command)) for command in station.commands]
+    rows.sort(key=lambda row: row[0])
+    told = [(words.duration(at_s), what, detail) for at_s, what, detail in rows]
+    if station is not None and station.commands_left_out:
+        told.append(("later", "operator", f"{station.commands_left_out} more commands, which nobody has kept"))
+    return told
+
+
+def _of_fault(fault: FaultRecord) -> str:
+    details = [fault.detail] if fault.detail else []
+    if fault.fully_connected is not None:
+        details.append(f"fully connected: {words.value(fault.fully_connected)}")
+    if fault.by_hand:
+        details.append("asked for by hand")
+    return "; ".join(details)
+
+
+def _of_command(command: OperatorCommand) -> str:
+    """ "vehicle 2: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 2:05": what is 0 goes without saying."""
+    who = f"vehicle{'s' if len(command.vehicles) > 1 else ''} {' '.join(map(str, command.vehicles))}"
+    details = [f"{who}: {command.command or command.message}"]
+    values = [f"{name} {words.value(value)}" for name, value in command.values.items() if value]
+    if values:
+        details.append(", ".join(values))
+    if command.times > 1:
+        details.append(f"{command.times} times until {words.duration(command.until_s)}")
+    return "; ".join(details)
+
+
+def ground_station(record: RunRecord) -> str | None:
+    """A sentence on what passed between the vehicles and a ground station, if there was one."""
+    if (station := record.ground_station) is None:
+        return None
+    dropped = f", and {words.value(station.dropped)} were dropped" if station.dropped else ""
+    came = f"{words.value(station.received)} came from it{dropped}"
+    return f"Ground station at {station.address}: {words.value(station.sent)} datagrams went there, {came}."

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.connectivity import read_connectivity
-from harness.report.network import strip
+from harness.archive.record import RunRecord
+from harness.report.network import ground_station, happened, strip
 
 
 def drawn(path: Path, *lines: dict[str, Any]) -> list[str]:
@@ -66,3 +67,42 @@ def test_what_distance_loses_is_added_and_what_is_out_of_range_is_a_partition(tm
 
 def test_without_a_record_there_is_no_strip(tmp_path: Path) -> None:
     assert strip(read_connectivity(tmp_path / "network.jsonl", (1, 2)), [], 600.0) is None
+
+
+def test_what_was_asked_for_by_hand_stands_among_what_was_scheduled() -> None:
+    record = RunRecord.model_validate(
+        {
+            "faults": [
+                {"at_s": 60, "what": "kill", "detail": "agent 2", "agents": [2], "by_hand": True},
+                {"at_s": 300, "what": "heal", "detail": "loss 0 %", "fully_connected": True},
+            ],
+            "ground_station": {
+                "address": "127.0.0.1:14550",
+                "sent": 12345,
+                "received": 9,
+                "dropped": 2,
+                "commands_left_out": 4,
+                "commands": [
+                    {
+                        "at_s": 125.5,
+                        "until_s": 130,
+                        "times": 3,
+                        "vehicles": [1, 3],
+                        "message": "COMMAND_LONG",
+                        "command": "MAV_CMD_DO_SET_MODE",
+                        "values": {"param1": 1.0, "param2": 6.0, "param3": 0.0, "param4": None},
+                    }
+                ],
+            },
+        }
+    )
+    rows = [[cell.replace("\u00a0", " ") for cell in row] for row in happened(record)]
+    assert rows == [
+        ["60 s", "kill", "agent 2; asked for by hand"],
+        ["125.5 s", "operator", "vehicles 1 3: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 130 s"],
+        ["300 s", "heal", "loss 0 %; fully connected: yes"],
+        ["later", "operator", "4 more commands, which nobody has kept"],
+    ]
+    told = "Ground station at 127.0.0.1:14550: 12\u202f345 datagrams went there, 9 came from it, and 2 were dropped."
+    assert ground_station(record) == told
+    assert ground_station(RunRecord()) is None
