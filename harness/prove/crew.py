@@ -183,7 +183,7 @@ class _Other:
                 numbers.append(add(next(fresh), parent))
             yield Expansion(
                 expansion.ways,
-                tuple(tuple(numbers[told] for told in after) for after in expansion.alone),
+                tuple(tuple(numbers[told] for told in after) for after in expansion.by_timer),
                 tuple(numbers[told] for told in expansion.crossing),
             )
 

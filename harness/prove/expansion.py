@@ -1,6 +1,7 @@
 """What may follow one state."""
 
 from collections.abc import Callable
+from itertools import chain
 from typing import NamedTuple
 
 from harness.prove.swarm import State, Swarm
@@ -9,14 +10,14 @@ NumberOf = Callable[[State], int]
 
 
 class Expansion(NamedTuple):
-    """What may follow one state, in `ways`. The rest is by the numbers of states.
+    """What may follow one state, in `ways`; the rest by numbers of states: nobody loses anything, no block comes.
 
-    `alone` has for each timer that may end next what may follow if it ends alone, nobody loses anything, and no new
-    block comes; `crossing` what may follow if several end at once.
+    `by_timer` has for each timer that may end next what may follow if it does: it ends alone, or others that have to
+    end at that very moment end before it or with it. `crossing` has what may follow if any that may end at once do.
     """
 
     ways: int
-    alone: tuple[tuple[int, ...], ...]
+    by_timer: tuple[tuple[int, ...], ...]
     crossing: tuple[int, ...]
 
 
@@ -33,12 +34,14 @@ def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
 
 def quiet(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
     """Where the state goes on when nothing is lost and no new block comes."""
-    alone: list[tuple[int, ...]] = []
-    crossing: dict[int, None] = {}
-    for actions in swarm.ending(state):
-        numbers = dict.fromkeys(map(number_of, swarm.after(state, actions, lossy=False)))
-        if len(actions) == 1:
-            alone.append(tuple(numbers))
-        else:
-            crossing |= numbers
-    return Expansion(0, tuple(alone), tuple(crossing))
+    after = {
+        actions: dict.fromkeys(map(number_of, swarm.after(state, actions, lossy=False)))
+        for actions in swarm.ending(state)
+    }
+    by_timer = []
+    for action, tied in swarm.tied(state).items():
+        if (action,) in after:
+            choices = [after[actions] for actions in after if tied.issuperset(actions)]
+            by_timer.append(tuple(dict.fromkeys(chain.from_iterable(choices))))
+    crossing = dict.fromkeys(chain.from_iterable(after[actions] for actions in after if len(actions) > 1))
+    return Expansion(0, tuple(by_timer), tuple(crossing))

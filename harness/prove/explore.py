@@ -23,8 +23,8 @@ NO_PARENT = -1
 class Graph:
     """The states by number, and how each was come to first. `ended` is "complete" if there are no others.
 
-    `quiet` has for each state and each timer that may end next the states that may follow if this one ends alone and
-    nobody loses anything; `crossing` those that may follow if several end at once.
+    `quiet` has for each state and each timer that may end next the states that may follow if nobody loses anything, and
+    `crossing` those that may follow if several end at once: both as `Expansion` has them.
     """
 
     swarm: Swarm
@@ -70,7 +70,7 @@ class Graph:
         """What follows the next state of which that is not known yet."""
         number = len(self.quiet)
         self.transitions += expansion.ways
-        self.quiet.append(expansion.alone)
+        self.quiet.append(expansion.by_timer)
         if expansion.crossing:
             self.crossing[number] = expansion.crossing
 

@@ -22,7 +22,8 @@ class Liveness:
     states on it, the nearest first.
 
     `astray`: how many states have no way to rest with one chain if there are 0, 1, 2, ... more votes, until it is none,
-    or there was one vote for each agent. `lost` is the nearest of those that are left then.
+    or there was one vote for each agent. `lost` is the nearest of those that are left then, `reluctant` the nearest of
+    those for which one is not enough.
     """
 
     forks: int = 0
@@ -30,6 +31,7 @@ class Liveness:
     cycles: list[list[int]] = field(default_factory=list)
     astray: list[int] = field(default_factory=list)
     lost: int | None = None
+    reluctant: int | None = None
     decided: bool = True
     """Whether all that follows more votes was looked at."""
 
@@ -50,6 +52,8 @@ def look(graph: Graph, check: Check = lambda: None) -> Liveness:
     while True:
         astray = [number for number in range(reachable) if number not in safe]
         result.astray.append(len(astray))
+        if astray and len(result.astray) == 2:
+            result.reluctant = astray[0]
         if not astray or len(result.astray) > graph.swarm.bounds.agents:
             result.lost = astray[0] if astray else None
             return result
@@ -94,6 +98,7 @@ def _attracted(graph: Graph, check: Check, goal: set[int]) -> set[int]:
     """All states from which, whichever timer is the next to end, some way leads to the goal.
 
     The durations decide which timer is next, and a zone does not tell: so all that it leaves open have to lead there.
+    Of timers that have to end at the same moment only how long messages take decides which is first: any may be.
     """
     before: dict[int, list[tuple[int, int]]] = defaultdict(list)
     open_timers: list[set[int]] = []

@@ -73,6 +73,8 @@ class Proof:
     example: Example | None = None
     fork: Example | None = None
     """The nearest state at rest with several chains: nothing is violated, and it stays so until somebody votes."""
+    reluctant: Example | None = None
+    """The nearest state for which one more vote is not enough, if more votes are."""
     livelocks: list[Livelock] = field(default_factory=list)
     """The first of each form, those that were played."""
     way: list[str] = field(default_factory=list)
@@ -113,6 +115,7 @@ class Proof:
             "way": self.way,
             "forks_at_rest": None if live is None else live.forks,
             "fork": None if self.fork is None else self.fork.to_json(),
+            "reluctant": None if self.reluctant is None else self.reluctant.to_json(),
             "without_a_way_to_one_chain": None if live is None else live.astray,
             "livelocks": None if live is None else len(live.cycles),
             "livelock_forms": [each.to_json() for each in self.livelocks],
@@ -217,6 +220,10 @@ def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
         beside = path.with_stem(f"{path.stem}_fork")
         sentence = "all are at rest, and chains differ: they will until somebody votes"
         proof.fork = _example(graph, live.fork, sentence, beside, f"{name} fork")
+    if live is not None and live.reluctant is not None and live.lost is None and live.decided:
+        beside = path.with_stem(f"{path.stem}_votes")
+        sentence = "one more vote does not lead from here to one chain"
+        proof.reluctant = _example(graph, live.reluctant, sentence, beside, f"{name} votes")
 
 
 def _example(graph: Graph, number: int, sentence: str, path: Path, name: str) -> Example:

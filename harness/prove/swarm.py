@@ -79,6 +79,14 @@ class Swarm:
             Action(running[first - 1][0], "timer", running[first - 1][1]) for first in self.zones.firsts(state[ZONE])
         ]
 
+    def tied(self, state: State) -> dict[Action, frozenset[Action]]:
+        """The timers that may be the next to end, each with those that have to end at that very moment, and itself."""
+        firsts = self.firsts(state)
+        if self.bounds.timers_any:
+            return {action: frozenset((action,)) for action in firsts}
+        tied = self.zones.tied(state[ZONE])
+        return {action: frozenset(firsts[other] for other in tied[index]) for index, action in enumerate(firsts)}
+
     def ending(self, state: State) -> Iterator[tuple[Action, ...]]:
         """All sets of timers that may end in one instant, of each agent one at most; some of the sets cannot."""
         by_place: dict[int, list[Action]] = {}

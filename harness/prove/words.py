@@ -85,6 +85,9 @@ def _of_the_whole(proof: Proof) -> Iterator[str]:
     if votes and live.decided:
         counts = ", ".join(f"{count:,} with {number}" for number, count in enumerate(live.astray[:-1]))
         yield f"    states that cannot yet, by how many more votes there are: {counts}"
+    if proof.reluctant is not None:
+        nearest = proof.reluctant
+        yield f"    the nearest that needs more than one vote, {nearest.instants} instants: {nearest.replay}"
     yield f"    {live.forks:,} states are at rest with several chains, and stay so until somebody votes"
     if proof.fork is not None:
         fork = proof.fork

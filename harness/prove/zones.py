@@ -19,6 +19,7 @@ class Zones:
         self._matrices: list[Matrix] = []
         self._numbers: dict[Matrix, int] = {}
         self._after: dict[tuple[int, tuple[int, ...], tuple[int, ...]], int | None] = {}
+        self._tied: dict[int, list[tuple[int, ...]]] = {}
         self._permuted: dict[tuple[int, tuple[int, ...]], int] = {}
         self._coincidences: dict[tuple[int, tuple[int, ...]], int] = {}
         self._intern(((0,),))
@@ -37,6 +38,18 @@ class Zones:
         """The timers, from 1, that may be the next to end."""
         least = self._matrices[zone][0]
         return [timer for timer in range(1, len(least)) if not least[timer]]
+
+    def tied(self, zone: int) -> list[tuple[int, ...]]:
+        """For each of `firsts` which of them have to end at the very moment at which it does, if it is the next."""
+        tied = self._tied.get(zone)
+        if tied is None:
+            firsts = self.firsts(zone)
+            ended = [self._ended(zone, (timer,)) for timer in firsts]
+            tied = self._tied[zone] = [
+                tuple(index for index, other in enumerate(firsts) if matrix is not None and not matrix[other][0])
+                for matrix in ended
+            ]
+        return tied
 
     def bounds(self, zone: int, timer: int) -> tuple[int, ...]:
         """Tells timers apart, whatever their places."""

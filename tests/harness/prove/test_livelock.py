@@ -46,6 +46,23 @@ def test_nothing_goes_round_if_nothing_is_at_once_by_chance(tmp_path: Path) -> N
     assert not proof.liveness.forks
 
 
+def test_one_more_vote_is_enough_for_three_agents_and_two_blocks(tmp_path: Path) -> None:
+    """Whoever has to end a timer at the same moment as another may be before it or after: that is what it takes."""
+    proof = prove(Bounds(3, 2, "lossy"), out=tmp_path / "three.yaml")
+    assert proof.liveness is not None
+    assert proof.liveness.lost is proof.reluctant is None
+    assert proof.liveness.astray == [78, 0]
+
+
+def test_what_needs_more_than_one_vote_is_a_scenario(tmp_path: Path) -> None:
+    proof = prove(Bounds(4, 2, "lossy"), out=tmp_path / "four.yaml")
+    assert proof.liveness is not None
+    assert proof.liveness.astray[1:] == [1, 0]
+    assert proof.reluctant is not None
+    assert (proof.reluctant.path.name, proof.reluctant.chains) == ("four_votes.yaml", 3)
+    assert any("needs more than one vote" in line for line in in_words(proof))
+
+
 def test_a_coincidence_is_a_difference_that_was_open() -> None:
     zones = Zones()
     ten_s = -10_000_000 - 1

@@ -34,6 +34,16 @@ def test_zones_are_the_times_that_are_possible() -> None:
             assert points == set(inside(zones, zone, len(stay) + len(new)))
 
 
+def test_some_timers_have_to_end_at_one_moment() -> None:
+    zones = Zones()
+    zone = zones.after(NOTHING_RUNS, (), (-11, -11))
+    assert zone is not None
+    assert zones.tied(zone) == [(0, 1), (0, 1)]
+    apart = zones.after(zone, (), (1, 2, -6))  # the third was started any time later
+    assert apart is not None
+    assert zones.tied(apart) == [(0, 1), (0, 1), (2,)]
+
+
 def inside(zones: Zones, zone: int, timers: int) -> list[tuple[int, ...]]:
     """The whole points of a zone."""
     matrix = zones.matrix(zone)
