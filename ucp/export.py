@@ -1,6 +1,7 @@
 """The chain export, schema `ucp-chain-export/1`: everything that an agent holds, as a JSON document."""
 
 import base64
+from collections.abc import Mapping
 from typing import Any
 
 from ucp.block import Block
@@ -9,9 +10,19 @@ from ucp.state import AgentState
 SCHEMA = "ucp-chain-export/1"
 
 
-def export_chain(state: AgentState, exported_at_us: int) -> dict[str, Any]:
-    """An agent's export. Blocks of the chain are oldest first, of the deque front first, of the stack top last."""
+def export_chain(
+    state: AgentState, exported_at_us: int, signatures: Mapping[bytes, bytes] | None = None
+) -> dict[str, Any]:
+    """An agent's export. Blocks of the chain are oldest first, of the deque front first, of the stack top last.
+
+    `signatures` are their makers', by block hash, in a secured mission.
+    """
     inception = state.chain.inception
+
+    def exported(block: Block, chain_hash: bytes | None) -> dict[str, Any]:
+        signature = signatures.get(block.block_hash) if signatures else None
+        return _block(block, chain_hash) | ({"signature": _base64(signature)} if signature else {})
+
     return {
         "schema": SCHEMA,
         "agent_id": state.agent_id,
@@ -21,9 +32,9 @@ def export_chain(state: AgentState, exported_at_us: int) -> dict[str, Any]:
             "block_hash": inception.block_hash.hex(),
             "chain_hash": inception.chain_hash.hex(),
         },
-        "chain": [_block(block, chain_hash) for block, chain_hash in state.chain.with_chain_hashes()],
-        "blocks_to_be_committed": [_block(block, None) for block in state.blocks_to_be_committed],
-        "reconcile_stack": [_block(block, None) for block in state.reconcile_stack],
+        "chain": [exported(block, chain_hash) for block, chain_hash in state.chain.with_chain_hashes()],
+        "blocks_to_be_committed": [exported(block, None) for block in state.blocks_to_be_committed],
+        "reconcile_stack": [exported(block, None) for block in state.reconcile_stack],
         "current_block": {"event_data": _base64(bytes(state.current_block))},
         "reconcile_in_progress": state.reconcile_in_progress,
         "idle": state.idle,

@@ -37,16 +37,29 @@ class StoreError(Exception):
 
 
 @dataclass(slots=True)
+class SecuredState:
+    """What a secured agent keeps besides: when its life began, in microseconds UTC, what its blocks' makers signed, by
+    block hash, and the newest revocation that it heard.
+    """
+
+    started_us: int
+    signatures: dict[bytes, bytes] = field(default_factory=dict, repr=False)
+    revocation: bytes | None = None
+
+
+@dataclass(slots=True)
 class StoredState:
     """What an agent holds where, and the hashes of the blocks that it completed.
 
-    Blocks of the chain are oldest first, of the deque front first, of the stack top last.
+    Blocks of the chain are oldest first, of the deque front first, of the stack top last. `secured` is None of an agent
+    without keys.
     """
 
     completed: list[bytes] = field(default_factory=list)
     chain: list[Block] = field(default_factory=list)
     deque: list[Block] = field(default_factory=list)
     stack: list[Block] = field(default_factory=list)
+    secured: SecuredState | None = None
 
     @classmethod
     def of(cls, state: AgentState) -> "StoredState":

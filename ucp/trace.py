@@ -188,7 +188,12 @@ Entry = HandlerRun | Dropped | Commanded
 
 
 def header_line(
-    agent_id: int, roster: list[int], initial_data: bytes, settings: dict[str, Any], clock: dict[str, Any]
+    agent_id: int,
+    roster: list[int],
+    initial_data: bytes,
+    settings: dict[str, Any],
+    clock: dict[str, Any],
+    secured: bool = False,
 ) -> str:
     """The first line of a trace: which agent, in which mission, with which settings and clock."""
     header = {
@@ -198,6 +203,7 @@ def header_line(
         "initial_data": in_base64(initial_data),
         "settings": settings,
         "clock": clock,
+        **({"secured": True} if secured else {}),
     }
     return _encode(header) + "\n"
 

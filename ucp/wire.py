@@ -19,6 +19,8 @@ class Kind(Enum):
     MAGIC = "2s"
     FLAG = "?"
     """One byte, 0 or 1."""
+    BOOT = "16s"
+    """Which life of a vehicle, in secured datagrams."""
     HASH = "32s"
     OPTIONAL_HASH = "hash or nothing"
     """The last field: all that is left, 32 bytes or none."""

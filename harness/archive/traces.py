@@ -23,14 +23,17 @@ MAX_LINE_BYTES = 16 * 1024 * 1024
 LARGEST = 2**64
 """No whole number in a header is as large; larger ones are none that a float can hold."""
 PLACES = ("chain", "deque", "stack")
-_HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clock")
+_HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clock", "secured")
 
 
 Version = Literal["ucp-trace/1", "ucp-trace/2"]
 
 
 class Header(BaseModel):
-    """`initial_data` is in base64; None in version 1, which has no inputs in full either."""
+    """`initial_data` is in base64; None in version 1, which has no inputs in full either.
+
+    In a `secured` mission datagrams were longer than they are here, and some were dropped that look good.
+    """
 
     model_config = ConfigDict(extra="ignore", populate_by_name=True)
 
@@ -40,6 +43,7 @@ class Header(BaseModel):
     settings: dict[str, Any]
     clock: dict[str, Any]
     initial_data: str | None = None
+    secured: bool | None = None
 
     @model_validator(mode="after")
     def _complete(self) -> "Header":

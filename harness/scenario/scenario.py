@@ -22,6 +22,7 @@ from harness.scenario.numbered import Lateness
 from harness.scenario.quirks import AskedQuirks, OfSome, of_agent
 from harness.scenario.quirks import check as check_quirks
 from harness.scenario.schedule import NEEDED, Schedule
+from harness.scenario.security import Security
 from harness.scenario.stagger import Stagger, staggered
 from harness.scenario.states import Step, refuse_ambiguity, steps
 from harness.scenario.timeline import TimelineEntry
@@ -95,6 +96,8 @@ class Scenario(Model):
     """The agents' timers, and how they read what the thesis leaves open."""
     stagger: Stagger = {}
     """By how many seconds timers of each agent run longer than those of the agent before it: it is told so."""
+    security: Security | None = None
+    """Keys for all agents; without, whatever is on the air counts."""
     quirks: AskedQuirks = {}
     """Mistakes that all agents make, or those that are named (`ucp.quirks`)."""
     clocks: dict[VehicleKey, Clock] = {}

@@ -3,6 +3,9 @@
 from ucp.export import SCHEMA
 from ucp.schemas.parts import AGENT_ID, BASE64, COUNT, EVENT_DATA, FLAG, HASH, TIMESTAMP, Schema, listed, record
 
+SIGNATURE: Schema = {**BASE64, "minLength": 88, "maxLength": 88}
+"""Its maker's, 64 bytes, in a secured mission."""
+
 
 def block(chain_hash: Schema) -> Schema:
     """A block of the chain; in deque and stack it has no chain hash."""
@@ -13,7 +16,9 @@ def block(chain_hash: Schema) -> Schema:
             "event_data": EVENT_DATA,
             "block_hash": HASH,
             "chain_hash": chain_hash,
-        }
+            "signature": SIGNATURE,
+        },
+        optional=("signature",),
     )
 
 

@@ -35,6 +35,21 @@ DROPS = (
 )
 """Why a datagram is given to no handler."""
 
+SECURED_DROPS = (
+    "not secured",
+    "revoked sender",
+    "epoch out of range",
+    "old boot",
+    "replayed",
+    "not authentic",
+    "not signed by its sender",
+    "answers no request",
+    "block not signed by its maker",
+    "not signed by the authority",
+    "known already",
+)
+"""Why, in a secured mission, besides."""
+
 
 def header() -> Schema:
     """The first line of a life."""
@@ -47,7 +62,9 @@ def header() -> Schema:
             "initial_data": BASE64,
             "settings": settings(optional=False),
             "clock": clock,
-        }
+            "secured": {"const": True},
+        },
+        optional=("secured",),
     )
 
 
@@ -167,7 +184,7 @@ def aside() -> Schema:
     """A line of what was given to no handler: a datagram that was dropped, or a command."""
     return {
         "oneOf": [
-            record({"t": SECONDS, "dropped": {"enum": list(DROPS)}, "datagram": BASE64}),
+            record({"t": SECONDS, "dropped": {"enum": [*DROPS, *SECURED_DROPS]}, "datagram": BASE64}),
             record({"t": SECONDS, "command": {"type": "string"}, "request": {"type": "object"}}),
         ]
     }

@@ -4,10 +4,10 @@ Ed25519 (RFC 8032) over a domain tag, the mission's ID and BD (eq. 3.5): nothing
 another mission, passes for it.
 """
 
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-SIGNATURE_BYTES = 64
+from ucp.secure.suite import Signed, verify
+
 _TAG = b"UCP block\0"
 
 
@@ -16,10 +16,11 @@ def sign_block(maker: Ed25519PrivateKey, mission: bytes, block_data: bytes) -> b
     return maker.sign(_TAG + mission + block_data)
 
 
+def claim_of_block(public_key: bytes, mission: bytes, block_data: bytes, signature: bytes) -> Signed:
+    """That the maker with this public key signed the block with this BD in this mission."""
+    return Signed(public_key, signature, _TAG + mission + block_data)
+
+
 def is_signed(signature: bytes, public_key: bytes, mission: bytes, block_data: bytes) -> bool:
     """Whether the maker with this public key signed the block in this mission. Never raises, whatever the bytes are."""
-    try:
-        Ed25519PublicKey.from_public_bytes(public_key).verify(signature, _TAG + mission + block_data)
-    except (InvalidSignature, ValueError):
-        return False
-    return True
+    return verify(claim_of_block(public_key, mission, block_data, signature))

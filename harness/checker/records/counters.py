@@ -11,7 +11,8 @@ from harness.checker.records.clocks import in_virtual_time, slack_s
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.checker.replay import Life
 from ucp.messages import Datagram, datagram_bytes
-from ucp.trace import Dropped, Recorded
+from ucp.secure.envelope import ADDED_BYTES
+from ucp.trace import Commanded, Dropped, Recorded
 
 ROUNDED_S = 5e-4
 """run.json has milliseconds."""
@@ -101,8 +102,13 @@ def _counted(
             yield of_agent(agent_id, detail)
 
 
-def _bytes_sent(trace: Trace) -> int:
-    return sum([_bytes(message.datagram) for run in trace.runs for message in run.sent if message.datagram is not None])
+def _bytes_sent(trace: Trace) -> int | None:
+    """In datagrams as they were on the air; revocations, which an agent tells of beside the protocol, are not known."""
+    if any(isinstance(aside, Commanded) and aside.command == "revoke" for _, aside in trace.asides):
+        return None
+    added = ADDED_BYTES if trace.header.secured else {}
+    sent = [message for run in trace.runs for message in run.sent]
+    return sum([_bytes(message.datagram) + added.get(message.message, 0) for message in sent if message.datagram])
 
 
 def _bytes(datagram: Recorded) -> int:

@@ -95,8 +95,8 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Fol
 
 def wrongly_dropped(header: CheckedHeader, line: int, aside: Dropped | Commanded) -> Deviation | None:
     """What is wrong with a line that is no handler run: a datagram was dropped, and should have been handled."""
-    if not isinstance(aside, Dropped):
-        return None
+    if not isinstance(aside, Dropped) or header.secured:
+        return None  # what a secured agent drops without a look at its message is not in plain
     try:
         sender, _, message = decoded(aside.datagram)
     except MalformedDatagramError:

@@ -34,6 +34,7 @@ class CheckedHeader:
     rate: float
     early_s: float
     late_s: float
+    secured: bool = False
 
     def local(self, mission_s: float) -> float:
         """What the agent's clock shows at `mission_s`."""
@@ -61,6 +62,7 @@ def checked(header: Header) -> CheckedHeader:
         1 + drift,
         EARLY_WALL_S * speedup + ROUNDING_S,
         SLACK_WALL_S * speedup,
+        bool(header.secured),
     )
 
 

@@ -42,6 +42,8 @@ class InFlight:
     lots: RandomDraws
     datagram: Recorded | None
     """None if there are no traces to have it."""
+    sealed: bytes | None = None
+    """As it is on the air in a secured mission."""
 
     def __lt__(self, other: object) -> bool:
         return False  # of two copies that arrive at one agent in one instant either is the first
@@ -177,12 +179,15 @@ class VirtualAir:
         message: Message,
         data_bytes: int,
         datagram: Recorded | None = None,
+        sealed: bytes | None = None,
     ) -> None:
         """The agent with this number sends `message`, in a datagram with so many bytes of data."""
         self._rank += 1
         lots = self._medium.draw(number, now, data_bytes)
         kind = type(message)
-        flight = InFlight(self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots, datagram)
+        flight = InFlight(
+            self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots, datagram, sealed
+        )
         if now + lots.latest > self.quiet_at:
             self.quiet_at = now + lots.latest
         answered = None if self._deliver_all else ANSWERED.get(kind)

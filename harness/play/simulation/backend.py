@@ -362,7 +362,7 @@ class Simulation(Clockwork):
             "completed_before": list(completed),
             "idle": life.idle if life else None,
             "bytes_sent": sum(life.bytes_sent for life in lives),
-            **({"dropped": dict(dropped)} if self._rogue is not None else {}),
+            **({"dropped": dict(dropped)} if self._rogue is not None or self._keys is not None else {}),
             "messages_sent": sum(life.agent.messages_sent for life in lives),
             "reconciles": sum(status.reconciles for status in known if status) if all(known) else None,
             "chain_changed_at_s": _rounded(life.chain_changed_at) if life else None,

@@ -63,7 +63,7 @@ class CapturedAir(VirtualAir):
         for happening in super().until(mission_s):
             at, _, number, what = happening
             if isinstance(what, InFlight):
-                frame = _frame(what.sender, what.sequence, what.message)
+                frame = _frame(what.sender, what.sequence, what.message, what.sealed)
                 self._capture.take_down(at, number, frame, outbound=False)
             elif isinstance(what, StrayDatagram):
                 frame = udp_broadcast(what.source, PORT, what.datagram)
@@ -82,11 +82,12 @@ class CapturedAir(VirtualAir):
         message: Message,
         data_bytes: int,
         datagram: Recorded | None = None,
+        sealed: bytes | None = None,
     ) -> None:
-        self._capture.take_down(now, number, _frame(self._roster[number], sequence, message), outbound=True)
-        super().broadcast(now, number, sequence, message, data_bytes, datagram)
+        self._capture.take_down(now, number, _frame(self._roster[number], sequence, message, sealed), outbound=True)
+        super().broadcast(now, number, sequence, message, data_bytes, datagram, sealed)
 
 
 @lru_cache(FRAMES_KEPT)
-def _frame(sender: int, sequence: int, message: Message) -> bytes:
-    return udp_broadcast(sender, PORT, encode(sender, sequence, message))
+def _frame(sender: int, sequence: int, message: Message, sealed: bytes | None) -> bytes:
+    return udp_broadcast(sender, PORT, sealed or encode(sender, sequence, message))

@@ -8,7 +8,7 @@ import base64
 from collections import deque
 from collections.abc import Callable, Sequence
 from random import Random
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from harness.gc_pause import gc_paused
 from harness.play.mission import Sought
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from harness.play.simulation.foreign.foreigners import Foreigners
     from harness.play.simulation.foreign.programs import Programs
     from harness.play.simulation.rogue import VirtualRogue
+    from harness.play.simulation.secured import Keys, SecuredOwnAgent
 
 ANY_LIFE = 0
 REMEMBERED = 10_000
@@ -46,8 +47,9 @@ class Clockwork:
 
     `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. Where anybody
     has quirks, or is not the harness's own, all hear everything: what cannot matter to the right agent may matter to a
-    wrong one. `told`: somebody may yet inject. `fate_script` makes what plays the scenario's fates, `air` what carries
-    messages, and `programs` are those that play agents of another make.
+    wrong one. So they do in a secured mission: what comes again is a replay, whether or not it mattered. `told`:
+    somebody may yet inject. `fate_script` makes what plays the scenario's fates, `air` what carries messages, and
+    `programs` are those that play agents of another make.
     """
 
     def __init__(
@@ -71,7 +73,8 @@ class Clockwork:
         self._tracing = recorder.tracing
         self._anybody_is_unknown = scenario.has_wrong_agents or bool(scenario.foreign)
         """Whether anybody may do what no right agent of ours does."""
-        self._deliver_all = deliver_all = deliver_all or self._anybody_is_unknown
+        self._keys = self._keys_of_agents() if scenario.security else None
+        self._deliver_all = deliver_all = deliver_all or self._anybody_is_unknown or self._keys is not None
         self._now = 0.0
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
@@ -101,6 +104,11 @@ class Clockwork:
         from harness.play.simulation.foreign.foreigners import Foreigners  # most scenarios have none
 
         return Foreigners(self.scenario, self.seed, self._initial_data, programs, tracing=self._tracing)
+
+    def _keys_of_agents(self) -> "Keys":
+        from harness.play.simulation.secured import Keys  # needs the extra `secure`
+
+        return Keys(self.scenario, self.seed)
 
     def _rogue_node(self) -> "VirtualRogue":
         from harness.play.simulation.rogue import VirtualRogue  # scapy takes long to import
@@ -154,7 +162,10 @@ class Clockwork:
         state = life.state
         if self._deliver_all or state is None or flight.matters(state, sender, message):
             now = self._now if life.clock is None else life.local_s(self._now)
-            life.agent.receive_message(sender, flight.sequence, message, now, flight.datagram)
+            if flight.sealed is None:
+                life.agent.receive_message(sender, flight.sequence, message, now, flight.datagram)
+            else:
+                life.agent.receive_datagram(flight.sealed, now)
             self._say(number, life)
             if self._deliver_all or state is None or state.reconcile_in_progress:
                 self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
@@ -219,6 +230,9 @@ class Clockwork:
         """Send what the agent has to say, and take down what it has done."""
         if self._tracing:
             self._take_down(life, self._now)
+        if life.secured is not None:
+            self._say_sealed(number, life, life.secured)
+            return
         for sequence, message, datagram in life.agent.outgoing():
             if message is None:
                 assert datagram is not None, "it is there, if it is no message"
@@ -231,6 +245,17 @@ class Clockwork:
                 self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
             elif self._on_the_air is not None:
                 self._on_the_air.append((life.agent.agent_id, sequence, message, self._now))
+
+    def _say_sealed(self, number: int, life: Incarnation, agent: "SecuredOwnAgent") -> None:
+        """Send what the agent has to say, sealed. Who comes upon the mission late has heard nothing of it."""
+        for sealed, sequence, message, plain in agent.sealed_to_send():
+            if message is None:
+                self._send_stray(number, life, sealed)
+                continue
+            life.bytes_sent += len(sealed)
+            self._air.broadcast(self._now, number, sequence, message, len(sealed), plain, sealed)
+            if self._rogue is not None:
+                self._rogue.hears_datagram(sealed, self._now)
 
     def _send_stray(self, number: int, life: Incarnation, datagram: bytes) -> None:
         """Send what is no message of the agent's own. A rogue node learns nothing from it."""
@@ -300,9 +325,10 @@ class Clockwork:
         if self._foreigners is not None and agent_id in self._foreigners:
             agent = self._foreigners.begin(agent_id, len(lives) + 1, local_s, stored)
         else:
-            agent = self._own_agent(agent_id, seed)
+            agent = self._own_agent(agent_id, seed, len(lives) + 1)
         state = agent.state if isinstance(agent, OwnAgent) else None
-        life = Incarnation(agent, source, clock, self._now, state, stored is not None)
+        secured = cast("SecuredOwnAgent", agent) if self._keys is not None and isinstance(agent, OwnAgent) else None
+        life = Incarnation(agent, source, clock, self._now, state, secured, stored is not None)
         lives.append(life)
         self._alive[number] = life
         self._air.born_at[number] = self._now
@@ -312,9 +338,10 @@ class Clockwork:
         self._after(number, life)
         self._expect_event(number, life)
 
-    def _own_agent(self, agent_id: int, seed: int) -> OwnAgent:
+    def _own_agent(self, agent_id: int, seed: int, life: int) -> OwnAgent:
         quirks = self.scenario.quirks_of(agent_id)
-        return OwnAgent(
+        make = OwnAgent if self._keys is None else self._keys.agent(agent_id, life, self._now)
+        return make(
             agent_id,
             self.roster,
             self._initial_data,

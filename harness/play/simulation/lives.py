@@ -2,12 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from harness.play.simulation.agents import VirtualAgent
 from harness.play.simulation.air import Happening
 from harness.scenario.scenario import Clock
 from ucp.events import RandomEvents
 from ucp.state import AgentState
+
+if TYPE_CHECKING:
+    from harness.play.simulation.secured import SecuredOwnAgent
 
 
 @dataclass(slots=True)
@@ -21,6 +25,8 @@ class Incarnation:
     born_at: float
     state: AgentState | None = None
     """What it holds, asks and counts; None of an agent into which nobody sees."""
+    secured: "SecuredOwnAgent | None" = None
+    """The agent, if it has keys."""
     rebooted: bool = False
     """It came back from a brown-out with what was on its disk."""
     deadline: float | None = None

@@ -70,4 +70,5 @@ def header(life: Incarnation) -> dict[str, Any]:
         "initial_data": agent.initial_data,
         "settings": agent.settings.told(),
         "clock": clock,
+        "secured": life.secured is not None,
     }

@@ -35,7 +35,10 @@ class VirtualRogue:
         return dict(self._rogue.sent)
 
     def hears(self, sender: int, sequence: int, message: Message, now: float) -> None:
-        self._rogue.hears(encode(sender, sequence, message), now)
+        self.hears_datagram(encode(sender, sequence, message), now)
+
+    def hears_datagram(self, datagram: bytes, now: float) -> None:
+        self._rogue.hears(datagram, now)
         self._send(now)
 
     def begin(self, injected: Injected, now: float) -> None:

@@ -1,0 +1,14 @@
+"""Keys of a mission, in a scenario."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from harness.scenario.model import Model
+
+
+class Security(Model):
+    """The mission is secured: datagrams are authentic, confidential and fresh, blocks signed by their makers."""
+
+    keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
+    """`fresh`: each run has keys of its own. Else the directory with the vehicles' bundles (`ucp-harness keys new`)."""

@@ -1,0 +1,47 @@
+"""A secured mission in virtual time is the plain one, and nobody without keys gets in."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.run.simulate import Simulated, simulate
+from harness.scenario import Scenario, load_scenario
+from harness.scenario.security import Security
+from tests.harness.virtual import scenario
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+
+
+def dropped(run: Simulated) -> set[str]:
+    """Why agents dropped what they did."""
+    return {reason for agent in run.played.agents.values() for reason in agent.get("dropped", {})}
+
+
+def secured(plain: Scenario) -> Scenario:
+    return plain.model_copy(update={"security": Security()})
+
+
+@pytest.mark.parametrize("name", ["attrition", "late_joiner", "loss_30", "rolling_partitions"])
+def test_a_secured_mission_has_the_chains_of_the_plain_one(name: str) -> None:
+    plain = load_scenario(SCENARIOS / f"{name}.yaml")
+    assert simulate(secured(plain), 1).result.chains == simulate(plain, 1).result.chains
+
+
+def test_a_secured_mission_is_judged_as_a_plain_one() -> None:
+    run = simulate(secured(scenario(network={"loss": 0.1}, duration_s=300)), 2, tracing=True)
+    assert run.result.characteristics["1"].kind == "good"
+    assert not run.result.bad
+    assert not dropped(run)
+
+
+def test_what_comes_twice_is_a_replay_and_on_record() -> None:
+    run = simulate(secured(scenario(network={"duplicate": 0.5}, duration_s=300)), 2, tracing=True)
+    assert not run.result.bad
+    assert dropped(run) == {"replayed"}
+
+
+def test_who_has_no_keys_forges_nothing() -> None:
+    rogue = load_scenario(SCENARIOS / "rogue.yaml")
+    assert simulate(rogue, 1, tracing=True).result.bad
+    run = simulate(secured(rogue), 1, tracing=True)
+    assert not run.result.bad

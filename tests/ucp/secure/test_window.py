@@ -1,0 +1,28 @@
+"""The window of RFC 6479, against a set that forgets nothing."""
+
+from random import Random
+
+from ucp.secure.window import WINDOW, ReplayWindow
+
+
+def test_a_number_counts_once_and_not_when_it_is_older_than_the_window() -> None:
+    for seed in range(20):
+        draw, window, came, newest = Random(seed), ReplayWindow(), set[int](), -1
+        at = 0
+        for _ in range(3000):
+            at = max(0, at + draw.choice((1, 1, 1, 2, -3, -70, 65, 700, -1000, 1025)))
+            fresh = at not in came and at > newest - WINDOW
+            assert window.is_fresh(at) == fresh
+            if fresh:
+                window.accept(at)
+                came.add(at)
+                newest = max(newest, at)
+
+
+def test_a_leap_over_the_whole_ring_forgets_what_was_there() -> None:
+    window = ReplayWindow()
+    for sequence in (0, 63, 64, 2**32 - 1):
+        window.accept(sequence)
+    assert not window.is_fresh(2**32 - 1)
+    assert not window.is_fresh(64)
+    assert all(window.is_fresh(2**32 - 1 - back) for back in range(1, WINDOW))
