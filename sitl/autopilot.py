@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from sitl.failsafes import Failsafe, Failsafes
 from sitl.kinematics import Course, Fall, Motion, Point, Rest, Segment, end_of
 from sitl.models import MODELS
 from sitl.modes import BOOT_MODES, MODES
@@ -58,6 +59,7 @@ class Autopilot:
         self.listeners: list[Listener] = []
         self.mission: Sequence[Any] = ()  # MISSION_ITEM_INTs; the first is home, as ArduPilot has it
         self.current_item = 0
+        self.failsafes = Failsafes(vehicle_type)
         self._model = MODELS[vehicle_type]
         self._speed_ms = self._model.cruise_ms
         self._in_mission = False
@@ -66,8 +68,22 @@ class Autopilot:
         self._course = Course(0.0, [Rest(Motion(yaw_rad=math.radians(home.heading_deg)))])
 
     @property
-    def ready(self) -> bool:
+    def has_booted(self) -> bool:
         return self.now_s >= READY_S
+
+    @property
+    def ready(self) -> bool:
+        """It knows where it is, and can be armed."""
+        return self.has_booted and self.failsafes.has_gps
+
+    @property
+    def battery_used(self) -> float:
+        """0 to 1."""
+        return self.used_mah / BATTERY_FULL_MAH
+
+    @property
+    def volts(self) -> float:
+        return self.failsafes.volts(self.battery_used)
 
     @property
     def motion(self) -> Motion:
@@ -86,6 +102,10 @@ class Autopilot:
             self.now_s = self._course.end_s
             self._then()
         self.now_s = until_s
+        while self.has_booted and (failsafe := self.failsafes.look(self.now_s, self.battery_used)):
+            self._save(failsafe)
+        if self.failsafes.lacks_a_motor and self.armed and self.airborne:
+            self._lose_thrust()
 
     def say(self, severity: int, text: str) -> None:
         """Tell every client: a STATUSTEXT."""
@@ -193,6 +213,34 @@ class Autopilot:
     def _refuse(self, text: str) -> int:
         self.say(mavlink.MAV_SEVERITY_CRITICAL, text)
         return FAILED
+
+    # What befalls it
+
+    def _save(self, failsafe: Failsafe) -> None:
+        """Do what ArduPilot does by itself: a copter without a position lands, others fly on or hold."""
+        can_land = self.vehicle_type == "copter"
+        if failsafe == "ekf":
+            self.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF variance")
+            if self.armed and self.vehicle_type != "plane":
+                mode = "LAND" if can_land else "HOLD"
+                self.say(mavlink.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {mode} Mode")
+                self._switch_to(mode)
+            return
+        level = failsafe.removeprefix("battery ")
+        used = f"{self.volts:.2f}V used {self.used_mah:.0f} mAh"
+        self.say(mavlink.MAV_SEVERITY_WARNING, f"Battery 1 is {level} {used}")
+        if self.armed and self.mode != "LAND":
+            self._switch_to("LAND" if can_land and (level == "critical" or not self.ready) else "RTL")
+
+    def _switch_to(self, mode: str) -> None:
+        if mode != self.mode:
+            self.set_mode(MODES[self.vehicle_type][mode])
+
+    def _lose_thrust(self) -> None:
+        """Of its four motors one is gone, and nothing keeps it level."""
+        self.say(mavlink.MAV_SEVERITY_EMERGENCY, "Potential Thrust Loss (2)")
+        self.say(mavlink.MAV_SEVERITY_EMERGENCY, "Crash: Disarming")
+        self.disarm(force=True)
 
     # What it is doing
 

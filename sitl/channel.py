@@ -24,7 +24,7 @@ NO_POSITION = (
     | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
     | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
 )
-TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # the one parameter that can be set, of a plane
+TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # of a plane; what else can be set is in failsafes.py
 SYSTEM_ID = "SYSID_THISMAV"
 
 
@@ -155,18 +155,23 @@ class Channel:
             vehicle.go_to(vehicle.place(message.coordinate_frame, message.lat_int, message.lon_int, message.alt))
 
     def _set_parameter(self, message: Any) -> None:
-        vehicle = self._autopilot
-        if message.param_id != TAKE_OFF_ALTITUDE or vehicle.vehicle_type != "plane":
+        """One that it does not have is answered with nothing, as by ArduPilot."""
+        vehicle, name, value = self._autopilot, message.param_id, message.param_value
+        if name == TAKE_OFF_ALTITUDE and vehicle.vehicle_type == "plane":
+            if 0 < value <= MAX_ALTITUDE_M:
+                vehicle.take_off_altitude_m = value
+        elif name not in vehicle.failsafes.parameters:
             return
-        if 0 < message.param_value <= MAX_ALTITUDE_M:
-            vehicle.take_off_altitude_m = message.param_value
-        self.send(self._parameters()[TAKE_OFF_ALTITUDE])
+        elif math.isfinite(value):
+            vehicle.failsafes.parameters[name] = value
+        self.send(self._parameters()[name])
 
     def _parameters(self) -> dict[str, Any]:
         """PARAM_VALUE of each: a ground station asks for all before it shows a vehicle."""
         values: dict[str, float] = {SYSTEM_ID: self._autopilot.sysid}
         if self._autopilot.vehicle_type == "plane":
             values[TAKE_OFF_ALTITUDE] = self._autopilot.take_off_altitude_m
+        values |= self._autopilot.failsafes.parameters
         kind = mavlink.MAV_PARAM_TYPE_REAL32
         return {
             name: mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(values), at)

@@ -61,6 +61,8 @@ class Link(asyncio.Protocol):
         self.foreign_sysid: int | None = None
         self.acks: dict[int, int] = {}  # MAV_CMD: the last MAV_RESULT
         self.parameters: dict[str, float] = {}
+        self._asked_mode: int | None = None
+        self._was_in_asked_mode = self._was_armed = False
         self.on_mission: Callable[[Any], None] | None = None  # hears the messages of the mission protocol
         self._socket = sock
         self._tlog: TelemetryLog | None = TelemetryLog(tlog)
@@ -126,10 +128,33 @@ class Link(asyncio.Protocol):
         padded = [*params, *[0.0] * (7 - len(params))]
         self.send(mavlink.MAVLink_command_long_message(self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1, command, 0, *padded))
 
+    def ask_for_mode(self, number: int) -> None:
+        """Have the vehicle change its mode (custom_mode), if it does."""
+        kind = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        if number != self._asked_mode:
+            self._asked_mode, self._was_in_asked_mode = number, False
+        self.command(mavlink.MAV_CMD_DO_SET_MODE, kind, float(number))
+        if self.acks.get(mavlink.MAV_CMD_DO_SET_MODE) == mavlink.MAV_RESULT_UNSUPPORTED:  # ArduCopter 3.5
+            self.send(mavlink.MAVLink_set_mode_message(self.sysid, kind, number))
+
+    @property
+    def has_left_its_mode(self) -> bool:
+        """Whether it was in the mode that it was last asked for, and is no more."""
+        return self._was_in_asked_mode and self.state.mode != self._asked_mode
+
+    @property
+    def has_disarmed(self) -> bool:
+        return self._was_armed and not self.state.armed
+
     def set_parameter(self, name: str, value: float) -> None:
         """What the vehicle answers is in `parameters`."""
         target = (self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
         self.send(mavlink.MAVLink_param_set_message(*target, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32))
+
+    def request_parameter(self, name: str) -> None:
+        """As `set_parameter`; a vehicle without it may answer nothing."""
+        target = (self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
+        self.send(mavlink.MAVLink_param_request_read_message(*target, name.encode(), -1))
 
     def send(self, message: Any) -> None:
         if self._transport is not None and not self._transport.is_closing():
@@ -213,7 +238,9 @@ class Link(asyncio.Protocol):
         self.heartbeats += 1
         self.heartbeat_at = self.heard_at
         self.state.mode = message.custom_mode
+        self._was_in_asked_mode |= message.custom_mode == self._asked_mode
         self.state.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        self._was_armed |= self.state.armed
 
     def _on_sys_status(self, message: Any) -> None:
         check = mavlink.MAV_SYS_STATUS_PREARM_CHECK

@@ -13,10 +13,12 @@ import math
 import socket
 import time
 from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 
 from sitl.by_guided import GuidedFlight
 from sitl.by_mission import MissionFlight
+from sitl.circumstances import Circumstance, bring_about
 from sitl.link import Link
 from sitl.modes import mode_name
 from sitl.plan import By, Plan
@@ -54,6 +56,7 @@ class Pilot:
         self.vehicle_type: VehicleType = vehicle_type
         self.vehicle_id = sysid if vehicle_id is None else vehicle_id
         self._terminated = self._handed_over = False
+        self._befallen = False
 
     @property
     def state(self) -> VehicleState:
@@ -102,6 +105,16 @@ class Pilot:
         self._terminated = True
         await self._pursue(Termination(self.link))
 
+    async def befall(self, circumstance: Circumstance) -> Mapping[str, float]:
+        """Have the vehicle simulate this; which parameters have which values for it. Raises NotSimulatedError.
+
+        From now on it may do what it was not asked for: when it leaves its mode, disarms, or does not make a step in
+        time, what was being flown ends, without an error.
+        """
+        values = await bring_about(self.link, circumstance)
+        self._befallen = True
+        return values
+
     def hand_over(self) -> None:
         """Somebody else flies it from now on: whatever this pilot was about ends, without an error."""
         self._handed_over = True
@@ -117,7 +130,11 @@ class Pilot:
         while (step := self._next_step(procedure)) is not None:
             if self._is_over(procedure):
                 return
-            if problem := clocks.problem(step):
+            if problem := clocks.lost():
+                raise self._failed(procedure, step.name, problem)
+            if problem := clocks.overdue(step):
+                if self._befallen:
+                    return
                 raise self._failed(procedure, step.name, problem)
             if asked != (step, self.link.heartbeats):
                 if asked is None or self._telemetry_is_missing():
@@ -135,13 +152,15 @@ class Pilot:
         """Whether nobody wants it any more: a flight that ended by force, or that somebody else flies."""
         if isinstance(procedure, Termination):
             return False
-        return self._terminated or (self._handed_over and not isinstance(procedure, _Listening))
+        left = self.link.has_left_its_mode or self.link.has_disarmed
+        handed_over = self._handed_over or (self._befallen and left)
+        return self._terminated or (handed_over and not isinstance(procedure, _Listening))
 
     def _next_step(self, procedure: Procedure) -> Step | None:
         try:
             return procedure.next_step()
         except HopelessError as error:
-            if self._is_over(procedure):
+            if self._befallen or self._is_over(procedure):
                 return None
             raise self._failed(procedure, "the next leg", str(error)) from None
 
@@ -185,7 +204,19 @@ class _StepClocks:
         self._at = time.monotonic()
         self.patience_s = 0.0  # of our time: then it is worth looking again, even if nothing is heard
 
-    def problem(self, step: Step) -> str | None:
+    def lost(self) -> str | None:
+        """Why nothing more can be expected of the vehicle, if so."""
+        now = time.monotonic()
+        if self._link.closed.is_set():
+            return "it ended the connection"
+        if self._link.foreign_sysid is not None:
+            return f"it says that its system ID is {self._link.foreign_sysid}"
+        for what, at in self._streams().items():
+            if now - at >= self._silence_limit_s:
+                return f"{what} for {now - at:.1f} s"
+        return None
+
+    def overdue(self, step: Step) -> str | None:
         """Why the wait for `step` is over, if it is."""
         link, now = self._link, time.monotonic()
         if self._step is not None:
@@ -195,23 +226,19 @@ class _StepClocks:
         self._step, self._time_s, self._at = step, link.state.time_s, now
         # a vehicle that crawls must end, too: no step takes longer than in real time
         wall_limit_s = max(step.limit_s, step.limit_s / link.speedup)
-        silence_limit_s = SILENCE_S / min(1.0, link.speedup)
-        heard = {"it has been silent": link.heard_at, **self._streams()}
-        self.patience_s = min(wall_limit_s - self._waited_s[step], min(heard.values()) + silence_limit_s - now)
-        if link.closed.is_set():
-            return "it ended the connection"
-        if link.foreign_sysid is not None:
-            return f"it says that its system ID is {link.foreign_sysid}"
+        silent_s = now - min(self._streams().values())
+        self.patience_s = min(wall_limit_s - self._waited_s[step], self._silence_limit_s - silent_s)
         if self._flown_s[step] >= step.limit_s and self._waited_s[step] >= LEAST_WAIT_S:
             return f"{step.limit_s:g} simulated seconds were not enough"
         if self._waited_s[step] >= wall_limit_s:
             return f"after {self._waited_s[step]:.0f} s it has flown {self._flown_s[step]:.0f} simulated seconds"
-        for what, at in heard.items():
-            if now - at >= silence_limit_s:
-                return f"{what} for {now - at:.1f} s"
         return None
 
+    @property
+    def _silence_limit_s(self) -> float:
+        return SILENCE_S / min(1.0, self._link.speedup)
+
     def _streams(self) -> dict[str, float]:
-        """When each message that a pilot lives on was last heard, once it has been."""
+        """When anything was last heard, and each message that a pilot lives on, once it has been."""
         times = {"it has sent no heartbeat": self._link.heartbeat_at, "it has sent no position": self._link.position_at}
-        return {what: at for what, at in times.items() if at is not None}
+        return {"it has been silent": self._link.heard_at, **{what: at for what, at in times.items() if at is not None}}

@@ -91,10 +91,7 @@ class Commander:
         return self.state.mode == MODES[self.vehicle_type][name]
 
     def set_mode(self, name: str) -> None:
-        number, kind = MODES[self.vehicle_type][name], mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, kind, float(number))
-        if self.link.acks.get(mavlink.MAV_CMD_DO_SET_MODE) == mavlink.MAV_RESULT_UNSUPPORTED:  # ArduCopter 3.5
-            self.link.send(mavlink.MAVLink_set_mode_message(self.link.sysid, kind, number))
+        self.link.ask_for_mode(MODES[self.vehicle_type][name])
 
     def arming(self) -> Step | None:
         """The step towards being armed that is not made."""

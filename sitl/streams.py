@@ -8,11 +8,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.autopilot import BATTERY_FULL_MAH, CURRENT_ARMED_A, CURRENT_IDLE_A, Autopilot
+from sitl.autopilot import CURRENT_ARMED_A, CURRENT_IDLE_A, Autopilot
 from sitl.modes import MODES
 from sitl.vehicle import Home, VehicleType
-
-BATTERY_FULL_MV, BATTERY_EMPTY_MV = 16_800, 13_200
 
 MAV_TYPES: dict[VehicleType, int] = {
     "copter": mavlink.MAV_TYPE_QUADROTOR,
@@ -35,27 +33,39 @@ def heartbeat(vehicle: Autopilot) -> Any:
     base_mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if vehicle.armed:
         base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-    active = vehicle.airborne or (vehicle.armed and vehicle.vehicle_type == "rover")
     return mavlink.MAVLink_heartbeat_message(
         MAV_TYPES[vehicle.vehicle_type],
         mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         base_mode,
         MODES[vehicle.vehicle_type][vehicle.mode],
-        mavlink.MAV_STATE_ACTIVE if active else mavlink.MAV_STATE_STANDBY,
+        _state(vehicle),
         3,  # MAVLink 2 still says 3 here
     )
 
 
+def _state(vehicle: Autopilot) -> int:
+    if vehicle.armed and vehicle.failsafes.acting:
+        return int(mavlink.MAV_STATE_CRITICAL)
+    active = vehicle.airborne or (vehicle.armed and vehicle.vehicle_type == "rover")
+    return int(mavlink.MAV_STATE_ACTIVE if active else mavlink.MAV_STATE_STANDBY)
+
+
+def _health(vehicle: Autopilot) -> int:
+    """The sensors that are well, and what depends on them."""
+    low = any(failsafe.startswith("battery") for failsafe in vehicle.failsafes.acting)
+    unwell = (0 if vehicle.ready else NOT_YET) | (mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if low else 0)
+    return int(SENSORS & ~unwell)
+
+
 def sys_status(vehicle: Autopilot) -> Any:
-    left = 1 - vehicle.used_mah / BATTERY_FULL_MAH
     return mavlink.MAVLink_sys_status_message(
         onboard_control_sensors_present=SENSORS,
         onboard_control_sensors_enabled=SENSORS,
-        onboard_control_sensors_health=SENSORS if vehicle.ready else SENSORS & ~NOT_YET,
+        onboard_control_sensors_health=_health(vehicle),
         load=50,
-        voltage_battery=round(BATTERY_EMPTY_MV + left * (BATTERY_FULL_MV - BATTERY_EMPTY_MV)),
+        voltage_battery=round(vehicle.volts * 1e3),
         current_battery=round(100 * (CURRENT_ARMED_A if vehicle.armed else CURRENT_IDLE_A)),
-        battery_remaining=round(100 * left),
+        battery_remaining=round(100 * (1 - vehicle.battery_used)),
         drop_rate_comm=0,
         errors_comm=0,
         errors_count1=0,
@@ -80,7 +90,7 @@ def attitude(vehicle: Autopilot) -> Any:
 def global_position_int(vehicle: Autopilot) -> Any:
     motion = vehicle.motion
     # as ArduPilot before its first fix: nowhere
-    place = vehicle.home.offset(motion.north_m, motion.east_m) if vehicle.ready else Home(0.0, 0.0)
+    place = vehicle.home.offset(motion.north_m, motion.east_m) if vehicle.has_booted else Home(0.0, 0.0)
     return mavlink.MAVLink_global_position_int_message(
         _boot_ms(vehicle),
         round(place.lat_deg * 1e7),

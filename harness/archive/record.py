@@ -358,7 +358,8 @@ class RunRecord(JudgedRecord):
     settled: bool = False
     vehicles: dict[AgentKey, dict[str, Any]] = {}
     unmatched_fates: list[str] = []
-    """A sentence for each scripted fate that decided nothing, and each injection that sent nothing."""
+    """A sentence for each scripted fate that decided nothing, each injection that sent nothing, and each vehicle that
+    does not simulate what was to befall it."""
     capture: dict[AgentKey, CapturedFrames] | None = None
     """Of each vehicle, if captures were asked for and came to their end."""
     ground_station: GroundStationRecord | None = None

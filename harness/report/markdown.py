@@ -22,7 +22,7 @@ def to_markdown(left: ReportSource) -> str:
     lines += [_short(" \u00b7 ".join(facts.summary(record, left.exports))), ""]
     if ended:
         lines += [f"**{_short(ended[0])}** {_short(ended[1])}".rstrip(), ""]
-    lines += _listed([*left.chains_missing, *left.files_missing])
+    lines += _listed([*left.chains_missing, *left.files_missing, *record.unmatched_fates])
     lines += [*_verdict_table(judged), *_evidence(judged)] if judged else []
     if figures := facts.figures(record):
         lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]

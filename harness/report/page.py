@@ -41,6 +41,7 @@ def draw(left: ReportSource) -> str:
         missing=[
             ("Not all chains are known. What is below is drawn from the others.", left.chains_missing),
             ("Not all that a run leaves is here. What is below is drawn from the rest.", left.files_missing),
+            ("This run does not show all that it was meant to.", record.unmatched_fates),
         ],
         verdicts=judged,
         figures=facts.figures(record),

@@ -27,7 +27,7 @@ from harness.play.radio_range import TRACK_S, RadioRange
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
 from harness.scenario.fates import Fate
-from harness.scenario.faults import Fault
+from harness.scenario.faults import Fault, VehicleFault
 from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
@@ -290,6 +290,16 @@ class ProcessRun:
         landed = [self._shoot_down(self.vehicles[number])] if self.vehicles else []
         await asyncio.gather(self.agents[number].switch_off(), *landed)
 
+    async def befall(self, agent_id: int, fault: VehicleFault) -> None:
+        if not self.vehicles:
+            raise ScenarioError(f"`{fault.what}` needs vehicles, and this run has none")
+        self._watchers.task(self._befall(agent_id, fault, round(self.clock.now(), 3)))
+
+    async def _befall(self, agent_id: int, fault: VehicleFault, at_s: float) -> None:
+        vehicle = self.vehicles[self._number(agent_id)]
+        if problem := await vehicle.befall(fault.what, fault.circumstance, at_s):
+            self.played.unmatched_fates.append(problem)
+
     def _number(self, agent_id: int) -> int:
         return self.scenario.roster.index(agent_id)
 
@@ -476,7 +486,7 @@ class ProcessRun:
         except MachineError as error:
             if self.played.outcome == "completed":
                 self._ended_early(error)
-        self.played.unmatched_fates = injected_nothing(self._injected, rogue.sent)
+        self.played.unmatched_fates += injected_nothing(self._injected, rogue.sent)
 
     def _show(self, stage: str) -> None:
         self.stage = stage

@@ -13,6 +13,7 @@ from harness.errors import HarnessError
 from harness.play.process.lab import MissionLab, Program
 from harness.scenario.flight import Flight
 from netem.radio import Place
+from sitl.circumstances import Circumstance
 from sitl.ground_station import GroundStation
 from sitl.pilot import Pilot
 from sitl.procedure import Procedure
@@ -54,6 +55,7 @@ class VehicleProcess:
         self._directory = rundir.vehicle(vehicle_id, life)
         self._process: Program | None = None
         self._flight: Procedure | None = None
+        self._befallen: list[dict[str, Any]] = []
         self._station_port = STATION_PORT
 
     @property
@@ -170,6 +172,19 @@ class VehicleProcess:
         assert self.pilot is not None
         await self._piloted(self.pilot.terminate_flight())
 
+    async def befall(self, what: str, circumstance: Circumstance, at_s: float) -> str | None:
+        """Have it simulate this; returns why it does not, in a sentence, if so. Raises nothing."""
+        assert self.pilot is not None
+        told: dict[str, Any] = {"at_s": at_s, "what": what, "parameters": {}}
+        self._befallen.append(told)
+        try:
+            told["parameters"] = dict(await self.pilot.befall(circumstance))
+        except VehicleError as error:
+            return (
+                f"{what} at {at_s:g} s: vehicle {self.vehicle_id} ({self.kind.name} {self.kind.vehicle_type}) {error}"
+            )
+        return None
+
     async def stop(self) -> None:
         if self.pilot is not None:
             await self.pilot.close()
@@ -189,6 +204,8 @@ class VehicleProcess:
                 record["garbage"] = state.garbage
             if state.log_error is not None:
                 record["telemetry_log_error"] = state.log_error
+            if self._befallen:
+                record["befallen"] = self._befallen
             if state.texts:
                 record["last_text"] = state.texts[-1]
         return record

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from harness.errors import ScenarioError
 from harness.play.control import Status
 from harness.play.mission import RunOutcome, Sought
 from harness.play.radio_range import TRACK_S, RadioRange, tracks_of
@@ -25,6 +26,7 @@ from harness.play.simulation.recurrence import LOOK_AFTER_S, Recurrence, Waiting
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, disconnected_until, injected_nothing
 from harness.scenario.fates import Fate
+from harness.scenario.faults import VehicleFault
 from netem.radio import Place
 from ucp.trace import HandlerRun
 
@@ -176,6 +178,8 @@ class Simulation(Clockwork):
         if isinstance(change, NetworkChange):
             self._put_into_force(self._reach.ask(change), asked=change.conditions.to_json())
             return
+        if isinstance(change, VehicleFault):
+            raise ScenarioError(no_vehicles([change.what]))
         record = change.to_json(round(self._now, 3))
         self.played.record(record)
         if isinstance(change, Injected):
@@ -411,6 +415,9 @@ class Simulation(Clockwork):
     async def fall(self, agent_id: int) -> None:
         """A track knows nothing of that."""
 
+    async def befall(self, agent_id: int, fault: VehicleFault) -> None:
+        raise AssertionError("was refused")
+
     async def pause(self, agent_id: int) -> None:
         number = self._number[agent_id]
         if (life := self._alive[number]) is not None:
@@ -434,6 +441,15 @@ class Simulation(Clockwork):
         await self.end_life(agent_id)
         if life is not None:
             self._switched_off[number] = life
+
+
+def no_vehicles(keys: Sequence[str]) -> str:
+    """Why these keys cannot be played here, and the way out."""
+    named = ", ".join(f"`{key}`" for key in keys)
+    return (
+        f"{named} need{'s' if len(keys) == 1 else ''} vehicles that fly, and tracks in virtual time are computed: "
+        "use --backend process, or leave it out"
+    )
 
 
 def _initial_data(scenario: Scenario, seed: int) -> bytes:

@@ -11,10 +11,11 @@ from harness.play.backend import Backend
 from harness.play.pace import Pace
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
-from harness.play.simulation.backend import Simulation
+from harness.play.simulation.backend import Simulation, no_vehicles
 from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
 from harness.play.simulation.on_disk import OnDisk
 from harness.scenario import Scenario
+from harness.scenario.faults import VehicleFault
 
 if TYPE_CHECKING:
     from harness.play.simulation.captured_air import VirtualCapture
@@ -37,6 +38,9 @@ class VirtualTime(Backend):
         if keys:
             verb = "need" if len(keys) > 1 else "needs"
             raise ScenarioError(f"{', '.join(keys)} {verb} real processes: use --backend process, or leave it out")
+        befall = {fault.what: fault for fault in scenario.faults_in_order() if isinstance(fault, VehicleFault)}
+        if befall:
+            raise ScenarioError(no_vehicles([*befall]))
         if scenario.foreign:
             _refuse_what_foreign_agents_cannot(scenario)
 

@@ -8,12 +8,15 @@ its own in this directory is a new fault, which everything else then knows.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 from pydantic import Field
 
 from harness.scenario.model import VehicleId
 from harness.scenario.vehicles import Vehicles
+
+if TYPE_CHECKING:
+    from harness.scenario.faults.vehicle_fault import VehicleFault
 
 Agents = Annotated[list[VehicleId], Field(min_length=1)]
 Disk = Literal["kept", "lost"]
@@ -55,6 +58,9 @@ class Lives(Protocol):
 
     async def reconcile(self, agent_id: int) -> None:
         """Have the agent begin a reconcile."""
+
+    async def befall(self, agent_id: int, fault: "VehicleFault") -> None:
+        """Have the agent's vehicle simulate the fault's circumstance; whether it does is on record at the end."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,115 @@
+"""What befalls a simulated vehicle: parameters of ArduPilot's simulation (SIM_...), whose names changed over versions.
+
+A circumstance is several ways to bring it about, the present one first; of these the first counts of which the vehicle
+has all parameters. ArduPilot answers nothing to a question for a parameter that it does not have, and answers in the
+order of the questions: who has answered to a later way does not have an earlier one. What is set has come about when
+the vehicle says that value back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from sitl.link import Link
+from sitl.vehicle import VehicleError
+
+ANSWER_S = 3.0
+"""Of our time, and at a speedup below 1 of simulated time: a vehicle answers within one turn of its main loop."""
+ASK_AGAIN_S = 0.5
+LOOK_S = 0.01
+
+GPS_OFF = ({"SIM_GPS1_ENABLE": 0.0}, {"SIM_GPS_DISABLE": 1.0})
+GPS_ON = ({"SIM_GPS1_ENABLE": 1.0}, {"SIM_GPS_DISABLE": 0.0})
+_COMPASSES = tuple(f"SIM_MAG{number}_FAIL" for number in (1, 2, 3))
+
+
+class NotSimulatedError(VehicleError):
+    """The vehicle does not simulate it, or did not say that it does."""
+
+
+@dataclass(frozen=True)
+class Circumstance:
+    """`what` in words, after "simulate"; each of `ways` is parameters and their values."""
+
+    what: str
+    ways: tuple[Mapping[str, float], ...]
+
+
+GPS_LOST = Circumstance("the loss of its GPS", GPS_OFF)
+GPS_REGAINED = Circumstance("a GPS that is back", GPS_ON)
+COMPASS_LOST = Circumstance("the loss of its compasses", (dict.fromkeys(_COMPASSES, 1.0), {_COMPASSES[0]: 1.0}))
+COMPASS_REGAINED = Circumstance("compasses that are back", (dict.fromkeys(_COMPASSES, 0.0), {_COMPASSES[0]: 0.0}))
+MOTOR_STOPPED = Circumstance("the failure of a motor", ({"SIM_ENGINE_MUL": 0.0, "SIM_ENGINE_FAIL": 1.0},))
+"""SIM_ENGINE_FAIL 1 is the second motor where that is an output's number, the first where it is a mask: one of them."""
+
+
+def battery(volts: float) -> Circumstance:
+    """From now on it has so many volts, and goes on from there."""
+    return Circumstance(f"a battery of {volts:g} V", ({"SIM_BATT_VOLTAGE": volts},))
+
+
+def wind(speed_ms: float, from_deg: float) -> Circumstance:
+    """Wind of metres per second from a direction in degrees clockwise from north."""
+    return Circumstance(f"wind of {speed_ms:g} m/s", ({"SIM_WIND_SPD": speed_ms, "SIM_WIND_DIR": from_deg},))
+
+
+async def bring_about(link: Link, circumstance: Circumstance) -> Mapping[str, float]:
+    """Have the vehicle simulate it; which parameters now have which values. Raises NotSimulatedError."""
+    ways, limit_s = circumstance.ways, ANSWER_S / min(1.0, link.speedup)
+    for way in ways:
+        for name in way:
+            link.parameters.pop(name, None)
+
+    def ask_for_all() -> None:
+        for way in ways:
+            for name in way:
+                link.request_parameter(name)
+
+    def known() -> Mapping[str, float] | None:
+        return next((way for way in ways if link.parameters.keys() >= way.keys()), None)
+
+    chosen = await _heard(link, known, ask_for_all, limit_s)
+    if chosen is None:
+        names = " and no ".join(" with ".join(way) for way in ways)
+        raise NotSimulatedError(f"cannot simulate {circumstance.what}: it has no {names}")
+    values = dict(chosen)
+
+    def set_all() -> None:
+        for name, value in values.items():
+            link.set_parameter(name, value)
+            link.request_parameter(name)  # who has that value already does not say it again
+
+    def came_about() -> Mapping[str, float] | None:
+        return values if all(_same(link.parameters[name], value) for name, value in values.items()) else None
+
+    if await _heard(link, came_about, set_all, limit_s) is None:
+        said = ", ".join(f"{name} {link.parameters[name]:g}" for name in values)
+        raise NotSimulatedError(f"did not take {circumstance.what}: after {limit_s:g} s it says {said}")
+    return values
+
+
+async def _heard(
+    link: Link,
+    answer: Callable[[], Mapping[str, float] | None],
+    ask: Callable[[], None],
+    limit_s: float,
+) -> Mapping[str, float] | None:
+    """The answer, asked for again and again until the time is over or the connection has ended."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + limit_s
+    while loop.time() < deadline and not link.closed.is_set():
+        ask()
+        again_at = min(deadline, loop.time() + ASK_AGAIN_S)
+        while loop.time() < again_at and not link.closed.is_set():
+            if (heard := answer()) is not None:
+                return heard
+            await asyncio.sleep(LOOK_S)
+    return answer()
+
+
+def _same(said: float, meant: float) -> bool:
+    """As far as a float of 32 bits tells."""
+    return math.isclose(said, meant, rel_tol=1e-5, abs_tol=1e-5)

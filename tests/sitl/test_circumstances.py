@@ -1,0 +1,162 @@
+"""What befalls a vehicle: asked for by parameters, as far as it has them, and what its failsafes make of it."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+import sitl.circumstances
+from sitl.autopilot import Autopilot
+from sitl.circumstances import (
+    COMPASS_LOST,
+    GPS_LOST,
+    GPS_REGAINED,
+    MOTOR_STOPPED,
+    Circumstance,
+    NotSimulatedError,
+    battery,
+)
+from sitl.modes import MODES
+from sitl.plan import GoTo, Plan, TakeOff
+from sitl.streams import heartbeat, sys_status
+from sitl.vehicle import READY_S, VehicleType
+from tests.sitl.flying import HOME
+from tests.sitl.puppet import on_strings
+
+FAR = Plan((TakeOff(20.0), GoTo(5000.0, 0.0)))
+
+
+def airborne(vehicle_type: VehicleType = "copter") -> tuple[Autopilot, list[str]]:
+    """A vehicle in the air, or on its way, and what it says."""
+    vehicle, texts = Autopilot(3, HOME, 0, vehicle_type), list[str]()
+
+    class Ear:
+        def send(self, message: object) -> None:
+            texts.append(getattr(message, "text", ""))
+
+    vehicle.listeners.append(Ear())
+    vehicle.advance(READY_S + 1)
+    vehicle.set_mode(MODES[vehicle_type]["TAKEOFF" if vehicle_type == "plane" else "GUIDED"])
+    vehicle.arm()
+    if vehicle_type == "copter":
+        vehicle.take_off(20.0)
+    vehicle.advance(60.0)
+    texts.clear()
+    return vehicle, texts
+
+
+def mode_of(vehicle: Autopilot) -> str:
+    return vehicle.mode
+
+
+def test_without_gps_a_copter_lands_and_says_so_and_its_position_does_not_count() -> None:
+    vehicle, texts = airborne()
+    vehicle.failsafes.parameters["SIM_GPS1_ENABLE"] = 0.0
+    assert not sys_status(vehicle).onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_AHRS
+    vehicle.advance(61.0)
+    assert mode_of(vehicle) == "GUIDED"
+    vehicle.advance(70.0)
+    assert texts == ["EKF variance", "EKF Failsafe: changed to LAND Mode"]
+    assert heartbeat(vehicle).system_status == mavlink.MAV_STATE_CRITICAL
+    vehicle.advance(300.0)
+    assert not vehicle.airborne
+    assert vehicle.arm() == mavlink.MAV_RESULT_FAILED
+    vehicle.failsafes.parameters["SIM_GPS1_ENABLE"] = 1.0
+    vehicle.advance(301.0)
+    assert sys_status(vehicle).onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_AHRS
+    assert heartbeat(vehicle).system_status == mavlink.MAV_STATE_STANDBY
+
+
+@pytest.mark.parametrize(("vehicle_type", "mode"), [("plane", "TAKEOFF"), ("rover", "HOLD")])
+def test_without_gps_a_plane_flies_on_and_a_rover_stops(vehicle_type: VehicleType, mode: str) -> None:
+    vehicle, texts = airborne(vehicle_type)
+    vehicle.failsafes.parameters["SIM_GPS1_ENABLE"] = 0.0
+    vehicle.advance(61.0)
+    vehicle.advance(70.0)
+    assert texts[0] == "EKF variance"
+    assert vehicle.mode == mode
+
+
+@pytest.mark.parametrize(
+    ("volts", "mode", "said"), [(10.4, "RTL", "Battery 1 is low 1"), (9.5, "LAND", "Battery 1 is critical 9")]
+)
+def test_a_low_battery_brings_it_home_and_a_critical_one_down(volts: float, mode: str, said: str) -> None:
+    vehicle, texts = airborne()
+    vehicle.failsafes.parameters["SIM_BATT_VOLTAGE"] = volts
+    vehicle.advance(61.0)
+    vehicle.advance(69.0)
+    assert (vehicle.mode, texts) == ("GUIDED", [])
+    vehicle.advance(72.0)
+    assert (vehicle.mode, texts[0].startswith(said)) == (mode, True)
+    status = sys_status(vehicle)
+    assert status.voltage_battery < volts * 1000
+    assert not status.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+
+
+def test_without_a_motor_a_copter_falls() -> None:
+    vehicle, texts = airborne()
+    vehicle.failsafes.parameters["SIM_ENGINE_MUL"] = 0.0
+    vehicle.advance(61.0)
+    vehicle.advance(70.0)
+    assert not vehicle.armed
+    assert not vehicle.airborne
+    assert texts[:2] == ["Potential Thrust Loss (2)", "Crash: Disarming"]
+
+
+def test_a_flight_that_a_failsafe_ends_is_no_failure(tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            flying = asyncio.create_task(pilot.fly(pilot.flight(FAR, "mission")))
+            while not puppet.vehicle.airborne:
+                await asyncio.sleep(0.01)
+            assert await pilot.befall(GPS_LOST) == {"SIM_GPS1_ENABLE": 0.0}
+            await asyncio.wait_for(flying, 20)
+            while puppet.vehicle.airborne:
+                await asyncio.sleep(0.01)
+            assert mode_of(puppet.vehicle) == "LAND"
+            await asyncio.sleep(0.2)
+            assert not puppet.vehicle.armed, "nobody takes it off again"
+            assert await pilot.befall(GPS_REGAINED) == {"SIM_GPS1_ENABLE": 1.0}
+
+    asyncio.run(fly())
+
+
+def test_the_name_of_an_earlier_version_is_used_where_the_vehicle_has_that(tmp_path: Path) -> None:
+    async def ask() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            parameters = puppet.vehicle.failsafes.parameters
+            del parameters["SIM_GPS1_ENABLE"]
+            parameters["SIM_GPS_DISABLE"] = 0.0
+            assert await pilot.befall(GPS_LOST) == {"SIM_GPS_DISABLE": 1.0}
+            assert parameters["SIM_GPS_DISABLE"] == 1.0
+            assert await pilot.befall(GPS_LOST) == {"SIM_GPS_DISABLE": 1.0}, "again, though nothing changes"
+
+    asyncio.run(ask())
+
+
+@pytest.mark.parametrize(
+    ("circumstance", "vehicle_type", "sentence"),
+    [
+        (COMPASS_LOST, "copter", "loss of its compasses: it has no SIM_MAG1_FAIL with .* and no SIM_MAG1_FAIL$"),
+        (MOTOR_STOPPED, "plane", "failure of a motor: it has no SIM_ENGINE_MUL with SIM_ENGINE_FAIL$"),
+        (battery(float("nan")), "copter", "did not take a battery of nan V: .* it says SIM_BATT_VOLTAGE 16.8"),
+    ],
+)
+def test_what_a_vehicle_does_not_simulate_is_a_sentence(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    circumstance: Circumstance,
+    vehicle_type: VehicleType,
+    sentence: str,
+) -> None:
+    monkeypatch.setattr(sitl.circumstances, "ANSWER_S", 0.2)
+
+    async def ask() -> None:
+        async with on_strings(tmp_path, vehicle_type) as (pilot, _):
+            with pytest.raises(NotSimulatedError, match=sentence):
+                await pilot.befall(circumstance)
+
+    asyncio.run(ask())
