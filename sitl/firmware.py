@@ -1,10 +1,11 @@
-"""Installing ArduPilot's own SITL binaries, for Linux on x86-64, into the cache (sitl/installed.py).
+"""Installing ArduPilot's own SITL binaries for Linux into the cache (sitl/installed.py).
 
-What the firmware server has, at VEHICLE/RELEASE/SITL_x86_64_linux_gnu/: the binary, statically linked, and
-`git-version.txt`, which names the commit and the version that it was built from. RELEASE is stable, beta, latest, or
-stable-4.6.3. The vehicle's default parameters are taken from ArduPilot's source tree at that very commit: a tag would
-not do, for `latest` has none, and the binary of 4.6.3 was built from the commit before its tag. A mirror (`base`)
-replaces both hosts; the paths stay as they are.
+What the firmware server has, at VEHICLE/RELEASE/BOARD/: the binary, statically linked, and `git-version.txt`, which
+names the commit and the version that it was built from. RELEASE is stable, beta, latest, or stable-4.6.3; BOARD is
+SITL_x86_64_linux_gnu or SITL_arm_linux_gnueabihf, and there are no others (ArduPilot's Tools/scripts/board_list.py): an
+aarch64 takes the latter, if it runs programs of 32 bits. The vehicle's default parameters are taken from ArduPilot's
+source tree at that very commit: a tag would not do, for `latest` has none, and the binary of 4.6.3 was built from the
+commit before its tag. A mirror (`base`) replaces both hosts; the paths stay as they are.
 
 This was written without a way to the server, from ArduPilot's build scripts and from files and listings of the server
 that others have published. Not verified, hence not relied on: which validators the server sends (a download is resumed
@@ -20,6 +21,7 @@ import fcntl
 import platform
 import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -34,10 +36,11 @@ from sitl.vehicle import VehicleError, VehicleType
 
 FIRMWARE = "https://firmware.ardupilot.org"
 SOURCE = "https://raw.githubusercontent.com"
-PLATFORM = "SITL_x86_64_linux_gnu"
 
 LIMIT = 100_000_000  # bytes; a binary has about 7 MB
 TEXT_LIMIT = 1_000_000  # bytes
+HELP_S = 10.0
+"""A program that has begun to say its help runs, however long it takes."""
 
 # Where the source tree keeps a vehicle's defaults; the plane's have moved.
 _AUTOTEST = "Tools/autotest"
@@ -49,7 +52,22 @@ _PARAMETERS: dict[VehicleType, tuple[str, ...]] = {
 _NEWEST_NAMED = 10  # versions
 
 _NUMBER = re.compile(r"\d+\.\d+\.\d+")
-_ELF_X86_64 = re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL)  # 64 bits, little endian; e_machine 62
+
+
+@dataclass(frozen=True)
+class _Board:
+    """For which processor a binary is built: its directory on the server, and how its ELF header begins."""
+
+    directory: str
+    processor: str
+    header: re.Pattern[bytes]
+
+
+_X86_64 = _Board("SITL_x86_64_linux_gnu", "x86_64", re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL))
+_ARM = _Board("SITL_arm_linux_gnueabihf", "32-bit ARM", re.compile(rb"\x7fELF\x01\x01.{12}\x28\x00", re.DOTALL))
+_BOARDS = {"x86_64": _X86_64, "aarch64": _ARM, "armv7l": _ARM}
+"""By what platform.machine() says; 64 and 32 bits, little endian, e_machine 62 and 40."""
+_FROM_SOURCE = "build ArduPilot SITL from source and set ARDUPILOT_SITL to its directory"
 
 
 class RequestError(VehicleError):
@@ -109,12 +127,13 @@ def install(
     """
     if not re.fullmatch(r"[a-z0-9][\w.-]*", version, re.ASCII):
         raise RequestError(f"{version!r} is no version: give stable, beta, latest or a number such as 4.6.3")
-    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
+    board = _BOARDS.get(platform.machine()) if sys.platform == "linux" else None
+    if board is None:
         raise VehicleError(
-            f"this installs binaries for Linux on x86_64, and this is {sys.platform} on {platform.machine()}: "
-            "build ArduPilot SITL from source and set ARDUPILOT_SITL to its directory"
+            f"ArduPilot publishes SITL for Linux on x86_64 and 32-bit ARM, and this is {sys.platform} on "
+            f"{platform.machine()}: {_FROM_SOURCE}"
         )
-    server = _Server(vehicle, version, base, stall_s)
+    server = _Server(vehicle, version, board, base, stall_s)
     home = cache(environ) / vehicle
     with _ways_out(home), _locked(home, watcher):
         number = version.removeprefix("stable-")
@@ -140,11 +159,11 @@ def install(
 class _Server:
     """One release of one vehicle, as ArduPilot or a mirror publishes it. Raises RequestError for a bad `base`."""
 
-    def __init__(self, vehicle: VehicleType, version: str, base: str | None, stall_s: float) -> None:
-        self._vehicle, self._version, self._stall_s = vehicle, version, stall_s
+    def __init__(self, vehicle: VehicleType, version: str, board: _Board, base: str | None, stall_s: float) -> None:
+        self._vehicle, self._version, self._board, self._stall_s = vehicle, version, board, stall_s
         firmware, self._source = (_checked(base),) * 2 if base else (FIRMWARE, SOURCE)
         self._releases = f"{firmware}/{vehicle.title()}/"
-        self._release = f"{self._releases}{f'stable-{version}' if version[0].isdigit() else version}/{PLATFORM}/"
+        self._release = f"{self._releases}{f'stable-{version}' if version[0].isdigit() else version}/{board.directory}/"
 
     def build(self) -> _Build:
         """What the release is at present."""
@@ -170,12 +189,15 @@ class _Server:
                 raise self._no_such_version() from None
         with path.open("rb") as file:
             head = file.read(20)
-        if not _ELF_X86_64.match(head):
+        if not self._board.header.match(head):
             path.unlink()
             raise DownloadError(
-                f"{url} is no program for Linux on x86_64, it begins with {head[:12]!r}: does a proxy answer for it?"
+                f"{url} is no program for Linux on {self._board.processor}, it begins with {head[:12]!r}: "
+                "does a proxy answer for it?"
             )
         path.chmod(0o755)
+        if platform.machine() == "aarch64":
+            _refuse_what_does_not_run(path)
         return File.of(path, url)
 
     def fetch_parameters(self, directory: Path, build: _Build) -> File:
@@ -205,6 +227,21 @@ class _Server:
         known = [name for name in ("stable", "beta", "latest") if name in names] + numbers[:_NEWEST_NAMED]
         way_out = f"there are {', '.join(known)}" if known else f"look at {self._releases} for those that there are"
         return RequestError(f"there is no {self._vehicle} {self._version} at {self._release}: {way_out}")
+
+
+def _refuse_what_does_not_run(program: Path) -> None:
+    """Not every aarch64 runs programs of 32 bits. Raises VehicleError."""
+    try:
+        subprocess.run([program, "--help"], capture_output=True, timeout=HELP_S, stdin=subprocess.DEVNULL, check=False)
+    except subprocess.TimeoutExpired:
+        return
+    except OSError as error:
+        if error.errno != errno.ENOEXEC:
+            raise
+        raise VehicleError(
+            "for ARM ArduPilot publishes SITL in 32 bits only, and this aarch64 does not run programs of 32 bits: "
+            f"{_FROM_SOURCE}"
+        ) from None
 
 
 def _checked(base: str) -> str:

@@ -38,7 +38,7 @@ def install_into_cache(
         ),
     ] = None,
 ) -> None:
-    """Fetch ArduPilot's SITL binary for Linux on x86_64, with its default parameters, into the cache."""
+    """Fetch ArduPilot's SITL binary for Linux, on x86_64 or ARM, with its default parameters, into the cache."""
     console = Console()
     try:
         with _Bar(console, BINARIES[vehicle]) as bar:

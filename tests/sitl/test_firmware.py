@@ -68,6 +68,16 @@ class Onlooker:
             raise self._end
 
 
+ARM_BINARY = b"\x7fELF\x01\x01\x01" + bytes(9) + b"\x02\x00\x28\x00" + BINARY[20:]
+
+
+def serve_arm(server: FirmwareServer, binary: bytes) -> None:
+    """The files of 32-bit ARM, with this binary."""
+    arm = RELEASE.replace("SITL_x86_64_linux_gnu", "SITL_arm_linux_gnueabihf")
+    server.files[f"{arm}git-version.txt"] = server.files[f"{RELEASE}git-version.txt"]
+    server.files[f"{arm}arducopter"] = Resource(binary)
+
+
 @pytest.fixture
 def environ(tmp_path: Path) -> dict[str, str]:
     return {"XDG_CACHE_HOME": str(tmp_path / "cache")}
@@ -512,10 +522,48 @@ def test_what_other_installs_left_unfinished_is_removed(server: FirmwareServer, 
     assert sorted(path.name for path in left.parent.iterdir()) == [".lock", "4.6.3", "current"]
 
 
-def test_another_machine_is_told_what_it_can_do(environ: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    with pytest.raises(VehicleError, match="this is linux on aarch64: build ArduPilot SITL from source"):
+@pytest.mark.parametrize("machine", ["riscv64", "ppc64le"])
+def test_another_machine_is_told_what_it_can_do(
+    machine: str, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    with pytest.raises(VehicleError, match=f"this is linux on {machine}: build ArduPilot SITL from source"):
         install("copter", "stable", environ, Onlooker(), "http://127.0.0.1:1")
+
+
+def test_on_32_bit_arm_its_own_binary_is_fetched(
+    server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "armv7l")
+    with pytest.raises(RequestError, match="SITL_arm_linux_gnueabihf"):
+        install_copter(server, environ)
+    serve_arm(server, BINARY)
+    with pytest.raises(DownloadError, match="is no program for Linux on 32-bit ARM"):
+        install_copter(server, environ)
+    serve_arm(server, ARM_BINARY)
+    install_copter(server, environ)
+    assert the_binary(environ) == ARM_BINARY
+
+
+def test_an_aarch64_that_runs_no_32_bit_programs_is_told_so(
+    server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the machine of the test does not."""
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    serve_arm(server, ARM_BINARY)
+    with pytest.raises(VehicleError, match="this aarch64 does not run programs of 32 bits: build ArduPilot SITL"):
+        install_copter(server, environ)
+    assert current("copter", environ) is None
+
+
+def test_an_aarch64_that_runs_them_has_them(
+    server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    monkeypatch.setattr("sitl.firmware.subprocess.run", lambda *_, **__: None)
+    serve_arm(server, ARM_BINARY)
+    install_copter(server, environ)
+    assert the_binary(environ) == ARM_BINARY
 
 
 # Flying what is installed.
