@@ -33,6 +33,10 @@ COMMANDS = {
         "harness.commands.runs:runs_command",
         "List what was run, the newest first, with its verdict; or open a report in the browser.",
     ),
+    "watch": (
+        "harness.commands.watch:watch_command",
+        "Show a run as a film in the browser: map, links, chains, votes and reconciles along time.",
+    ),
     "shell": (
         "harness.commands.shell:shell_command",
         "Open a shell in the network of a vehicle whose run goes on (ping, tcpdump, ip); without one, list what runs.",

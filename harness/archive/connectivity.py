@@ -106,7 +106,9 @@ class Connectivity:
         return [(ends[at], ends[at + 1], at < len(times)) for at in range(0, len(ends) - 1, 2)]
 
 
-class _Line(BaseModel):
+class NetworkLine(BaseModel):
+    """A line of `network.jsonl`: a change of the network, or a fault of agents."""
+
     model_config = ConfigDict(strict=True)
 
     at_s: MissionSeconds
@@ -116,8 +118,8 @@ class _Line(BaseModel):
     agents: list[int] = []
 
 
-class _Network:
-    """The network while its record is read."""
+class Network:
+    """The network while its record is read, line by line."""
 
     def __init__(self, vehicles: Collection[int]) -> None:
         self.vehicles = tuple(sorted(vehicles))
@@ -133,7 +135,7 @@ class _Network:
     def cut(self) -> set[Pair]:
         return self._out_of_range | self._cut_off
 
-    def play(self, line: _Line) -> None:
+    def play(self, line: NetworkLine) -> None:
         """Raises ValueError, TypeError, AttributeError or KeyError if the line means nothing."""
         losses = {self._pairs[name]: loss for name, loss in line.losses.items()}
         if line.asked is not None:
@@ -161,9 +163,13 @@ class _Network:
         """What each link loses now, in either direction: everything where there is none."""
         losses: dict[Link, float] = {}
         for low, high in self._asked:
-            there, back = self._directions((low, high)) if self._is_up((low, high)) else (1.0, 1.0)
+            there, back = self.directions((low, high))
             losses |= {(low, high): there, (high, low): back}
         return losses
+
+    def directions(self, pair: Pair) -> tuple[float, float]:
+        """What the pair loses now, there and back: everything where there is no link."""
+        return self._directions(pair) if self._is_up(pair) else (1.0, 1.0)
 
     def by_pair(self) -> dict[Pair, float]:
         """What each pair loses now, both ways together."""
@@ -203,8 +209,8 @@ def _loss(link: LinkConditions) -> float:
 
 def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectivity:
     """The network among `vehicles`. A line that means nothing, or comes before the first conditions, is left out."""
-    lines = JsonLines(path, _Line)
-    network = _Network(vehicles)
+    lines = JsonLines(path, NetworkLine)
+    network = Network(vehicles)
     states: list[Topology] = []
     losses: list[Losses] = []
     reboots: list[tuple[float, int]] = []
@@ -244,10 +250,10 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
 
     A link that is cut, out of range, or of a vehicle that is lost, loses everything.
     """
-    network = _Network(vehicles)
+    network = Network(vehicles)
     before: dict[Link, float] = {}
     now_s = 0.0
-    for line in JsonLines(path, _Line):
+    for line in JsonLines(path, NetworkLine):
         if not before and line.asked is None:
             continue
         try:

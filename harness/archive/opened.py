@@ -35,12 +35,7 @@ class _Content(io.RawIOBase):
     def __init__(self, path: Path, most_bytes: int) -> None:
         self.trouble = ""
         self._left = self._most = most_bytes
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a fifo would wait for its writer
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            is_directory = stat.S_ISDIR(os.fstat(descriptor).st_mode)
-            os.close(descriptor)
-            raise OSError(errno.EISDIR, "is a directory") if is_directory else OSError(errno.EINVAL, "is not a file")
-        self._file = open(descriptor, "rb", buffering=0)  # noqa: PTH123, SIM115
+        self._file = open(open_plain_file(path), "rb", buffering=0)  # noqa: SIM115
         self.packed = self._file.read(2) == GZIP_MAGIC
         self._file.seek(0)
         self._unpacker = _unpacker()
@@ -91,6 +86,16 @@ class _Content(io.RawIOBase):
             if data:
                 return data
         return b""
+
+
+def open_plain_file(path: Path) -> int:
+    """A descriptor to read the file by. Raises OSError if there is none, it may not be read, or is none (a fifo)."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a fifo would wait for its writer
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        is_directory = stat.S_ISDIR(os.fstat(descriptor).st_mode)
+        os.close(descriptor)
+        raise OSError(errno.EISDIR, "is a directory") if is_directory else OSError(errno.EINVAL, "is not a file")
+    return descriptor
 
 
 def _unpacker() -> Any:

@@ -53,7 +53,9 @@ def between(before: Fix, after: Fix, at_s: float) -> Fix:
     )
 
 
-class _Line(BaseModel):
+class TrackLine(BaseModel):
+    """A line of `tracks.jsonl`: where vehicles were at one moment; metres north, east and up."""
+
     model_config = ConfigDict(strict=True)
 
     at_s: MissionSeconds
@@ -62,7 +64,7 @@ class _Line(BaseModel):
 
 def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
     """The tracks of those of `vehicles` that have any. A line that names another vehicle means nothing."""
-    lines = JsonLines(path, _Line)
+    lines = JsonLines(path, TrackLine)
     fixes: dict[int, list[Fix]] = {}
     known = set(vehicles)
     for line in lines:

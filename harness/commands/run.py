@@ -1,6 +1,7 @@
 """`ucp-harness run`: play a scenario and judge it."""
 
 import secrets
+from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,7 @@ from harness.archive.played import scenario_of
 from harness.archive.record import CapturedFrames
 from harness.backend_names import BackendName
 from harness.commands.terminal import complain, show_programs, show_result, show_rogue, show_survival
+from harness.commands.watch import PORT, show_address
 from harness.errors import HarnessError, ScenarioError
 from harness.machine.kernel import Kernel, run_inside
 from harness.play import progress
@@ -23,6 +25,7 @@ from harness.run.run import Run, run
 from harness.scenario import Scenario
 from harness.scenario.load import explain
 from harness.scenario.quirks import in_words
+from harness.watch.beside import beside
 
 
 class Vehicles(StrEnum):
@@ -57,6 +60,10 @@ def run_command(
     image_from_host: Annotated[
         bool, typer.Option("--image-from-host", help="Containers of this machine's own files: no image is built.")
     ] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show the run in the browser while it goes on, and as a film afterwards.")
+    ] = False,
+    watch_port: Annotated[int, PORT] = 0,
     out: Annotated[Path | None, typer.Option(help="Run directory; must be new or empty.")] = None,
     emit_compose: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Run nothing: write a docker compose file to start by hand.")
@@ -76,6 +83,8 @@ def run_command(
         _emit_compose(console, request, chosen_seed, emit_compose)
         return
     if kernel is Kernel.uml:
+        if watch:
+            raise ScenarioError("no page looks into User Mode Linux: leave out --kernel uml, or --watch")
         if why := BACKENDS[backend].not_in_uml:
             raise HarnessError(why)
         if request.gcs:
@@ -90,18 +99,28 @@ def run_command(
         console.print(f"wrong on purpose: {wrong}", style="dim", highlight=False)
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
-    shown = progress.for_console(console)
-    try:
-        finished = run(request, chosen_seed, directory, shown, backend)
-    finally:
-        shown.close()
+    with beside(directory, watch_port) if watch else nullcontext() as page:
+        if page is not None:
+            show_address(console, page.address)
+        shown = progress.for_console(console)
+        try:
+            finished = run(request, chosen_seed, directory, shown, backend)
+        finally:
+            shown.close()
+        _show(console, finished)
+        if page is not None and page.run_is_over():
+            console.print("The page stays until it is closed, or Ctrl-C.", style="dim")
+            page.wait()
+    raise typer.Exit(finished.exit_status)
+
+
+def _show(console: Console, finished: Run) -> None:
     if finished.played.outcome != "not supported":
         show_result(console, finished.result)
         show_survival(console, finished.survival)
         show_rogue(console, finished.rogue)
     show_programs(console, finished.record)
     _show_end(console, finished)
-    raise typer.Exit(finished.exit_status)
 
 
 def _emit_compose(console: Console, scenario: Scenario, seed: int, file: Path) -> None:

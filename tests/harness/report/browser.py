@@ -1,4 +1,4 @@
-"""A headless Chromium, driven over its remote debugging pipe with the standard library; it loads files only."""
+"""A headless Chromium, driven over its remote debugging pipe with the standard library; it loads our own pages."""
 
 import contextlib
 import json
@@ -49,13 +49,13 @@ class Browser:
         for domain in ("Page", "Runtime", "Log"):
             self._call(f"{domain}.enable")
 
-    def show(self, page: Path, *, width: int, scheme: Literal["light", "dark"], height: int = 800) -> None:
+    def show(self, page: Path | str, *, width: int, scheme: Literal["light", "dark"], height: int = 800) -> None:
         self._call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500
         )
         self._call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         self._loaded = False
-        self._call("Page.navigate", url=page.resolve().as_uri())
+        self._call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not self._loaded:
             self._read()
 

@@ -1,0 +1,59 @@
+"""`ucp-harness watch`: a finished run as a film in the browser."""
+
+import asyncio
+import os
+import sys
+import webbrowser
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from harness.watch.beside import require_packages
+
+if TYPE_CHECKING:
+    from harness.watch.feed import Feed
+
+PORT = typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0 is a free one.")
+
+
+def watch_command(
+    run: Annotated[Path, typer.Argument(help="A run directory, also of a run that was killed, or one `import` made.")],
+    port: Annotated[int, PORT] = 0,
+) -> None:
+    """Show a run as a film in the browser: map, links, chains, votes and reconciles along time.
+
+    Ctrl-C ends it.
+    """
+    require_packages()
+    from harness.watch.feed import Feed
+
+    feed = Feed(run)
+    with closing(feed):
+        try:
+            asyncio.run(_show(feed, run, port))
+        except KeyboardInterrupt:
+            raise typer.Exit(0) from None
+
+
+async def _show(feed: "Feed", run: Path, port: int) -> None:
+    from harness.watch.projector import tell_film
+    from harness.watch.server import Server
+    from harness.watch.story import Story
+
+    with closing(Story()) as story:
+        async with Server(story, run, live=False).open(port) as address:
+            show_address(Console(), address)
+            await tell_film(feed, story)
+            await asyncio.Event().wait()
+
+
+def show_address(console: Console, address: str) -> None:
+    """Print the page's address as a link; and open it, for somebody who sits at a desktop."""
+    console.print(Text("watch it at "), Text(address, style=f"link {address}"), sep="", soft_wrap=True)
+    has_desktop = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if console.is_terminal and has_desktop:
+        webbrowser.open(address)

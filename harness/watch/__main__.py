@@ -1,0 +1,65 @@
+"""`python -m harness.watch DIRECTORY PORT`: the server beside a run that goes on, as a process of its own.
+
+So it takes no time from the run, and cannot hurt it. It prints its address; whoever plays the run writes a line to its
+standard input once the run is over. It then stays while a page is open, and ends at once if whoever played is gone.
+"""
+
+import asyncio
+import contextlib
+import signal
+import sys
+from pathlib import Path
+
+from harness.archive.exports import RUN_FILE
+from harness.errors import HarnessError
+from harness.watch.feed import Feed
+from harness.watch.projector import tell_live
+from harness.watch.server import UPDATE_S, Server
+from harness.watch.story import Story
+
+LEFT_S = 3.0
+"""After a run, so long without a page is the end: one that is loaded anew comes back."""
+
+
+async def main(directory: Path, port: int) -> None:
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    story, ended = Story(), asyncio.Event()
+    server = Server(story, directory, live=True)
+    async with server.open(port) as address:
+        print(address, flush=True)  # noqa: T201
+        telling = asyncio.create_task(_tell(directory, story, ended))
+        if await reader.readline():
+            ended.set()
+            await telling
+            server.live = False
+            print(server.readers, flush=True)  # noqa: T201
+            staying = asyncio.create_task(_while_looked_at(server))
+            left = asyncio.create_task(reader.read(1))
+            await asyncio.wait({staying, left}, return_when=asyncio.FIRST_COMPLETED)
+
+
+async def _tell(directory: Path, story: Story, ended: asyncio.Event) -> None:
+    while not (directory / RUN_FILE).exists():
+        if ended.is_set():
+            return
+        await asyncio.sleep(UPDATE_S)
+    feed = Feed(directory)
+    with contextlib.closing(feed):
+        await tell_live(feed, story, ended)
+
+
+async def _while_looked_at(server: Server) -> None:
+    alone_s = LEFT_S if server.readers == 0 else 0.0
+    while alone_s < LEFT_S:
+        await asyncio.sleep(UPDATE_S)
+        alone_s = 0.0 if server.readers else alone_s + UPDATE_S
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which tells us when it is over
+    try:
+        asyncio.run(main(Path(sys.argv[1]), int(sys.argv[2])))
+    except HarnessError as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(error.exit_status)
