@@ -1,8 +1,9 @@
-"""Where a ground station listens, in words."""
+"""Where a ground station listens, in words, and whether there is a way to it."""
 
 from __future__ import annotations
 
 import ipaddress
+import socket
 from dataclasses import dataclass
 from typing import Self
 
@@ -33,6 +34,25 @@ class Address:
 
     def __str__(self) -> str:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def find(address: Address) -> None:
+    """See whether there is a way to the address; nothing is sent. Raises VehicleError if there is none."""
+    try:
+        (family, kind, protocol, _, place), *_ = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM)
+        with socket.socket(family, kind, protocol) as probe:
+            probe.connect(place)
+    except (OSError, UnicodeError) as error:
+        raise no_way_to(address, error) from None
+
+
+def no_way_to(address: Address, error: OSError | UnicodeError) -> VehicleError:
+    """The error, for people, that nothing can be sent there."""
+    reason = getattr(error, "strerror", None) or str(error)
+    return VehicleError(
+        f"the ground station at {address} cannot be sent anything ({reason}): name an address that this machine "
+        "knows, for example 127.0.0.1:14550"
+    )
 
 
 def _is_ipv6(host: str) -> bool:

@@ -15,10 +15,9 @@ from typing import Any, Self, cast
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.address import Address
+from sitl.address import Address, no_way_to
 from sitl.frames import FrameSplitter
 from sitl.operator import CommandLog
-from sitl.vehicle import VehicleError
 
 MOST_DATAGRAMS_PER_S = 1000
 """From the ground station; more are dropped, and counted."""
@@ -55,11 +54,7 @@ class GroundStation(asyncio.DatagramProtocol):
         try:
             await loop.create_datagram_endpoint(lambda: station, remote_addr=(address.host, address.port))
         except (OSError, UnicodeError) as error:
-            reason = getattr(error, "strerror", None) or str(error)
-            raise VehicleError(
-                f"the ground station at {address} cannot be sent anything ({reason}): name an address that this "
-                "machine knows, for example 127.0.0.1:14550"
-            ) from None
+            raise no_way_to(address, error) from None
         return station
 
     async def attach(self, vehicle_id: int, sysid: int, sock: socket.socket) -> None:

@@ -171,6 +171,12 @@ def _show_end(console: Console, finished: Run) -> None:
     captured = finished.played.capture or {}
     if lacks := gaps({vehicle: CapturedFrames.model_validate(frames) for vehicle, frames in captured.items()}):
         complain(f"{lacks}: choose a smaller --speedup")
+    station = finished.record.ground_station
+    if station is not None and station.dropped:
+        complain(
+            f"{station.dropped} datagrams of the ground station at {station.address} were dropped: they were too many, "
+            "or damaged"
+        )
     slow = [
         f"{vehicle} ({record['real_time_factor']:.2f})"
         for vehicle, record in finished.played.vehicles.items()

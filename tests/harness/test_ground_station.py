@@ -66,9 +66,13 @@ def test_an_operator_sees_all_vehicles_and_flies_the_one_that_is_commanded(tmp_p
         (["--gcs", "14550"], "a ground station is HOST:PORT, for example 127.0.0.1:14550, not '14550'"),
         (["--gcs", "127.0.0.1:14550", "--backend", "sim"], "`gcs` needs real processes: use --backend process"),
         (["--gcs", "127.0.0.1:14550", "--kernel", "uml"], "no ground station reaches into User Mode Linux"),
+        (["--gcs", "127.0.0.1:14550", "--vehicles", "none"], "a ground station sees vehicles, and `vehicles.kind` is"),
+        (["--gcs", "255.255.255.255:14550"], "255.255.255.255:14550 cannot be sent anything (Permission denied)"),
     ],
 )
 def test_a_ground_station_that_cannot_be_is_one_sentence(arguments: list[str], sentence: str, tmp_path: Path) -> None:
-    done = harness("run", write_scenario(tmp_path), "--out", tmp_path / "run", *arguments)
+    scenario = write_scenario(tmp_path, vehicles={"kind": "embedded"})
+    done = harness("run", scenario, "--out", tmp_path / "run", *arguments)
     assert done.returncode == 2
+    assert not (tmp_path / "run").exists()
     assert sentence in " ".join(done.stderr.split())
