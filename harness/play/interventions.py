@@ -79,6 +79,11 @@ class Interventions(GrowingTimeline):
         return self._closed
 
     @property
+    def now_s(self) -> float:
+        """Mission seconds since the start."""
+        return self._swarm.now() if self._swarm is not None else 0.0
+
+    @property
     def paused(self) -> bool:
         """Whether virtual time stands still but for steps."""
         return self.pace is not None and self.pace.paused
@@ -124,7 +129,7 @@ class Interventions(GrowingTimeline):
         """Pause, but go on for so many mission seconds; the answer is the mission second at which it stands again."""
         if not 0 < seconds <= MOST_STEP_S:
             return _refused(f"{seconds:g} s is no step: it is more than 0 and at most {MOST_STEP_S:g} s")
-        return self._at_pace(lambda pace, answer: pace.step(self._now() + seconds, answer), answers=False)
+        return self._at_pace(lambda pace, answer: pace.step(self.now_s + seconds, answer), answers=False)
 
     def step_to_next_run(self) -> Future[float]:
         """As `step`, until an agent has run a handler."""
@@ -141,16 +146,13 @@ class Interventions(GrowingTimeline):
                 return
             do(pace, answer)
             if answers:
-                answer.set_result(self._now())
+                answer.set_result(self.now_s)
 
         with self._lock:
             if self._loop is None:
                 return _refused("the run does not go on: it has not begun, or has ended")
             self._loop.call_soon_threadsafe(act)
         return answer
-
-    def _now(self) -> float:
-        return self._swarm.now() if self._swarm is not None else 0.0
 
     # The story, in the thread that plays it: see harness.play.mission.Story
 

@@ -24,6 +24,7 @@ from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, 
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
+from harness.play.by_hand import listening
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import Progress
@@ -77,7 +78,7 @@ def run(
     story: mission.Story = mission.play
     options: dict[str, Any] = {"delivers_all": delivers_all}
     if interventions is not None:
-        story = interventions.story
+        story = partial(_by_hand, interventions, recording.directory)
         options |= {"told": True, "pace": interventions.pace}
         interventions.taken_down = partial(recording.take_down_by_hand, interventions)
     try:
@@ -174,6 +175,12 @@ class Recording:
 
 def _updated(record: RunRecord, **keys: Any) -> RunRecord:
     return RunRecord.model_validate({**record.to_json(), **keys})
+
+
+async def _by_hand(hand: Interventions, directory: RunDirectory, swarm: mission.Swarm, scenario: Scenario) -> None:
+    """The story of a mission in which somebody may intervene, also from another process."""
+    async with listening(hand, directory.path):
+        await hand.story(swarm, scenario)
 
 
 async def _until_interrupted(

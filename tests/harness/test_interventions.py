@@ -1,5 +1,8 @@
 """Somebody has things happen to a run that goes on."""
 
+import asyncio
+import json
+import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,6 +12,7 @@ from typing import Any
 import pytest
 
 from harness.errors import HarnessError, ScenarioError
+from harness.play.by_hand import SOCKET
 from harness.play.interventions import Interventions
 from harness.play.progress import Silent
 from harness.run.run import Run, run
@@ -181,3 +185,47 @@ def test_no_more_waits_than_there_is_room_for(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="real processes cannot stand still"):
         hand.pause().result(0)
     assert issubclass(ScenarioError, HarnessError)
+
+
+def test_another_process_asks_by_the_socket_in_the_runs_directory(tmp_path: Path) -> None:
+    out = tmp_path / ("a directory that lies deep " * 4) / "run"
+    answers: dict[str, Any] = {}
+
+    def click(hand: Interventions) -> None:
+        async def ask() -> None:
+            directory = os.open(out, os.O_PATH)
+            reader, writer = await asyncio.open_unix_connection(f"/proc/self/fd/{directory}/{SOCKET}")
+            for line in LINES:
+                writer.write(line.encode() + b"\n")
+                answers[line] = json.loads(await asyncio.wait_for(reader.readline(), TIMEOUT_S))
+            writer.close()
+            os.close(directory)
+
+        asyncio.run(ask())
+
+    assert played(scenario(duration_s=100, agents=3), out, click).exit_status == 0
+    wrong = {line: answer["error"] for line, answer in answers.items() if not answer["ok"]}
+    assert [answer.get("at_s") for answer in answers.values()][:4] == [10.0, 10.0, 10.001, 10.001]
+    assert answers[LINES[3]]["by_hand"] == [{"at_s": 10.0, "kill": [2]}, {"at_s": 10.001, "loss": 0.5}]
+    assert answers[LINES[3]]["paused"] and answers[LINES[3]]["closed"] is None
+    assert [*wrong] == [*LINES[4:]]
+    assert wrong[LINES[4]].startswith("kill: agent 2 is killed then")
+    assert not (out / SOCKET).exists()
+
+
+LINES = (
+    '{"command": "step", "seconds": 10}',
+    '{"command": "happen", "entry": {"kill": [2]}}',
+    '{"command": "happen", "entry": {"loss": 0.5}}',
+    '{"command": "state"}',
+    '{"command": "happen", "entry": {"kill": [2], "for_s": null}}',
+    '{"command": "happen", "entry": [1]}',
+    '{"command": "step", "seconds": "10"}',
+    '{"command": "step", "seconds": 1e400}',
+    '{"command": "pace", "factor": true}',
+    '{"command": ["pause"]}',
+    "[" * 10_000,
+    "pause",
+    "[]",
+    "null",
+)
