@@ -45,7 +45,7 @@ from typing import Any
 
 from ucp import commit, reconcile
 from ucp.block import MAX_AGENT_ID
-from ucp.core import Core
+from ucp.core import Core, Seal
 from ucp.events import LoggableEvent
 from ucp.handler import EventHandler, LocalEvent
 from ucp.messages import (
@@ -112,8 +112,8 @@ HANDLERS: dict[str, EventHandler[Any]] = {
 class Agent:
     """An agent as whoever drives it sees it; `state` is to look at.
 
-    `handlers` are wrong ones, which make a wrong agent (`ucp.quirks`). Raises ValueError for an agent ID or roster that
-    is impossible.
+    `handlers` are wrong ones, which make a wrong agent (`ucp.quirks`). With `seal` event data is sealed. Raises
+    ValueError for an agent ID or roster that is impossible.
     """
 
     def __init__(
@@ -125,6 +125,7 @@ class Agent:
         *,
         handlers: Sequence[EventHandler[Any]] = (),
         tracing: bool = True,
+        seal: Seal | None = None,
     ) -> None:
         self.agent_id = agent_id
         self.roster = frozenset(roster)
@@ -135,7 +136,7 @@ class Agent:
             raise ValueError(f"agent {agent_id} is not on the roster {sorted(self.roster)}")
         self.received: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
-        self._core = Core(agent_id, initial_data, settings or Settings(), tracing=tracing)
+        self._core = Core(agent_id, initial_data, settings or Settings(), tracing=tracing, seal=seal)
         self.state: AgentState = self._core
         self._tracing = tracing
         self._trace: list[Entry] = []
@@ -305,6 +306,8 @@ class Agent:
             run.tally = tally_of(core, handler)
         if core.started:
             run.started, core.started = core.started, {}
+        if core.sealed is not None:
+            run.sealed, core.sealed = Recorded(in_base64(core.sealed)), None
         self._trace.append(run)
 
     def _state_now(self) -> StateSummary:

@@ -20,7 +20,7 @@ def build_data_block(core: Core, event: LoggableEvent) -> str:
     # The newest event's timestamp (Section 4.2). A clock that stands still must not make two equal blocks
     # (Section 3.4.2), so a block is at least a microsecond younger than the agent's last, as long as there is time.
     timestamp_us = min(max(event.timestamp_us, core.newest_block_timestamp_us + 1), LATEST_US)
-    core.complete(Block(core.agent_id, timestamp_us, bytes(core.current_block)))
+    core.complete(Block(core.agent_id, timestamp_us, core.event_data(timestamp_us)))
     core.current_block.clear()
     core.trigger("Process Next Deque Block")
     return "full"

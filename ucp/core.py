@@ -4,16 +4,20 @@ An agent has two faces. `ucp.agent` is the one that whoever drives it sees; this
 handler is held to what it has declared: to send, start or trigger anything else is an error of the handler.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
-from ucp.block import Block
+from ucp.block import MAX_EVENT_DATA_BYTES, Block
 from ucp.handler import EventHandler, LocalEvent
 from ucp.messages import Message
+from ucp.sealed import SEAL_BYTES
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.timers import Timer
 from ucp.trace import Recorded, Sent
+
+Seal = Callable[[bytes, int], bytes]
+"""What event data becomes when it is sealed, given it and its block's timestamp."""
 
 
 class Core(AgentState):
@@ -21,18 +25,30 @@ class Core(AgentState):
 
     `outbox` has (sequence, message, its datagram as it is on record) to broadcast. `changes`, `announced` and `started`
     are what the running handler changed, sent and started, as a line of the trace says it; like the record of datagrams
-    they are kept only while `tracing`.
+    they are kept only while `tracing`. `sealed` is what it sealed, if it did: nobody else could do it again.
     """
 
     running: EventHandler[Any]
     """The handler that runs."""
 
-    def __init__(self, agent_id: int, initial_data: bytes, settings: Settings, *, tracing: bool = True) -> None:
+    def __init__(
+        self,
+        agent_id: int,
+        initial_data: bytes,
+        settings: Settings,
+        *,
+        tracing: bool = True,
+        seal: Seal | None = None,
+    ) -> None:
         super().__init__(agent_id, initial_data, settings)
         self.outbox: list[tuple[int, Message, Recorded | None]] = []
         self.changes: list[tuple[str, str]] = []
         self.announced: list[Sent] = []
         self.started: dict[str, float] = {}
+        if seal is not None and settings.max_block_bytes + SEAL_BYTES > MAX_EVENT_DATA_BYTES:
+            raise ValueError(f"sealed event data leaves {MAX_EVENT_DATA_BYTES - SEAL_BYTES} for max_block_bytes")
+        self.sealed: bytes | None = None
+        self._seal = seal
         self._tracing = tracing
         self._sequence = 0
 
@@ -79,6 +95,14 @@ class Core(AgentState):
         for block in (*self.chain, *self.blocks_to_be_committed, *self.reconcile_stack):
             if block.block_hash in own:
                 self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
+
+    def event_data(self, timestamp_us: int) -> bytes:
+        """What goes into a block of what was built: its events, or what they are sealed to (`ucp.secure`)."""
+        events = bytes(self.current_block)
+        if self._seal is None:
+            return events
+        self.sealed = self._seal(events, timestamp_us)
+        return self.sealed
 
     def complete(self, block: Block) -> None:
         """A block of our own is full: push it onto the back of the deque."""

@@ -109,6 +109,7 @@ class HandlerRun:
         {block hash, or "" for Is Top Of Chain: [count, timestamp in microseconds]}; of Algorithm 15
         {block hash: count} of the chosen block.
     started: timers that the run started, and their durations in mission seconds.
+    sealed: event data of a block that it completed, if it is sealed.
     """
 
     t: float
@@ -122,6 +123,7 @@ class HandlerRun:
     input: Recorded | None = None
     tally: Tally | None = None
     started: dict[str, float] | None = None
+    sealed: Recorded | None = None
 
     def to_line(self) -> str:
         state = self.state
@@ -144,6 +146,7 @@ class HandlerRun:
             ],
             "tally": self.tally,
             "started": self.started,
+            "sealed": self.sealed and self.sealed.text,
             "state": {
                 "chain": state.chain,
                 "deque": state.deque,
@@ -153,7 +156,7 @@ class HandlerRun:
                 "top": state.top,
             },
         }
-        for key in ("input", "tally", "started"):
+        for key in ("input", "tally", "started", "sealed"):
             if record[key] is None:
                 del record[key]
         return _encode(record) + "\n"

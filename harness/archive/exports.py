@@ -71,6 +71,11 @@ class ExportedInception(BaseModel):
     block_hash: Hash
     chain_hash: Hash
 
+    @property
+    def data(self) -> bytes:
+        """What all agents of the mission were given (Section 3.4.1)."""
+        return base64.b64decode(self.block_data)
+
 
 class CurrentBlock(BaseModel):
     """The block that is being built: the events that it has by now, in base64."""

@@ -8,6 +8,7 @@ import typer
 
 from harness import logbook
 from harness.archive.archive import RunArchive
+from harness.commands.depot_key import DepotKey, depot_of
 from harness.commands.new_file import write_new
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST, ExportError
@@ -27,16 +28,17 @@ def chain_command(
         Path | None, typer.Option("--geojson", help="Instead, write the vehicles' positions there; must be new.")
     ] = None,
     kml_file: Annotated[Path | None, typer.Option("--kml", help="The same for Google Earth; must be new.")] = None,
+    depot_key: DepotKey = None,
 ) -> None:
     """Print each agent's chain, block by block; or put what the vehicles logged on a map."""
     archive = RunArchive(*paths)
-    whole = logbook.read(archive)
+    whole = logbook.read(archive, depot_of(depot_key))
     shown = whole if agent is None else whole.only(agent)
     if geojson_file is not None or kml_file is not None:
         record = archive.origin
         recorded = flown(record, archive.tracks(record.known_agents))
         made = tracks(shown) or [track for track in recorded if agent in (None, track.agent_id)]
-        _write_maps(made, shown.telemetry, geojson_file, kml_file)
+        _write_maps(made, shown, geojson_file, kml_file)
     elif as_json:
         print_lines([json.dumps(document(shown, decode), indent=1)])
     else:
@@ -47,11 +49,15 @@ def chain_command(
         raise typer.Exit(WRONG_REQUEST)
 
 
-def _write_maps(made: list[Track], telemetry: bool, geojson_file: Path | None, kml_file: Path | None) -> None:
+def _write_maps(made: list[Track], shown: logbook.Logbook, geojson_file: Path | None, kml_file: Path | None) -> None:
     if not made:
-        why = (
-            "no vehicle logged one" if telemetry else "the events are not those of vehicles, and no track is on record"
-        )
+        why = "the events are not those of vehicles, and no track is on record"
+        if shown.telemetry:
+            why = (
+                "they are sealed: give the depot's key by --depot-key"
+                if shown.event_data.is_closed
+                else "no vehicle logged one"
+            )
         raise ExportError(f"there is no position in these chains ({why}), so there is no map")
     if geojson_file is not None:
         write_new(geojson_file, [json.dumps(geojson(made), ensure_ascii=False) + "\n"])

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from harness.archive.directory import claim
+from harness.commands.depot_key import DepotKey, depot_of
 from harness.commands.new_file import refuse_existing, write_new
 from harness.commands.terminal import complain, print_lines
 from harness.depot import outputs
@@ -47,6 +48,7 @@ def consolidate_command(
             help="Also let the exports reconcile with each other, into NAME.reconciled/.",
         ),
     ] = False,
+    depot_key: DepotKey = None,
 ) -> None:
     """Merge what vehicles brought home into one record: every event once, who holds what, what was lost with whom.
 
@@ -58,7 +60,7 @@ def consolidate_command(
         raise ExportError(f"{out}: the record is a *{RECORD} file; other forms have options of their own, as --kml")
     if final_reconcile and out is None:
         raise ExportError("--reconcile puts the exports beside the record: say where that is by -o NAME.jsonl")
-    record = consolidate(came_home(paths))
+    record = consolidate(came_home(paths), depot_of(depot_key))
     reconciliation = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
     reconciled = reconciliation.line if reconciliation else None
     print_lines(in_words(record, reconciled))

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from harness.commands.depot_key import DepotKey, depot_of
 from harness.commands.new_file import newly, refuse_existing
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
@@ -24,6 +25,7 @@ def export_command(
     rosbag: Annotated[
         Path | None, typer.Option(metavar="DIR", help="A bag for ROS 2, which `import` reads again; must be new.")
     ] = None,
+    depot_key: DepotKey = None,
 ) -> None:
     """Write tracks, links, chains, handler runs, MAVLink and logs of a run for other tools.
 
@@ -35,7 +37,7 @@ def export_command(
         raise ExportError("say what to write: --mcap FILE, --perfetto FILE or --rosbag DIR")
     refuse_existing([path for path, _, _ in asked])
     writers = [(path, counted, writer()) for path, counted, writer in asked]
-    recording = Recording(run)
+    recording = Recording(run, depot_of(depot_key))
     with Console(stderr=True).status(f"reading {run}") as status:
         for path, counted, write in writers:
 

@@ -9,8 +9,10 @@ import base64
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from harness.archive.block_names import name_blocks
+from harness.archive.event_data import EventData, SealedError
 from harness.archive.exports import Export, ExportedBlock
 from harness.depot.came_home import CameHome, all_blocks
 from harness.depot.lines import Block, ExportUsed, Fork, Header, Held, Lost, Place, Way
@@ -19,6 +21,9 @@ from harness.gc_pause import gc_paused
 from harness.report.chain_tree import ranges
 from ucp.events import EVENT_FIELDS, EVENT_HEADER_BYTES, LoggableEvent
 from ucp.wire import struct_of
+
+if TYPE_CHECKING:
+    from ucp.secure.sealing import Depot
 
 UNFINISHED = "unfinished"
 _HEADER = struct_of(EVENT_FIELDS)
@@ -66,8 +71,9 @@ class Consolidation:
 
 
 @gc_paused()
-def consolidate(home: CameHome) -> Consolidation:
-    """The record of what came home."""
+def consolidate(home: CameHome, depot: "Depot | None" = None) -> Consolidation:
+    """The record of what came home; `depot` opens what is sealed. Raises ExportError if that is nothing here."""
+    event_data = EventData.of(home.exports.values(), depot)
     blocks = all_blocks(home.brought)
     chains = {agent_id: export.chain_of_block_hashes for agent_id, export in home.exports.items()}
     names = _names(home)
@@ -76,8 +82,8 @@ def consolidate(home: CameHome) -> Consolidation:
     on_record = []
     for number, block_hash in enumerate(ordered(blocks, [*chains.values()]), 1):
         block = blocks[block_hash]
-        data = block.event_bytes
-        events = events_in(data)
+        data, sealed = _opened(block, event_data)
+        events = [] if sealed else events_in(data)
         line = Block(
             number=number,
             name=names[block_hash],
@@ -89,8 +95,9 @@ def consolidate(home: CameHome) -> Consolidation:
             held=held[block_hash],
             claimed_hash=claims.get(block_hash),
             unreadable=_unreadable(data, events),
+            sealed=sealed,
         )
-        on_record.append(BlockOnRecord(line, data))
+        on_record.append(BlockOnRecord(line, b"" if sealed else data))
     _add_unfinished(on_record, home)
     made = Counter(block.agent_id for block in blocks.values())
     flown = sorted({*home.roster, *made, *(brought.export.agent_id for brought in home.brought)})
@@ -142,6 +149,14 @@ def _header(home: CameHome, flown: list[int], blocks: list[BlockOnRecord], mutua
 def _writable(text: str) -> str:
     """A file's name may have bytes that are no text: question marks instead."""
     return text.encode(errors="replace").decode()
+
+
+def _opened(block: ExportedBlock, event_data: EventData) -> tuple[bytes, bool]:
+    """What it holds, and whether that is sealed and nobody here opens it."""
+    try:
+        return event_data.of_block(block), False
+    except SealedError:
+        return block.event_bytes, True
 
 
 def events_in(event_data: bytes) -> list[tuple[int, int, int, int]]:

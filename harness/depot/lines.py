@@ -11,6 +11,7 @@ Data is in base64, hashes in lower-case hex, times in microseconds as blocks hav
 what of it is unreadable, its data is made again byte by byte, and so its hash.
 """
 
+from operator import not_
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, RootModel
@@ -103,7 +104,8 @@ class Block(Line):
     """`number` counts the record's blocks from 1. `block_hash` is null of a block that was being built.
 
     `mutual`: it is in the chain that all share. `claimed_hash` is what a file says its hash is, where that is wrong: it
-    was edited, or damaged. `unreadable` is what follows its events and is none.
+    was edited, or damaged. `unreadable` is what follows its events and is none. `sealed`: nobody has opened it, and it
+    is `unreadable` all of it.
     """
 
     line: Literal["block"] = "block"
@@ -117,6 +119,7 @@ class Block(Line):
     held: list[Held]
     claimed_hash: Hash | None = None
     unreadable: Base64 = ""
+    sealed: Annotated[bool, Field(exclude_if=not_)] = False
 
     @property
     def holders(self) -> list[int]:

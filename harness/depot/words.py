@@ -31,6 +31,8 @@ def in_words(record: Consolidation, reconciled: Reconciled | None = None) -> Ite
             f"{header.distinct_chains} distinct chains: the mutual chain has {_blocks(header.mutual_chain)}, "
             f"the longest {header.longest_chain}"
         )
+    if sealed := sum(block.line.sealed for block in record.blocks):
+        yield f"{_blocks(sealed)} sealed to the depot: --depot-key, with the key of this mission's, opens what it can"
     yield from map(fork_in_words, record.forks[:FORKS_TOLD])
     if len(record.forks) > FORKS_TOLD:
         yield f"and they part at {len(record.forks) - FORKS_TOLD} more places"

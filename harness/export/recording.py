@@ -10,6 +10,7 @@ from heapq import merge
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from harness import logbook
 from harness.archive.archive import RunArchive
@@ -44,19 +45,26 @@ from harness.scenario.verdicts import kind_of
 from sitl.vehicle import Home
 from ucp.trace import Dropped
 
+if TYPE_CHECKING:
+    from ucp.secure.sealing import Depot
+
 FAULTS, VERDICTS = "faults", "verdicts"
 MAX_LINKED = 100
 """Of so many vehicles the links are told one by one: there are 9900."""
 
 
 class Recording:
-    """Raises RunDirectoryError if the directory is none of a run, ExportError if there is nothing in it to export."""
+    """Where vehicles were is asked of their events, sealed or not, if nothing else tells: `depot` opens sealed ones.
 
-    def __init__(self, directory: Path) -> None:
+    Raises RunDirectoryError if the directory is none of a run, ExportError if there is nothing in it to export.
+    """
+
+    def __init__(self, directory: Path, depot: "Depot | None" = None) -> None:
         if not directory.is_dir():
             raise RunDirectoryError(f"{directory} is not a directory: name the directory of a run, or of an import")
         self.directory = directory
         self.archive = RunArchive(directory)
+        self._depot = depot
         self._problems: list[str] = []
         if self.archive.recorded and self.archive.record.outcome == "running":
             self.add_problem("the run has not recorded its end: it is still going on, or it was killed")
@@ -172,7 +180,10 @@ class Recording:
         if not self.archive.exports.by_agent:
             return
         untimed, field = 0, None
-        for track in tracks(logbook.read(self.archive)):
+        read = logbook.read(self.archive, self._depot)
+        if read.event_data.is_closed:
+            self._problems.append("event data is sealed to the depot: positions are not known without --depot-key")
+        for track in tracks(read):
             for timestamp_us, logged in track.fixes:
                 place = Place(*(logged.lat_e7 / 1e7, logged.lon_e7 / 1e7, logged.alt_mm / 1e3))
                 field = field or Home(*place)

@@ -30,6 +30,7 @@ from ucp.secure.bundle import (
 )
 from ucp.secure.keyfile import KeyFileError, key_in, read_key_file, write_key_file
 from ucp.secure.revocation import LAST_NUMBER, MAX_REVOKED, Revocation, RevocationError
+from ucp.secure.sealing import Depot
 
 AUTHORITY_NAME, DEPOT_NAME, VEHICLES_NAME = "authority.key", "depot.key", "vehicles.key"
 AUTHORITY_SCHEMA, DEPOT_SCHEMA, VEHICLES_SCHEMA = "ucp-authority-key/1", "ucp-depot-key/1", "ucp-vehicle-keys/1"
@@ -171,14 +172,14 @@ class Home:
         return _sound(lambda: read_key_file(self.directory / AUTHORITY_NAME, AUTHORITY_SCHEMA, parse, secret=True))
 
 
-def load_depot_key(path: Path) -> bytes:
-    """The depot's private key, from its file or from the directory that it is in. Raises KeysError."""
+def load_depot_key(path: Path) -> Depot:
+    """Who opens what was sealed: by the key in a file, or in the directory of a mission's keys. Raises KeysError."""
     file = path / DEPOT_NAME if path.is_dir() else path
-    return _sound(
-        lambda: read_key_file(
-            file, DEPOT_SCHEMA, lambda document: key_in(document, "private_key", KEY_BYTES), secret=True
-        )
-    )
+
+    def parse(document: dict[str, Any]) -> Depot:
+        return Depot(key_in(document, "mission", MISSION_ID_BYTES), key_in(document, "private_key", KEY_BYTES))
+
+    return _sound(lambda: read_key_file(file, DEPOT_SCHEMA, parse, secret=True))
 
 
 def load_revocation(path: Path, public: PublicKeys) -> Revocation:

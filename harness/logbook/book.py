@@ -1,13 +1,18 @@
 """Gathers exports, and what is known of where their events come from."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
+from harness.archive.event_data import EventData
 from harness.archive.exports import SUFFIX, Export
 from harness.archive.record import AgentRecord, RunRecord
 from harness.errors import ExportError, RunDirectoryError
 from harness.play.backends import in_virtual_time
+
+if TYPE_CHECKING:
+    from ucp.secure.sealing import Depot
 
 
 @dataclass
@@ -15,7 +20,7 @@ class Logbook:
     """Exports by agent; `names` of their blocks; `errors`, a sentence for each file that could not be used.
 
     `telemetry`: events are those of the source `mavlink`. Exports that came without a run are taken for such.
-    `absent`: a sentence for each agent of the mission that has no export here.
+    `absent`: a sentence for each agent of the mission that has no export here. `event_data` reads what blocks hold.
     """
 
     exports: dict[int, Export]
@@ -23,6 +28,7 @@ class Logbook:
     telemetry: bool = True
     absent: dict[int, str] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
+    event_data: EventData = field(default_factory=EventData)
 
     def name(self, block_hash: str) -> str:
         return self.names.get(block_hash, block_hash[:12])
@@ -30,15 +36,18 @@ class Logbook:
     def only(self, agent_id: int) -> "Logbook":
         """The logbook with one agent's export; blocks keep their names. Raises ExportError if there is none."""
         if agent_id in self.exports:
-            return Logbook({agent_id: self.exports[agent_id]}, self.names, self.telemetry, errors=self.errors)
+            return replace(self, exports={agent_id: self.exports[agent_id]}, absent={})
         known = (
             f"exports here are of agents {', '.join(map(str, self.exports))}" if self.exports else "nor of any other"
         )
         raise ExportError(f"{self.absent.get(agent_id, f'there is no export of agent {agent_id}')}; {known}")
 
 
-def read(archive: RunArchive) -> Logbook:
-    """The logbook of an archive. Raises RunDirectoryError if it has no exports at all."""
+def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
+    """The logbook of an archive; `depot` opens what is sealed.
+
+    Raises RunDirectoryError if it has no exports at all, ExportError if nothing here is sealed to this depot.
+    """
     exports = archive.exports
     if not exports.by_agent and not exports.errors:
         why = f"holds no exports (*{SUFFIX}): no agent of this run left its chain"
@@ -51,6 +60,7 @@ def read(archive: RunArchive) -> Logbook:
         telemetry=logged_telemetry(record),
         absent={agent_id: _absent(agent_id, record.agents.get(str(agent_id))) for agent_id in absent},
         errors=[*archive.record_problems, *exports.errors],
+        event_data=EventData.of(exports.by_agent.values(), depot),
     )
 
 

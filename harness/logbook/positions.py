@@ -11,7 +11,7 @@ from typing import Protocol
 
 from harness.archive.exports import ExportedBlock
 from harness.logbook.book import Logbook
-from ucp.events import LoggableEvent, MalformedEventsError, decode_events
+from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.telemetry import position_of
 
 LAST_TIMESTAMP_US = 253_402_300_799_999_999
@@ -80,7 +80,7 @@ def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[Log
     logged = []
     for block in blocks:
         try:
-            events = decode_events(block.event_bytes)
+            events = logbook.event_data.events(block)
         except MalformedEventsError:
             continue
         name = logbook.name(block.block_hash)

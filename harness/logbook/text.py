@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 from typing import Any
 
+from harness.archive.event_data import EventData, SealedError
 from harness.archive.exports import Export, ExportedBlock
 from harness.logbook.book import Logbook
 from harness.present.words import moment
-from ucp.events import LoggableEvent, MalformedEventsError, decode_events
+from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.telemetry import describe
 
 _HASH_DIGITS = 12
@@ -20,9 +21,9 @@ def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
         names = [logbook.name(block.block_hash) for block in export.chain]
         width = max(map(len, names), default=0)
         for name, block in zip(names, export.chain, strict=True):
-            yield f"  {name:<{width}}  {_block(block)}"
+            yield f"  {name:<{width}}  {_block(block, logbook.event_data)}"
             if decode:
-                yield from (f"    {line}" for line in _events(block, logbook.telemetry))
+                yield from (f"    {line}" for line in _events(block, logbook))
         if beside := _beside(export):
             yield f"  beside the chain: {beside}"
 
@@ -52,18 +53,22 @@ def words(event: LoggableEvent, telemetry: bool) -> str:
     return f"{description}: {raw}" if description else raw
 
 
-def _block(block: ExportedBlock) -> str:
+def _block(block: ExportedBlock, event_data: EventData) -> str:
     try:
-        events = _count(len(decode_events(block.event_bytes)), "event")
+        events = _count(len(event_data.events(block)), "event")
+    except SealedError as sealed:
+        events = str(sealed)
     except MalformedEventsError:
         events = "unreadable events"
     return f"{moment(block.timestamp_us)}  {_short(block.block_hash)}  {events}"
 
 
-def _events(block: ExportedBlock, telemetry: bool) -> Iterator[str]:
+def _events(block: ExportedBlock, logbook: Logbook) -> Iterator[str]:
     try:
-        for event in decode_events(block.event_bytes):
-            yield f"{moment(event.timestamp_us)}  {words(event, telemetry)}"
+        for event in logbook.event_data.events(block):
+            yield f"{moment(event.timestamp_us)}  {words(event, logbook.telemetry)}"
+    except SealedError:
+        return  # the block's line says so
     except MalformedEventsError as error:
         yield f"unreadable: {error}"
 
@@ -78,10 +83,11 @@ def _beside(export: Export) -> str:
 
 
 def _block_document(logbook: Logbook, block: ExportedBlock, decode: bool) -> dict[str, Any]:
+    sealed = False
     try:
-        events = decode_events(block.event_bytes)
-    except MalformedEventsError:
-        events = None
+        events = logbook.event_data.events(block)
+    except MalformedEventsError as error:
+        events, sealed = None, isinstance(error, SealedError)
     return {
         "name": logbook.name(block.block_hash),
         "agent_id": block.agent_id,
@@ -89,6 +95,7 @@ def _block_document(logbook: Logbook, block: ExportedBlock, decode: bool) -> dic
         "block_hash": block.block_hash,
         "chain_hash": block.chain_hash,
         "events": None if events is None else [_event_document(event, logbook.telemetry, decode) for event in events],
+        **({"sealed": True} if sealed else {}),
     }
 
 

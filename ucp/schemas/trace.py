@@ -130,9 +130,10 @@ def handler_run() -> Schema:
             "sent": listed(sent),
             "tally": {"anyOf": [votes, candidates, chosen]},
             "started": started,
+            "sealed": BASE64,
             "state": state,
         },
-        optional=("input", "tally", "started"),
+        optional=("input", "tally", "started", "sealed"),
     )
     came = {"anyOf": [{"required": [kind]} for kind in ("message", "event", "boot")]}
     return run | {

@@ -9,7 +9,7 @@ from harness.archive.traces import Trace
 from harness.archive.vocabulary import branch_is_known, tally_is_known, timer_that_ended, timers_are_known
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.header import CheckedHeader
-from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, stored_blocks
+from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded, event_of, sealed_of, stored_blocks
 from harness.checker.steps.reference import Before, ReferenceCore
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of, why_not_handled
 from ucp.block import Block
@@ -118,6 +118,7 @@ class Follower:
             else:
                 handler, inputs = self._input(run, now)
                 core.running = handler
+                core.told_sealed = sealed_of(run.sealed)
                 if self.stops_before_handler:
                     breakpoint()
                 branch = handler.run(core, *inputs)

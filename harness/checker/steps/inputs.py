@@ -52,6 +52,14 @@ def event_of(record: Recorded | None) -> LoggableEvent:
     return event
 
 
+def sealed_of(record: Recorded | None) -> bytes | None:
+    """What an agent sealed; None if it tells of nothing that it can be."""
+    try:
+        return None if record is None else base64.b64decode(record.text, validate=True)
+    except ValueError:
+        return None
+
+
 def stored_blocks(record: Recorded | None) -> Iterator[Block]:
     """The blocks of a store, each after its length. Raises ValueError."""
     if record is not None and isinstance(record.content, StoredState):

@@ -16,6 +16,7 @@ from ucp.messages import (
     RequestForBlock,
     block_named,
 )
+from ucp.sealed import SEAL_BYTES, sealed_to
 from ucp.settings import Settings
 from ucp.timers import Timer
 from ucp.trace import HandlerRun, Sent
@@ -35,8 +36,17 @@ class ReferenceCore(Core):
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Settings) -> None:
         super().__init__(agent_id, initial_data, settings)
+        self.told_sealed: bytes | None = None
+        """What the agent says that it sealed in this step: without its keys nobody can do it again."""
+        self._seals = sealed_to(initial_data) is not None
         self._moved: dict[str, Block] = {}
         """Every block that has ever been anywhere here, by hash."""
+
+    def event_data(self, timestamp_us: int) -> bytes:
+        """Sealed where the mission seals, if what the agent tells is as long as that is."""
+        events = bytes(self.current_block)
+        sealed = self.told_sealed
+        return sealed if self._seals and sealed and len(sealed) == len(events) + SEAL_BYTES else events
 
     def _changed(self, operation: str, block: Block) -> None:
         block_hash = block.block_hash.hex()

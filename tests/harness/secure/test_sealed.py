@@ -1,0 +1,140 @@
+"""Event data that is sealed to the depot: agents carry it, the judge follows it, and the depot alone reads it."""
+
+import base64
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from harness.archive.exports import SUFFIX, Export
+from harness.archive.traces import HANDLER_RUN, Header, Trace
+from harness.checker import Evidence, steps
+from harness.keyring.home import Home
+from tests.harness.command import harness
+from tests.ucp.air import Air
+from ucp.agent import Agent
+from ucp.export import export_chain
+from ucp.sealed import seal_to
+from ucp.secure.sealing import seal_of
+from ucp.settings import Settings
+from ucp.trace import SCHEMA, Recorded, in_base64
+
+ROSTER = (1, 2, 3)
+SETTINGS = Settings(max_block_bytes=976)
+LOGGED = b"nobody else reads this"
+
+
+class SealedSwarm:
+    """Three agents that sealed and committed a few blocks, and whose exports and keys are in a directory."""
+
+    def __init__(self, directory: Path) -> None:
+        self.home = Home.new(directory / "keys", ROSTER, seals=True, epoch_s=600.0)
+        bundles = self.home.bundles()
+        self.initial_data = seal_to(b"sealed", bundles[1].public.depot or b"")
+        self.air = Air(ROSTER)
+        self.air.agents = {
+            agent_id: Agent(agent_id, ROSTER, self.initial_data, SETTINGS, seal=seal_of(bundle))
+            for agent_id, bundle in bundles.items()
+        }
+        for agent_id in ROSTER:
+            for number in range(40):
+                self.air.log(agent_id, LOGGED + bytes([number]))
+            self.air.settle()
+        self.exports = {agent_id: export_chain(agent.state, 1) for agent_id, agent in self.air.agents.items()}
+        self.directory = directory / "home"
+        self.directory.mkdir()
+        for agent_id, export in self.exports.items():
+            (self.directory / f"{agent_id}{SUFFIX}").write_text(json.dumps(export))
+
+    def evidence(self) -> Evidence:
+        clock = {"epoch_us": 0, "speedup": 1.0}
+        traces = {
+            agent_id: Trace(
+                Header(
+                    schema=SCHEMA,
+                    agent_id=agent_id,
+                    roster=list(ROSTER),
+                    settings=SETTINGS.told(),
+                    clock=clock,
+                    initial_data=in_base64(self.initial_data),
+                ),
+                [HANDLER_RUN.validate_json(run.to_line()) for run in runs],
+            )
+            for agent_id, runs in self.air.runs.items()
+        }
+        return Evidence({agent: Export.model_validate(export) for agent, export in self.exports.items()}, traces)
+
+
+@pytest.fixture(scope="module")
+def swarm(tmp_path_factory: pytest.TempPathFactory) -> SealedSwarm:
+    return SealedSwarm(tmp_path_factory.mktemp("sealed"))
+
+
+def test_others_carry_it_and_cannot_read_it(swarm: SealedSwarm) -> None:
+    chains = [[block["block_hash"] for block in export["chain"]] for export in swarm.exports.values()]
+    assert chains[0] == chains[1] == chains[2] and len(chains[0]) >= 3
+    for export in swarm.exports.values():
+        for block in export["chain"]:
+            assert LOGGED not in base64.b64decode(block["event_data"])
+
+
+def test_the_judge_follows_agents_that_seal(swarm: SealedSwarm) -> None:
+    judgement = steps.check(swarm.evidence())
+    assert judgement.verdict == "as specified", judgement
+
+
+@pytest.mark.parametrize("told", [None, b"", LOGGED * 40, b"?"])
+def test_the_judge_finds_an_agent_that_tells_of_another_seal(swarm: SealedSwarm, told: bytes | None) -> None:
+    evidence = swarm.evidence()
+    runs = evidence.traces[2].runs
+    position = next(position for position, run in enumerate(runs) if run.sealed is not None)
+    runs[position] = dataclasses.replace(runs[position], sealed=None if told is None else Recorded(in_base64(told)))
+    judgement = steps.check(evidence)
+    assert judgement.verdict == "deviates"
+    assert judgement.evidence[0].handler == "build_data_block"
+
+
+def test_chains_say_that_it_is_sealed_and_the_depots_key_opens_it(swarm: SealedSwarm) -> None:
+    closed = harness("chain", "--decode", swarm.directory)
+    assert closed.returncode == 0
+    assert "sealed to the depot" in closed.stdout
+    assert "event 7" not in closed.stdout
+    key = swarm.home.directory / "depot.key"
+    opened = harness("chain", "--decode", "--json", "--depot-key", key, swarm.directory)
+    blocks = json.loads(opened.stdout)["agents"]["1"]["chain"]
+    assert all(event["data"].startswith(LOGGED.hex()) for block in blocks for event in block["events"])
+    closed = harness("chain", "--json", swarm.directory)
+    assert all(
+        block["sealed"] and block["events"] is None for block in json.loads(closed.stdout)["agents"]["1"]["chain"]
+    )
+
+
+def test_a_consolidated_record_has_the_events_once_the_depot_opens_them(swarm: SealedSwarm, tmp_path: Path) -> None:
+    closed = harness("consolidate", swarm.directory, "--out", tmp_path / "closed.jsonl")
+    assert closed.returncode == 0
+    assert "sealed to the depot" in closed.stdout
+    key = swarm.home.directory / "depot.key"
+    opened = harness("consolidate", swarm.directory, "--out", tmp_path / "open.jsonl", "--depot-key", key)
+    assert opened.returncode == 0, opened.stderr
+    assert "sealed" not in opened.stdout
+    events = {name: (tmp_path / name).read_text().count('"line":"event"') for name in ("closed.jsonl", "open.jsonl")}
+    logged = sum(len(runs) for runs in ([r for r in rs if "event" in r.trigger] for rs in swarm.air.runs.values()))
+    assert events["open.jsonl"] == logged
+    assert events["closed.jsonl"] < logged
+
+
+def test_another_depots_key_is_refused(swarm: SealedSwarm, tmp_path: Path) -> None:
+    other = Home.new(tmp_path / "other", ROSTER, seals=True, epoch_s=600.0)
+    for command in ("chain", "consolidate"):
+        done = harness(command, swarm.directory, "--depot-key", other.directory)
+        assert done.returncode == 2
+        assert "sealed to another depot" in done.stderr
+
+
+def test_a_block_that_is_not_what_it_says_is_not_opened(swarm: SealedSwarm, tmp_path: Path) -> None:
+    export = json.loads(json.dumps(swarm.exports[1]))
+    export["chain"][0]["event_data"] = base64.b64encode(b"in plain, by who has no depot key").decode()
+    (tmp_path / f"1{SUFFIX}").write_text(json.dumps(export))
+    done = harness("chain", "--depot-key", swarm.home.directory, tmp_path)
+    assert "not sealed to this depot" in done.stdout

@@ -1,0 +1,79 @@
+"""Sealed event data: HPKE as RFC 9180 says it, which the library opens, and the depot alone."""
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+
+from ucp.sealed import SEAL_BYTES, seal_to, sealed_to
+from ucp.secure.bundle import KeySet
+from ucp.secure.sealing import Depot, NotOpenedError, key_schedule, seal_of
+
+KEYS = KeySet.derived(b"a seed".ljust(32), (1, 7), seals=True)
+DEPOT = Depot(KEYS.public.mission, KEYS.depot or b"")
+EVENTS = b"what vehicle 7 logged"
+
+
+def test_keys_are_those_of_rfc_9180() -> None:
+    """Its test vector A.2.1: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, base mode."""
+    ephemeral = X25519PrivateKey.from_private_bytes(
+        bytes.fromhex("f4ec9b33b792c372c1d2c2063507b684ef925b8c75a42dbcbf57d63ccd381600")
+    )
+    enc = bytes.fromhex("1afa08d3dec047a643885163f1180476fa7ddb54c6a8029ea33f95796bf2ac4a")
+    recipient = bytes.fromhex("4310ee97d88cc1f088a5576c77ab0cf5c3ac797f3d95139c6c84b5429c59662a")
+    assert ephemeral.public_key().public_bytes_raw() == enc
+    shared = ephemeral.exchange(X25519PublicKey.from_public_bytes(recipient))
+    key, nonce = key_schedule(shared, enc, recipient, b"Ode on a Grecian Urn")
+    assert key.hex() == "ad2744de8e17f4ebba575b3f5f5a8fa1f69c2a07f6e7500bc60ca6e3e3ec1c91"
+    assert nonce.hex() == "5c4d98150661b848853b547f"
+
+
+def seal(event_data: bytes, timestamp_us: int, agent_id: int = 7) -> bytes:
+    how = seal_of(KEYS.bundle(agent_id))
+    assert how is not None
+    return how(event_data, timestamp_us)
+
+
+@pytest.mark.parametrize("events", [b"", EVENTS, bytes(976)])
+def test_the_librarys_hpke_opens_what_is_sealed(events: bytes) -> None:
+    sealed = seal(events, 5)
+    assert len(sealed) == len(events) + SEAL_BYTES
+    assert DEPOT.open(sealed, 7, 5) == events
+
+
+def test_equal_blocks_are_equal_bytes_and_others_share_no_key() -> None:
+    assert seal(EVENTS, 5) == seal(EVENTS, 5)
+    ephemeral = {
+        sealed[:32] for sealed in (seal(EVENTS, 5), seal(EVENTS, 6), seal(EVENTS + b".", 5), seal(EVENTS, 5, 1))
+    }
+    assert len(ephemeral) == 4
+
+
+def test_nothing_else_opens_it() -> None:
+    sealed = seal(EVENTS, 5)
+    assert EVENTS not in sealed
+    others = KeySet.derived(b"another".ljust(32), (1, 7), seals=True)
+    for depot, data, agent_id, timestamp_us in (
+        (DEPOT, sealed, 1, 5),
+        (DEPOT, sealed, 7, 6),
+        (Depot(bytes(16), KEYS.depot or b""), sealed, 7, 5),
+        (Depot(KEYS.public.mission, others.depot or b""), sealed, 7, 5),
+        (Depot(KEYS.public.mission, KEYS.vehicles[7]), sealed, 7, 5),
+        *((DEPOT, sealed[:end], 7, 5) for end in range(len(sealed))),
+        *((DEPOT, sealed[:at] + bytes([sealed[at] ^ 1]) + sealed[at + 1 :], 7, 5) for at in range(len(sealed))),
+        (DEPOT, bytes(200), 7, 5),
+    ):
+        with pytest.raises(NotOpenedError):
+            depot.open(data, agent_id, timestamp_us)
+
+
+def test_the_inception_block_says_to_whom() -> None:
+    assert sealed_to(b"a mission") is None
+    assert sealed_to(b"") is None
+    public = DEPOT.public_key
+    assert public == KEYS.public.depot
+    assert sealed_to(seal_to(b"a mission", public)) == public
+    assert sealed_to(public) is None
+
+
+def test_without_a_depot_nothing_is_sealed() -> None:
+    assert seal_of(KeySet.derived(bytes(32), [7]).bundle(7)) is None
+    assert "private_key" not in repr(DEPOT)

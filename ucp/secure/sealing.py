@@ -1,0 +1,105 @@
+"""Event data that the depot alone can read: whoever carries it, or captures who carries it, cannot.
+
+HPKE (RFC 9180) in base mode: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, one message with each key.
+What is sealed cannot be passed off as another block's: mission, agent and timestamp are in `info`. (As additional data
+they would be bound no closer, and libraries whose HPKE knows none could not open it.)
+
+A vehicle that draws no random numbers derives each ephemeral key from its private key and from all that it seals with
+it. So equal blocks are equal bytes, and two that differ in anything never have a key in common. No library's HPKE takes
+an ephemeral key; what is to be opened is opened by the library's own.
+"""
+
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives import hpke
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.hmac import HMAC
+from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
+
+from ucp.core import Seal
+from ucp.secure.bundle import KEY_BYTES, Bundle
+
+_TAG = b"UCP event data\0"
+_BLOCK = struct.Struct(">IQ")
+_NONCE_BYTES = 12
+_KEM_SUITE = b"KEM" + struct.pack(">H", 0x0020)  # DHKEM(X25519, HKDF-SHA256)
+_SUITE = b"HPKE" + struct.pack(">HHH", 0x0020, 0x0001, 0x0003)  # ..., HKDF-SHA256, ChaCha20-Poly1305
+_LIBRARY = hpke.Suite(hpke.KEM.X25519, hpke.KDF.HKDF_SHA256, hpke.AEAD.CHACHA20_POLY1305)
+_BASE_MODE = b"\0"
+
+
+class NotOpenedError(Exception):
+    """Event data that this key does not open: one sentence."""
+
+
+@dataclass(frozen=True)
+class Depot:
+    """Who can read what was sealed in a mission."""
+
+    mission: bytes
+    private_key: bytes = field(repr=False)
+
+    @property
+    def public_key(self) -> bytes:
+        return X25519PrivateKey.from_private_bytes(self.private_key).public_key().public_bytes_raw()
+
+    def open(self, sealed: bytes, agent_id: int, timestamp_us: int) -> bytes:
+        """The events of a block. Raises NotOpenedError."""
+        key: Any = X25519PrivateKey.from_private_bytes(self.private_key)
+        try:
+            return _LIBRARY.decrypt(sealed, key, _info(self.mission, agent_id, timestamp_us))
+        except (InvalidTag, ValueError):
+            raise NotOpenedError("not sealed to this depot by the agent that it names, or damaged") from None
+
+
+def seal_of(bundle: Bundle) -> Seal | None:
+    """How this vehicle seals its event data; None if its mission does not."""
+    depot = bundle.public.depot
+    if depot is None:
+        return None
+    recipient, mission, agent_id = X25519PublicKey.from_public_bytes(depot), bundle.public.mission, bundle.agent_id
+
+    def seal(event_data: bytes, timestamp_us: int) -> bytes:
+        info = _info(mission, agent_id, timestamp_us)
+        everything = HMAC(bundle.private_key, SHA256())
+        everything.update(b"UCP ephemeral key\0" + depot + info + event_data)
+        return sealed(event_data, recipient, X25519PrivateKey.from_private_bytes(everything.finalize()), info)
+
+    return seal
+
+
+def sealed(plain: bytes, recipient: X25519PublicKey, ephemeral: X25519PrivateKey, info: bytes) -> bytes:
+    """HPKE's one message in base mode: the ephemeral public key (32), the ciphertext, the tag (16)."""
+    enc = ephemeral.public_key().public_bytes_raw()
+    key, nonce = key_schedule(ephemeral.exchange(recipient), enc, recipient.public_bytes_raw(), info)
+    return enc + ChaCha20Poly1305(key).encrypt(nonce, plain, None)
+
+
+def key_schedule(shared: bytes, enc: bytes, recipient: bytes, info: bytes) -> tuple[bytes, bytes]:
+    """The key, and the nonce of the first message (RFC 9180, Sections 4.1 and 5.1), of a Diffie-Hellman secret."""
+    secret = _expand(_KEM_SUITE, _extract(_KEM_SUITE, b"", b"eae_prk", shared), b"shared_secret", enc + recipient)
+    context = _BASE_MODE + _extract(_SUITE, b"", b"psk_id_hash", b"") + _extract(_SUITE, b"", b"info_hash", info)
+    secret = _extract(_SUITE, secret, b"secret", b"")
+    return _expand(_SUITE, secret, b"key", context), _expand(_SUITE, secret, b"base_nonce", context, _NONCE_BYTES)
+
+
+def _info(mission: bytes, agent_id: int, timestamp_us: int) -> bytes:
+    return _TAG + mission + _BLOCK.pack(agent_id, timestamp_us)
+
+
+def _extract(suite: bytes, salt: bytes, label: bytes, secret: bytes) -> bytes:
+    """LabeledExtract (RFC 9180, Section 4)."""
+    extraction = HMAC(salt or bytes(KEY_BYTES), SHA256())
+    extraction.update(b"HPKE-v1" + suite + label + secret)
+    return extraction.finalize()
+
+
+def _expand(suite: bytes, secret: bytes, label: bytes, info: bytes, length: int = KEY_BYTES) -> bytes:
+    """LabeledExpand (RFC 9180, Section 4)."""
+    labeled = length.to_bytes(2, "big") + b"HPKE-v1" + suite + label + info
+    return HKDFExpand(SHA256(), length, labeled).derive(secret)
