@@ -2,6 +2,7 @@
 
 failure.txt       what was expected and what came
 vector.jsonl      the inputs and answers that lead there, as `COMMAND --virtual` reads and writes them
+scenario.yaml     the same as a scenario, for `ucp-harness run --backend sim`
 air.pcapng        what crossed the air, for Wireshark and `ucp-harness packets`
 """
 
@@ -12,6 +13,7 @@ from pathlib import Path
 from harness.conformance.air import AGENTS, PEERS_ON
 from harness.conformance.lines import Writer
 from harness.conformance.results import Case
+from harness.conformance.scenario import scenario_of
 from harness.conformance.seen import Exchange
 from harness.conformance.states import VARIANTS
 from harness.conformance.table import lines_of
@@ -25,13 +27,15 @@ EPOCH_US = 1_700_000_000_000_000
 """Of the capture: mission second 0."""
 
 
-def keep(case: Case, directory: Path) -> None:
+def keep(case: Case, command: Sequence[str], directory: Path) -> None:
     """Raises MachineError if the disk refuses."""
     try:
         directory.mkdir(parents=True)
         (directory / "failure.txt").write_text("\n".join(lines_of(case)) + "\n", encoding="utf-8")
         if case.settings in VARIANTS:
             _write_vector(case, directory / "vector.jsonl")
+            scenario = scenario_of(case.name, command, VARIANTS[case.settings], case.inputs)
+            (directory / "scenario.yaml").write_text(scenario, encoding="utf-8")
         if case.exchanges:
             _write_capture(case.exchanges, directory)
     except OSError as error:

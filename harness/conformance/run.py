@@ -58,8 +58,7 @@ def conform(
         asyncio.run(_run(asked, place, chosen, lambda count: told(count, total), results))
     except KeyboardInterrupt:
         results.interrupted = True
-    if asked.keep is not None:
-        results.cases = _kept(results.cases, asked.keep)
+    results.cases = _kept(results.cases, asked)
     results.wall_s = time.monotonic() - began
     return results
 
@@ -135,13 +134,15 @@ def _case(failure: Failure, evidence: Evidence) -> Case:
     )
 
 
-def _kept(cases: Sequence[Case], directory: Path) -> list[Case]:
-    """Each failure with its directory."""
+def _kept(cases: Sequence[Case], asked: Asked) -> list[Case]:
+    """Each failure with its directory, if any is asked for."""
+    if asked.keep is None:
+        return list(cases)
     numbered = []
     for number, case in enumerate(cases, 1):
         if case.verdict == "failed":
-            place = directory / f"{number:02d}-{case.handler or 'program'}"
-            keep(case, place)
+            place = asked.keep / f"{number:02d}-{case.handler or 'program'}"
+            keep(case, asked.command, place)
             numbered.append(replace(case, directory=str(place)))
         else:
             numbered.append(case)

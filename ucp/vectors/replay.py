@@ -67,6 +67,8 @@ def play(player: Player, transcript: Path) -> str | None:
             answer = player.give(given)
             if answer.get("unsupported"):
                 return f"not supported: {answer.get('error')}"
+            if "error" in answer and "error" not in expected:
+                return f"line {number}: the agent answers the error {_shown(answer['error'])}"
             stores[number] = (answer.get("answer") or {}).get("store") if given.get("command") == "store" else None
             for where, got, wanted in differences(answer, expected):
                 return f"line {number}: {where} is {_shown(got)}, and should be {_shown(wanted)}"

@@ -59,7 +59,7 @@ def test_of_a_wrong_agent_the_algorithm_is_named(
     assert {case.algorithm for case in results.failures} == {algorithm}
     first = results.failures[0]
     assert first.directory is not None
-    kept = {"failure.txt", "vector.jsonl", *(["air.pcapng"] if first.exchanges else [])}
+    kept = {"failure.txt", "vector.jsonl", "scenario.yaml", *(["air.pcapng"] if first.exchanges else [])}
     assert {path.name for path in Path(first.directory).iterdir()} == kept
     assert to_junit(results).count("<failure") == len(results.failures)
 
