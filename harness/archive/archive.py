@@ -10,9 +10,10 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, Link, read_connectivity, read_link_losses
-from harness.archive.directory import ROGUE_FILE
+from harness.archive.directory import PUBLIC_KEYS_FILE, ROGUE_FILE
 from harness.archive.exports import (
     BEFORE_FINAL_RECONCILE,
     RUN_FILE,
@@ -31,6 +32,9 @@ from harness.archive.trace_lines import Line, read_lines
 from harness.archive.traces import SUFFIX, Trace, read_trace, why_none
 from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
 from harness.errors import RunDirectoryError
+
+if TYPE_CHECKING:
+    from ucp.secure.bundle import PublicKeys
 
 LARGE_BYTES = 16 * 1024 * 1024
 """Traces that are larger together are read without what only took a message in, if that is enough."""
@@ -178,6 +182,28 @@ class RunArchive:
             traces[agent_id] = trace
         return dict(sorted(traces.items())), problems, gaps
 
+    @cached_property
+    def public_keys(self) -> "PublicKeys | None":
+        """Those of a secured mission, beside the run's record or beside the exports; None without, or if unusable."""
+        return self._public_keys[0]
+
+    @cached_property
+    def _public_keys(self) -> tuple["PublicKeys | None", list[str]]:
+        """The public keys, and what is wrong with them."""
+        beside = [*([self.directory] if self.directory else []), *self._agents]
+        path = next((place / PUBLIC_KEYS_FILE for place in beside if (place / PUBLIC_KEYS_FILE).exists()), None)
+        if path is None:
+            return None, []
+        try:
+            from ucp.secure.bundle import load_public
+            from ucp.secure.keyfile import KeyFileError
+        except ModuleNotFoundError:
+            return None, [f"{path}: signatures are not checked without the package cryptography (extra `secure`)"]
+        try:
+            return load_public(path), []
+        except KeyFileError as error:
+            return None, [f"{error}; signatures of blocks are not checked"]
+
     # What was going on around them
 
     def network(self, vehicles: Collection[int]) -> Connectivity:
@@ -207,7 +233,7 @@ class RunArchive:
     def problems(self) -> list[str]:
         """A sentence that names the file for each that cannot be used, or not wholly."""
         before = self._before_final_reconcile.errors
-        return [*self.record_problems, *self._read_traces[1], *self.exports.errors, *before]
+        return [*self.record_problems, *self._read_traces[1], *self._public_keys[1], *self.exports.errors, *before]
 
     @property
     def gaps(self) -> list[str]:

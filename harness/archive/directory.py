@@ -17,7 +17,7 @@ import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from harness.archive import traces
 from harness.archive.connectivity import NETWORK_FILE
@@ -29,7 +29,11 @@ from harness.errors import MachineError, RunDirectoryError
 from netem.radio import Place
 from ucp.files import write_json_atomically
 
+if TYPE_CHECKING:
+    from ucp.secure.bundle import PublicKeys
+
 ROGUE_FILE = "rogue.jsonl"
+PUBLIC_KEYS_FILE = "public.json"
 ROGUE_CONTROL = "rogue.control"
 
 
@@ -102,6 +106,10 @@ class RunDirectory:
         kept.mkdir()
         for path in export_paths(self.path):
             shutil.copyfile(path, kept / path.name)
+
+    def write_public_keys(self, keys: "PublicKeys") -> None:
+        """What everybody may know of a secured mission's keys: by it signatures are checked. Raises OSError."""
+        write_json_atomically(self.path / PUBLIC_KEYS_FILE, keys.to_json())
 
     def append_network(self, record: Mapping[str, Any]) -> None:
         """A change of the network or a fault of agents, at `at_s` mission seconds, as it was made."""

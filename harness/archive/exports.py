@@ -8,7 +8,7 @@ import base64
 import binascii
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +29,9 @@ BEFORE_FINAL_RECONCILE = "before_final_reconcile"
 MAX_EXPORT_BYTES = 64 * 1024 * 1024
 """Some 35,000 blocks."""
 
+MAX_SIGNATURE = 4 * (64 // 3 + 1)
+"""Characters of 64 bytes in base64."""
+
 Hash = Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * HASH_BYTES}}}$")]
 AgentId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]
 
@@ -46,7 +49,7 @@ EventData = Annotated[Base64, Field(max_length=4 * (MAX_EVENT_DATA_BYTES // 3 + 
 
 
 class ExportedBlock(BaseModel):
-    """A block as exported; `chain_hash` is null outside the chain."""
+    """A block as exported; `chain_hash` is null outside the chain. `signature` is its maker's in a secured mission."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -55,6 +58,9 @@ class ExportedBlock(BaseModel):
     event_data: EventData
     block_hash: Hash
     chain_hash: Hash | None
+    signature: Annotated[
+        Base64 | None, Field(max_length=MAX_SIGNATURE, exclude_if=lambda signature: signature is None)
+    ] = None
 
     @property
     def event_bytes(self) -> bytes:
@@ -132,12 +138,12 @@ class ExportMaker:
     """Exports of agents in this process, without a file between. Blocks that agents share are made once."""
 
     def __init__(self) -> None:
-        self._blocks: dict[tuple[bytes, bytes | None], ExportedBlock] = {}
+        self._blocks: dict[tuple[bytes, bytes | None, bytes | None], ExportedBlock] = {}
         self._event_data: dict[bytes, str] = {}
 
-    def export(self, state: AgentState, exported_at_us: int) -> Export:
-        """What `read_export` would read of a file with `ucp.export.export_chain(state, exported_at_us)`."""
-        inception = state.chain.inception
+    def export(self, state: AgentState, exported_at_us: int, signatures: Mapping[bytes, bytes] | None = None) -> Export:
+        """What `read_export` would read of a file with `ucp.export.export_chain` of the same."""
+        inception, signed = state.chain.inception, signatures or {}
         return Export.model_construct(
             schema_=SCHEMA,
             agent_id=state.agent_id,
@@ -147,17 +153,18 @@ class ExportMaker:
                 block_hash=inception.block_hash.hex(),
                 chain_hash=inception.chain_hash.hex(),
             ),
-            chain=[self._block(block, chain_hash) for block, chain_hash in state.chain.with_chain_hashes()],
-            blocks_to_be_committed=[self._block(block, None) for block in state.blocks_to_be_committed],
-            reconcile_stack=[self._block(block, None) for block in state.reconcile_stack],
+            chain=[self._block(block, chain_hash, signed) for block, chain_hash in state.chain.with_chain_hashes()],
+            blocks_to_be_committed=[self._block(block, None, signed) for block in state.blocks_to_be_committed],
+            reconcile_stack=[self._block(block, None, signed) for block in state.reconcile_stack],
             current_block=CurrentBlock.model_construct(event_data=_base64(bytes(state.current_block))),
             reconcile_in_progress=state.reconcile_in_progress,
             idle=state.idle,
             completed=[block_hash.hex() for block_hash in state.completed],
         )
 
-    def _block(self, block: Block, chain_hash: bytes | None) -> ExportedBlock:
-        key = block.block_hash, chain_hash
+    def _block(self, block: Block, chain_hash: bytes | None, signed: Mapping[bytes, bytes]) -> ExportedBlock:
+        signature = signed.get(block.block_hash)
+        key = block.block_hash, chain_hash, signature
         exported = self._blocks.get(key)
         if exported is None:
             event_data = self._event_data.setdefault(block.block_hash, _base64(block.event_data))
@@ -167,6 +174,7 @@ class ExportMaker:
                 event_data=event_data,
                 block_hash=block.block_hash.hex(),
                 chain_hash=chain_hash.hex() if chain_hash else None,
+                signature=_base64(signature) if signature else None,
             )
         return exported
 

@@ -27,6 +27,7 @@ from ucp.trace import HandlerRun, Sent
 
 if TYPE_CHECKING:
     from harness.checker.records import Examination
+    from ucp.secure.bundle import PublicKeys
 
 Sending = tuple[tuple[float, Sent], ...]
 """What an agent sent when with one type and sequence number: one message in each of its lives, at most."""
@@ -109,6 +110,8 @@ class Evidence:
     conditions: list[Condition] | None = None
     """What was taken down of network and faults as it was made; None if nothing was."""
     captures: Captures | None = None
+    public_keys: "PublicKeys | None" = None
+    """Of a secured mission, by which blocks are told to be their makers'."""
     watch: Watch | None = None
     """Is shown each step that the step judge follows."""
 
@@ -301,6 +304,7 @@ def gather(archive: RunArchive) -> Evidence:
         injected,
         archive.conditions(Condition),
         _captures(archive),
+        archive.public_keys,
     )
 
 

@@ -2,12 +2,16 @@
 
 import base64
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from harness.archive.exports import Export, ExportedBlock
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
 from ucp.block import Block, InceptionBlock, next_chain_hash
+
+if TYPE_CHECKING:
+    from ucp.secure.bundle import PublicKeys
 
 NAME = "genuine"
 
@@ -43,8 +47,39 @@ class _Recomputed:
         return True
 
 
+class _Signatures:
+    """Signatures of blocks, each of which is checked once."""
+
+    def __init__(self, keys: "PublicKeys") -> None:
+        self._keys = keys
+        self._checked: dict[tuple[_Content, str | None], str | None] = {}
+
+    def what_is_wrong(self, block: ExportedBlock) -> str | None:
+        """The end of a sentence on the block; None if its maker signed it."""
+        claim = (block.agent_id, block.timestamp_us, block.event_data, block.block_hash), block.signature
+        if claim not in self._checked:
+            self._checked[claim] = self._look(block)
+        return self._checked[claim]
+
+    def _look(self, block: ExportedBlock) -> str | None:
+        from ucp.secure.block_signature import is_signed
+
+        public_key = self._keys.vehicles.get(block.agent_id)
+        if public_key is None:
+            return f"and agent {block.agent_id} has no key in this mission"
+        if block.signature is None:
+            return "without a signature: it was made or edited by somebody without keys"
+        data = Block(block.agent_id, block.timestamp_us, block.event_bytes).block_data()
+        if not is_signed(base64.b64decode(block.signature), public_key, self._keys.mission, data):
+            return f"whose signature is not agent {block.agent_id}'s of this block: it was forged or edited"
+        return None
+
+
 def check(evidence: Evidence) -> Judgement:
     """By the exports, whose hashes are computed anew, and by what every agent says to have completed.
+
+    In a secured mission signatures decide, so that a maker need not have come home. A block that is signed and that its
+    maker is known not to have completed is not genuine all the same: others have its key.
 
     `not applicable` where there is no export, or nothing tells what a maker of blocks completed.
     """
@@ -56,21 +91,27 @@ def check(evidence: Evidence) -> Judgement:
     unknown: set[int] = set()
     blocks = 0
     recomputed = _Recomputed()
+    signatures = _Signatures(evidence.public_keys) if evidence.public_keys else None
     for agent_id, export in evidence.exports.items():
         findings += _hashes_that_do_not_recompute(agent_id, export, evidence, recomputed)
         for block in export.blocks():
             blocks += 1
             on_the_roster = roster is None or block.agent_id in roster
-            if on_the_roster and completed.get(block.block_hash) == block.agent_id:
+            wrong_signature = signatures.what_is_wrong(block) if signatures else None
+            if on_the_roster and not wrong_signature and completed.get(block.block_hash) == block.agent_id:
                 continue  # most are like this
             name = evidence.name(block.block_hash)
             if not on_the_roster:
                 detail = f"holds block {name} of agent {block.agent_id}, which is not on the roster"
+            elif wrong_signature:
+                detail = f"holds block {name}, {wrong_signature}"
             elif block.agent_id not in known:
-                unknown.add(block.agent_id)
+                if not signatures:
+                    unknown.add(block.agent_id)
                 continue
             else:
                 detail = f"holds block {name}, which agent {block.agent_id} never completed"
+                detail += ", signed with its key, which others must have" if signatures else ""
                 detail += _since(evidence.traces.get(agent_id), block.block_hash)
             findings.append(Finding(agent_id, detail, name, block.block_hash))
     for agent_id, export in evidence.before_final_reconcile.items():
@@ -86,8 +127,9 @@ def check(evidence: Evidence) -> Judgement:
             "not applicable",
             f"neither export nor trace tells what {agents(unknown)} completed, so who made their blocks is unknown",
         )
+    made = "signed" if signatures else "completed"
     return Judgement(
-        NAME, "holds", f"all hashes recompute, and each of {blocks} blocks was completed by the agent that it names"
+        NAME, "holds", f"all hashes recompute, and each of {blocks} blocks was {made} by the agent that it names"
     )
 
 

@@ -29,13 +29,17 @@ def bundles_of(scenario: Scenario, secret: bytes) -> Mapping[int, "Bundle"]:
             "leave out `security`"
         ) from None
     if scenario.security.keys == FRESH:
-        fresh = KeySet.derived(secret, scenario.roster)
+        fresh = KeySet.derived(secret, scenario.roster, seals=scenario.security.seal)
         return {agent_id: fresh.bundle(agent_id) for agent_id in scenario.roster}
     directory = Path(scenario.security.keys)
     try:
         bundles = {agent_id: load_bundle(directory / bundle_name(agent_id)) for agent_id in scenario.roster}
     except KeyFileError as error:
         raise ScenarioError(f"`security.keys`: {error}; make keys with `ucp-harness keys new`") from None
+    if scenario.security.seal and any(bundle.public.depot is None for bundle in bundles.values()):
+        raise ScenarioError(
+            f"`security.seal`: the keys in {directory} have no depot's: `ucp-harness keys new` makes one"
+        )
     for agent_id, bundle in bundles.items():
         if bundle.agent_id != agent_id or not {*scenario.roster} <= bundle.public.vehicles.keys():
             raise ScenarioError(

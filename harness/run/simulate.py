@@ -150,12 +150,22 @@ class InMemory:
                 "agents": simulation.played.agents,
             }
         )
-        return Evidence(self._exports(simulation), self._traces, record, [], self._kept, self._injected)
+        return Evidence(
+            self._exports(simulation),
+            self._traces,
+            record,
+            [],
+            self._kept,
+            self._injected,
+            public_keys=simulation.public_keys,
+        )
 
     def _exports(self, simulation: Simulation) -> dict[int, Export]:
         return {
             life.agent.agent_id: Export.model_validate(simulation.export_of(life))
             if life.state is None
-            else self._maker.export(life.state, simulation.timestamp_us(life))
+            else self._maker.export(
+                life.state, simulation.timestamp_us(life), life.secured.signatures if life.secured else None
+            )
             for life in simulation.exporting()
         }

@@ -32,9 +32,10 @@ from netem.errors import ConditionsError
 from sitl.address import Address
 from sitl.plan import PlanError
 from sitl.vehicle import VehicleError
-from ucp.block import MAX_AGENT_ID
+from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
 from ucp.events import EVENT_HEADER_BYTES
 from ucp.quirks import Quirks, in_force
+from ucp.sealed import SEAL_BYTES
 from ucp.settings import Settings
 from ucp.shown import shown
 
@@ -137,7 +138,13 @@ class Scenario(Model):
 
     def settings_of(self, agent_id: int) -> Settings:
         """What the mission tells the agent."""
-        return staggered(self.settings, self.stagger, self.roster.index(agent_id))
+        told = staggered(self.settings, self.stagger, self.roster.index(agent_id))
+        if self.security is not None and self.security.seal:
+            largest = min(told.max_block_bytes, MAX_EVENT_DATA_BYTES - SEAL_BYTES)
+            told = dataclasses.replace(
+                told, max_block_bytes=largest, max_event_bytes=min(told.max_event_bytes, largest)
+            )
+        return told
 
     @property
     def rogue(self) -> int | None:

@@ -12,3 +12,5 @@ class Security(Model):
 
     keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
     """`fresh`: each run has keys of its own. Else the directory with the vehicles' bundles (`ucp-harness keys new`)."""
+    seal: bool = False
+    """Event data is sealed to the depot, too: whoever carries it cannot read it. Blocks have 48 bytes less of it."""

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from harness.play.simulation.foreign.programs import Programs
     from harness.play.simulation.rogue import VirtualRogue
     from harness.play.simulation.secured import Keys, SecuredOwnAgent
+    from ucp.secure.bundle import PublicKeys
 
 ANY_LIFE = 0
 REMEMBERED = 10_000
@@ -74,6 +75,8 @@ class Clockwork:
         self._anybody_is_unknown = scenario.has_wrong_agents or bool(scenario.foreign)
         """Whether anybody may do what no right agent of ours does."""
         self._keys = self._keys_of_agents() if scenario.security else None
+        if self._keys is not None:
+            self._initial_data = self._keys.sealed_to_depot(initial_data)
         self._deliver_all = deliver_all = deliver_all or self._anybody_is_unknown or self._keys is not None
         self._now = 0.0
         self._generating = True
@@ -104,6 +107,11 @@ class Clockwork:
         from harness.play.simulation.foreign.foreigners import Foreigners  # most scenarios have none
 
         return Foreigners(self.scenario, self.seed, self._initial_data, programs, tracing=self._tracing)
+
+    @property
+    def public_keys(self) -> "PublicKeys | None":
+        """Those of the vehicles; None of a mission that is not secured."""
+        return self._keys.public if self._keys else None
 
     def _keys_of_agents(self) -> "Keys":
         from harness.play.simulation.secured import Keys  # needs the extra `secure`

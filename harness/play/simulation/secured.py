@@ -15,8 +15,10 @@ from harness.play.simulation.agents import OwnAgent
 from harness.scenario import Scenario
 from ucp.clock import MICROSECONDS
 from ucp.export import export_chain
+from ucp.sealed import seal_to
 from ucp.secure.agent import SecuredAgent, boot_of
-from ucp.secure.bundle import Bundle
+from ucp.secure.bundle import Bundle, PublicKeys
+from ucp.secure.sealing import seal_of
 from ucp.secure.session import Session
 from ucp.secure.suite import Signed, verify
 from ucp.store import StoredState
@@ -42,8 +44,18 @@ class Keys:
     def __init__(self, scenario: Scenario, seed: int) -> None:
         """Raises HarnessError."""
         self._seed = seed
+        self._seals = scenario.security is not None and scenario.security.seal
         self._bundles: dict[int, Bundle] = dict(bundles_of(scenario, _of_seed(seed, "keys")))
         self._verified: Callable[[Signed], bool] = lru_cache(SIGNATURES_REMEMBERED)(verify)
+
+    @property
+    def public(self) -> PublicKeys:
+        """What everybody may know of them."""
+        return next(iter(self._bundles.values())).public
+
+    def sealed_to_depot(self, initial_data: bytes) -> bytes:
+        """The inception block's data, which says to whom event data is sealed, if it is."""
+        return seal_to(initial_data, self.public.depot) if self._seals and self.public.depot else initial_data
 
     def agent(self, agent_id: int, life: int, now: float) -> Callable[..., SecuredOwnAgent]:
         """What makes the agent of a life that begins `now`, in mission seconds; lives are counted from 1."""
@@ -52,7 +64,9 @@ class Keys:
             self._bundles[agent_id] = bundle
 
         boot = boot_of(round(now * MICROSECONDS) + life, _of_seed(self._seed, f"boot {agent_id} {life}")[:8])
-        return partial(SecuredOwnAgent, Session(self._bundles[agent_id], boot, keep, self._verified))
+        bundle = self._bundles[agent_id]
+        session = Session(bundle, boot, keep, self._verified)
+        return partial(SecuredOwnAgent, session, seal=seal_of(bundle) if self._seals else None)
 
 
 def _of_seed(seed: int, what: str) -> bytes:

@@ -83,6 +83,8 @@ class VirtualTime(Backend):
                 programs=programs,
             )
             try:
+                if simulation.public_keys is not None:
+                    rundir.write_public_keys(simulation.public_keys)
                 yield simulation
             except InterruptedRunError as error:
                 simulation.played.end_early("interrupted", error)
