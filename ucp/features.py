@@ -16,6 +16,7 @@ UNSUPPORTED = 127
 FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "store": lambda mission: mission.get("store") is not None,
     "telemetry": lambda mission: mission["events"]["source"] == "mavlink",
+    "secured": lambda mission: mission.get("security") is not None,
     "quirks": lambda mission: any(mission["quirks"].values()),
     "vote_names_chain": lambda mission: mission["settings"]["vote_names_chain"],
     "changed_before_tally": lambda mission: mission["settings"]["changed_before_tally"],

@@ -56,6 +56,13 @@ class EventSource:
 
 
 @dataclass(frozen=True)
+class Security:
+    """The mission is secured. `bundle` is the file with the agent's keys, as seen from the mission file's directory."""
+
+    bundle: str
+
+
+@dataclass(frozen=True)
 class Mission:
     """`epoch_us` is the mission's start, microseconds since the Unix epoch; None waits for the command `start`.
 
@@ -74,6 +81,7 @@ class Mission:
     speedup: float
     epoch_us: int | None
     store: str | None = None
+    security: Security | None = None
 
 
 def load_mission(path: Path) -> Mission:
@@ -126,6 +134,7 @@ def parse_mission(document: Any) -> Mission:
         speedup=_positive(document, "speedup", MAX_SPEEDUP),
         epoch_us=epoch_us,
         store=store,
+        security=_security(document.get("security")),
     )
 
 
@@ -218,6 +227,15 @@ def _settings(document: Any) -> Settings:
         return Settings(**_known(document, "settings", Settings))
     except (TypeError, ValueError) as error:
         raise MissionError(f"`settings`: {error}") from None
+
+
+def _security(document: Any) -> Security | None:
+    if document is None:
+        return None
+    bundle = document.get("bundle") if isinstance(document, dict) else None
+    if not (isinstance(bundle, str) and bundle.isprintable() and bundle):
+        raise MissionError("`security` must have the path of a file with keys as its `bundle`, or be null")
+    return Security(bundle)
 
 
 def _quirks(document: Any) -> dict[str, bool | float]:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from ucp.agent import Agent
 from ucp.clock import MissionClock
@@ -25,10 +25,14 @@ from ucp.export import export_chain
 from ucp.features import UNSUPPORTED
 from ucp.files import LogFile, TraceFile, write_json_atomically
 from ucp.loop import Loop, Timer
+from ucp.messages import MalformedDatagramError
 from ucp.mission import Mission, MissionError, UnsupportedMissionError, is_epoch, load_mission
 from ucp.status import status_of
 from ucp.store import Store, StoreError
 from ucp.trace import Commanded, Entry, HandlerRun, header_line
+
+if TYPE_CHECKING:
+    from ucp.secure.agent import SecuredAgent
 
 MAX_READ_BYTES = 65536
 DATAGRAMS_PER_TURN = 64
@@ -38,14 +42,16 @@ WRONG_MISSION = 2
 class Node:
     """Files go to `directory`; `loop` is the main loop of whoever has one (examples/ros2 is one of rclpy).
 
-    Raises OSError if the port or a file cannot be had, StoreError for another's store.
+    Raises OSError if the port or a file cannot be had, StoreError for another's store, MissionError for keys that are
+    none.
     """
 
     def __init__(self, mission: Mission, directory: Path, loop: Loop | None = None) -> None:
         self.mission = mission
+        self._log_file = LogFile(directory / f"{mission.agent_id}.log")
         self.clock = MissionClock(mission.speedup)
         self._lots = Random(mission.seed)  # of what is random about its quirks
-        self.agent = Agent(
+        self.agent = self._maker_of_agents(mission, directory)(
             mission.agent_id,
             mission.roster,
             mission.initial_data,
@@ -53,13 +59,13 @@ class Node:
         )
         if any(mission.quirks.values()):
             self._make_wrong()
+        self._secured = None if mission.security is None else cast("SecuredAgent", self.agent)
         self.generating = False
         self.handled = 0
         self.bytes_sent = 0
         self.send_failures = 0
         self._born_s = 0.0  # mission seconds at which the agent joined a mission that was under way
         self._directory = directory
-        self._log_file = LogFile(directory / f"{mission.agent_id}.log")
         self._trace = TraceFile(directory / f"{mission.agent_id}.trace.jsonl")
         self._store = Store(directory / mission.store, self.agent.state) if mission.store else None
         self._socket = _broadcast_socket(mission)
@@ -77,9 +83,25 @@ class Node:
                 "export": self._export_command,
                 "quirk": self._quirk,
                 "reconcile": self._reconcile,
+                **({} if self._secured is None else {"revoke": self._revoke}),
             },
             self._loop,
         )
+
+    def _maker_of_agents(self, mission: Mission, directory: Path) -> "Callable[..., Agent]":
+        if mission.security is None:
+            return Agent
+        try:
+            from ucp.secure.vehicle import secured_agent  # needs the extra `secure`
+        except ModuleNotFoundError as error:
+            raise UnsupportedMissionError(
+                f"needs the feature 'secured', and {error.name} is not installed here"
+            ) from None
+
+        def not_erased(error: OSError) -> None:
+            self._say(f"the group's last secret is still on disk: {error.strerror}")
+
+        return secured_agent(mission, directory, not_erased)
 
     def run(self) -> int:
         """Serve until SIGTERM or SIGINT; the exit status, 1 if the chain could not be exported."""
@@ -116,7 +138,8 @@ class Node:
         """Write the chain export whole or not at all. Raises OSError."""
         path = self._directory / f"{self.mission.agent_id}.chain.json"
         now = self.clock.now()
-        write_json_atomically(path, export_chain(self.agent.state, self.clock.timestamp_us(now)))
+        signatures = None if self._secured is None else self._secured.signatures
+        write_json_atomically(path, export_chain(self.agent.state, self.clock.timestamp_us(now), signatures))
         return path
 
     def _make_wrong(self) -> None:
@@ -179,7 +202,8 @@ class Node:
         runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
         self.handled += len(runs)
         if self._store is not None and self._store.problem is None:
-            self._store.write([change for run in runs for change in run.changes])
+            secured = None if self._secured is None else self._secured.secured_state()
+            self._store.write([change for run in runs for change in run.changes], secured)
             if self._store.problem:
                 self._say(f"the store ends here: {self._store.problem}")
         if self._trace.problem is None:
@@ -200,6 +224,7 @@ class Node:
                 self.mission.initial_data,
                 self.mission.settings.told(),
                 {"epoch_us": epoch_us, "speedup": self.mission.speedup},
+                self._secured is not None,
             )
         )
         if self._store is not None and self._store.recovered is not None:
@@ -311,6 +336,19 @@ class Node:
         if self.clock.running:
             self._keep([Commanded(self.clock.now(), str(request.get("command")), request)])
 
+    def _revoke(self, request: dict[str, Any]) -> dict[str, Any]:
+        revocation = request.get("revocation")
+        agent = self._secured
+        assert agent is not None, "no other has this command"
+        if not self.clock.running:
+            raise CommandError("the mission has not started")
+        try:
+            self._drive(partial(agent.revoke, base64.b64decode(revocation, validate=True)))  # type: ignore[arg-type]
+        except (TypeError, ValueError) as error:
+            why = str(error) if isinstance(error, MalformedDatagramError) else "not in base64"
+            raise CommandError(f"no revocation: {why}") from None
+        return {"revoked": sorted(agent.revocation.revoked) if agent.revocation else []}
+
     def _reconcile(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.clock.running:
             raise CommandError("the mission has not started")
@@ -351,6 +389,9 @@ def main(arguments: list[str], node: Callable[[Mission, Path], Node] = Node) -> 
 
     try:
         return node(mission, path.parent).run()
+    except MissionError as error:
+        sys.stderr.write(f"{path}: {error}\n")
+        return UNSUPPORTED if isinstance(error, UnsupportedMissionError) else WRONG_MISSION
     except StoreError as error:
         sys.stderr.write(f"{error}\n")
         return WRONG_MISSION

@@ -16,7 +16,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -43,8 +43,16 @@ class SecuredState:
     """
 
     started_us: int
-    signatures: dict[bytes, bytes] = field(default_factory=dict, repr=False)
+    signatures: Mapping[bytes, bytes] = field(default_factory=dict, repr=False)
     revocation: bytes | None = None
+
+    def replay(self, entry: dict[str, Any]) -> None:
+        """Take what an entry has of it, which is what was new then."""
+        self.started_us = max(self.started_us, int(entry.get("started_us", 0)))
+        new = {bytes.fromhex(name): base64.b64decode(text) for name, text in entry.get("signatures", {}).items()}
+        self.signatures = {**self.signatures, **new}
+        if (revocation := entry.get("revocation")) is not None:
+            self.revocation = base64.b64decode(revocation)
 
 
 @dataclass(slots=True)
@@ -107,6 +115,10 @@ class StoredState:
             known[block.block_hash.hex()] = block
         for operation, block_hash in entry["changes"]:
             self._change(operation, known[block_hash])
+        if "secured" in entry:
+            if self.secured is None:
+                self.secured = SecuredState(0)
+            self.secured.replay(entry["secured"])
 
 
 class Store:
@@ -126,6 +138,8 @@ class Store:
             "inception": state.chain.inception.block_hash.hex(),
         }
         self._written: set[str] = set()
+        self._secured: SecuredState | None = None
+        """As it was written last in this life."""
         self._file: BinaryIO | None = None
         self.recovered = self._read()
 
@@ -162,15 +176,22 @@ class Store:
         stored.check()
         return stored
 
-    def write(self, changes: list[Change]) -> None:
-        """Have these changes, of one input to the agent, on disk. The first of a life name all that was found."""
-        if self.problem is not None or not changes:
+    def write(self, changes: list[Change], secured: SecuredState | None = None) -> None:
+        """Have these changes, of one input to the agent, on disk. The first of a life name all that was found.
+
+        With them goes what is new of what a `secured` agent keeps.
+        """
+        if self.problem is not None:
+            return
+        beside = {} if secured is None else self._new_of(secured)
+        if not (changes or beside):
             return
         new = dict.fromkeys(block_hash for _, block_hash in changes if block_hash not in self._written)
         blocks = [self._block(block_hash) for block_hash in new]
         entry = {
             "changes": changes,
-            "blocks": [[block.agent_id, block.timestamp_us, _base64(block)] for block in blocks],
+            "blocks": [[block.agent_id, block.timestamp_us, _base64(block.event_data)] for block in blocks],
+            **({"secured": beside} if beside else {}),
         }
         try:
             if self._file is None:
@@ -180,6 +201,19 @@ class Store:
         except OSError as error:
             self.problem = error.strerror or str(error)
         self._written.update(new)
+
+    def _new_of(self, secured: SecuredState) -> dict[str, Any]:
+        """What an entry has of it."""
+        before, self._secured = self._secured, secured
+        new: dict[str, Any] = {}
+        if before is None:
+            new["started_us"] = secured.started_us
+            before = SecuredState(secured.started_us)
+        if signed := secured.signatures.keys() - before.signatures.keys():
+            new["signatures"] = {name.hex(): _base64(secured.signatures[name]) for name in sorted(signed)}
+        if secured.revocation is not None and secured.revocation != before.revocation:
+            new["revocation"] = _base64(secured.revocation)
+        return new
 
     def _begin(self, lines: bytes) -> BinaryIO:
         """A journal that begins with these lines, in the place of what was there."""
@@ -259,5 +293,5 @@ def _entries(path: Path) -> Iterator[Any]:
             yield json.loads(text)
 
 
-def _base64(block: Block) -> str:
-    return base64.b64encode(block.event_data).decode("ascii")
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

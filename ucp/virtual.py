@@ -68,6 +68,8 @@ class VirtualAgent:
             self._mission = mission = parse_mission(given["mission"])
         except MissionError as error:
             raise InputError(str(error), unsupported=isinstance(error, UnsupportedMissionError)) from None
+        if mission.security is not None:
+            raise InputError("in virtual time this agent takes no keys", unsupported=True)
         if mission.epoch_us is None:
             raise InputError("`epoch_us` of the mission must be a whole number: in virtual time nobody says `start`")
         self._epoch_us = mission.epoch_us

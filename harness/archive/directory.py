@@ -50,6 +50,8 @@ class RunDirectory:
         self.vehicles = self.path / "vehicles"
         self.lab_log = self.path / "lab.log"
         self.rogue_log = self.path / "rogue.log"
+        self.keys: Mapping[int, Path] = {}
+        """Where each vehicle has its keys while it is played: elsewhere, for nothing secret is kept here."""
         claim(path, self.agents, self.vehicles)
 
     def vehicle(self, vehicle_id: int, life: int = 1) -> Path:

@@ -12,6 +12,7 @@ from harness.archive.played import scenario_of
 from harness.archive.runs import RUNS
 from harness.commands.terminal import complain, print_json
 from harness.run.sweep import cores
+from harness.scenario import Scenario
 
 SEEDS = 1000
 _DURATION = re.compile(r"(\d{1,9}(?:\.\d{1,6})?)(s|m|h|)")
@@ -34,6 +35,7 @@ def explore_command(
         int | None, typer.Option(min=0, help="The first of them; 0, or that of RUN, if not given.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="File of the smallest run; must be new.")] = None,
+    secured: Annotated[bool, typer.Option("--secured", help="With fresh keys, if the scenario has none.")] = False,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
     ] = None,
@@ -65,11 +67,11 @@ def explore_command(
             raise typer.BadParameter(
                 "a hunt (--for, --runs) needs no --seeds and no --out: its findings are in --corpus"
             )
-        _hunt(scenario, first_seed, for_time, runs, corpus, jobs, as_json)
+        _hunt(scenario, secured, first_seed, for_time, runs, corpus, jobs, as_json)
     if corpus is not None or as_json:
         raise typer.BadParameter("--corpus and --json are for a hunt: add --for TIME or --runs NUMBER")
     console = Console()
-    request, own_seed = scenario_of(scenario)
+    request, own_seed = _asked(scenario, secured)
     if first_seed is None:
         first_seed = own_seed or 0
     with explore.watching(console) as watcher:
@@ -84,8 +86,15 @@ def explore_command(
     raise typer.Exit(explored.exit_status)
 
 
+def _asked(scenario: Path, secured: bool) -> tuple[Scenario, int | None]:
+    """The scenario, and the seed of the run that it was."""
+    request, own_seed = scenario_of(scenario)
+    return request.secured() if secured else request, own_seed
+
+
 def _hunt(
     scenario: Path,
+    secured: bool,
     first_seed: int | None,
     for_time: str | None,
     runs: int | None,
@@ -95,7 +104,7 @@ def _hunt(
 ) -> None:
     from harness.explore import guided  # pages take long to import
 
-    request, own_seed = scenario_of(scenario)
+    request, own_seed = _asked(scenario, secured)
     directory = corpus or RUNS / _directory_name(request.name)
     with guided.watching(Console(stderr=True)) as watcher:
         night = guided.spend(

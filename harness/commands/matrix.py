@@ -37,6 +37,7 @@ def matrix_command(
     coverage: Annotated[
         bool, typer.Option("--coverage", help="Also say how much of the protocol the runs have tried; takes longer.")
     ] = False,
+    secured: Annotated[bool, typer.Option("--secured", help="With fresh keys, if the scenario has none.")] = False,
     nights: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Keep this night there, and draw the trend of those that are there."),
@@ -44,6 +45,8 @@ def matrix_command(
 ) -> None:
     """Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated."""
     request = matrix.load_matrix(file, backend)
+    if secured:
+        request = request.model_copy(update={"scenario": request.scenario.secured()})
     baseline = load_baseline(against, request) if against else None
     kept = nights_of_matrix.opened(nights) if nights else None
     directory = (out or default_path(request.name)).absolute()

@@ -57,6 +57,7 @@ def run_command(
     capture: Annotated[
         bool, typer.Option("--capture", help="Keep each frame that a vehicle sent or got, in capture/<ID>.pcapng.")
     ] = False,
+    secured: Annotated[bool, typer.Option("--secured", help="With fresh keys, if the scenario has none.")] = False,
     image_from_host: Annotated[
         bool, typer.Option("--image-from-host", help="Containers of this machine's own files: no image is built.")
     ] = False,
@@ -76,6 +77,8 @@ def run_command(
     console = Console()
     asked, own_seed = scenario_of(scenario)
     request = _with_options(asked, speedup, vehicles, gcs, capture, image_from_host)
+    if secured:
+        request = request.secured()
     directory = (out or default_path(request.name)).absolute()
     seed = own_seed if seed is None else seed
     chosen_seed = secrets.randbelow(2**32) if seed is None else seed
@@ -92,6 +95,7 @@ def run_command(
         options = {"--seed": chosen_seed, "--out": directory, "--speedup": speedup, "--vehicles": vehicles}
         given = [f"{option}={value}" for option, value in options.items() if value is not None]
         given += ["--capture"] if capture else []
+        given += ["--secured"] if secured else []
         console.print("Booting User Mode Linux.", style="dim")
         raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)

@@ -1,6 +1,12 @@
-"""The keys of a secured mission's vehicles: fresh ones, or those of a directory."""
+"""The keys of a secured mission's vehicles: fresh ones, or those of a directory; and how they are handed out.
 
-from collections.abc import Mapping
+Programs find theirs outside of the run directory, which holds no secret, and only while the run goes on.
+"""
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +17,7 @@ if TYPE_CHECKING:
     from ucp.secure.bundle import Bundle
 
 FRESH = "fresh"
+FRESH_BYTES = 32
 
 
 def bundles_of(scenario: Scenario, secret: bytes) -> Mapping[int, "Bundle"]:
@@ -47,3 +54,35 @@ def bundles_of(scenario: Scenario, secret: bytes) -> Mapping[int, "Bundle"]:
                 f"{len(scenario.roster)} such agents: make keys for this roster with `ucp-harness keys new`"
             )
     return bundles
+
+
+class Handed:
+    """Each vehicle's directory with its bundle, which nobody else reads; none of a mission that is not secured."""
+
+    def __init__(self, bundles: Mapping[int, "Bundle"], directory: Path) -> None:
+        self._bundles = bundles
+        self.directories = {agent_id: directory / str(agent_id) for agent_id in bundles}
+
+    def hand(self, agent_id: int, *, kept: bool) -> Path | None:
+        """The vehicle's bundle, anew from home unless what it had is `kept`. Raises OSError."""
+        directory = self.directories.get(agent_id)
+        if directory is None:
+            return None
+        from ucp.secure.bundle import bundle_name, write_bundle
+
+        directory.mkdir(exist_ok=True)
+        path = directory / bundle_name(agent_id)
+        if not (kept and path.exists()):
+            write_bundle(path, self._bundles[agent_id])
+        return path
+
+
+@contextmanager
+def handed_out(scenario: Scenario) -> Iterator[Handed]:
+    """The vehicles' keys, until the run is over. Raises as `bundles_of`, and OSError."""
+    bundles = bundles_of(scenario, os.urandom(FRESH_BYTES))
+    if not bundles:
+        yield Handed({}, Path())
+        return
+    with tempfile.TemporaryDirectory(prefix="ucp-keys-") as directory:
+        yield Handed(bundles, Path(directory))

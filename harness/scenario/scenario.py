@@ -136,6 +136,10 @@ class Scenario(Model):
         """The agents' IDs, ascending."""
         return tuple(range(1, self.agents + 1)) if isinstance(self.agents, int) else tuple(sorted(self.agents))
 
+    def secured(self) -> "Scenario":
+        """The same with keys; fresh ones if it has none."""
+        return self if self.security else self.model_copy(update={"security": Security()})
+
     def settings_of(self, agent_id: int) -> Settings:
         """What the mission tells the agent."""
         told = staggered(self.settings, self.stagger, self.roster.index(agent_id))

@@ -24,7 +24,7 @@ from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER
 from ucp.features import FEATURES, needed
 from ucp.messages import RequestForBlock, encode
 from ucp.schemas.control import MAY_BE_MISSING, REQUESTS, STATUS
-from ucp.schemas.trace import DROPS, OPERATIONS
+from ucp.schemas.trace import DROPS, OPERATIONS, SECURED_DROPS
 from ucp.settings import Settings
 from ucp.vectors.replay import differences
 
@@ -75,7 +75,7 @@ def test_the_page_has_each_handler_with_its_number_and_each_of_its_branches() ->
         [message.NAME for message in ON_MESSAGE],
         ON_TIMER,
         OPERATIONS,
-        DROPS,
+        [*DROPS, *SECURED_DROPS],
         FEATURES,
         [setting.name for setting in fields(Settings)],
         [f'{{"command": "{command}"' for command in REQUESTS],
@@ -154,7 +154,7 @@ def test_mission_files_fit_their_schema_and_name_the_features_that_they_need() -
     )
     told = {"address": "10.0.0.1", "broadcast": "10.0.0.255"}
     without = mission_file(1, plain, 0, b"", with_vehicle=False, **told)
-    with_all = mission_file(1, rich, 0, b"", with_vehicle=True, store="1.store", **told)
+    with_all = mission_file(1, rich, 0, b"", with_vehicle=True, store="1.store", bundle="1.bundle.json", **told)
     assert (without["contract"], without["features"]) == (2, [])
     assert with_all["features"] == [*FEATURES] == needed(with_all)
     for document in (without, with_all):

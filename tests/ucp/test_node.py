@@ -60,16 +60,17 @@ class AgentUnderTest:
     def __init__(self, directory: Path, document: dict[str, Any]) -> None:
         self.directory = directory
         self.document = document
-        path = directory / "7.mission.json"
+        self.name = str(document["agent_id"])
+        path = directory / f"{self.name}.mission.json"
         path.write_text(json.dumps(document))
         self.process = subprocess.Popen(
             [sys.executable, "-m", "ucp.node", str(path)], stderr=subprocess.PIPE, text=True
         )
-        self.wait_for(lambda: (directory / "7.control").exists() or self.process.poll() is not None)
+        self.wait_for(lambda: (directory / f"{self.name}.control").exists() or self.process.poll() is not None)
 
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         async def ask() -> dict[str, Any]:
-            control = AgentControl(self.directory / "7.control")
+            control = AgentControl(self.directory / f"{self.name}.control")
             try:
                 return await control.ask(command, timeout_s=DEADLINE_S, **arguments)
             finally:

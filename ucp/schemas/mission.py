@@ -69,6 +69,7 @@ def schema() -> Schema:
             "speedup": ABOVE_0 | {"maximum": MAX_SPEEDUP},
             "epoch_us": {"type": ["integer", "null"], "minimum": 0, "maximum": LATEST_EPOCH_US},
             "store": {"type": ["string", "null"], "minLength": 1},
+            "security": {"oneOf": [{"type": "null"}, record({"bundle": {"type": "string", "minLength": 1}})]},
         },
-        optional=("contract", "features", "settings", "quirks", "epoch_us", "store"),
+        optional=("contract", "features", "settings", "quirks", "epoch_us", "store", "security"),
     )

@@ -10,6 +10,7 @@ were dropped are there as they came.
 
 import struct
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from ucp.agent import Agent, why_not_handled
@@ -182,5 +183,8 @@ class SecuredAgent(Agent):
             if self.started_us <= secured.started_us:
                 self.session.boot = boot_of(secured.started_us + 1, self.session.boot[_BOOT_TIME.size :])
             if secured.revocation is not None:
-                self.revocation = Revocation.decode(secured.revocation, self.session.authority, self.session.mission)
+                with suppress(RevocationError):  # of keys that it had before
+                    self.revocation = Revocation.decode(
+                        secured.revocation, self.session.authority, self.session.mission
+                    )
         super().boot(recovered, now)

@@ -3,6 +3,7 @@
 hashes.py    events, blocks, inception blocks and chains: bytes and hashes
 messages.py  every message as a datagram
 drops.py     datagrams that are dropped, and why
+secured.py   secured datagrams, which need the extra `secure`
 blocks.py    after which event a block is full, and its timestamp
 missions.py  whole missions in virtual time, input by input
 """
@@ -17,11 +18,19 @@ from ucp.vectors import blocks, drops, hashes, messages, missions
 
 DIRECTORY = Path(__file__).parent
 
+
+def _secured() -> Any:
+    from ucp.vectors import secured  # draws in cryptography, which who replays missions need not have
+
+    return secured.vectors()
+
+
 DOCUMENTS: dict[str, Callable[[], Any]] = {
     "hashes": hashes.vectors,
     "messages": messages.vectors,
     "drops": drops.vectors,
     "blocks": blocks.vectors,
+    "secured": _secured,
 }
 """Name of a file -> what it has."""
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from harness.errors import RunDirectoryError
+from harness.errors import RunDirectoryError, ScenarioError
 from harness.play.containers import images, ownership
 from harness.play.containers.backend import Containers
 from harness.play.containers.images import Image
@@ -40,6 +40,8 @@ def write_compose(
     scenario: Scenario, seed: int, kinds: dict[VehicleType, VehicleKind], system_ids: dict[int, int], file: Path
 ) -> Path:
     """Write `file` and the directory beside it, which is returned. Raises RunDirectoryError if one is there already."""
+    if scenario.security:
+        raise ScenarioError("`security` needs keys, which no compose file hands out: leave it out, or --emit-compose")
     beside = file.with_suffix("")
     for path in (file, beside):
         if path.exists():

@@ -44,11 +44,11 @@ LOOK_EVERY_S = 5.0
 class ContainerLab:
     """Made by `ContainerLab.open` only. Errors are DockerError, and netem's."""
 
-    def __init__(self, engine: Engine, rundir: Path, scenario: Scenario) -> None:
+    def __init__(self, engine: Engine, rundir: RunDirectory, scenario: Scenario) -> None:
         self._engine = engine
         self._rundir = rundir
         self._docker = scenario.docker
-        self._name = ownership.run_name(rundir)
+        self._name = ownership.run_name(rundir.path)
         self._in_named = set(images.agents_in_named(scenario))
         self._ours: Image | None = None
         self._named: Image | None = None
@@ -68,7 +68,7 @@ class ContainerLab:
     async def open(cls, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "ContainerLab":
         """Bring up the network with a holder for each vehicle. Raises DockerError, or as netem.lab.Lab.open does."""
         engine = await asyncio.to_thread(Engine.connect)
-        lab = cls(engine, rundir.path, scenario)
+        lab = cls(engine, rundir, scenario)
         try:
             await lab._choose_images(scenario, say)
             say("starting containers")
@@ -231,7 +231,8 @@ class ContainerLab:
         self._lives[vehicle, role] += 1
         life = self._lives[vehicle, role]
         name = f"{self._name}-{role}-{vehicle}" + (f"-{life}" if life > 1 else "")
-        given = recipe(self._engine.api, image, argv, self._rundir, network, limits)
+        kept = [self._rundir.path, *([self._rundir.keys[vehicle]] if vehicle in self._rundir.keys else [])]
+        given = recipe(self._engine.api, image, argv, kept, network, limits)
         labels = ownership.labels(self._name, vehicle, role)
         try:
             made = await self._engine.ask(

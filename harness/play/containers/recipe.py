@@ -17,14 +17,17 @@ INIT = 1
 
 
 def recipe(
-    api: docker.APIClient, image: Image, argv: Sequence[str], rundir: Path, network_mode: str, limits: Docker
+    api: docker.APIClient, image: Image, argv: Sequence[str], kept: Sequence[Path], network_mode: str, limits: Docker
 ) -> dict[str, Any]:
-    """Keywords for the SDK's create_container: no capability, no way to write but into the run directory and /tmp."""
+    """Keywords for the SDK's create_container: no capability, no way to write but into /tmp and what is `kept`.
+
+    That is the run directory, and where the vehicle has its keys, if it has any.
+    """
     command = image.command(argv)
     shared = [Mount(str(path), str(path), type="bind", read_only=True) for path in image.shared(argv)]
     host_config = api.create_host_config(
         network_mode=network_mode,
-        mounts=[*shared, Mount(str(rundir), str(rundir), type="bind")],
+        mounts=[*shared, *(Mount(str(path), str(path), type="bind") for path in kept)],
         tmpfs={"/tmp": ""},  # noqa: S108  (the container's own)
         read_only=True,
         init=True,

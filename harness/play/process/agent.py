@@ -22,6 +22,7 @@ from harness.archive.directory import RunDirectory
 from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
 from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError, UnsupportedError
 from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, AgentUnsupportedError, Status
+from harness.play.keys import Handed
 from harness.play.last_words import UNSUPPORTED, last_words, last_words_in, of_a_shell
 from harness.play.process.lab import MissionLab, Program
 from harness.play.process.mission_file import mission_file
@@ -132,14 +133,16 @@ class AgentProcess:
         initial_data: bytes,
         with_vehicle: bool,
         keeps_disk: bool,
-        epoch_us: int | None = None,
+        epoch_us: int | None,
+        keys: Handed,
     ) -> None:
         """Start the program and wait until it answers; with `epoch_us` it joins the mission that began then.
 
-        With `keeps_disk` it stores what it holds, to be rebooted with it.
+        With `keeps_disk` it stores what it holds, to be rebooted with it. `keys` are the mission's, if it is secured.
         Raises AgentFailedError, AgentRefusedError, UnsupportedError; ScenarioError for a program that is none.
         """
         life = self._begin_life()
+        bundle = keys.hand(self.agent_id, kept=life.reboot)
         mission = mission_file(
             self.agent_id,
             scenario,
@@ -151,6 +154,7 @@ class AgentProcess:
             life=len(self._lives),
             epoch_us=epoch_us,
             store=os.path.relpath(life.store, life.directory) if keeps_disk else None,
+            bundle=None if bundle is None else str(bundle),
         )
         path = self._rundir.write_mission(life.directory, self.agent_id, mission)
         output = self._log

@@ -15,6 +15,7 @@ from typing import Any, Self
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
 from harness.play.control import AgentRefusedError, Status
+from harness.play.keys import Handed, handed_out
 from harness.play.mission import RunOutcome, Sought
 from harness.play.process.agent import AgentProcess, reboots_with_disk
 from harness.play.process.lab import MissionLab, OpenLab
@@ -84,6 +85,7 @@ class ProcessRun:
         self.agents = [
             AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now) for agent_id in scenario.roster
         ]
+        self._keys: Handed
         self._capture: LiveCapture | None = None
         self._station: GroundStation | None = None
         self._reach = RadioRange(scenario)
@@ -106,6 +108,13 @@ class ProcessRun:
 
         All else that goes wrong is in `played`.
         """
+        with handed_out(self.scenario) as self._keys:
+            self.rundir.keys = self._keys.directories
+            async with self._in_lab():
+                yield self
+
+    @asynccontextmanager
+    async def _in_lab(self) -> AsyncIterator[None]:
         try:
             lab = await unless_interrupted(self._open_lab(self.scenario, self.rundir, self._show), self.interrupted)
         except HarnessError:
@@ -119,7 +128,7 @@ class ProcessRun:
             self.played.engine = lab.engine
             try:
                 async with self._watchers.guard(self._watch_for_interruption(), lab.watch()):
-                    yield self
+                    yield
             except HarnessError as error:
                 self._ended_early(error)
             except CaptureError as error:
@@ -223,7 +232,9 @@ class ProcessRun:
         with_vehicle = bool(self.vehicles)
         keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
         epoch_us = self.clock.epoch_us
-        await agent.start(lab, self.scenario, self.seed, self.initial_data, with_vehicle, keeps_disk, epoch_us)
+        await agent.start(
+            lab, self.scenario, self.seed, self.initial_data, with_vehicle, keeps_disk, epoch_us, self._keys
+        )
         self._watchers.start(agent.watch(), of=f"agent {agent.agent_id}")
 
     async def _start_clock(self) -> None:

@@ -27,8 +27,12 @@ def mission_file(
     life: int = 1,
     epoch_us: int | None = None,
     store: str | None = None,
+    bundle: str | None = None,
 ) -> dict[str, Any]:
-    """`seed` is the run's; an agent has one of its own in each `life`. With `epoch_us` it joins a mission under way."""
+    """`seed` is the run's; an agent has one of its own in each `life`. With `epoch_us` it joins a mission under way.
+
+    `bundle` is the file with its keys, in a secured mission.
+    """
     events = scenario.events
     document = {
         "schema": SCHEMA,
@@ -53,6 +57,8 @@ def mission_file(
         "epoch_us": epoch_us,
         "store": store,
     }
+    if bundle is not None:
+        document["security"] = {"bundle": bundle}
     return document | {"features": needed(document)}
 
 
