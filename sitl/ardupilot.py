@@ -10,17 +10,37 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shutil
+import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
-from sitl.installed import BINARIES, DEFAULTS, current, install_command
-from sitl.vehicle import Home, Launch, NoBinaryError, UnusableBinaryError, VehicleError, VehicleType, check_launch
+from sitl.airframes import BINARIES, Airframe, airframe
+from sitl.installed import current, install_command
+from sitl.parameters import in_lines
+from sitl.places import autotest
+from sitl.setup import USUAL as USUAL_SETUP
+from sitl.setup import Debugger, Setup
+from sitl.vehicle import (
+    Home,
+    Launch,
+    NoBinaryError,
+    NoProgramError,
+    UnusableBinaryError,
+    VehicleError,
+    VehicleType,
+    check_launch,
+)
 
-MODELS: dict[VehicleType, str] = {"copter": "+", "plane": "plane", "rover": "rover"}
 OWN_DEFAULTS = "vehicle.parm"
 ENVIRONMENT = "ARDUPILOT_SITL"  # a directory that holds binaries and, better, their default parameters
+
+ANSWER_LIMIT_S = 5.0  # of our time
+PATIENT_S = 32_000.0  # simulated; LOG_FILE_TIMEOUT has 16 bits
+MAX_SHOWN = 60
 
 WAY_OUT = "give the path of an ArduPilot SITL binary, or fly embedded vehicles"
 
@@ -38,29 +58,50 @@ _ELF_NAMES = {number: name for machines in _ELF_MACHINES.values() for number, na
 
 @dataclass(frozen=True)
 class ArduPilot:
-    """The `VehicleKind` of real vehicles: an executable and, when it has any beside it, its default parameters."""
+    """The `VehicleKind` of real vehicles: an executable, `defaults` that lie beside it, and how it is set up.
+
+    `missing` are default parameters of its frame that do not.
+    """
 
     binary: Path
-    defaults: Path | None = None
+    defaults: tuple[Path, ...] = ()
     vehicle_type: VehicleType = "copter"
+    setup: Setup = USUAL_SETUP
+    missing: tuple[str, ...] = ()
     name: str = "ardupilot"
+
+    @property
+    def frame(self) -> str:
+        """What its program calls its frame."""
+        return self._airframe.model
+
+    @property
+    def _airframe(self) -> Airframe:
+        return airframe(self.setup.frame, self.vehicle_type)
 
     @property
     def lack(self) -> str | None:
         """Without its default parameters a vehicle may refuse to arm."""
-        if self.defaults is not None:
+        if not self.missing:
             return None
-        return f"it flew without default parameters: put ArduPilot's {DEFAULTS[self.vehicle_type]} beside {self.binary}"
+        files = " and ".join(self.missing)
+        return f"it flew without default parameters: put ArduPilot's {files} beside {self.binary}"
 
     @classmethod
-    def find(cls, binary: Path | None, environ: Mapping[str, str], vehicle_type: VehicleType = "copter") -> ArduPilot:
-        """The binary that the scenario names, else the type's own in ARDUPILOT_SITL, on PATH, or installed.
+    def find(
+        cls,
+        binary: Path | None,
+        environ: Mapping[str, str],
+        vehicle_type: VehicleType = "copter",
+        setup: Setup = USUAL_SETUP,
+    ) -> ArduPilot:
+        """The binary that the scenario names, else that of the frame in ARDUPILOT_SITL, on PATH, or installed.
 
         Raises UnusableBinaryError when one is named and will not do, NoBinaryError when none is named or found.
         """
-        program = BINARIES[vehicle_type]
+        program = airframe(setup.frame, vehicle_type).program
         if binary is not None:
-            return cls._checked(binary, "the scenario", vehicle_type)
+            return cls._checked(binary, "the scenario", vehicle_type, setup)
         if named := environ.get(ENVIRONMENT):
             directory = Path(named)
             if not directory.is_dir():
@@ -68,20 +109,25 @@ class ArduPilot:
                     f"{ENVIRONMENT} is {named}, which is no directory: set it to the directory that holds {program}"
                 )
             present = [name for name in BINARIES.values() if (directory / name).exists()]
-            if program in present or not present:  # a directory with nothing in it is a mistake
-                return cls._checked(directory / program, ENVIRONMENT, vehicle_type)
+            if (directory / program).exists() or not present:  # a directory with nothing in it is a mistake
+                return cls._checked(directory / program, ENVIRONMENT, vehicle_type, setup)
         if on_path := shutil.which(program, path=environ.get("PATH", "")):
-            return cls._checked(Path(on_path), "PATH", vehicle_type)
-        if installed := current(vehicle_type, environ):
-            return cls._checked(installed.binary, "the cache", vehicle_type)
+            return cls._checked(Path(on_path), "PATH", vehicle_type, setup)
+        installed = current(vehicle_type, environ)
+        if installed and installed.binary.name == program:
+            return cls._checked(installed.binary, "the cache", vehicle_type, setup)
+        ways = (
+            f"run {install_command(vehicle_type)}, {WAY_OUT}"
+            if program == BINARIES[vehicle_type]
+            else f"put {program} into the directory that {ENVIRONMENT} names, or leave out frame {setup.frame}"
+        )
         raise NoBinaryError(
             f"no ArduPilot {vehicle_type}: the scenario names none, {ENVIRONMENT} "
-            f"{'has none' if named else 'is not set'}, no {program} is on PATH, and none is installed; "
-            f"run {install_command(vehicle_type)}, {WAY_OUT}"
+            f"{'has none' if named else 'is not set'}, no {program} is on PATH, and none is installed; {ways}"
         )
 
     @classmethod
-    def _checked(cls, binary: Path, source: str, vehicle_type: VehicleType) -> ArduPilot:
+    def _checked(cls, binary: Path, source: str, vehicle_type: VehicleType, setup: Setup) -> ArduPilot:
         subject = f"the ArduPilot binary {binary} (from {source})"
         try:
             if binary.is_dir():
@@ -100,33 +146,112 @@ class ArduPilot:
             raise UnusableBinaryError(f"{subject} {problem}: {WAY_OUT}")
         if not os.access(binary, os.X_OK):
             raise UnusableBinaryError(f"{subject} is not executable: run chmod +x {binary}")
-        beside = binary.resolve().parent / DEFAULTS[vehicle_type]
-        return cls(binary.absolute(), beside if beside.is_file() else None, vehicle_type)
+        defaults = {name: _defaults(binary, name) for name in airframe(setup.frame, vehicle_type).defaults}
+        missing = tuple(name for name, path in defaults.items() if path is None)
+        found = tuple(path for path in defaults.values() if path is not None)
+        return cls(binary.absolute(), found, vehicle_type, setup, missing)
+
+    def check(self) -> None:
+        """Raises VehicleError if the binary, or this machine, lacks what the vehicle's setup asks for."""
+        if self.setup.frame is not None:
+            if self.missing:
+                files, many = " and ".join(self.missing), len(self.missing) > 1
+                raise UnusableBinaryError(
+                    f"frame {self.setup.frame} needs ArduPilot's default parameters {files}, which "
+                    f"{'are' if many else 'is'} not beside {self.binary}: copy "
+                    f"{'them' if many else 'it'} there from Tools/autotest of its source tree"
+                )
+            self._check_model(self.setup.frame)
+        if self.setup.debugger is not None and shutil.which(self.setup.debugger) is None:
+            raise NoProgramError(f"no {self.setup.debugger} is on PATH: install it, or leave out `debugger`")
+
+    def _check_model(self, frame: str) -> None:
+        """A model fits if one that the binary offers is its beginning, in capitals or not: that is how it looks."""
+        offered = models(self.binary)
+        model = self.frame.lower()
+        if offered and not any(model.startswith(name.lower()) for name in offered):
+            nearest = get_close_matches(frame, offered, n=1)
+            meant = f"did you mean {nearest[0]}?" if nearest else f"there are {', '.join(offered)}"
+            raise UnusableBinaryError(f"{self.binary} has no frame {frame[:MAX_SHOWN]!r}: {meant}")
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """Write the vehicle's parameters into `directory`. Raises VehicleError."""
         check_launch(sysid, home, speedup)
         # names, not paths: ArduPilot takes a comma in a path for the end of it
-        files = [OWN_DEFAULTS]
+        files = [path.name for path in self.defaults]
         try:
-            if self.defaults is not None:
-                defaults = DEFAULTS[self.vehicle_type]
-                shutil.copyfile(self.defaults, directory / defaults)
-                files.insert(0, defaults)
-            (directory / OWN_DEFAULTS).write_text(_own_defaults(sysid))
+            for path in self.defaults:
+                shutil.copyfile(path, directory / path.name)
+            (directory / OWN_DEFAULTS).write_text(_own_defaults(sysid) + in_lines(self.parameters))
         except OSError as error:
             raise VehicleError(f"vehicle {sysid}: cannot write its parameters into {directory}: {error}") from None
         return Launch(
             [
+                *self._bounded(),
+                *_DEBUGGERS.get(self.setup.debugger, ()),
                 str(self.binary),
-                *("--model", MODELS[self.vehicle_type]),
+                *("--model", self.frame),
                 *("--home", str(home)),
                 *("-I", "0"),
-                *("--defaults", ",".join(files)),
+                *("--defaults", ",".join([*files, OWN_DEFAULTS])),
                 *("--speedup", f"{speedup:g}"),
                 *("--serial0", "tcp:0"),  # the default waits for a client before anything runs, the clock included
+                *self.setup.arguments,
             ]
         )
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What it is given beside its defaults; how much it logs yields to what the user says of it."""
+        match self.setup.log_mib:
+            case None:
+                logging = {}
+            case 0:
+                logging = {"LOG_BACKEND_TYPE": 0.0}
+            case _:
+                logging = {"LOG_FILE_TIMEOUT": PATIENT_S}
+        return {**logging, **self.setup.parameters}
+
+    def _bounded(self) -> list[str]:
+        """What starts a program of which no file gets longer than its log may.
+
+        ArduPilot takes that for a disk that is slow, and writes no more; it would begin another log after
+        LOG_FILE_TIMEOUT seconds. `ulimit -f` counts blocks of 512 bytes (POSIX).
+        """
+        if not self.setup.log_mib:
+            return []
+        return ["sh", "-c", f"trap '' XFSZ; ulimit -f {self.setup.log_mib * 2048}; exec \"$@\"", "sh"]
+
+
+_DEBUGGERS: dict[Debugger | None, tuple[str, ...]] = {
+    "gdb": (
+        *("gdb", "-q", "-nx", "-batch", "-return-child-result", "-ex", "set pagination off", "-ex", "run"),
+        *("-ex", "thread apply all backtrace", "--args"),
+    ),
+    "valgrind": ("valgrind", "--log-file=valgrind.log", "--soname-synonyms=somalloc=nouserintercepts"),
+}
+"""gdb tells on the vehicle's output where each thread was if it crashes."""
+
+
+def models(binary: Path) -> list[str]:
+    """The frames that a binary offers, in its own words: it lists them when it is given none. Empty if it does not."""
+    try:
+        said = subprocess.run(
+            [binary], stdin=subprocess.DEVNULL, capture_output=True, timeout=ANSWER_LIMIT_S, check=False, cwd="/"
+        ).stdout.decode("utf-8", "replace")
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    _, found, listed = said.partition("Options are:")
+    return [line.strip() for line in listed.splitlines() if re.fullmatch(r"  [\w+.-]+", line)] if found else []
+
+
+def _defaults(binary: Path, name: str) -> Path | None:
+    """A file of default parameters for a binary, where it lies in ArduPilot's source tree or beside the binary."""
+    for directory in autotest(binary.resolve().parent):
+        for path in (directory / name, directory / "default_params" / name, directory / "models" / name):
+            if path.is_file():
+                return path
+    return None
 
 
 def _own_defaults(sysid: int) -> str:

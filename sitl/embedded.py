@@ -14,13 +14,16 @@ import selectors
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
+from sitl.airframes import USUAL
 from sitl.autopilot import Autopilot
 from sitl.port import Port
+from sitl.setup import USUAL as USUAL_SETUP
+from sitl.setup import Setup
 from sitl.vehicle import (
     AGENT_PORT,
     PILOT_PORT,
@@ -43,8 +46,25 @@ class Embedded:
     """The `VehicleKind` that needs nothing but this package."""
 
     vehicle_type: VehicleType = "copter"
+    setup: Setup = USUAL_SETUP
     name: str = "embedded"
     lack: str | None = None
+    frame: str | None = None
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        return self.setup.parameters
+
+    def check(self) -> None:
+        """Raises VehicleError for what only ArduPilot has."""
+        frame = self.setup.frame
+        asked = {
+            f"frame {frame}": frame is not None and frame != USUAL[self.vehicle_type],
+            "arguments": bool(self.setup.arguments),
+            "debugger": self.setup.debugger is not None,
+        }
+        if lacks := [what for what, needed in asked.items() if needed]:
+            raise VehicleError(f"embedded vehicles have no {' and no '.join(lacks)}: fly ArduPilot, or leave it out")
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """The embedded vehicle keeps no files: `directory` stays as it is. Raises VehicleError."""

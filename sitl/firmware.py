@@ -30,8 +30,9 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
+from sitl.airframes import BINARIES, DEFAULTS
 from sitl.download import STALL_S, DownloadError, NotThereError, UnreachableError, download, fetch_text
-from sitl.installed import BINARIES, CURRENT, DEFAULTS, File, Installed, Manifest, cache
+from sitl.installed import CURRENT, File, Installed, Manifest, cache
 from sitl.vehicle import VehicleError, VehicleType
 
 FIRMWARE = "https://firmware.ardupilot.org"

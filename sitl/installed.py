@@ -19,11 +19,8 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 
+from sitl.airframes import BINARIES, DEFAULTS
 from sitl.vehicle import UnusableBinaryError, VehicleError, VehicleType
-
-BINARIES: dict[VehicleType, str] = {"copter": "arducopter", "plane": "arduplane", "rover": "ardurover"}
-DEFAULTS: dict[VehicleType, str] = {"copter": "copter.parm", "plane": "plane.parm", "rover": "rover.parm"}
-"""Parameters of ArduPilot's Tools/autotest (default_params, models), beside the binary."""
 
 MANIFEST = "manifest.json"
 CURRENT = "current"

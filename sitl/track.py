@@ -21,7 +21,7 @@ class Track:
     """The course of one vehicle. Times are mission seconds, lengths metres; a track never ends."""
 
     course: Course
-    home_offset: tuple[float, float]
+    home_offset: tuple[float, float, float]
 
     def at(self, t_s: float) -> tuple[float, float, float]:
         """(north_m, east_m, up_m) relative to the vehicle's own home, at any second of the mission."""
@@ -31,13 +31,13 @@ class Track:
     def in_field(self, t_s: float) -> tuple[float, float, float]:
         """(north_m, east_m, up_m) relative to the field's centre: `at` plus `home_offset`."""
         north_m, east_m, up_m = self.at(t_s)
-        return north_m + self.home_offset[0], east_m + self.home_offset[1], up_m
+        return north_m + self.home_offset[0], east_m + self.home_offset[1], up_m + self.home_offset[2]
 
 
 def track(
     vehicle_type: VehicleType,
     plan: Plan | None,
-    home_offset: tuple[float, float] = (0.0, 0.0),
+    home_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     begin_s: float = 0.0,
     *,
     heading_deg: float = 0.0,
@@ -46,9 +46,9 @@ def track(
     """The track of a vehicle that is ready at mission second `begin_s`, and begins to fly `plan` then.
 
     It stands at home until then; after the plan it stays, a plane circling, unless it has landed. `home_offset` is the
-    home's place in the field (metres north and east of its centre), `heading_deg` the home's heading. A `plan` of None
-    is that of a vehicle in no plan: a copter takes off to `takeoff_altitude_m` and stays there, a plane circles, a
-    rover stands. Raises PlanError if the type cannot fly the plan.
+    home's place in the field (metres north, east and up from its centre), `heading_deg` the home's heading. A `plan`
+    of None is that of a vehicle in no plan: a copter takes off to `takeoff_altitude_m` and stays there, a plane
+    circles, a rover stands. Raises PlanError if the type cannot fly the plan.
     """
     model = MODELS[vehicle_type]
     segments: list[Segment] = [Rest(Motion(yaw_rad=math.radians(heading_deg)), 0.0)]

@@ -41,6 +41,10 @@ class UnusableBinaryError(VehicleError):
     """An ArduPilot binary was named, or found, and cannot be run."""
 
 
+class NoProgramError(VehicleError):
+    """A program that is to run around a vehicle is not on this machine."""
+
+
 class FlightError(VehicleError):
     """A vehicle did not do what its pilot asked, or stopped answering."""
 
@@ -114,8 +118,19 @@ class VehicleKind(Protocol):
     def vehicle_type(self) -> VehicleType: ...
 
     @property
+    def frame(self) -> str | None:
+        """What its program calls its frame, if it has several."""
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """What it is given that it has to know."""
+
+    @property
     def lack(self) -> str | None:
         """What it may need to fly and does not have, with the way out; None if nothing is known to be missing."""
+
+    def check(self) -> None:
+        """Raises VehicleError if it cannot be had as it is set up."""
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """Prepare `directory`, which exists and is the vehicle's working directory, and say how to start it.

@@ -15,10 +15,11 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.text import Text
 
 from harness.errors import HarnessError, InterruptedRunError, MachineError
+from sitl.airframes import BINARIES
 from sitl.ardupilot import ENVIRONMENT
 from sitl.download import megabytes
 from sitl.firmware import RequestError, install
-from sitl.installed import BINARIES, all_installed, current, install_command
+from sitl.installed import all_installed, current, install_command
 from sitl.vehicle import VEHICLE_TYPES, VehicleError, VehicleType
 
 app = typer.Typer(no_args_is_help=True, help="Install ArduPilot's SITL binaries, and say which there are.")

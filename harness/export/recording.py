@@ -167,7 +167,7 @@ class Recording:
         scenario = self.archive.record.scenario
         if scenario is None:
             self._problems.append("where the field lies is not known: vehicles are in metres, and on no map")
-        home = Home(*scenario.vehicles.home) if scenario else None
+        home = scenario.vehicles.field if scenario else None
         for vehicle, fixes in self.tracks.by_vehicle.items():
             for fix in fixes:
                 metres = fix.east_m, fix.north_m, fix.up_m

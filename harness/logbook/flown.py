@@ -21,7 +21,7 @@ def flown(record: RunRecord, recorded: Tracks) -> list[Track]:
     """A track without events for each vehicle that is on record, on the field of the scenario's home."""
     if record.scenario is None:
         return []
-    home = Home(*record.scenario.vehicles.home)
+    home = record.scenario.vehicles.field
     return [_track(vehicle, fixes, home) for vehicle, fixes in recorded.by_vehicle.items()]
 
 

@@ -167,7 +167,7 @@ def load_matrix(path: Path, backend: BackendName | None = None) -> Matrix:
     if isinstance(document.get("scenario"), str):
         document["scenario"] = load_scenario(path.parent / document["scenario"])
     try:
-        return Matrix.model_validate(document)
+        return Matrix.model_validate(document, context={"beside": path.parent})
     except ValidationError as error:
         raise ScenarioError(f"{path}: {explain(error, Matrix)}") from None
 

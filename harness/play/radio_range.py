@@ -67,14 +67,21 @@ def tracks_of(scenario: Scenario) -> dict[int, Track]:
     """How the vehicles fly in virtual time; none do where neither a plan nor a radio asks where they are."""
     if not (scenario.flight or scenario.network.radio):
         return {}
-    vehicles = scenario.vehicles
-    return {
-        vehicle: track(
-            vehicles.type_of(vehicle),
-            flight.planned() if (flight := scenario.flight_of(vehicle)) else None,
-            place_in_field(index, vehicles.spacing_m),
-            heading_deg=vehicles.home[3] % 360,
-            takeoff_altitude_m=vehicles.takeoff_altitude_m,
-        )
-        for index, vehicle in enumerate(scenario.roster)
-    }
+    return {vehicle: _track(scenario, vehicle, index) for index, vehicle in enumerate(scenario.roster)}
+
+
+def _track(scenario: Scenario, vehicle: int, index: int) -> Track:
+    vehicles, flight = scenario.vehicles, scenario.flight_of(vehicle)
+    if index in vehicles.swarm or vehicle in vehicles.each:
+        home = vehicles.home_of(vehicle, index)
+        north_m, east_m, up_m = vehicles.field.metres_to(home.lat_deg, home.lon_deg, home.alt_m)
+    else:  # as it was meant, and not by way of degrees
+        home, up_m = vehicles.field, 0.0
+        north_m, east_m = place_in_field(index, vehicles.spacing_m)
+    return track(
+        vehicles.type_of(vehicle),
+        flight.planned() if flight else None,
+        (north_m, east_m, up_m),
+        heading_deg=home.heading_deg,
+        takeoff_altitude_m=vehicles.takeoff_altitude_m,
+    )

@@ -27,15 +27,18 @@ def load_scenario(path: Path) -> Scenario:
     if "scenario" in document:
         raise ScenarioError(f"{path}: this is a matrix, which `ucp-harness matrix {path}` plays")
     try:
-        return parse(document)
+        return parse(document, beside=library.find(path).parent)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
 
 
-def parse(document: dict[str, Any]) -> Scenario:
-    """Raises ScenarioError: one sentence that names the key, the value and what is allowed."""
+def parse(document: dict[str, Any], beside: Path | None = None) -> Scenario:
+    """A document that lies `beside` the files that it names, if it is in a file itself.
+
+    Raises ScenarioError: one sentence that names the key, the value and what is allowed.
+    """
     try:
-        return Scenario.model_validate(document)
+        return Scenario.model_validate(document, context={"beside": beside})
     except ValidationError as error:
         raise ScenarioError(explain(error, Scenario)) from None
 

@@ -261,6 +261,7 @@ class Scenario(Model):
                 (f"quirks.{name}.agents", agent) for agent in (asked.agents if isinstance(asked, OfSome) else ())
             )
         yield from (("vehicles.types", vehicle) for vehicle in self.vehicles.types)
+        yield from (("vehicles.each", vehicle) for vehicle in self.vehicles.each)
         yield from ((f"expect.{key}", agent) for key, agent in (self.expect.named() if self.expect else ()))
         for index, flight in enumerate(self.flight):
             yield from ((f"flight.{index}.vehicles", vehicle) for vehicle in flight.vehicles)
@@ -284,6 +285,12 @@ class Scenario(Model):
         for key, asked in (("flight", self.flight), ("network.radio", self.network.radio)):
             if asked and self.vehicles.kind == "none":
                 raise ValueError(f"`{key}` needs vehicles, and `vehicles.kind` is none: leave one of them out")
+        self.vehicles.check_frames(self.roster)
+        for index, vehicle in enumerate(self.roster):
+            try:
+                self.vehicles.home_of(vehicle, index)
+            except VehicleError as error:
+                raise ValueError(f"the home of vehicle {vehicle}: {error}") from None
         types = {self.vehicles.type_of(vehicle) for vehicle in self.roster}
         if self.vehicles.binary is not None and len(types) > 1:
             raise ValueError(

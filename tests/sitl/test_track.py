@@ -56,7 +56,7 @@ def test_it_stands_until_it_is_ready_and_stays_where_it_ends() -> None:
 
 
 def test_a_place_in_the_field_is_that_beside_home() -> None:
-    square = track("copter", SQUARE, home_offset=(7.0, -3.0))
+    square = track("copter", SQUARE, home_offset=(7.0, -3.0, 0.0))
     assert square.in_field(30.0) == pytest.approx((square.at(30.0)[0] + 7, square.at(30.0)[1] - 3, square.at(30.0)[2]))
 
 

@@ -18,7 +18,7 @@ from harness.play.containers.images import Image
 from harness.play.process.mission_file import mission_file
 from harness.scenario import Scenario
 from netem import addresses
-from sitl.vehicle import Home, VehicleKind, VehicleType, home_in_field
+from sitl.vehicle import VehicleKind
 from ucp.files import write_json_atomically
 
 INSIDE = "/ucp"
@@ -37,7 +37,7 @@ TOP = """\
 
 
 def write_compose(
-    scenario: Scenario, seed: int, kinds: dict[VehicleType, VehicleKind], system_ids: dict[int, int], file: Path
+    scenario: Scenario, seed: int, kinds: dict[int, VehicleKind], system_ids: dict[int, int], file: Path
 ) -> Path:
     """Write `file` and the directory beside it, which is returned. Raises RunDirectoryError if one is there already."""
     if scenario.security:
@@ -71,7 +71,7 @@ def _network() -> dict[str, Any]:
 
 
 def _services(
-    scenario: Scenario, seed: int, kinds: dict[VehicleType, VehicleKind], system_ids: dict[int, int], beside: Path
+    scenario: Scenario, seed: int, kinds: dict[int, VehicleKind], system_ids: dict[int, int], beside: Path
 ) -> dict[str, Any]:
     ours, build = _our_image(scenario, beside)
     asked = scenario.docker.image
@@ -95,10 +95,8 @@ def _services(
         if kinds:
             directory = beside / "vehicles" / str(vehicle)
             directory.mkdir(parents=True)
-            centre = Home(*scenario.vehicles.home)
-            home = home_in_field(number, centre, scenario.vehicles.spacing_m)
-            kind = kinds[scenario.vehicles.type_of(vehicle)]
-            launch = kind.launch(system_ids[vehicle], home, scenario.speedup, directory)
+            home = scenario.vehicles.home_of(vehicle, number)
+            launch = kinds[vehicle].launch(system_ids[vehicle], home, scenario.speedup, directory)
             name = f"vehicle-{vehicle}"
             services[name] = _service(scenario, ours, launch.argv, f"vehicles/{vehicle}", beside) | build | network
             services[name] |= {"environment": dict(launch.env)} if launch.env else {}

@@ -35,7 +35,7 @@ from netem.engine import Applied
 from netem.errors import CaptureError, LabUnavailable, NetemError
 from sitl.address import Address
 from sitl.ground_station import GroundStation
-from sitl.vehicle import Home, VehicleError, VehicleKind, VehicleType, home_in_field
+from sitl.vehicle import Home, VehicleError, VehicleKind
 from ucp.clock import MICROSECONDS, MissionClock
 
 POLL_S = 0.25
@@ -46,7 +46,7 @@ FOLLOW_S = 0.1
 
 
 class ProcessRun:
-    """One run; open it once. `kinds` of vehicles by type, none: no vehicles. `interrupted` ends the mission early.
+    """One run; open it once. `kinds` of vehicles, none: no vehicles. `interrupted` ends the mission early.
 
     `open_lab` says what vehicles and agents are made of, `agent_commands` what starts each agent there.
     With `keeps_disks` every agent has a disk that it can be rebooted with, else those that the scenario reboots so.
@@ -56,7 +56,7 @@ class ProcessRun:
         self,
         scenario: Scenario,
         seed: int,
-        kinds: Mapping[VehicleType, VehicleKind],
+        kinds: Mapping[int, VehicleKind],
         initial_data: bytes,
         rundir: RunDirectory,
         progress: Progress,
@@ -99,8 +99,7 @@ class ProcessRun:
         """Agents that begin again and do not answer yet."""
 
     def _vehicle(self, vehicle_id: int, life: int = 1) -> VehicleProcess:
-        kind = self._kinds[self.scenario.vehicles.type_of(vehicle_id)]
-        return VehicleProcess(vehicle_id, self._system_ids[vehicle_id], kind, self.rundir, life)
+        return VehicleProcess(vehicle_id, self._system_ids[vehicle_id], self._kinds[vehicle_id], self.rundir, life)
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Self]:
@@ -182,8 +181,7 @@ class ProcessRun:
         self._watchers.start(vehicle.fly(), of=f"flight {vehicle.vehicle_id}")
 
     def _home(self, number: int) -> Home:
-        vehicles = self.scenario.vehicles
-        return home_in_field(number, Home(*vehicles.home), vehicles.spacing_m)
+        return self.scenario.vehicles.home_of(self.scenario.roster[number], number)
 
     async def _start_vehicles(self, lab: MissionLab) -> None:
         if not self.vehicles:
@@ -356,7 +354,7 @@ class ProcessRun:
 
     async def _follow_flight(self) -> None:
         """Write down where the vehicles are, and have the network follow them."""
-        field, radio = Home(*self.scenario.vehicles.home), self.scenario.network.radio
+        field, radio = self.scenario.vehicles.field, self.scenario.network.radio
         every_s = max(FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
         while True:
             places = {vehicle.vehicle_id: vehicle.place(field) for vehicle in self.vehicles}

@@ -32,6 +32,7 @@ class VirtualTime(Backend):
         asked = {
             "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
             "vehicles.binary": scenario.vehicles.binary is not None,
+            **{f"vehicles.{key}": True for key in _of_real_vehicles(scenario)},
             "gcs": scenario.gcs is not None,
         }
         keys = [f"`{key}`" for key, needed in asked.items() if needed]
@@ -102,6 +103,13 @@ class VirtualTime(Backend):
                 await _compare_again(simulation, breathe)
             for agent_id, problem in files.problems().items():
                 simulation.played.agents[str(agent_id)]["trace_problem"] = problem
+
+
+def _of_real_vehicles(scenario: Scenario) -> list[str]:
+    """The keys of what only a program that flies can have."""
+    asked = (scenario.vehicles, *scenario.vehicles.each.values())
+    keys = ("frame", "parameters", "wind", "arguments", "debugger")
+    return [key for key in keys if any(getattr(vehicles, key) for vehicles in asked)]
 
 
 def _export(simulation: Simulation, files: OnDisk) -> None:

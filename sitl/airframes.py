@@ -1,0 +1,127 @@
+"""ArduPilot's frames: the type of vehicle that each is, what its program calls it, and the defaults that it needs.
+
+These are parameter files of ArduPilot's Tools/autotest, one over the other, as its sim_vehicle.py stacks them. A frame
+that is not in this table is passed on as it is, if the program offers it, with the defaults of its type.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sitl.vehicle import VehicleType
+
+BINARIES: dict[VehicleType, str] = {"copter": "arducopter", "plane": "arduplane", "rover": "ardurover"}
+DEFAULTS: dict[VehicleType, str] = {"copter": "copter.parm", "plane": "plane.parm", "rover": "rover.parm"}
+"""Parameters of ArduPilot's Tools/autotest (default_params, models), beside the binary."""
+
+HELI = "arducopter-heli"
+
+
+@dataclass(frozen=True)
+class Airframe:
+    """`model` is what the option --model of `program` is given, `defaults` the names of files in their order."""
+
+    vehicle_type: VehicleType
+    model: str
+    defaults: tuple[str, ...]
+    program: str
+
+
+def airframe(name: str | None, vehicle_type: VehicleType) -> Airframe:
+    """That of a name, or of the type where it is None."""
+    if name is None:
+        name = USUAL[vehicle_type]
+    own = (DEFAULTS[vehicle_type],)
+    return _TABLE.get(_ALIASES.get(name, name)) or Airframe(vehicle_type, name, own, BINARIES[vehicle_type])
+
+
+def type_of(name: str) -> VehicleType | None:
+    """Which type of vehicle has this frame; None if that is not known."""
+    known = _TABLE.get(_ALIASES.get(name, name))
+    return known.vehicle_type if known else None
+
+
+USUAL: dict[VehicleType, str] = {"copter": "+", "plane": "plane", "rover": "rover"}
+
+NOT_FLOWN = {
+    **dict.fromkeys(("submarine", "vectored", "vectored_6dof"), "ArduSub"),
+    "blimp": "Blimp",
+    "tracker": "AntennaTracker",
+}
+"""Frames of programs that no pilot here flies, though every ArduPilot binary offers them."""
+
+_ALIASES = {"helicopter": "heli", "boat": "motorboat", "quad": "+"}
+
+_COPTERS: dict[str, tuple[str, ...]] = {
+    "+": (),
+    **{frame: (f"copter-{frame}.parm",) for frame in ("X", "bfx", "djix", "cwx", "hexa", "octa", "deca", "tri", "y6")},
+    "hexax": ("copter-hexa.parm", "copter-X.parm"),
+    **{f"{frame}-{order}": (f"copter-{frame}.parm", f"copter-{frame}-{order}.parm")
+       for frame, order in (("hexa", "cwx"), ("hexa", "dji"), ("octa", "cwx"), ("octa", "dji"), ("deca", "cwx"))},
+    "octa-quad": ("copter-octaquad.parm",),
+    "octa-quad-cwx": ("copter-octaquad.parm", "copter-octaquad-cwx.parm"),
+    "dodeca-hexa": ("copter-dodecahexa.parm",),
+}  # fmt: skip
+
+_ALONE: dict[str, tuple[str, ...]] = {"singlecopter": (), "coaxcopter": ("copter-coax.parm",)}
+
+_HELICOPTERS: dict[str, tuple[str, ...]] = {
+    "heli": (),
+    "heli-gas": ("copter-heli-gas.parm",),
+    "heli-dual": ("copter-heli-dual.parm",),
+    "heli-blade360": (),
+}
+
+_PLANES: dict[str, tuple[str, ...]] = {
+    "plane": (),
+    "plane-elevon": ("plane-elevons.parm",),
+    **{
+        f"plane-{kind}": (f"plane-{kind}.parm",)
+        for kind in ("vtail", "jet", "ice", "dspoilers", "redundant", "soaring")
+    },
+    "quadplane-tilthvec": ("quadplane-tilthvec.parm",),
+}
+
+_QUADPLANES: dict[str, tuple[str, ...]] = {
+    "quadplane": (),
+    **{f"quadplane-{kind}": (f"quadplane-{kind}.parm",)
+       for kind in ("tilttri", "tilttrivec", "tri", "cl84", "tilt", "copter_tailsitter")},
+    "quadplane-ice": ("plane-ice.parm", "quadplane-ice.parm"),
+    "firefly": ("firefly.parm",),
+}  # fmt: skip
+
+_PLANES_OF_THEIR_OWN: dict[str, tuple[str, ...]] = {
+    "plane-tailsitter": ("plane-tailsitter.parm",),
+    "plane-3d": (),
+    "glider": ("glider.parm",),
+}
+
+_ROVERS: dict[str, tuple[str, ...]] = {
+    "rover": (),
+    **{f"rover-{kind}": (f"rover-{kind}.parm",) for kind in ("skid", "omni3mecanum", "vectored")},
+    "balancebot": ("rover-skid.parm", "balancebot.parm"),
+    "motorboat": ("motorboat.parm",),
+    "motorboat-skid": ("motorboat.parm", "rover-skid.parm"),
+    "sailboat": ("sailboat.parm",),
+    "sailboat-motor": ("sailboat-motor.parm",),
+}
+
+
+def _table() -> dict[str, Airframe]:
+    table: dict[str, Airframe] = {}
+    kinds: tuple[tuple[VehicleType, dict[str, tuple[str, ...]], tuple[str, ...], str], ...] = (
+        ("copter", _COPTERS, ("copter.parm",), BINARIES["copter"]),
+        ("copter", _ALONE, ("copter-single.parm",), BINARIES["copter"]),
+        ("copter", _HELICOPTERS, ("copter-heli.parm",), HELI),
+        ("plane", _PLANES, ("plane.parm",), BINARIES["plane"]),
+        ("plane", _QUADPLANES, ("quadplane.parm",), BINARIES["plane"]),
+        ("plane", _PLANES_OF_THEIR_OWN, (), BINARIES["plane"]),
+        ("rover", _ROVERS, ("rover.parm",), BINARIES["rover"]),
+    )
+    for vehicle_type, frames, first, program in kinds:
+        for name, rest in frames.items():
+            table[name] = Airframe(vehicle_type, name, (*first, *rest), program)
+    return table
+
+
+_TABLE = _table()

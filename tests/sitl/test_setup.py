@@ -1,0 +1,189 @@
+"""What may differ between vehicles: files of parameters and places, frames and their defaults, debuggers, logs."""
+
+from __future__ import annotations
+
+import math
+import struct
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from sitl import parameters, places
+from sitl.airframes import airframe, type_of
+from sitl.ardupilot import ArduPilot
+from sitl.embedded import Embedded
+from sitl.setup import Setup
+from sitl.vehicle import NoBinaryError, NoProgramError, VehicleError, VehicleType
+from tests.sitl.flying import HOME
+from tests.sitl.test_ardupilot import program
+
+LISTS_ITS_MODELS = """#!/bin/sh
+if [ $# = 0 ]; then
+    printf 'You must specify a vehicle model.  Options are:\\n  quadplane\\n  +\\n  hexa\\n  heli\\n  plane\\n'
+    exit 1
+fi
+echo "$@"; ulimit -f
+"""
+
+
+def written(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_parameters_are_read_as_ground_stations_write_them_but_for_the_system_id(tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "x.parm", "# mine\nWPNAV_SPEED 500\nSIM_WIND_SPD,4.5 // gusty\n1\t1\tRTL_ALT\t30\t6\nMAV_SYSID 9\n\n"
+    )
+    assert parameters.read(path) == {"WPNAV_SPEED": 500, "SIM_WIND_SPD": 4.5, "RTL_ALT": 30}
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("WPNAV_SPEED\n", "line 1: 'WPNAV_SPEED' is no parameter: write NAME VALUE"),
+        ("A 1\nwpnav 2\n", "line 2: 'wpnav 2' is no parameter"),
+        ("A nan\n", "is no parameter"),
+        ("A 1e39\n", "is no parameter"),
+        ("".join(f"P{number} 1\n" for number in range(5001)), "more than 5000"),
+        ("A" * 1_000_001, "larger than"),
+    ],
+)
+def test_a_file_that_holds_something_else_is_refused_with_its_line(text: str, problem: str, tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match=problem):
+        parameters.read(written(tmp_path / "x.parm", text))
+
+
+def test_what_is_no_file_is_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match="No such file"):
+        parameters.read(tmp_path / "gone.parm")
+    with pytest.raises(VehicleError, match="is not a file"):
+        parameters.read(tmp_path)
+    (tmp_path / "x.parm").write_bytes(b"\xff\xfe")
+    with pytest.raises(VehicleError, match="is not a text file"):
+        parameters.read(tmp_path / "x.parm")
+
+
+def test_what_is_written_is_read_the_same_to_the_last_bit(tmp_path: Path) -> None:
+    floats = [0.0, 1.0, -0.1, 1e-9, math.pi, 16777217.0, 3.4028234e38]
+    values = {f"P{number}": struct.unpack("<f", struct.pack("<f", value))[0] for number, value in enumerate(floats)}
+    again = parameters.read(written(tmp_path / "x.parm", parameters.in_lines(values)))
+    assert [struct.pack("<f", again[name]) for name in values] == [struct.pack("<f", values[name]) for name in values]
+    assert parameters.in_lines({"A": values["P2"]}) == "A -0.1\n"
+
+
+def test_a_parameter_that_is_not_known_is_named_with_the_nearest() -> None:
+    known = ["SIM_WIND_SPD", "SIM_WIND_DIR", "RTL_ALT"]
+    assert parameters.unknown(["RTL_ALT"], known) is None
+    assert parameters.unknown(["SIM_WIND_SPED"], known) == "no parameter SIM_WIND_SPED: did you mean SIM_WIND_SPD?"
+    assert (parameters.unknown(["ZZ", "YY"], known) or "").startswith("no parameter YY (nor 1 more): its whole list")
+
+
+def test_named_locations_are_looked_for_beside_the_scenario_then_where_the_user_keeps_them(tmp_path: Path) -> None:
+    mine = written(tmp_path / "config" / "ardupilot" / "locations.txt", "#N=x\nAVC=40.07,-105.2,1583.7,366 # field\n")
+    environ = {"XDG_CONFIG_DIR": str(mine.parents[1])}
+    assert places.named("AVC", tmp_path, environ).heading_deg == 6
+    written(tmp_path / "locations.txt", "AVC=1,2,3,4\n")
+    assert places.named("AVC", tmp_path, environ).lat_deg == 1
+    with pytest.raises(VehicleError, match=r"no such location in .*: did you mean AVC\?"):
+        places.named("AVD", tmp_path, environ)
+    with pytest.raises(VehicleError, match="no file of named locations: looked for"):
+        places.named("AVC", tmp_path / "none", {"HOME": "/nowhere"})
+    tree = tmp_path / "ardupilot"
+    written(tree / "Tools" / "autotest" / "locations.txt", "CMAC=-35.3,149.1,584,353\n")
+    assert places.named("CMAC", None, {"HOME": "/nowhere", "ARDUPILOT_SITL": str(tree / "build/sitl/bin")}).alt_m == 584
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("here\n", "line 1: 'here' has no = in it"),
+        ("AVC=1,2,3\n", "is not LATITUDE,LONGITUDE,ALTITUDE,HEADING"),
+        ("AVC=91,2,3,4\n", "line 1: home latitude 91.0 is not on Earth"),
+    ],
+)
+def test_a_location_that_is_none_is_refused_with_its_line(text: str, problem: str, tmp_path: Path) -> None:
+    written(tmp_path / "locations.txt", text)
+    with pytest.raises(VehicleError, match=problem):
+        places.named("AVC", tmp_path, {})
+
+
+def test_a_swarm_is_laid_out_by_instance(tmp_path: Path) -> None:
+    path = written(tmp_path / "swarm.txt", "#instance=East,North,Up,Heading\n1=20,30,4,90\n2=-20,0,0\n1=9,9,9,9\n")
+    offsets = places.swarm(path)
+    assert offsets.keys() == {1, 2}
+    home = offsets[1].of(HOME)
+    assert HOME.metres_to(home.lat_deg, home.lon_deg, home.alt_m) == pytest.approx((30, 20, 4))
+    assert home.heading_deg == 90 and offsets[2].of(HOME).heading_deg == HOME.heading_deg
+    for text, problem in (("x=1,2,3\n", "is no instance"), ("1=1,2\n", "is not EAST,NORTH"), ("#\n", "has no offsets")):
+        with pytest.raises(VehicleError, match=problem):
+            places.swarm(written(tmp_path / "swarm.txt", text))
+
+
+@pytest.mark.parametrize(
+    ("frame", "vehicle_type", "model", "defaults"),
+    [
+        ("hexa-cwx", "copter", "hexa-cwx", ["copter.parm", "copter-hexa.parm", "copter-hexa-cwx.parm"]),
+        ("boat", "rover", "motorboat", ["rover.parm", "motorboat.parm"]),
+        ("quadplane-tilt", "plane", "quadplane-tilt", ["quadplane.parm", "quadplane-tilt.parm"]),
+        ("of-tomorrow", "plane", "of-tomorrow", ["plane.parm"]),
+    ],
+)
+def test_a_frame_has_its_stack_of_defaults(
+    frame: str, vehicle_type: VehicleType, model: str, defaults: list[str]
+) -> None:
+    known = airframe(frame, vehicle_type)
+    assert (known.model, list(known.defaults)) == (model, defaults)
+    assert type_of(frame) in (None, vehicle_type)
+
+
+def test_the_stack_is_copied_in_its_order_with_the_users_parameters_last(tmp_path: Path) -> None:
+    binary = program(tmp_path / "bin" / "arducopter", LISTS_ITS_MODELS)
+    setup = Setup("hexa", {"RTL_ALT": 30.0}, ("--rate", "400"))
+    lacking = ArduPilot.find(binary, {}, setup=setup)
+    with pytest.raises(VehicleError, match=r"frame hexa needs .* copter.parm and copter-hexa.parm, which are not"):
+        lacking.check()
+    written(tmp_path / "bin" / "copter.parm", "FRAME_CLASS 1\n")
+    written(tmp_path / "bin" / "default_params" / "copter-hexa.parm", "FRAME_CLASS 2\n")
+    kind = ArduPilot.find(binary, {}, setup=setup)
+    kind.check()
+    (tmp_path / "7").mkdir()
+    argv = kind.launch(7, HOME, 1.0, tmp_path / "7").argv
+    assert argv[argv.index("--model") + 1] == "hexa"
+    assert argv[argv.index("--defaults") + 1] == "copter.parm,copter-hexa.parm,vehicle.parm"
+    assert argv[-2:] == ["--rate", "400"]
+    assert (tmp_path / "7" / "vehicle.parm").read_text().splitlines()[-1] == "RTL_ALT 30"
+
+
+def test_a_frame_that_the_binary_lacks_and_a_debugger_that_is_not_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    binary = program(tmp_path / "arducopter", LISTS_ITS_MODELS)
+    for name in ("copter.parm", "copter-octa.parm"):
+        written(tmp_path / name, "")
+    with pytest.raises(VehicleError, match=r"has no frame 'octa': there are quadplane, \+, hexa, heli, plane"):
+        ArduPilot.find(binary, {}, setup=Setup("octa")).check()
+    with pytest.raises(NoBinaryError, match="no arducopter-heli is on PATH"):
+        ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path), "PATH": ""}, setup=Setup("heli"))
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(NoProgramError, match="no valgrind is on PATH: install it, or leave out `debugger`"):
+        ArduPilot.find(binary, {}, setup=Setup(debugger="valgrind")).check()
+
+
+def test_a_log_is_left_out_or_bounded(tmp_path: Path) -> None:
+    binary = program(tmp_path / "arducopter", LISTS_ITS_MODELS)
+    without = ArduPilot(binary, setup=Setup(log_mib=0)).launch(7, HOME, 1.0, tmp_path)
+    assert without.argv[0] == str(binary) and "LOG_BACKEND_TYPE 0\n" in (tmp_path / "vehicle.parm").read_text()
+    bounded = ArduPilot(binary, setup=Setup(log_mib=3)).launch(7, HOME, 1.0, tmp_path)
+    said = subprocess.run(bounded.argv, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert said[-1] == str(3 * 2048)
+    asked = ArduPilot(binary, setup=Setup(parameters={"LOG_BACKEND_TYPE": 2.0}, log_mib=0)).parameters
+    assert asked == {"LOG_BACKEND_TYPE": 2.0}
+
+
+def test_embedded_vehicles_refuse_what_only_ardupilot_has() -> None:
+    Embedded("plane", Setup("plane", {"TKOFF_ALT": 30.0})).check()
+    with pytest.raises(VehicleError, match="embedded vehicles have no frame quadplane and no debugger: fly ArduPilot"):
+        Embedded("plane", Setup("quadplane", debugger="gdb")).check()
