@@ -20,6 +20,7 @@ from harness.errors import HarnessError, ScenarioError
 from harness.machine.kernel import Kernel, run_inside
 from harness.play import progress
 from harness.play.backends import BACKENDS
+from harness.play.interventions import Interventions
 from harness.report.capture import gaps
 from harness.run.run import Run, run
 from harness.scenario import Scenario
@@ -103,16 +104,20 @@ def run_command(
         console.print(f"wrong on purpose: {wrong}", style="dim", highlight=False)
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
-    with beside(directory, watch_port) if watch else nullcontext() as page:
+    virtual = BACKENDS[backend].virtual_time
+    hand = Interventions(request, virtual_time=virtual, factor=request.speedup) if watch else None
+    with beside(directory, watch_port, hand) if hand is not None else nullcontext() as page:
         if page is not None:
             show_address(console, page.address)
         shown = progress.for_console(console)
+        heard = shown if page is None else page.overhears(shown)
         try:
-            finished = run(request, chosen_seed, directory, shown, backend)
+            all_heard = watch and virtual  # the page shows who heard what
+            finished = run(request, chosen_seed, directory, heard, backend, delivers_all=all_heard, interventions=hand)
         finally:
             shown.close()
         _show(console, finished)
-        if page is not None and page.run_is_over():
+        if page is not None and page.run_is_over() and finished.played.outcome != "interrupted":
             console.print("The page stays until it is closed, or Ctrl-C.", style="dim")
             page.wait()
     raise typer.Exit(finished.exit_status)

@@ -1,14 +1,16 @@
 """`python -m harness.watch DIRECTORY PORT`: the server beside a run that goes on, as a process of its own.
 
-So it takes no time from the run, and cannot hurt it. It prints its address; whoever plays the run writes a line to its
-standard input once the run is over. It then stays while a page is open, and ends at once if whoever played is gone.
+So it takes no time from the run, and cannot hurt it. What it says to whoever plays the run, and hears from there, is in
+`harness.watch.beside`. After the run it stays while a page is open; it ends at once if whoever played is gone.
 """
 
 import asyncio
 import contextlib
+import json
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 from harness.archive.exports import RUN_FILE
 from harness.errors import HarnessError
@@ -25,18 +27,43 @@ async def main(directory: Path, port: int) -> None:
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
     story, ended = Story(), asyncio.Event()
-    server = Server(story, directory, live=True)
+    server = Server(story, directory, live=True, ask=_say)
     async with server.open(port) as address:
-        print(address, flush=True)  # noqa: T201
+        _print(address)
         telling = asyncio.create_task(_tell(directory, story, ended))
-        if await reader.readline():
-            ended.set()
-            await telling
-            server.live = False
-            print(server.readers, flush=True)  # noqa: T201
-            staying = asyncio.create_task(_while_looked_at(server))
-            left = asyncio.create_task(reader.read(1))
-            await asyncio.wait({staying, left}, return_when=asyncio.FIRST_COMPLETED)
+        if not await _hear_until_over(reader, server, story):
+            return
+        ended.set()
+        await telling
+        server.live = False
+        _print(str(server.readers))
+        staying = asyncio.create_task(_while_looked_at(server))
+        left = asyncio.create_task(reader.read(1))
+        await asyncio.wait({staying, left}, return_when=asyncio.FIRST_COMPLETED)
+
+
+def _print(line: str) -> None:
+    print(line, flush=True)  # noqa: T201
+
+
+def _say(page: int, asked: Any) -> None:
+    """Somebody asks for something."""
+    if isinstance(asked, dict):
+        _print(json.dumps([page, asked.get("number"), asked]))
+
+
+async def _hear_until_over(reader: asyncio.StreamReader, server: Server, story: Story) -> bool:
+    """Whether the run is over; otherwise whoever played it is gone."""
+    while line := await reader.readline():
+        kind, *rest = json.loads(line)
+        if kind == "over":
+            return True
+        if kind == "answer":
+            page, number, answer = rest
+            server.answer(page, ["answer", number, answer])
+        else:
+            story.tell([[kind, *rest]])
+    return False
 
 
 async def _tell(directory: Path, story: Story, ended: asyncio.Event) -> None:

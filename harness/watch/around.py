@@ -21,6 +21,7 @@ MAX_DETAIL = 300
 class _Told(NetworkLine):
     detail: Any = ""
     """What it did, for people."""
+    by_hand: bool = False
 
 
 Line = TypeVar("Line", _Told, TrackLine)
@@ -123,7 +124,9 @@ class Around:
         agents = [agent for agent in line.agents if agent in self._known]
         what = "" if line.what == RANGE else line.what
         detail = str(line.detail)[:MAX_DETAIL]
-        self.changes.append(["n", line.at_s, what, detail, agents, _state_after(fault), changed, named_parts])
+        self.changes.append(
+            ["n", line.at_s, what, detail, agents, _state_after(fault), changed, named_parts, line.by_hand]
+        )
 
     def _moved(self, line: TrackLine) -> None:
         places = {str(vehicle): place for vehicle, place in line.places.items() if vehicle in self._known}

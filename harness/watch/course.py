@@ -5,7 +5,6 @@ has them all). Most lines of a trace only take a message in; those are looked at
 """
 
 import re
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +22,7 @@ _TAKES_IN = re.compile(
     rb'\{"t":([\d.]+),"handler":"receive_\w+","algorithm":\d+,'
     rb'"trigger":\{"message":"[\w ]+","from":(\d+),"seq":(\d+)\}'
 )
+_CANNOT_MATTER = b'"branch":"no vote running"'
 _NOTHING_ELSE = b'"changes":[],"sent":[]'
 
 
@@ -46,8 +46,7 @@ class Sent(NamedTuple):
 class Course:
     """An agent of the run. `changes` are those since somebody took them, `sent` and `heard` likewise."""
 
-    def __init__(self, agents: Path, agent_id: int, clock: Callable[[Header], None]) -> None:
-        """`clock` is told of each life's header."""
+    def __init__(self, agents: Path, agent_id: int) -> None:
         self.agent_id = agent_id
         self.changes: list[Change] = []
         self.sent: list[Sent] = []
@@ -56,8 +55,9 @@ class Course:
         """When it did what was read last."""
         self.problem: str | None = None
         """Why nothing more of it is read, if that is so."""
+        self.takes_in_all = False
+        """Whether it was given something that cannot matter to it: not so in virtual time, unless asked for."""
         self._lives = Lives(agents, agent_id)
-        self._clock = clock
         self._ahead: Heard | HandlerRun | Dropped | None = None
         """What was read, and is of later than somebody has asked for."""
         self._born = False
@@ -101,6 +101,7 @@ class Course:
             if line is None:
                 self.problem = self._lives.trouble
                 return None
+            self.takes_in_all = self.takes_in_all or _CANNOT_MATTER in line
             if _NOTHING_ELSE in line and (taken := _TAKES_IN.match(line)) and not self._may_be_idle_too_early(line):
                 t, sender, seq = taken.groups()
                 entry: Heard | Header | Entry = Heard(float(t), int(sender), int(seq))
@@ -111,7 +112,6 @@ class Course:
                     self.problem = f"the trace of agent {self.agent_id} is damaged, and read up to there"
                     return None
             if isinstance(entry, Header):
-                self._clock(entry)
                 self._begin()
             elif not isinstance(entry, Commanded) and 0 <= entry.t <= LATEST_S:
                 return entry
@@ -186,8 +186,3 @@ class Course:
             first = next(iter(self._held.not_in_chain))
             self.changes.append(["x", run.t, self.agent_id, 2, first[:KEY_LENGTH]])
         self._idle_without = idle_without
-
-
-def in_order(changes: list[Change]) -> Iterator[Change]:
-    """By time; of one time as they came."""
-    return iter(sorted(changes, key=lambda change: float(change[1])))

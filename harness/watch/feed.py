@@ -6,7 +6,7 @@ A change is a list: its kind, its mission second, and more. Blocks go by KEY_LEN
 |---|---|
 | `p` | vehicle -> metres north, east and up |
 | `n` | a change of network or agents: what, detail, agents, their state, [low, high, loss there, loss back] of each
-        pair that changed, and the parts that the swarm is in, if they changed |
+        pair that changed, the parts that the swarm is in, if they changed, and whether somebody asked for it by hand |
 | `b` | a block was completed: key, agent, ordinal |
 | `c` | an agent's blocks moved: agent, [operation, key] of each, top chain hash, how it came to a block |
 | `z` | an agent's life ended, and another begins with nothing: agent |
@@ -15,10 +15,10 @@ A change is a list: its kind, its mission second, and more. Blocks go by KEY_LEN
 | `d` | an agent dropped a datagram: agent, reason |
 | `x` | what is against a characteristic at once: agent, number, key |
 | `t` | it is that late |
+| `all` | agents were given all that reached them: who did not take a message in has lost it |
 | `run`, `end`, `note` | no second, but a document: what the run is; how it ended; a sentence on what cannot be shown |
 """
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
@@ -30,7 +30,6 @@ from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE, agents_directory
 from harness.archive.record import RunRecord
 from harness.archive.record_file import read_record
-from harness.archive.traces import Header
 from harness.errors import RunDirectoryError
 from harness.play.backends import in_virtual_time
 from harness.present.colours import inks
@@ -76,15 +75,14 @@ class Feed:
             )
         agents = agents_directory(directory)
         self._bit = {agent_id: 1 << number for number, agent_id in enumerate(self._roster)}
-        self._courses = [Course(agents, agent_id, self._hear_clock) for agent_id in self._roster]
+        self._courses = [Course(agents, agent_id) for agent_id in self._roster]
         self._around = Around(directory, self._roster)
         self._on_the_air: dict[tuple[int, int], _Broadcast] = {}
         self._looks = 0
-        self._clock: tuple[float, float] | None = None
-        """Mission second 0 in seconds of the Unix epoch, and the speedup, if agents run by the clock."""
         self._told_s = 0.0
         self._told_of: set[str] = set()
         self._record = archive.record
+        self._all_heard = self._record.backend is not None and not in_virtual_time(self._record.backend)
         self._record_stamp = self._stamp()
 
     def first(self, *, live: bool) -> Change:
@@ -103,7 +101,7 @@ class Feed:
                 "backend": record.backend,
                 "seed": record.seed,
                 "live": live,
-                "all_heard": record.backend is not None and not in_virtual_time(record.backend),
+                "all_heard": self._all_heard,
             },
         ]
 
@@ -116,12 +114,12 @@ class Feed:
         changes = [*self._take(), *self._messages(told_now=False)]
         changes.sort(key=lambda change: float(change[1]))
         at_s = max(self._around.at_s, *(course.at_s for course in self._courses))
-        if until_s == float("inf") and self._clock is not None and not self.over:
-            epoch_s, speedup = self._clock
-            at_s = max(at_s, (time.time() - epoch_s) * speedup)
         if at_s > self._told_s:
             self._told_s = at_s
             changes.append(["t", round(at_s, 3)])
+        if not self._all_heard and any(course.takes_in_all for course in self._courses):
+            self._all_heard = True
+            changes.append(["all", self._told_s])
         return [*changes, *self._notes()], more
 
     def last(self) -> list[Change]:
@@ -205,14 +203,6 @@ class Feed:
             ],
             "report": (self._directory / "report.html").is_file(),
         }
-
-    def _hear_clock(self, header: Header) -> None:
-        """When the mission began by the clock of whoever wrote this."""
-        epoch_us, speedup = header.clock.get("epoch_us"), header.clock.get("speedup")
-        if self._record.backend is None or in_virtual_time(self._record.backend):
-            return
-        if isinstance(epoch_us, int | float) and isinstance(speedup, int | float) and 0 < speedup <= 1000:
-            self._clock = epoch_us / 1e6, speedup
 
     def _stamp(self) -> tuple[int, int] | None:
         try:

@@ -8,15 +8,19 @@ hide where they come from (Origin), and a name of theirs that leads to 127.0.0.1
 import asyncio
 import contextlib
 import hmac
+import json
 import os
 import secrets
+from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from harness.errors import MachineError
+from harness.watch.course import Change
 from harness.watch.story import Story
 
 _PAGE = Path(__file__).parent / "page"
@@ -29,8 +33,10 @@ GONE_S = 20.0
 """A browser that is silent for so long is gone."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-Ask = Callable[[str], Awaitable[str]]
-"""What a page asks of the run that goes on, and the answer."""
+Ask = Callable[[int, Any], None]
+"""Is told which page asks for what; `Server.answer` brings the answer."""
+MOST_ANSWERS = 32
+"""Of one page that are on their way; it asks faster than it listens, and further ones are lost."""
 
 
 @dataclass(frozen=True)
@@ -47,18 +53,25 @@ def _files() -> Mapping[str, _File]:
     }
 
 
+class _Page:
+    """One that is open somewhere."""
+
+    def __init__(self, socket: web.WebSocketResponse) -> None:
+        self.socket = socket
+        self.answers: deque[str] = deque(maxlen=MOST_ANSWERS)
+
+
 class Server:
     """Serves one story. `live` is whether the run that it is of goes on."""
 
     def __init__(self, story: Story, directory: Path, *, live: bool, ask: Ask | None = None) -> None:
         self.live = live
-        self.readers = 0
-        """How many pages are open."""
         self._story, self._directory, self._ask = story, directory, ask
         self._token = secrets.token_urlsafe(24)
         self._files = _files()
         self._hosts: tuple[str, ...] = ()
-        self._sockets: set[web.WebSocketResponse] = set()
+        self._pages: dict[int, _Page] = {}
+        self._opened = 0
 
     @contextlib.asynccontextmanager
     async def open(self, port: int) -> AsyncIterator[str]:
@@ -82,9 +95,9 @@ class Server:
             self._hosts = f"127.0.0.1:{bound}", f"localhost:{bound}"
             yield f"http://127.0.0.1:{bound}/{self._token}/"
         finally:
-            for socket in list(self._sockets):
-                with contextlib.suppress(ConnectionError):
-                    await asyncio.wait_for(socket.close(code=WSCloseCode.GOING_AWAY), 1.0)
+            for page in list(self._pages.values()):
+                with contextlib.suppress(ConnectionError, TimeoutError):
+                    await asyncio.wait_for(page.socket.close(code=WSCloseCode.GOING_AWAY), 1.0)
             await runner.cleanup()
 
     @web.middleware
@@ -134,35 +147,46 @@ class Server:
             raise web.HTTPServiceUnavailable(reason=f"{MAX_READERS} pages are open: close one")
         socket = web.WebSocketResponse(heartbeat=GONE_S, max_msg_size=MAX_MESSAGE_BYTES, compress=False)
         await socket.prepare(request)
-        self._sockets.add(socket)
-        self.readers += 1
-        listening = asyncio.create_task(self._listen(socket))
+        self._opened += 1
+        number, page = self._opened, _Page(socket)
+        self._pages[number] = page
+        listening = asyncio.create_task(self._listen(number, socket))
         try:
-            await self._read_out(socket)
+            await self._read_out(page)
         except ConnectionError:
             pass  # the browser went away
         finally:
-            self.readers -= 1
-            self._sockets.discard(socket)
+            del self._pages[number]
             listening.cancel()
         return socket
 
-    async def _read_out(self, socket: web.WebSocketResponse) -> None:
-        """Send the story, as fast as the browser takes it and no faster."""
+    @property
+    def readers(self) -> int:
+        """How many pages are open."""
+        return len(self._pages)
+
+    def answer(self, page: int, answer: Change) -> None:
+        """Tell one page alone, if it is still open."""
+        if page in self._pages:
+            self._pages[page].answers.append(json.dumps(answer) + "\n")
+
+    async def _read_out(self, page: _Page) -> None:
+        """Send answers and the story, as fast as the browser takes them and no faster."""
         start, caught_up = 0, False
-        while not socket.closed:
+        while not page.socket.closed:
+            if page.answers:
+                await page.socket.send_str(page.answers.popleft())
             start, lines = self._story.read(start, may_skip=self.live and caught_up)
             if lines:
-                await socket.send_str(lines)
+                await page.socket.send_str(lines)
             elif start >= self._story.size:
                 caught_up = True
                 await asyncio.sleep(UPDATE_S)
 
-    async def _listen(self, socket: web.WebSocketResponse) -> None:
-        """Hear what the page asks, and when it closes."""
+    async def _listen(self, page: int, socket: web.WebSocketResponse) -> None:
+        """Hear what the page asks for, and when it closes."""
         async for message in socket:
-            if message.type is WSMsgType.TEXT and self._ask is not None:
-                answer = await self._ask(message.data)
-                with contextlib.suppress(ConnectionError):
-                    await socket.send_str(answer)
+            if message.type is WSMsgType.TEXT and self._ask is not None and self.live:
+                with contextlib.suppress(ValueError, RecursionError):
+                    self._ask(page, json.loads(message.data))
         await socket.close()

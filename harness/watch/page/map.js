@@ -18,7 +18,7 @@ export class SwarmMap {
       if (event.sourceEvent) this.touched = true;
     });
     this.selection = d3.select(canvas).call(this.zoom);
-    this.hovered = null;
+    this.chosen = new Set();
     canvas.addEventListener("pointermove", (event) => { this.pointer = [event.offsetX, event.offsetY]; });
     canvas.addEventListener("pointerleave", () => { this.pointer = null; });
     this.placed = new Map();
@@ -29,15 +29,21 @@ export class SwarmMap {
 
   fit() { this.touched = false; this.selection.transition().duration(200).call(this.zoom.transform, d3.zoomIdentity); }
 
-  // From metres east and north to the window, all of what was flown in it; it follows as vehicles go further.
-  fitted(width, height) {
-    const [west, south, east, north] = this.story.extent ?? [-1, -1, 1, 1];
+  // From metres east and north to the window: the swarm, with where it was in the last minute, and evenly after it.
+  fitted(t, width, height) {
+    let west = Infinity, south = Infinity, east = -Infinity, north = -Infinity;
+    for (const id of this.story.tracks.keys()) for (const at of [t, t - TRAIL_S / 2, t - TRAIL_S].map((then) => this.story.at(id, then))) {
+      west = Math.min(west, at.east); east = Math.max(east, at.east);
+      south = Math.min(south, at.north); north = Math.max(north, at.north);
+    }
+    if (west > east) [west, south, east, north] = [-1, -1, 1, 1];
     const wide = Math.max(east - west, 30), tall = Math.max(north - south, 30);
     const scale = Math.min((width - 2 * MARGIN) / wide, (height - 2 * MARGIN) / tall);
     const target = { scale, x: width / 2 - scale * (west + east) / 2, y: height / 2 + scale * (south + north) / 2 };
     const base = this.base;
     if (!base || base.width !== width || base.height !== height) this.base = { ...target, width, height };
-    else for (const key of ["scale", "x", "y"]) base[key] += 0.15 * (target[key] - base[key]);
+    else if (!this.touched) for (const key of ["scale", "x", "y"]) base[key] += 0.08 * (target[key] - base[key]);
+    return this.touched || Math.abs(target.scale / this.base.scale - 1) < 0.005 && Math.abs(target.x - this.base.x) + Math.abs(target.y - this.base.y) < 1;
   }
 
   place(id, index, count, t, width, height) {
@@ -61,7 +67,7 @@ export class SwarmMap {
     const { context, width, height } = prepared(this.canvas);
     const { swarm, t } = playhead, { run } = this.story;
     const anywhere = this.story.tracks.size > 0;
-    this.fitted(width, height);
+    this.steady = this.fitted(t, width, height);
     this.placed = new Map(run.roster.map((id, index) => [id, this.place(id, index, run.roster.length, t, width, height)]));
     this.radius = Math.max(6.5, Math.min(13, 34 / Math.sqrt(run.roster.length) + 4));
     if (anywhere) this.grid(context, width, height);
@@ -229,6 +235,7 @@ export class SwarmMap {
         context.restore();
         return;
       }
+      if (this.chosen.has(id)) halo(context, radius + 8, colour("ink"), [2, 2]);
       if (agent.doing === "voting") halo(context, radius + 4, colour("vote"), []);
       if (swarm.reconcilingNow(agent)) halo(context, radius + 4, colour("reconcile"), [5, 3]);
       context.save();
@@ -256,15 +263,20 @@ export class SwarmMap {
     });
   }
 
+  // The vehicle at that place of the window, or null.
+  nearest(atX, atY) {
+    let nearest = null, least = this.radius + 6;
+    for (const [id, { x, y }] of this.placed) {
+      const away = Math.hypot(x - atX, y - atY);
+      if (away < least) { nearest = id; least = away; }
+    }
+    return nearest;
+  }
+
   // About the vehicle under the pointer.
   told(context, swarm, width, height) {
     if (!this.pointer) return;
-    const [mx, my] = this.pointer;
-    let nearest = null, least = this.radius + 6;
-    for (const [id, { x, y }] of this.placed) {
-      const away = Math.hypot(x - mx, y - my);
-      if (away < least) { nearest = id; least = away; }
-    }
+    const nearest = this.nearest(...this.pointer);
     if (nearest === null) return;
     const agent = swarm.agents.get(nearest), at = this.placed.get(nearest);
     const type = swarm.run.types[swarm.run.roster.indexOf(nearest)];

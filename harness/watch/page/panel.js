@@ -73,9 +73,10 @@ function inWords(change, swarm) {
     return came.length && how ? ["commit", `${agent} commits ${came.slice(0, 5).join(", ")}${came.length > 5 ? " …" : ""}, ${how}`] : null;
   }
   if (kind === "n") {
-    const [what, detail, agents, state, , parts] = rest;
-    if (agents.length || state) return ["loss", `${what.replaceAll("_", " ")}: ${detail}`];
-    if (what) return ["network", `${what.replaceAll("_", " ")}: ${detail}`];
+    const [what, detail, agents, state, , parts, byHand] = rest;
+    const words = `${what.replaceAll("_", " ")}: ${detail}${byHand ? " (by hand)" : ""}`;
+    if (agents.length || state) return ["loss", words];
+    if (what) return ["network", words];
     if (parts) return ["network", parts.length > 1 ? `in ${parts.length} parts: ${parts.map((part) => part.join(" ")).join(" | ")}` : "all are connected"];
     return null;
   }

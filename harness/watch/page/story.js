@@ -6,13 +6,13 @@ export class Story {
   constructor() {
     this.run = null;
     this.end = null;
+    this.hand = null;
     this.notes = [];
     this.until = 0;
     this.log = [];
     this.messages = [];
     this.tracks = new Map();
     this.firstChanged = Infinity;
-    this.extent = null;
   }
 
   // One line of what the server tells.
@@ -24,8 +24,10 @@ export class Story {
       this.ahead = new Swarm(second);
       this.ahead.history = new History(second);
     } else if (kind === "end") this.end = second;
+    else if (kind === "hand") this.hand = second;
     else if (kind === "note") this.notes.push(second);
     else if (this.run === null) return;
+    else if (kind === "all") this.run.all_heard = true;
     else if (kind === "t") this.until = Math.max(this.until, second);
     else if (kind === "p") this.place(second, change[2]);
     else if (kind === "m") insert(this.messages, change);
@@ -40,8 +42,6 @@ export class Story {
       let track = this.tracks.get(+agent);
       if (!track) this.tracks.set(+agent, (track = []));
       insert(track, [0, t, north, east, up], 1);
-      const e = (this.extent ??= [east, north, east, north]);
-      e[0] = Math.min(e[0], east); e[1] = Math.min(e[1], north); e[2] = Math.max(e[2], east); e[3] = Math.max(e[3], north);
     }
   }
 

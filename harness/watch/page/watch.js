@@ -2,6 +2,7 @@
 // run goes on that is a moment ago, and afterwards any.
 
 import { Chains } from "./chains.js";
+import { Hand } from "./hand.js";
 import { LINKS, clock, colour, family, percent, prepared, shape, whenColoursChange } from "./look.js";
 import { PULSE_WALL_S, SwarmMap } from "./map.js";
 import { Events, Verdicts, element } from "./panel.js";
@@ -18,7 +19,7 @@ const story = new Story();
 let playhead = null, map, chains, timeline, events, verdicts;
 let playing = true, following = true, speed = 20, dragged = false;
 let pulses = [], told = 0, before = 0, changed = true, lastDrawn = 0;
-let arrivals = [];
+let arrivals = [], hand = null, socket = null;
 
 function begin() {
   const { run } = story;
@@ -36,6 +37,17 @@ function begin() {
   speed = d3.least(SPEEDS, (each) => Math.abs(each - (run.live ? 1 : 20)));
   $("speed").value = speed;
   following = run.live;
+  if (run.live) {
+    hand = new Hand($("hand"), (asked) => socket.send(JSON.stringify(asked)), () => { changed = true; });
+    hand.roster = run.roster;
+    map.chosen = hand.chosen;
+    $("map").addEventListener("click", (event) => {
+      const id = story.end ? null : map.nearest(event.offsetX, event.offsetY);
+      if (id !== null) hand.choose(id);
+    });
+    if (story.hand) hand.take(story.hand);
+    $("hand").hidden = false;
+  }
   $("live").hidden = !run.live;
   drawLegend();
 }
@@ -95,7 +107,7 @@ function frame(now) {
   }
   if (story.firstChanged < playhead.next) changed = true;
   gather(passed);
-  if (!changed && !pulses.length && !map.pointer) return;
+  if (!changed && !pulses.length && !map.pointer && map.steady) return;
   changed = false;
   move(time);
   show();
@@ -151,6 +163,7 @@ function show() {
   $("at").textContent = `${clock(time)} / ${clock(end)}`;
   $("play").textContent = playing && !(following && live) ? "❚❚" : "▶";
   $("play").setAttribute("aria-label", playing ? "Pause" : "Play");
+  $("speeds").hidden = following && live;
   $("live").classList.toggle("on", following && live);
 }
 
@@ -176,11 +189,13 @@ function showStatus() {
   const { end, run } = story, status = $("status");
   status.classList.remove("good", "bad", "now");
   if (!end) {
-    status.textContent = run?.live ? "● live" : "reading";
+    const stage = story.hand?.paused ? "held" : story.hand?.stage ?? "";
+    status.textContent = run?.live ? `● live${stage && stage !== "mission" ? `: ${stage}` : ""}` : "reading";
     if (run?.live) status.classList.add("now");
     return;
   }
   $("live").hidden = true;
+  $("hand").hidden = true;
   const bad = end.judgements.filter(([, , , , kind]) => kind === "bad");
   const open = end.judgements.filter(([, , , , kind]) => kind === "unknown");
   if (!end.judgements.length) status.textContent = end.outcome === "running" ? "did not come to its end" : end.outcome;
@@ -264,14 +279,19 @@ function toggle() {
 function connect() {
   const address = new URL("live", location.href);
   address.protocol = "ws:";
-  const socket = new WebSocket(address);
+  socket = new WebSocket(address);
   socket.addEventListener("message", ({ data }) => {
     const had = story.run, ended = story.end;
-    for (const line of data.split("\n")) if (line) story.take(JSON.parse(line));
+    const stood = story.hand;
+    for (const line of data.split("\n")) if (line) {
+      const change = JSON.parse(line);
+      if (change[0] === "answer") hand?.answered(change[1], change[2]); else story.take(change);
+    }
     if (!had && story.run) begin();
     arrivals.push([performance.now(), story.until]);
     changed = true;
-    if (story.run && (!had || story.end !== ended)) showStatus();
+    if (story.hand !== stood && hand) hand.take(story.hand);
+    if (story.run && (!had || story.end !== ended || story.hand !== stood)) showStatus();
     if (story.notes.length && !story.end) complain(story.notes);
   });
   socket.addEventListener("close", () => {
@@ -285,4 +305,4 @@ connect();
 requestAnimationFrame(frame);
 
 // For tests: what the page knows and where it stands.
-window.watch = { story, get time() { return time; }, get playhead() { return playhead; }, seek, get playing() { return playing; } };
+window.watch = { story, get time() { return time; }, get playhead() { return playhead; }, get hand() { return hand; }, seek, get playing() { return playing; } };

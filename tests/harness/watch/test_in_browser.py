@@ -3,47 +3,17 @@
 import json
 import shutil
 import signal
-import subprocess
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.harness.command import COMMAND, DEADLINE_S
+from tests.harness.command import DEADLINE_S
 from tests.harness.report.browser import Browser
+from tests.harness.watch.pages import page_of, until
 from tests.harness.watch.runs import film, of_kind, played
 from tests.harness.watch.test_feed import chains_of
 
 HOSTILE = "</title><script>document.title = 'owned'</script><img src=x onerror=\"document.title='owned'\">"
-
-
-@contextmanager
-def page_of(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The command, and the address of its page; ended by Ctrl-C."""
-    process = subprocess.Popen(
-        [*COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    try:
-        line = next(line for line in process.stdout if "http://" in line)
-        yield process, line.split()[-1]
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        process.communicate(timeout=DEADLINE_S)
-
-
-def until(browser: Browser, expression: str) -> Any:
-    """What the expression comes to, once that is something."""
-    deadline = time.monotonic() + DEADLINE_S
-    while time.monotonic() < deadline:
-        if value := browser.evaluate(expression):
-            return value
-        time.sleep(0.1)
-    raise AssertionError(f"{expression} comes to nothing; {browser.complaints}")
 
 
 @pytest.fixture(scope="module")

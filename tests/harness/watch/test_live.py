@@ -1,0 +1,103 @@
+"""`run --watch`: a run while it goes on, and what somebody has happen to it from the page."""
+
+import asyncio
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+
+from harness.archive.record_file import read_record
+from tests.harness.command import DEADLINE_S
+from tests.harness.report.browser import Browser
+from tests.harness.watch.pages import page_of, until
+
+LONG = """
+name: Long
+agents: 4
+duration_s: 100000
+network: {loss: 0.1}
+events: {mean_s: 10}
+"""
+
+
+def scenario(directory: Path) -> Path:
+    path = directory / "long.yaml"
+    path.write_text(LONG)
+    return path
+
+
+class Page:
+    """What a page hears and says, without a browser."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self._socket = socket
+        self._unread: list[list[Any]] = []
+        self._number = 0
+
+    async def next(self, kind: str) -> list[Any]:
+        """The next change of that kind."""
+        while True:
+            while self._unread:
+                if (change := self._unread.pop(0))[0] == kind:
+                    return change
+            text = await asyncio.wait_for(self._socket.receive_str(), DEADLINE_S)
+            self._unread = [json.loads(line) for line in text.splitlines()]
+
+    async def ask(self, **asked: Any) -> dict[str, Any]:
+        self._number += 1
+        await self._socket.send_str(json.dumps({"number": self._number, **asked}))
+        _, number, answer = await self.next("answer")
+        assert number == self._number
+        return answer
+
+
+def test_what_a_page_asks_for_happens_and_is_on_record(tmp_path: Path) -> None:
+    async def visit(address: str) -> None:
+        async with aiohttp.ClientSession() as client, client.ws_connect(f"{address}live", max_msg_size=0) as socket:
+            page = Page(socket)
+            assert (await page.next("run"))[1]["live"] is True
+            while (await page.next("hand"))[1]["closed"] is not None:
+                pass
+            held_s = (await page.ask(do="pause"))["at_s"]
+            assert (await page.ask(do="step", seconds=10))["at_s"] >= held_s + 10
+            parted_s = (await page.ask(do="happen", entry={"partition": [[1, 2], [3, 4]]}))["at_s"]
+            assert parted_s >= held_s + 10
+            assert "error" in await page.ask(do="happen", entry={"partition": [[1, 2, 99], [3, 4]]})
+            assert "error" in await page.ask(do="happen", entry={"kill": [1, 2, 3, 4]})
+            assert await page.ask(do="fly") == {"error": "that cannot be asked for"}
+            assert await page.ask(do="step", seconds="soon") == {"error": "that cannot be asked for"}
+            assert "at_s" in await page.ask(do="happen", entry={"kill": [4]})
+            await socket.send_str("[[[")
+            await socket.send_str("7")
+            assert "at_s" in await page.ask(do="next run")
+
+    out = tmp_path / "run"
+    with page_of("run", scenario(tmp_path), "--backend", "sim", "--watch", "--out", out) as (process, address):
+        asyncio.run(visit(address))
+        process.send_signal(signal.SIGINT)
+        assert process.wait(DEADLINE_S) == 130
+    record = read_record(out / "run.json").record
+    assert [(fault.what, fault.by_hand) for fault in record.faults] == [("partition", True), ("kill", True)]
+    assert (out / "replay.yaml").is_file()
+    assert (out / "report.html").is_file()
+
+
+def test_buttons_of_the_page(browser: Browser, tmp_path: Path) -> None:
+    def button(label: str) -> str:
+        return f"[...document.querySelectorAll('#hand button')].find(each => each.textContent === '{label}')"
+
+    out = tmp_path / "run"
+    with page_of("run", scenario(tmp_path), "--backend", "sim", "--watch", "--out", out) as (_, address):
+        browser.show(address, width=1280, scheme="dark")
+        until(browser, f"watch.hand && !{button('Heal')}.disabled")
+        assert browser.evaluate(f"{button('Kill')}.disabled && {button('Kill')}.title").startswith("choose vehicles")
+        browser.evaluate("watch.hand.choose(2)")
+        browser.evaluate(f"{button('Part')}.click()")
+        until(browser, "document.getElementById('events').textContent.includes('partition 2 | 1 3 4')")
+        assert "by hand" in browser.evaluate("document.getElementById('events').textContent")
+        browser.evaluate(f"{button('Hold')}.click()")
+        until(browser, f"{button('Go on')} !== undefined")
+        until(browser, "document.getElementById('status').textContent === '● live: held'")
+        assert browser.complaints == []
