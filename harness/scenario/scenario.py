@@ -344,6 +344,13 @@ class Scenario(Model):
         return self
 
     @model_validator(mode="after")
+    def _somebody_is_captured(self) -> "Scenario":
+        captured = self.security.captured if self.security else None
+        if captured is not None and captured not in self.roster:
+            raise ValueError(f"security.captured {captured} is not one of the agents {sorted(self.roster)}")
+        return self
+
+    @model_validator(mode="after")
     def _timeline_can_be_played(self) -> "Scenario":
         instants = Counter(entry.at_s for entry in self.timeline)
         for index, entry in enumerate(self.timeline):

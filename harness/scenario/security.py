@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from harness.scenario.model import Model
+from harness.scenario.model import Model, VehicleId
 
 
 class Security(Model):
@@ -12,5 +12,7 @@ class Security(Model):
 
     keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
     """`fresh`: each run has keys of its own. Else the directory with the vehicles' bundles (`ucp-harness keys new`)."""
+    captured: VehicleId | None = None
+    """The vehicle whose keys the rogue node has: what it injects is sealed with them."""
     seal: bool = False
     """Event data is sealed to the depot, too: whoever carries it cannot read it. Blocks have 48 bytes less of it."""

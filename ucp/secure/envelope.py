@@ -35,6 +35,9 @@ REVOCATION = 10
 """The type that says which keys are revoked; it is signed by the authority and not encrypted."""
 TYPES = frozenset(range(1, REVOCATION + 1))
 
+NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
+"""Type of a message -> its name, in clear as its type is."""
+
 REQUEST_FIELDS = {"request_sender": Kind.U32, "request_boot": Kind.BOOT, "request_sequence": Kind.U32}
 """Sealed before the body of a response: the request that it answers."""
 REQUEST = struct_of(REQUEST_FIELDS)

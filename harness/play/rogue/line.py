@@ -3,6 +3,8 @@
 from typing import Any
 
 from ucp.messages import MalformedDatagramError, block_named, decode
+from ucp.secure.envelope import NAMES, read_clear
+from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
 """The number of the injection of a datagram that the scenario itself has (`harness.scenario.datagrams`)."""
@@ -11,6 +13,8 @@ OF_NO_INJECTION = -1
 def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:
     """The record of a datagram, sent at `at_s`; `refused` is why no agent would take it for a message."""
     record = {"at_s": round(at_s, 6), "injection": injection, "what": what, "source": source}
+    if datagram[2:3] == bytes([SECURED]):
+        return {**record, "bytes": len(datagram), **_secured(datagram)}
     try:
         sender, sequence, message = decode(datagram)
     except MalformedDatagramError as malformed:
@@ -18,3 +22,14 @@ def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes
     block = block_named(message)
     decoded = {"message": message.NAME, "sender": sender, "sequence": sequence}
     return {**record, **decoded, "block": block.hex() if block else None, "bytes": len(datagram)}
+
+
+def _secured(datagram: bytes) -> dict[str, Any]:
+    """What is in clear of a sealed datagram."""
+    try:
+        clear = read_clear(datagram)
+    except MalformedDatagramError as malformed:
+        return {"refused": malformed.reason}
+    if clear.type not in NAMES:
+        return {"refused": "a revocation"}
+    return {"message": NAMES[clear.type], "sender": clear.sender, "sequence": clear.sequence, "block": None}

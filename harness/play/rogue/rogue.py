@@ -13,13 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from random import Random
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from harness.play.rogue import crafted
 from harness.play.rogue.line import line_of
 from harness.play.rogue.sequences import forged_sequence
 from harness.scenario.injection import Corrupt, DelayedCopy, Duplicate, Flood, Forge, Injection, Replay
-from ucp.block import next_chain_hash
+from ucp.block import HASH_BYTES, next_chain_hash
 from ucp.clock import MICROSECONDS
 from ucp.messages import (
     BlockAddRequest,
@@ -33,6 +33,12 @@ from ucp.messages import (
     NextInSequenceResponse,
     decode,
 )
+from ucp.secure.envelope import NAMES, read_clear
+from ucp.secure.envelope import VERSION as SECURED
+
+if TYPE_CHECKING:
+    from harness.play.rogue.captured import CapturedKeys
+    from ucp.secure.session import Request
 
 REMEMBERED = 10_000
 """Datagrams that it keeps to replay."""
@@ -50,9 +56,23 @@ class RogueDatagram:
     what: str
     source: int
     datagram: bytes
+    plain: bytes | None = None
+    """What it says in plain, if it is sealed and the rogue made it."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        return line_of(at_s, self.injection, self.what, self.source, self.datagram)
+        said = self.plain or self.datagram
+        return line_of(at_s, self.injection, self.what, self.source, said) | {"bytes": len(self.datagram)}
+
+
+@dataclass(frozen=True, slots=True)
+class _Heard:
+    """A datagram of an agent; `message` is None if it is sealed, and `request` how an answer to it names it."""
+
+    sender: int
+    name: str
+    message: Message | None
+    request: "Request | None"
+    datagram: bytes
 
 
 @dataclass(slots=True)
@@ -66,14 +86,19 @@ class _Window:
 
 
 class Rogue:
-    """`epoch_us` is mission second 0 on the agents' clocks, in microseconds."""
+    """`epoch_us` is mission second 0 on the agents' clocks, in microseconds; `captured` are a vehicle's keys."""
 
-    def __init__(self, roster: Sequence[int], seed: int, epoch_us: int = 0) -> None:
+    def __init__(
+        self, roster: Sequence[int], seed: int, epoch_us: int = 0, captured: "CapturedKeys | None" = None
+    ) -> None:
         self.sent: Counter[int] = Counter()
         """How many datagrams each injection that has begun has made."""
         self._roster = tuple(roster)
         self._rng = Random(f"{seed}/rogue")
         self._epoch_us = epoch_us
+        self._captured = captured
+        self._secured = False
+        """Whether the mission is, by what is on the air."""
         self._heard: deque[tuple[int, str, bytes]] = deque(maxlen=REMEMBERED)
         self._top_chain_hash: bytes | None = None
         self._votes_name_chain = False
@@ -85,10 +110,10 @@ class Rogue:
     def hears(self, datagram: bytes, now: float) -> None:
         """An agent has sent `datagram`. What is not a message of UCP tells a rogue nothing."""
         try:
-            sender, _, message = decode(datagram)
+            sender, name, message, request = self._understood(datagram, now)
         except MalformedDatagramError:
             return
-        self._heard.append((sender, message.NAME, datagram))
+        self._heard.append((sender, name, datagram))
         if isinstance(message, BlockAddRequest | CommitBlock):
             self._top_chain_hash = message.chain_hash
         elif isinstance(message, BlockAddResponse):
@@ -96,7 +121,20 @@ class Rogue:
         if self._windows:
             self._windows = [window for window in self._windows if window.until > now]
             for window in self._windows:
-                self._react(window, sender, message, datagram, now)
+                self._react(window, _Heard(sender, name, message, request, datagram), now)
+
+    def _understood(self, datagram: bytes, now: float) -> tuple[int, str, Message | None, "Request | None"]:
+        """Sender and type; and what it says, and how it is answered, if it is in plain, or the rogue has keys.
+
+        Raises MalformedDatagramError.
+        """
+        if datagram[2:3] != bytes([SECURED]):
+            sender, _, message = decode(datagram)
+            return sender, message.NAME, message, None
+        clear = read_clear(datagram)
+        self._secured = True
+        opened = self._captured.opened(datagram, now) if self._captured else None
+        return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))
 
     def begin(self, number: int, injection: Injection, now: float) -> None:
         """The injection with this number, from 1, begins. Some end at once, some last."""
@@ -129,12 +167,13 @@ class Rogue:
 
     # What it makes of what it hears
 
-    def _react(self, window: _Window, sender: int, message: Message, datagram: bytes, now: float) -> None:
-        injection = window.injection
+    def _react(self, window: _Window, heard: "_Heard", now: float) -> None:
+        injection, sender, datagram = window.injection, heard.sender, heard.datagram
         if isinstance(injection, Forge):
-            if sender != injection.sender and (answer := self._answer(injection, message)) is not None:
-                self._forge(window.number, "forge", injection.sender, answer)
-        elif not injection.matches(message.NAME, sender):
+            answer = None if heard.message is None else self._answer(injection, heard.message)
+            if sender != injection.sender and answer is not None:
+                self._forge(window.number, "forge", injection.sender, answer, now, heard.request)
+        elif not injection.matches(heard.name, sender):
             return
         elif isinstance(injection, Duplicate):
             for _ in range(injection.copies):
@@ -172,11 +211,13 @@ class Rogue:
             self._send(RogueDatagram(number, "replay", sender, data))
 
     def _forge_commit(self, number: int, forge: Forge, now: float) -> None:
+        if self._secured and self._top_chain_hash is None:
+            self._top_chain_hash = bytes(HASH_BYTES)  # what the chain ends in is sealed: it can but guess
         if self._top_chain_hash is None:
             return  # nobody has said yet what the chain ends in
         block = crafted.forged_block(forge.sender, self._timestamp_us(now))
         self._top_chain_hash = next_chain_hash(self._top_chain_hash, block.block_hash)
-        self._forge(number, "forge", forge.sender, crafted.forged_commit(block, self._top_chain_hash))
+        self._forge(number, "forge", forge.sender, crafted.forged_commit(block, self._top_chain_hash), now)
 
     def _flood(self, window: _Window, flood: Flood, now: float) -> None:
         messages = round(flood.for_s * flood.per_s)
@@ -188,12 +229,20 @@ class Rogue:
                 return
             content = crafted.random_message(flood.message, self._roster, self._timestamp_us(now), self._rng)
             sender = self._rng.choice(self._roster) if flood.sender is None else flood.sender
-            self._forge(window.number, "flood", sender, content)
+            self._forge(window.number, "flood", sender, content, now)
             window.next_at = window.until - flood.for_s + self.sent[window.number] / flood.per_s
 
-    def _forge(self, number: int, what: str, sender: int, message: Any) -> None:
+    def _forge(
+        self, number: int, what: str, sender: int, message: Any, now: float, request: "Request | None" = None
+    ) -> None:
         sequence = forged_sequence(number, self.sent[number])
-        self._send(RogueDatagram(number, what, sender, crafted.datagram(sender, sequence, message)))
+        plain = crafted.datagram(sender, sequence, message)
+        if not (self._secured and self._captured):
+            self._send(RogueDatagram(number, what, sender, plain))
+            return
+        said = decode(plain).message
+        sealed = self._captured.sealed(sender, sequence, said, request, now, self._timestamp_us(now))
+        self._send(RogueDatagram(number, what, sender, sealed, plain))
 
     def _send(self, injected: RogueDatagram) -> None:
         self.sent[injected.injection] += 1

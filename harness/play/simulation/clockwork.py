@@ -121,7 +121,8 @@ class Clockwork:
     def _rogue_node(self) -> "VirtualRogue":
         from harness.play.simulation.rogue import VirtualRogue  # scapy takes long to import
 
-        return VirtualRogue(self.roster, self.seed, self._air, len(self.roster), self._recorder.injected)
+        captured = self._keys.captured if self._keys else None
+        return VirtualRogue(self.roster, self.seed, self._air, len(self.roster), self._recorder.injected, captured)
 
     def _late_rogue(self) -> "VirtualRogue":
         """One that has been on the air all along, and begins to send now."""

@@ -4,7 +4,7 @@ What it sends reaches every living agent but the one that it imitates, which wou
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from harness.play.rogue.journal import Journal
 from harness.play.rogue.rogue import Rogue
@@ -13,6 +13,9 @@ from harness.scenario.changes import Injected
 from netem.medium import LATENCY
 from ucp.messages import Message, encode
 
+if TYPE_CHECKING:
+    from harness.play.rogue.captured import CapturedKeys
+
 MOMENT_S = LATENCY.mean_s
 
 
@@ -20,9 +23,15 @@ class VirtualRogue:
     """`number` is its own on the air, where agents are numbered in the roster's order."""
 
     def __init__(
-        self, roster: Sequence[int], seed: int, air: VirtualAir, number: int, write: Callable[[dict[str, Any]], None]
+        self,
+        roster: Sequence[int],
+        seed: int,
+        air: VirtualAir,
+        number: int,
+        write: Callable[[dict[str, Any]], None],
+        captured: "CapturedKeys | None" = None,
     ) -> None:
-        self._rogue = Rogue(roster, seed)
+        self._rogue = Rogue(roster, seed, captured=captured)
         self._roster = roster
         self._air = air
         self._number = number

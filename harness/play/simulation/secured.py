@@ -8,9 +8,11 @@ another key, would ask for something that nobody remembers.
 import hashlib
 from collections.abc import Callable
 from functools import lru_cache, partial
+from random import Random
 from typing import Any
 
 from harness.play.keys import bundles_of
+from harness.play.rogue.captured import CapturedKeys
 from harness.play.simulation.agents import OwnAgent
 from harness.scenario import Scenario
 from ucp.clock import MICROSECONDS
@@ -46,6 +48,10 @@ class Keys:
         self._seed = seed
         self._seals = scenario.security is not None and scenario.security.seal
         self._bundles: dict[int, Bundle] = dict(bundles_of(scenario, _of_seed(seed, "keys")))
+        captured = scenario.security.captured if scenario.security else None
+        chance = Random(f"{seed}/captured")
+        self.captured = None if captured is None else CapturedKeys(self._bundles[captured], lambda: chance.randbytes(8))
+        """What the rogue node has."""
         self._verified: Callable[[Signed], bool] = lru_cache(SIGNATURES_REMEMBERED)(verify)
 
     @property
