@@ -28,12 +28,16 @@ _BOOT_TIME = struct.Struct("!Q")
 
 
 class Outgoing(NamedTuple):
-    """A datagram to broadcast: as it goes on the air, and what it says, unless it is a revocation."""
+    """A datagram to broadcast: as it goes on the air, and what it says, unless it is a revocation.
 
-    sealed: bytes
+    In a simulation that knows what it would say it need not be sealed.
+    """
+
+    sealed: bytes | None
     sequence: int = 0
     message: Message | None = None
     plain: Recorded | None = None
+    length: int = 0
 
 
 def boot_of(started_us: int, chance: bytes) -> bytes:
@@ -119,14 +123,15 @@ class SecuredAgent(Agent):
     # To the air
 
     def datagrams_to_send(self) -> list[bytes]:
-        return [outgoing.sealed for outgoing in self.sealed_to_send()]
+        return [outgoing.sealed for outgoing in self.sealed_to_send() if outgoing.sealed is not None]
 
     def sealed_to_send(self) -> Iterator[Outgoing]:
         """What to broadcast, in order; empties the outbox."""
         self.session.epochs.look_at(self.state.now)
         if self._tells and self.revocation is not None:
             self._tells = False
-            yield Outgoing(self.session.tell(self.revocation.number, self.revocation.encode()))
+            told = self.session.tell(self.revocation.number, self.revocation.encode())
+            yield Outgoing(told, length=len(told))
         for sequence, message, plain in self._taken_from_outbox():
             if sequence > LAST_SEQUENCE:
                 self.problem = "it has used all sequence numbers of this life: it sends no more until it starts anew"
@@ -134,7 +139,7 @@ class SecuredAgent(Agent):
             signature = self.signatures.get(message.block.block_hash) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
             request = self._answers.pop(sequence, None)
             sealed = self.session.seal(sequence, message, request, signature, self._revocations)
-            yield Outgoing(sealed, sequence, message, plain)
+            yield Outgoing(sealed, sequence, message, plain, len(sealed))
 
     # Revocations
 

@@ -104,9 +104,8 @@ class Session:
         self, sequence: int, message: Message, request: Request | None, block_signature: bytes | None, revocations: int
     ) -> bytes:
         """The datagram of a message. Each sequence, at most LAST_SEQUENCE, is used once."""
+        self.asks(sequence, message)
         code = TYPE_CODES[type(message)]
-        if code in REQUESTS:
-            self._asked[code] = sequence
         body = message.body()
         if code in REQUEST_OF:
             body = REQUEST.pack(*(request or NOTHING_ASKED)) + body
@@ -120,6 +119,12 @@ class Session:
         ciphertext = keys.encrypt(sequence, body, clear)
         signature = self.private_key.sign(self._domain + clear + ciphertext)
         return clear + ciphertext + keys.masked(sequence, signature)
+
+    def asks(self, sequence: int, message: Message) -> None:
+        """It sends a message: if that asks something, answers to what it asked of the kind before no longer count."""
+        code = TYPE_CODES[type(message)]
+        if code in REQUESTS:
+            self._asked[code] = sequence
 
     def tell(self, number: int, revocation: bytes) -> bytes:
         """The datagram of a revocation with this number: whoever knows the authority can read it."""

@@ -48,9 +48,9 @@ class Clockwork:
 
     `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. Where anybody
     has quirks, or is not the harness's own, all hear everything: what cannot matter to the right agent may matter to a
-    wrong one. So they do in a secured mission: what comes again is a replay, whether or not it mattered. `told`:
-    somebody may yet inject. `fate_script` makes what plays the scenario's fates, `air` what carries messages, and
-    `programs` are those that play agents of another make.
+    wrong one. So they do in a secured mission where anything may be dropped: what comes again is a replay, whether or
+    not it mattered. `told`: somebody may yet inject. `fate_script` makes what plays the scenario's fates, `air` what
+    carries messages, and `programs` are those that play agents of another make.
     """
 
     def __init__(
@@ -74,10 +74,11 @@ class Clockwork:
         self._tracing = recorder.tracing
         self._anybody_is_unknown = scenario.has_wrong_agents or bool(scenario.foreign)
         """Whether anybody may do what no right agent of ours does."""
-        self._keys = self._keys_of_agents() if scenario.security else None
+        self._keys = self._keys_of_agents(watched=told or deliver_all) if scenario.security else None
         if self._keys is not None:
             self._initial_data = self._keys.sealed_to_depot(initial_data)
-        self._deliver_all = deliver_all = deliver_all or self._anybody_is_unknown or self._keys is not None
+        anything_counts = self._anybody_is_unknown or (self._keys is not None and not self._keys.sampled)
+        self._deliver_all = deliver_all = deliver_all or anything_counts
         self._now = 0.0
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
@@ -113,10 +114,10 @@ class Clockwork:
         """Those of the vehicles; None of a mission that is not secured."""
         return self._keys.public if self._keys else None
 
-    def _keys_of_agents(self) -> "Keys":
+    def _keys_of_agents(self, *, watched: bool) -> "Keys":
         from harness.play.simulation.secured import Keys  # needs the extra `secure`
 
-        return Keys(self.scenario, self.seed)
+        return Keys(self.scenario, self.seed, sampled=not (self._tracing or watched))
 
     def _rogue_node(self) -> "VirtualRogue":
         from harness.play.simulation.rogue import VirtualRogue  # scapy takes long to import
@@ -171,13 +172,16 @@ class Clockwork:
         state = life.state
         if self._deliver_all or state is None or flight.matters(state, sender, message):
             now = self._now if life.clock is None else life.local_s(self._now)
-            if flight.sealed is None:
-                life.agent.receive_message(sender, flight.sequence, message, now, flight.datagram)
-            else:
-                life.agent.receive_datagram(flight.sealed, now)
+            self._give(life.agent, flight, now)
             self._say(number, life)
             if self._deliver_all or state is None or state.reconcile_in_progress:
                 self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
+
+    def _give(self, agent: VirtualAgent, flight: InFlight, now: float) -> None:
+        if flight.sealed is None:
+            agent.receive_message(flight.sender, flight.sequence, flight.message, now, flight.datagram)
+        else:
+            agent.receive_datagram(flight.sealed, now)
 
     def _happen(self, number: int, life: Incarnation, what: Logged | StrayDatagram | None) -> None:
         """Anything else: the end of a timer, an event, or a datagram that is no message of an agent's."""
@@ -226,7 +230,7 @@ class Clockwork:
             if answer.matters(state, answer.sender, answer.message):
                 at = max(at, life.resumed_at)
                 local = max(state.now, life.local_s(at))
-                agent.receive_message(answer.sender, answer.sequence, answer.message, local, answer.datagram)
+                self._give(agent, answer, local)
                 if self._tracing:
                     self._take_down(life, at)
 
@@ -257,13 +261,14 @@ class Clockwork:
 
     def _say_sealed(self, number: int, life: Incarnation, agent: "SecuredOwnAgent") -> None:
         """Send what the agent has to say, sealed. Who comes upon the mission late has heard nothing of it."""
-        for sealed, sequence, message, plain in agent.sealed_to_send():
+        for sealed, sequence, message, plain, length in agent.sealed_to_send():
             if message is None:
+                assert sealed is not None, "a revocation is always there"
                 self._send_stray(number, life, sealed)
                 continue
-            life.bytes_sent += len(sealed)
-            self._air.broadcast(self._now, number, sequence, message, len(sealed), plain, sealed)
-            if self._rogue is not None:
+            life.bytes_sent += length
+            self._air.broadcast(self._now, number, sequence, message, length, plain, sealed)
+            if self._rogue is not None and sealed is not None:
                 self._rogue.hears_datagram(sealed, self._now)
 
     def _send_stray(self, number: int, life: Incarnation, datagram: bytes) -> None:
