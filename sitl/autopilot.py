@@ -45,6 +45,8 @@ class Listener(Protocol):
 class Autopilot:
     """One vehicle. `epoch_us` is the time of its boot, microseconds since the Unix epoch."""
 
+    takes_missions = True
+
     def __init__(self, sysid: int, home: Home, epoch_us: int, vehicle_type: VehicleType = "copter") -> None:
         self.sysid = sysid
         self.home = home

@@ -44,6 +44,8 @@ class MissionInbox:
 
     def _count(self, message: Any) -> Any:
         self._expected, self._items = None, []
+        if not self._vehicle.takes_missions:
+            return self._ack(message, mavlink.MAV_MISSION_DENIED)
         if message.count > MAX_ITEMS:
             return self._ack(message, mavlink.MAV_MISSION_NO_SPACE)
         if message.count == 0:

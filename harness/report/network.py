@@ -8,6 +8,7 @@ from markupsafe import Markup
 
 from harness.archive.connectivity import Connectivity, Losses, Pair, quality
 from harness.archive.record import FaultRecord, NetworkState, OperatorCommand, RunRecord
+from harness.play.backends import in_virtual_time
 from harness.present import words
 from harness.report import network_strip
 from harness.report.map_parts import divisions
@@ -80,8 +81,9 @@ def start(states: Sequence[NetworkState]) -> str | None:
 def happened(record: RunRecord) -> list[tuple[str, str, str]]:
     """When, what, and everything else that is known of each fault, and of each command of an operator, in order."""
     rows = [(fault.at_s, fault.what, _of_fault(fault)) for fault in record.faults]
-    if (station := record.ground_station) is not None:
-        rows += [(command.at_s, "operator", _of_command(command)) for command in station.commands]
+    station, refused = record.ground_station, "; refused" if in_virtual_time(record.backend) else ""
+    if station is not None:
+        rows += [(command.at_s, "operator", _of_command(command) + refused) for command in station.commands]
     rows.sort(key=lambda row: row[0])
     told = [(words.duration(at_s), what, detail) for at_s, what, detail in rows]
     if station is not None and station.commands_left_out:
@@ -116,4 +118,5 @@ def ground_station(record: RunRecord) -> str | None:
         return None
     dropped = f", and {words.value(station.dropped)} were dropped" if station.dropped else ""
     came = f"{words.value(station.received)} came from it{dropped}"
-    return f"Ground station at {station.address}: {words.value(station.sent)} datagrams went there, {came}."
+    refused = " Its commands were refused: tracks are computed." if in_virtual_time(record.backend) else ""
+    return f"Ground station at {station.address}: {words.value(station.sent)} datagrams went there, {came}.{refused}"

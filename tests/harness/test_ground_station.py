@@ -60,11 +60,29 @@ def test_an_operator_sees_all_vehicles_and_flies_the_one_that_is_commanded(tmp_p
     assert flown["1"] == flown["3"] == (MODES["copter"]["GUIDED"], True)
 
 
+@pytest.mark.whoever
+def test_tracks_in_virtual_time_are_seen_and_refuse_commands(tmp_path: Path) -> None:
+    ground = GroundStation()
+    ground.start()
+    timeline = [{"at_s": 60, "kill": [3]}]
+    scenario = write_scenario(tmp_path, vehicles={"types": {3: "plane"}}, timeline=timeline, duration_s=120, speedup=60)
+    out = tmp_path / "run"
+    done = harness("run", scenario, "--out", out, "--backend", "sim", "--gcs", f"127.0.0.1:{ground.port}")
+    ground.over.set()
+    ground.join()
+    assert done.returncode == 0, done.stderr
+    record = json.loads((out / "run.json").read_text())
+    assert ground.seen == {1, 2, 3}
+    (command,) = record["ground_station"]["commands"]
+    assert (command["vehicles"], command["command"]) == ([2], "MAV_CMD_DO_SET_MODE")
+    assert "Its commands were refused: tracks are computed" in (out / "report.html").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (["--gcs", "14550"], "a ground station is HOST:PORT, for example 127.0.0.1:14550, not '14550'"),
-        (["--gcs", "127.0.0.1:14550", "--backend", "sim"], "`gcs` needs real processes: use --backend process"),
+        (["--gcs", "255.255.255.255:1", "--backend", "sim"], "the ground station at 255.255.255.255:1 cannot be sent"),
         (["--gcs", "127.0.0.1:14550", "--kernel", "uml"], "no ground station reaches into User Mode Linux"),
         (["--gcs", "127.0.0.1:14550", "--vehicles", "none"], "a ground station sees vehicles, and `vehicles.kind` is"),
         (["--gcs", "255.255.255.255:14550"], "255.255.255.255:14550 cannot be sent anything (Permission denied)"),

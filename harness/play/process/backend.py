@@ -21,7 +21,7 @@ from harness.play.process.agent import AgentProcess, reboots_with_disk
 from harness.play.process.lab import MissionLab, OpenLab
 from harness.play.process.preflight import on_the_air
 from harness.play.process.rogue import RogueProcess
-from harness.play.process.vehicle import VehicleProcess, system_ids
+from harness.play.process.vehicle import VehicleProcess
 from harness.play.process.watchers import Watchers, unless_interrupted
 from harness.play.progress import Progress, Snapshot
 from harness.play.radio_range import TRACK_S, RadioRange
@@ -35,6 +35,7 @@ from netem.engine import Applied
 from netem.errors import CaptureError, LabUnavailable, NetemError
 from sitl.address import Address
 from sitl.ground_station import GroundStation
+from sitl.system_ids import system_ids
 from sitl.vehicle import Home, VehicleError, VehicleKind
 from ucp.clock import MICROSECONDS, MissionClock
 

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from sitl.circumstances import Circumstance
 from sitl.ground_station import GroundStation
 from sitl.pilot import Pilot
 from sitl.procedure import Procedure
-from sitl.vehicle import MAX_SYSID, STATION_PORT, Home, Launch, VehicleError, VehicleKind
+from sitl.vehicle import STATION_PORT, Home, Launch, VehicleError, VehicleKind
 
 LISTEN_LIMIT_S = 20.0
 CONNECT_LIMIT_S = 2.0
@@ -29,18 +29,6 @@ LAST_WORDS = 3
 
 class VehicleFailedError(HarnessError):
     """A vehicle could not be started or flown, or ended by itself."""
-
-
-def system_ids(vehicle_ids: Sequence[int]) -> dict[int, int]:
-    """A MAVLink system ID, 1 to 255, for each vehicle of a run: its own where that is one, else one that is free.
-
-    Of more than 255 vehicles some share theirs; each is alone in its namespace.
-    """
-    taken = {vehicle_id for vehicle_id in vehicle_ids if vehicle_id <= MAX_SYSID}
-    free = [sysid for sysid in range(1, MAX_SYSID + 1) if sysid not in taken] or [MAX_SYSID]
-    borrowers = (vehicle_id for vehicle_id in vehicle_ids if vehicle_id > MAX_SYSID)
-    lent = {vehicle_id: free[number % len(free)] for number, vehicle_id in enumerate(borrowers)}
-    return {vehicle_id: lent.get(vehicle_id, vehicle_id) for vehicle_id in vehicle_ids}
 
 
 class VehicleProcess:

@@ -8,7 +8,7 @@ one fault leaves the others as they are. Vehicles are tracks, without telemetry,
 import base64
 import dataclasses
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from harness.errors import ScenarioError
@@ -28,6 +28,7 @@ from harness.scenario.changes import Change, Injected, NetworkChange, disconnect
 from harness.scenario.fates import Fate
 from harness.scenario.faults import VehicleFault
 from netem.radio import Place
+from sitl.track import Track
 from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
@@ -94,8 +95,15 @@ class Simulation(Clockwork):
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
         self._moves_at = NEVER
+        self.lost_vehicles: set[int] = set()
+        """Those that fly no more."""
         self._injected: list[Injected] = []
         """What the rogue node was told."""
+
+    @property
+    def tracks(self) -> Mapping[int, Track]:
+        """How the vehicles fly, if anybody asks."""
+        return self._tracks
 
     # The swarm, as harness.play.mission drives it
 
@@ -397,6 +405,8 @@ class Simulation(Clockwork):
 
     async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
         number = self._number[agent_id]
+        if with_vehicle:
+            self.lost_vehicles.add(agent_id)
         if (life := self._alive[number]) is not None:
             self._hear(number, life)
             life.ended_at = self._now
@@ -410,10 +420,12 @@ class Simulation(Clockwork):
 
     async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
         number = self._number[agent_id]
+        self.lost_vehicles.discard(agent_id)
         self._start(number, self._disks.pop(number, None))
 
     async def fall(self, agent_id: int) -> None:
         """A track knows nothing of that."""
+        self.lost_vehicles.add(agent_id)
 
     async def befall(self, agent_id: int, fault: VehicleFault) -> None:
         raise AssertionError("was refused")
@@ -438,7 +450,7 @@ class Simulation(Clockwork):
     async def switch_off(self, agent_id: int) -> None:
         number = self._number[agent_id]
         life = self._alive[number]
-        await self.end_life(agent_id)
+        await self.end_life(agent_id, with_vehicle=True)
         if life is not None:
             self._switched_off[number] = life
 

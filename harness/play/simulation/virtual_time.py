@@ -20,6 +20,7 @@ from harness.scenario.faults import VehicleFault
 if TYPE_CHECKING:
     from harness.play.simulation.captured_air import VirtualCapture
     from harness.play.simulation.foreign.programs import Programs
+    from harness.play.simulation.on_station import TracksOnStation
 
 
 class VirtualTime(Backend):
@@ -33,7 +34,6 @@ class VirtualTime(Backend):
             "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
             "vehicles.binary": scenario.vehicles.binary is not None,
             **{f"vehicles.{key}": True for key in _of_real_vehicles(scenario)},
-            "gcs": scenario.gcs is not None,
         }
         keys = [f"`{key}`" for key, needed in asked.items() if needed]
         if keys:
@@ -63,8 +63,12 @@ class VirtualTime(Backend):
         delivers_all: bool = False,
         pace: Pace | None = None,
     ) -> AsyncIterator[Simulation]:
+        station: TracksOnStation | None = None
+
         async def breathe(simulation: Simulation) -> None:
             progress.show(_snapshot(simulation))
+            if station is not None:
+                station.show(simulation.now(), simulation.lost_vehicles)
             await asyncio.sleep(0)  # lets the loop hear of Ctrl-C
             if interrupted.is_set():
                 raise InterruptedRunError(f"the run was interrupted at mission second {simulation.now():.0f}")
@@ -72,6 +76,8 @@ class VirtualTime(Backend):
         with closing(OnDisk(rundir)) as files, _programs(scenario, rundir) as programs:
             capture = _captures(rundir, scenario) if scenario.capture else None
             air = capture.air if capture else VirtualAir
+            if scenario.gcs and pace is None:
+                pace = Pace(scenario.speedup)  # nobody could follow it otherwise
             simulation = Simulation(
                 scenario,
                 seed,
@@ -83,6 +89,8 @@ class VirtualTime(Backend):
                 air=air,
                 programs=programs,
             )
+            if scenario.gcs:
+                station = await _open_station(simulation)
             try:
                 if simulation.public_keys is not None:
                     rundir.write_public_keys(simulation.public_keys)
@@ -93,6 +101,8 @@ class VirtualTime(Backend):
                 simulation.fail(error)
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
+            if station is not None:
+                simulation.played.ground_station = station.close()
             try:
                 _export(simulation, files)
                 if capture:
@@ -110,6 +120,12 @@ def _of_real_vehicles(scenario: Scenario) -> list[str]:
     asked = (scenario.vehicles, *scenario.vehicles.each.values())
     keys = ("frame", "parameters", "wind", "arguments", "debugger")
     return [key for key in keys if any(getattr(vehicles, key) for vehicles in asked)]
+
+
+async def _open_station(simulation: Simulation) -> "TracksOnStation":
+    from harness.play.simulation.on_station import TracksOnStation  # draws in MAVLink
+
+    return await TracksOnStation.open(simulation.scenario, simulation.tracks, simulation.now)
 
 
 def _export(simulation: Simulation, files: OnDisk) -> None:
