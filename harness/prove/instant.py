@@ -174,7 +174,17 @@ class Instants:
         key = local, heard, lossy, answered
         outcomes = self._outcomes.get(key)
         if outcomes is None:
-            outcomes = list(self._work_out(local, heard, lossy, in_order=not answered))
+            names = self._local.first_names(local, [sender for sender, _ in heard])
+            if names is None:
+                outcomes = list(self._work_out(local, heard, lossy, in_order=not answered))
+            else:
+                called = tuple((names[sender - 2], message) for sender, message in heard)
+                outcomes = [
+                    (step._replace(local=self._local.renamed_back(step.local, names)), order)
+                    for step, order in self._outcomes_of(local, called, lossy, answered)
+                ]
+                self._outcomes[key] = outcomes
+                return outcomes
             if self._bounds.reduced:
                 if answered:
                     settled = {
@@ -236,30 +246,20 @@ class Instants:
 
         All of them, if a wrong agent comes to ever more states by hearing the same again and again.
         """
-        matter: list[int] = []
-        while True:
-            seen, waiting = {local}, [local]
-            while waiting:
-                if len(seen) > MOST_SEEN:
-                    return list(range(len(heard)))
-                at = waiting.pop()
-                for position in matter:
-                    after = self._local.hear(at, *heard[position]).local
-                    if after not in seen:
-                        seen.add(after)
-                        waiting.append(after)
-            more = [
-                position
-                for position in range(len(heard))
-                if position not in matter and any(self._does_something(at, heard[position]) for at in seen)
-            ]
-            if not more:
-                return sorted(matter)
-            matter += more
-
-    def _does_something(self, local: int, heard: tuple[int, int]) -> bool:
-        step = self._local.hear(local, *heard)
-        return step.local != local or bool(step.sent) or bool(step.started)
+        seen, waiting = {local}, [local]
+        matter: set[int] = set()
+        while waiting:
+            if len(seen) > MOST_SEEN:
+                return list(range(len(heard)))
+            at = waiting.pop()
+            for position, (sender, message) in enumerate(heard):
+                step = self._local.hear(at, sender, message)
+                if step.local != at or step.sent or step.started:
+                    matter.add(position)
+                    if step.local not in seen:
+                        seen.add(step.local)
+                        waiting.append(step.local)
+        return sorted(matter)
 
 
 def _is_covered(step: Step, outcomes: Sequence[tuple[Step, tuple[int, ...]]]) -> bool:

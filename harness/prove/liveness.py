@@ -3,7 +3,7 @@
 Both are asked of what follows when nothing is lost any more and no new block comes, beside some more votes.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -57,17 +57,9 @@ def look(graph: Graph, check: Check = lambda: None) -> Liveness:
         if not astray or len(result.astray) > graph.swarm.bounds.agents:
             result.lost = astray[0] if astray else None
             return result
-        forks = [number for number in range(len(graph.states)) if number not in safe and _is_fork(graph, number)]
-        for number in forks:
-            check()
-            if number not in votes:
-                votes[number] = _vote(graph, number)
-        while len(graph.quiet) < len(graph.states):
-            if len(graph.states) > reachable + MOST_ADDED:
-                result.decided = False
-                return result
-            check()
-            quieten(graph, len(graph.quiet))
+        if not _try_votes(graph, reachable, check, safe, votes):
+            result.decided = False
+            return result
         safe = _attracted(graph, check, {number for number in range(len(graph.states)) if _is_one(graph, number)})
         for _ in result.astray:  # one vote more, each time, of which all that follows is known by now
             safe = _attracted(graph, check, safe | {number for number, choices in votes.items() if choices & safe})
@@ -83,35 +75,64 @@ def _is_fork(graph: Graph, number: int) -> bool:
     return graph.swarm.is_idle(state) and len(graph.swarm.chains(state)) > 1
 
 
-def _vote(graph: Graph, number: int) -> set[int]:
-    """What follows a state at rest when somebody completes one more block."""
-    state = graph.states[number]
-    return {
-        graph.add(after, number)
-        for place, local in enumerate(state[AGENTS:])
-        if local != DEAD
-        for after in graph.swarm.after(state, (Action(place, "complete", state[BLOCKS] + 1),), lossy=False)
+def _try_votes(graph: Graph, reachable: int, check: Check, safe: set[int], votes: dict[int, set[int]]) -> bool:
+    """Let somebody vote in each state at rest that is not safe, one after the other until that leads to one chain.
+
+    What follows is in `votes`. False if it is too much.
+    """
+    forks = [number for number in range(len(graph.states)) if number not in safe and _is_fork(graph, number)]
+    trying = {number: _voters(graph, number) for number in forks if number not in votes}
+    votes.update((number, set()) for number in trying)
+    while trying:
+        for number, voters in trying.items():
+            check()
+            votes[number] |= _vote(graph, number, voters.pop())
+        while len(graph.quiet) < len(graph.states):
+            if len(graph.states) > reachable + MOST_ADDED:
+                return False
+            check()
+            quieten(graph, len(graph.quiet))
+        added = range(reachable, len(graph.states))
+        safe = _attracted(graph, check, safe.union(number for number in added if _is_one(graph, number)), added)
+        trying = {number: voters for number, voters in trying.items() if voters and not votes[number] & safe}
+    return True
+
+
+def _voters(graph: Graph, number: int) -> list[int]:
+    """Places of agents that make a difference; last those whose chain most have."""
+    locals_, known = graph.states[number][AGENTS:], graph.swarm.local.known
+    alike = {
+        local if graph.swarm.bounds.alike else place: place for place, local in enumerate(locals_) if local != DEAD
     }
+    chains = Counter(known[local].chain for local in locals_ if local != DEAD)
+    return sorted(alike.values(), key=lambda place: chains[known[locals_[place]].chain])
 
 
-def _attracted(graph: Graph, check: Check, goal: set[int]) -> set[int]:
-    """All states from which, whichever timer is the next to end, some way leads to the goal.
+def _vote(graph: Graph, number: int, place: int) -> set[int]:
+    """What follows a state at rest when the agent at this place completes one more block."""
+    state = graph.states[number]
+    actions = (Action(place, "complete", state[BLOCKS] + 1),)
+    return {graph.add(after, number) for after in graph.swarm.after(state, actions, lossy=False)}
+
+
+def _attracted(graph: Graph, check: Check, goal: set[int], of: range | None = None) -> set[int]:
+    """All states, or those of some of them, from which, whichever timer is the next to end, some way leads to the goal.
 
     The durations decide which timer is next, and a zone does not tell: so all that it leaves open have to lead there.
     Of timers that have to end at the same moment only how long messages take decides which is first: any may be.
     """
     before: dict[int, list[tuple[int, int]]] = defaultdict(list)
-    open_timers: list[set[int]] = []
-    for number, alone in enumerate(graph.quiet):
+    open_timers: dict[int, set[int]] = {}
+    for number in range(len(graph.quiet)) if of is None else of:
         check()
-        open_timers.append(set(range(len(alone))))
-        for timer, after in enumerate(alone):
+        open_timers[number] = set(range(len(graph.quiet[number])))
+        for timer, after in enumerate(graph.quiet[number]):
             for state in after:
                 before[state].append((number, timer))
     any_order = graph.swarm.bounds.timers_any
     attracted, waiting = set(goal), list(goal)
     while waiting:
-        for number, timer in before[waiting.pop()]:
+        for number, timer in before.get(waiting.pop(), ()):
             open_timers[number].discard(timer)
             if number not in attracted and (any_order or not open_timers[number]):
                 attracted.add(number)

@@ -6,7 +6,7 @@ looked at once, when it gets its number.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from random import Random
@@ -32,6 +32,11 @@ MOST_AT_ONCE = 100
 DEAD = -1
 """The local state of an agent that is gone."""
 
+FIRST, FIRST_OTHER = 1, 2
+"""What an agent calls itself, and the first of the others, where it makes no difference who is who."""
+
+Names = tuple[int, ...]
+"""What an agent is to call the others, from `FIRST_OTHER` on."""
 Started = tuple[tuple[int, int], ...]
 """Timers that an agent has started in this instant and that run: (number, duration in microseconds)."""
 
@@ -106,6 +111,7 @@ class LocalStates:
         roster = range(1, bounds.agents + 1)
         settings = bounds.agent_settings()
         self.settings, self._roster = settings, roster
+        self._others = tuple(range(FIRST_OTHER, bounds.agents + 1))
         self._agents = {agent_id: self._agent(agent_id) for agent_id in roster}
         self._reference = Reference(self._agent) if bounds.steps else None
         self.timers = [timer.name for timer in self._agents[1].state.timers]
@@ -154,11 +160,45 @@ class LocalStates:
         key = local, sender, message
         step = self._steps.get(key)
         if step is None:
-            heard = self.messages[message]
-            step = self._steps[key] = self._computed(
-                local, lambda agent: agent.receive_message(sender, 0, heard, NOW_S), hears=True
-            )
+            names = self._in_order(local, sender)
+            if names is None:
+                heard = self.messages[message]
+                step = self._computed(local, lambda agent: agent.receive_message(sender, 0, heard, NOW_S), hears=True)
+            else:
+                step = self.hear(self.renamed(local, names), names[sender - FIRST_OTHER], message)
+                step = step._replace(local=self.renamed(step.local, _back(names)))
+            self._steps[key] = step
         return step
+
+    def _in_order(self, local: int, sender: int) -> Names | None:
+        """Names by which the others are in order: those in tallies first, then the sender; None if they are.
+
+        Where it makes no difference who is who, what an agent does is the same but for these names (docs/proof.md).
+        """
+        known = self.known[local]
+        if not self.bounds.alike or known.agent_id != FIRST or known.flaw is not None:
+            return None
+        tallies = [known.snapshot[name] for name in NAMES_OF_OTHERS]
+        in_order = sorted(
+            range(FIRST_OTHER, self.bounds.agents + 1),
+            key=lambda other: (*(other not in tally for tally in tallies), other != sender),
+        )
+        return None if tuple(in_order) == self._others else _back(tuple(in_order))
+
+    def first_names(self, local: int, senders: Sequence[int]) -> Names | None:
+        """Names by which those who are heard are the first of the others, in their order; None if they are.
+
+        Or if they have other names to the agent, as it has heard of somebody before.
+        """
+        known = self.known[local]
+        if not self.bounds.alike or known.agent_id != FIRST or known.names_others or known.flaw is not None:
+            return None
+        in_order = tuple(dict.fromkeys((*senders, *self._others)))
+        return None if in_order == self._others else _back(in_order)
+
+    def renamed_back(self, local: int, names: Names) -> int:
+        """The agent that was `renamed` by these names as it was."""
+        return self.renamed(local, _back(names))
 
     def end_timer(self, local: int, timer: int) -> Step:
         """A timer of the agent ends."""
@@ -286,13 +326,15 @@ class LocalStates:
             number = self._settled[local] = self._with(local, parts) if parts else local
         return number
 
-    def renamed(self, local: int, names: tuple[int, ...]) -> int:
-        """The same agent when the others are called otherwise: `names` for those from 2 on."""
+    def renamed(self, local: int, names: Names) -> int:
+        """The same agent when the others are called otherwise."""
+        if not self.known[local].names_others or self.known[local].flaw is not None:
+            return local
         key = local, names
         number = self._renamed.get(key)
         if number is None:
             snapshot = self.known[local].snapshot
-            new = dict(zip(range(2, 2 + len(names)), names, strict=True))
+            new = dict(zip(self._others, names, strict=True))
             parts = {name: {new[other] for other in snapshot[name]} for name in NAMES_OF_OTHERS}
             number = self._renamed[key] = self._with(local, parts)
         return number
@@ -414,6 +456,12 @@ class LocalStates:
         held.update(before["chain"].parts["_block_of_hash"])
         if not all(state.holds(block_hash) for block_hash in held):
             raise ReductionError("a block that an agent held is gone: try again with --whole")
+
+
+def _back(names: Names) -> Names:
+    """The names by which everybody has the name again that he had."""
+    before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
+    return tuple(before[name] for name in sorted(names))
 
 
 def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:

@@ -69,6 +69,7 @@ class Order:
             return (self._local.known[locals_[place]].anonymous, *bounds)
 
         looks = [alone(place) for place in range(len(locals_))]
+        named: list[list[set[int]]] = []
         if any(local != DEAD and self._local.known[local].names_others for local in locals_):
             named = [self._named(local, place) for place, local in enumerate(locals_)]
             looks = [
@@ -85,7 +86,9 @@ class Order:
         groups = [
             list(group) for _, group in groupby(sorted(range(len(locals_)), key=looks.__getitem__), looks.__getitem__)
         ]
-        for chosen in product(*map(permutations, groups)):
+        matter = [bool(named) or (zone and timers[group[0]]) for group in groups]  # or they are one as the other
+        orders = [permutations(group) if many else (tuple(group),) for group, many in zip(groups, matter, strict=True)]
+        for chosen in product(*orders):
             yield tuple(place for group in chosen for place in group)
 
     def _named(self, local: int, place: int) -> list[set[int]]:
@@ -115,8 +118,7 @@ class Order:
         """The agent at its new place, calling the others by theirs."""
         if local == DEAD:
             return local
-        known = self._local.known[local]
-        if not known.names_others or known.flaw is not None:
+        if not self._local.known[local].names_others:
             return local
         names = [0] * (len(places) - 1)
         for other_new, other_old in enumerate(places):
