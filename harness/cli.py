@@ -37,6 +37,10 @@ COMMANDS = {
         "harness.commands.watch:watch_command",
         "Show a run as a film in the browser: map, links, chains, votes and reconciles along time.",
     ),
+    "tell": (
+        "harness.commands.tell:tell_command",
+        "Have something happen now to a run that goes on; in virtual time pause, step, go on; or see how it stands.",
+    ),
     "shell": (
         "harness.commands.shell:shell_command",
         "Open a shell in the network of a vehicle whose run goes on (ping, tcpdump, ip); without one, list what runs.",

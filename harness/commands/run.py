@@ -62,6 +62,10 @@ def run_command(
     image_from_host: Annotated[
         bool, typer.Option("--image-from-host", help="Containers of this machine's own files: no image is built.")
     ] = False,
+    by_hand: Annotated[
+        bool,
+        typer.Option("--by-hand", help="Have `ucp-harness tell` say what happens; virtual time stands still at first."),
+    ] = False,
     watch: Annotated[
         bool, typer.Option("--watch", help="Show the run in the browser while it goes on, and as a film afterwards.")
     ] = False,
@@ -87,6 +91,8 @@ def run_command(
         _emit_compose(console, request, chosen_seed, emit_compose)
         return
     if kernel is Kernel.uml:
+        if by_hand:
+            raise ScenarioError("nobody is heard inside User Mode Linux: leave out --kernel uml, or --by-hand")
         if watch:
             raise ScenarioError("no page looks into User Mode Linux: leave out --kernel uml, or --watch")
         if why := BACKENDS[backend].not_in_uml:
@@ -105,8 +111,9 @@ def run_command(
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
     virtual = BACKENDS[backend].virtual_time
-    hand = Interventions(request, virtual_time=virtual, factor=request.speedup) if watch else None
-    with beside(directory, watch_port, hand) if hand is not None else nullcontext() as page:
+    told = watch or by_hand
+    hand = Interventions(request, virtual_time=virtual, factor=request.speedup, paused=by_hand) if told else None
+    with beside(directory, watch_port, hand) if watch and hand is not None else nullcontext() as page:
         if page is not None:
             show_address(console, page.address)
         shown = progress.for_console(console)

@@ -1,6 +1,6 @@
 """What other processes ask of a run that goes on: a socket in its directory, and on it `Interventions`.
 
-One line of JSON each way, as with an agent's control socket (`harness.play.control.AgentControl` may ask):
+One line of JSON each way, as with an agent's control socket; `ask_run` is one who asks:
 
     {"command": "happen", "entry": {"partition": [[1, 2], [3, 4, 5]]}}      an entry of a timeline, now
     {"command": "pause"} {"command": "go_on"} {"command": "step", "seconds": 10} {"command": "step"}
@@ -26,6 +26,7 @@ from typing import Any
 from pydantic_core import from_json
 
 from harness.errors import HarnessError, ScenarioError
+from harness.play.control import connect
 from harness.play.interventions import Interventions
 
 SOCKET = "by-hand"
@@ -62,6 +63,22 @@ async def listening(hand: Interventions, directory: Path) -> AsyncIterator[None]
         (directory / SOCKET).unlink(missing_ok=True)
         for task in connections:
             task.cancel()
+
+
+async def ask_run(directory: Path, **request: Any) -> dict[str, Any]:
+    """What the run that goes on there answers. Raises ScenarioError if it refuses, OSError if nobody answers."""
+    reader, writer = await connect(directory / SOCKET)
+    try:
+        writer.write(json.dumps(request).encode() + b"\n")
+        line = await reader.readline()
+    finally:
+        writer.close()
+    if not line.endswith(b"\n"):
+        raise ConnectionResetError("it has ended")
+    answer: dict[str, Any] = json.loads(line)
+    if not answer.pop("ok"):
+        raise ScenarioError(answer["error"])
+    return answer
 
 
 async def _serve(hand: Interventions, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -127,5 +144,7 @@ def _state(hand: Interventions) -> dict[str, Any]:
         "paused": hand.paused,
         "factor": hand.factor,
         "closed": hand.closed,
-        "by_hand": [entry.model_dump(mode="json", exclude_none=True) for entry in hand.by_hand],
+        "by_hand": [
+            {"at_s": entry.at_s, **entry.model_dump(mode="json", exclude_defaults=True)} for entry in hand.by_hand
+        ],
     }

@@ -109,12 +109,17 @@ class AgentControl:
         return answer
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-        # A socket's address holds 107 bytes, and run directories lie deep: name it through its directory.
-        directory = os.open(self._path.parent, os.O_PATH)
-        try:
-            self._streams = await asyncio.open_unix_connection(
-                f"/proc/self/fd/{directory}/{self._path.name}", limit=ANSWER_LIMIT_BYTES
-            )
-        finally:
-            os.close(directory)
+        self._streams = await connect(self._path)
         return self._streams
+
+
+async def connect(socket_path: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """A connection to a socket that answers in lines. Raises OSError."""
+    # A socket's address holds 107 bytes, and run directories lie deep: name it through its directory.
+    directory = os.open(socket_path.parent, os.O_PATH)
+    try:
+        return await asyncio.open_unix_connection(
+            f"/proc/self/fd/{directory}/{socket_path.name}", limit=ANSWER_LIMIT_BYTES
+        )
+    finally:
+        os.close(directory)

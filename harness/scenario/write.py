@@ -49,7 +49,7 @@ def _lines(key: str, value: Any, remark: Callable[[Document], str | None]) -> It
         yield "events:"
         yield f"  source: {value['source']}"
         yield "  script:"
-        yield from (f"    - {_flow(event)}" for event in value["script"])
+        yield from (f"    - {in_a_line(event)}" for event in value["script"])
     elif isinstance(value, list) and value and isinstance(value[0], dict):
         yield f"{key}:"
         for entry in value:
@@ -58,15 +58,15 @@ def _lines(key: str, value: Any, remark: Callable[[Document], str | None]) -> It
     elif isinstance(value, dict) and any(map(_is_long, value.values())):
         yield f"{key}:"
         for name, item in value.items():
-            yield from _item(f"  {_flow(name)}", item)
+            yield from _item(f"  {in_a_line(name)}", item)
     else:
-        yield f"{key}: {_flow(value)}"
+        yield f"{key}: {in_a_line(value)}"
 
 
 def _entry(entry: Document, beside: str) -> Iterator[str]:
     """A list's entry in a line; one that has a long text in several."""
     if not any(map(_is_long, entry.values())):
-        yield f"  - {_flow(entry)}{beside}"
+        yield f"  - {in_a_line(entry)}{beside}"
         return
     begin = "  - "
     for name, item in entry.items():
@@ -77,7 +77,7 @@ def _entry(entry: Document, beside: str) -> Iterator[str]:
 def _item(key: str, value: Any) -> Iterator[str]:
     """A key whose text, if it is long, goes over several lines, as YAML's folded style has it."""
     if not _is_long(value) or " " not in value:
-        yield f"{key}: {_flow(value)}"
+        yield f"{key}: {in_a_line(value)}"
         return
     yield f"{key}: >-"
     indent = " " * (len(key) - len(key.lstrip(" -")) + 2)
@@ -88,7 +88,8 @@ def _is_long(value: Any) -> bool:
     return isinstance(value, str) and len(value) > WIDTH // 2
 
 
-def _flow(value: Any) -> str:
+def in_a_line(value: Any) -> str:
+    """It as YAML, in one line."""
     written: str = yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=1e9, allow_unicode=True)
     return written.strip()[1:-1]
 
