@@ -106,12 +106,21 @@ class Suite:
         self._starting = asyncio.Semaphore(STARTS_AT_ONCE)
 
     async def run(self, until: float) -> None:
-        """All vectors, until that second of the monotonic clock; then what is suspected.
+        """All vectors, until that second of the monotonic clock, the last of them alone; then what is suspected.
 
         Raises NoAgentError if the agent never starts.
         """
         workers = min(self._side_by_side, 1 + sum(atlas.left for atlas in self._maps) // 10)
         await _together([self._work(place, until) for place in range(workers)])
+        if not self._suspicious:
+            missed = iter(
+                [
+                    (tally, pair)
+                    for tally, atlas in zip(self.tallies, self._maps, strict=True)
+                    for pair in atlas.given_up
+                ]
+            )
+            await _together([self._try_with_time(missed, until) for _ in range(ALONE_AT_ONCE)])
         once_more = [(tally, suspicion) for tally in self.tallies for suspicion in self._worth(tally)]
         waiting = iter(once_more[: self._enough])
         await _together([self._try_again(waiting) for _ in range(ALONE_AT_ONCE)])
@@ -120,6 +129,9 @@ class Suite:
     def _suspicious(self) -> bool:
         """Whether there are as many suspicions as are tried again."""
         return sum(len(tally.suspicions) for tally in self.tallies) >= self._enough
+
+    def _tell(self) -> None:
+        self._told(sum(len(each.passed) for each in self.tallies))
 
     async def _work(self, place: int, until: float) -> None:
         while time.monotonic() < until and not self._suspicious and (number := self._most_left()) is not None:
@@ -173,7 +185,7 @@ class Suite:
         def passed(pair: Pair) -> None:
             tally.passed.add(pair)
             self._room = min(self._side_by_side, self._room + MORE_ROOM)
-            self._told(sum(len(each.passed) for each in self.tallies))
+            self._tell()
 
         try:
             suspicion = await Tour(atlas, subject, passed).go_on(until)
@@ -204,6 +216,20 @@ class Suite:
                 yield suspicion
 
     # Alone
+
+    async def _try_with_time(self, missed: Iterator[tuple[Tally, Pair]], until: float) -> None:
+        """What could not be seen beside others, because the machine was late."""
+        for tally, pair in missed:
+            if time.monotonic() >= until:
+                return
+            step = tally.vectors.wanted[pair]
+            outcome = await self._repeated(tally.vectors.variant, (*step.way, pair.input))
+            if isinstance(outcome, Failure):
+                tally.failures.append(outcome)
+                tally.passed.discard(outcome.seen.pair)
+            elif outcome is RIGHT:
+                tally.passed.add(pair)
+                self._tell()
 
     async def _try_again(self, waiting: Iterator[tuple[Tally, Suspicion]]) -> None:
         for tally, suspicion in waiting:

@@ -56,6 +56,8 @@ class Map:
         self._quiet: set[Pair] = set()
         self._growing: set[Pair] = set()
         self._tries: Counter[Pair] = Counter()
+        self.given_up: list[Pair] = []
+        """What could not be seen however often it was tried: the machine was late each time."""
         self.claimed: set[Pair] = set()
         """To which a tour is on its way."""
         for step in steps:
@@ -103,6 +105,7 @@ class Map:
         """It could not be seen: another time, if there were not too many."""
         self._tries[pair] += 1
         if self._tries[pair] >= MOST_TRIES:
+            self.given_up.append(pair)
             return False
         self._unseen[pair.doing, pair.holds].add(pair)
         self.left += 1
