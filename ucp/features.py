@@ -4,8 +4,11 @@ A mission file lists those that it needs, so that an agent that lacks one can en
 something else than it was asked for.
 """
 
+from base64 import b64decode
 from collections.abc import Callable, Mapping
 from typing import Any
+
+from ucp.sealed import sealed_to
 
 CONTRACT = 2
 """The version of CONTRACT.md by which mission files are written."""
@@ -17,6 +20,7 @@ FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "store": lambda mission: mission.get("store") is not None,
     "telemetry": lambda mission: mission["events"]["source"] == "mavlink",
     "secured": lambda mission: mission.get("security") is not None,
+    "sealed": lambda mission: sealed_to(b64decode(mission["initial_data"])) is not None,
     "quirks": lambda mission: any(mission["quirks"].values()),
     "vote_names_chain": lambda mission: mission["settings"]["vote_names_chain"],
     "changed_before_tally": lambda mission: mission["settings"]["changed_before_tally"],

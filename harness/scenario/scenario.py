@@ -273,7 +273,8 @@ class Scenario(Model):
             yield from ((f"schedule.{index}.{key}", vehicle) for key, vehicle in schedule.named())
         for index, entry in enumerate(self.timeline):
             if entry.fault is not None:
-                yield from ((f"timeline.{index}.{entry.fault.what}", agent) for agent in entry.fault.agents)
+                named = (*entry.fault.agents, *entry.fault.also_named)
+                yield from ((f"timeline.{index}.{entry.fault.what}", agent) for agent in named)
             if entry.network is not None:
                 yield from ((f"timeline.{index}.network.{key}", vehicle) for key, vehicle in entry.network.named())
             if entry.injection is not None:
@@ -390,10 +391,12 @@ class Scenario(Model):
                 fault.check(self.vehicles)
             except ValueError as error:
                 raise ValueError(f"{where} {error}") from None
+            if fault.needs_keys and self.security is None:
+                raise ValueError(f"{where} is about keys, which a mission has with `security: {{keys: fresh}}`")
             for agent in fault.agents:
                 if state[agent] not in fault.needs:
                     raise ValueError(f"{where}: agent {agent} is {state[agent]} then, not {' or '.join(fault.needs)}")
-                state[agent] = fault.leads_to
+                state[agent] = fault.leads_to or state[agent]
         if set(state.values()) == {KILLED}:
             raise ValueError("the timeline leaves nobody: at the end all agents are killed; spare or restart one")
         return self

@@ -16,7 +16,7 @@ from harness.scenario import load_scenario
 from harness.scenario.changes import RANGE
 from harness.scenario.expect import NUMBERS
 from tests.harness.command import harness
-from ucp.trace import StateSummary
+from ucp.trace import Commanded, StateSummary
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 MATRIX = SCENARIOS / "thesis_matrix.yaml"
@@ -258,6 +258,28 @@ def field_test_2020(run: Simulated, seed: int) -> None:
     }
 
 
+def secure(run: Simulated, seed: int) -> None:
+    """Whoever has no keys gets nothing in."""
+    dropped = sum((Counter(agent["dropped"]) for agent in run.played.agents.values()), Counter[str]())
+    assert dropped["replayed"]
+    assert dropped["not secured"]
+    final = run.evidence.exports.values()
+    assert len({export.chain[-1].chain_hash for export in final}) == 1
+
+
+def revoked_in_partition(run: Simulated, seed: int) -> None:
+    """All that live hear of the revocation, once they can, and tell who comes later."""
+    heard_s = {}
+    for agent_id, trace in run.evidence.traces.items():
+        heard = [aside.t for _, aside in trace.asides if isinstance(aside, Commanded) and aside.command == "revoke"]
+        if heard:
+            heard_s[agent_id] = heard[-1]
+    assert heard_s.keys() == {1, 2, 4, 5}
+    assert heard_s[1] == heard_s[2] == 350
+    assert heard_s[4] > 600
+    assert heard_s[5] > 800
+
+
 CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
     claim.__name__: claim
     for claim in (
@@ -284,6 +306,8 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         refused_by_the_third,
         by_turns,
         rogue,
+        secure,
+        revoked_in_partition,
         field_test_2020,
     )
 }

@@ -25,6 +25,7 @@ from ucp.features import FEATURES, needed
 from ucp.messages import RequestForBlock, encode
 from ucp.schemas.control import MAY_BE_MISSING, REQUESTS, STATUS
 from ucp.schemas.trace import DROPS, OPERATIONS, SECURED_DROPS
+from ucp.sealed import seal_to
 from ucp.settings import Settings
 from ucp.vectors.replay import differences
 
@@ -154,7 +155,9 @@ def test_mission_files_fit_their_schema_and_name_the_features_that_they_need() -
     )
     told = {"address": "10.0.0.1", "broadcast": "10.0.0.255"}
     without = mission_file(1, plain, 0, b"", with_vehicle=False, **told)
-    with_all = mission_file(1, rich, 0, b"", with_vehicle=True, store="1.store", bundle="1.bundle.json", **told)
+    with_all = mission_file(
+        1, rich, 0, seal_to(b"", bytes(32)), with_vehicle=True, store="1.store", bundle="1.bundle.json", **told
+    )
     assert (without["contract"], without["features"]) == (2, [])
     assert with_all["features"] == [*FEATURES] == needed(with_all)
     for document in (without, with_all):

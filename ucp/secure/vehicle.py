@@ -7,9 +7,11 @@ from functools import partial
 from pathlib import Path
 
 from ucp.mission import Mission, MissionError
+from ucp.sealed import sealed_to
 from ucp.secure.agent import SecuredAgent, boot_of
 from ucp.secure.bundle import Bundle, load_bundle, write_bundle
 from ucp.secure.keyfile import KeyFileError
+from ucp.secure.sealing import seal_of
 from ucp.secure.session import Session
 
 
@@ -38,4 +40,5 @@ def secured_agent(
             not_erased(error)
 
     boot = boot_of(time.time_ns() // 1000, os.urandom(8))
-    return partial(SecuredAgent, Session(bundle, boot, keep))
+    seal = seal_of(bundle) if sealed_to(mission.initial_data) == bundle.public.depot else None
+    return partial(SecuredAgent, Session(bundle, boot, keep), seal=seal)

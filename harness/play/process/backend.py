@@ -110,6 +110,9 @@ class ProcessRun:
         """
         with handed_out(self.scenario) as self._keys:
             self.rundir.keys = self._keys.directories
+            if (keys := self._keys.keys) is not None:
+                self.rundir.write_public_keys(keys.public)
+                self.initial_data = keys.sealed_to_depot(self.initial_data)
             async with self._in_lab():
                 yield self
 
@@ -299,6 +302,12 @@ class ProcessRun:
         self._watchers.stop(f"agent {agent_id}")
         landed = [self._shoot_down(self.vehicles[number])] if self.vehicles else []
         await asyncio.gather(self.agents[number].switch_off(), *landed)
+
+    async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
+        assert self._keys.keys is not None, "was refused"
+        revocation = base64.b64encode(self._keys.keys.revoke(agent_id)).decode("ascii")
+        hearers = [agent for agent in self.agents if agent.agent_id in heard_by and agent.awake]
+        await asyncio.gather(*(agent.ask("revoke", revocation=revocation) for agent in hearers))
 
     async def befall(self, agent_id: int, fault: VehicleFault) -> None:
         if not self.vehicles:

@@ -427,6 +427,16 @@ class Simulation(Clockwork):
         """A track knows nothing of that."""
         self.lost_vehicles.add(agent_id)
 
+    async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
+        assert self._keys is not None, "was refused"
+        revocation = self._keys.mission.revoke(agent_id)
+        for number in map(self._number.__getitem__, heard_by):
+            life = self._alive[number]
+            if life is not None and life.waiting is None and life.secured is not None:
+                self._hear(number, life)
+                life.secured.revoke(revocation, life.local_s(self._now))
+                self._after(number, life)
+
     async def befall(self, agent_id: int, fault: VehicleFault) -> None:
         raise AssertionError("was refused")
 

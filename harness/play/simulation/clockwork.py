@@ -76,7 +76,7 @@ class Clockwork:
         """Whether anybody may do what no right agent of ours does."""
         self._keys = self._keys_of_agents(watched=told or deliver_all) if scenario.security else None
         if self._keys is not None:
-            self._initial_data = self._keys.sealed_to_depot(initial_data)
+            self._initial_data = self._keys.mission.sealed_to_depot(initial_data)
         anything_counts = self._anybody_is_unknown or (self._keys is not None and not self._keys.sampled)
         self._deliver_all = deliver_all = deliver_all or anything_counts
         self._now = 0.0
@@ -112,7 +112,7 @@ class Clockwork:
     @property
     def public_keys(self) -> "PublicKeys | None":
         """Those of the vehicles; None of a mission that is not secured."""
-        return self._keys.public if self._keys else None
+        return self._keys.mission.public if self._keys else None
 
     def _keys_of_agents(self, *, watched: bool) -> "Keys":
         from harness.play.simulation.secured import Keys  # needs the extra `secure`

@@ -17,7 +17,7 @@ from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from harness.play.keys import bundles_of
+from harness.play.keys import keys_of
 from harness.play.rogue.captured import CapturedKeys
 from harness.play.simulation.agents import OwnAgent
 from harness.scenario import Scenario
@@ -26,10 +26,9 @@ from ucp.block import Block
 from ucp.clock import MICROSECONDS
 from ucp.export import export_chain
 from ucp.messages import CARRY_A_BLOCK, TYPE_CODES, Message
-from ucp.sealed import seal_to
 from ucp.secure.agent import Outgoing, SecuredAgent, boot_of
 from ucp.secure.block_signature import sign_block
-from ucp.secure.bundle import Bundle, PublicKeys
+from ucp.secure.bundle import Bundle
 from ucp.secure.envelope import REQUESTS, sealed_bytes
 from ucp.secure.sealing import seal_of
 from ucp.secure.session import Request, Session
@@ -98,22 +97,15 @@ class Keys:
         self.boots: dict[int, bytes] = {}
         """Which life of each vehicle goes on."""
         self._seed = seed
-        self._seals = scenario.security is not None and scenario.security.seal
-        self._bundles: dict[int, Bundle] = dict(bundles_of(scenario, _of_seed(seed, "keys")))
+        keys = keys_of(scenario, _of_seed(seed, "keys"))
+        assert keys is not None, "the scenario is secured"
+        self.mission = keys
+        self._bundles: dict[int, Bundle] = dict(keys.bundles)
         captured = scenario.security.captured if scenario.security else None
         chance = Random(f"{seed}/captured")
         self.captured = None if captured is None else CapturedKeys(self._bundles[captured], lambda: chance.randbytes(8))
         """What the rogue node has."""
         self._verified: Callable[[Signed], bool] = lru_cache(SIGNATURES_REMEMBERED)(verify)
-
-    @property
-    def public(self) -> PublicKeys:
-        """What everybody may know of them."""
-        return next(iter(self._bundles.values())).public
-
-    def sealed_to_depot(self, initial_data: bytes) -> bytes:
-        """The inception block's data, which says to whom event data is sealed, if it is."""
-        return seal_to(initial_data, self.public.depot) if self._seals and self.public.depot else initial_data
 
     def agent(self, agent_id: int, life: int, now: float) -> Callable[..., SecuredOwnAgent]:
         """What makes the agent of a life that begins `now`, in mission seconds; lives are counted from 1."""
@@ -126,7 +118,7 @@ class Keys:
         bundle = self._bundles[agent_id]
         session = Session(bundle, boot, keep, self._verified)
         make = partial(SampledAgent, self) if self.sampled else SecuredOwnAgent
-        return partial(make, session, seal=seal_of(bundle) if self._seals else None)
+        return partial(make, session, seal=seal_of(bundle) if self.mission.seals else None)
 
     def signature(self, block: Block) -> bytes:
         """Its maker's."""

@@ -59,6 +59,9 @@ class Lives(Protocol):
     async def reconcile(self, agent_id: int) -> None:
         """Have the agent begin a reconcile."""
 
+    async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
+        """Have these vehicles hear, from the ground, that the agent's keys are revoked."""
+
     async def befall(self, agent_id: int, fault: "VehicleFault") -> None:
         """Have the agent's vehicle simulate the fault's circumstance; whether it does is on record at the end."""
 
@@ -82,8 +85,10 @@ class Fault:
     """Whether it is a key of a timeline entry; otherwise it comes of another fault."""
     needs: ClassVar[tuple[str, ...]] = ()
     """The states that an agent may be in before."""
-    leads_to: ClassVar[str] = RUNNING
-    """The state that it is in afterwards."""
+    leads_to: ClassVar[str | None] = RUNNING
+    """The state that it is in afterwards; None: the same."""
+    needs_keys: ClassVar[bool] = False
+    """Whether it is about keys, which only secured missions have."""
     ends_a_life: ClassVar[bool] = False
     """What the agent held in memory is gone."""
     begins_a_life: ClassVar[bool] = False
@@ -115,6 +120,11 @@ class Fault:
 
     def check(self, vehicles: Vehicles) -> None:
         """Raises ValueError, with what to do instead, if it cannot happen to such vehicles."""
+
+    @property
+    def also_named(self) -> Sequence[int]:
+        """Vehicles that its further keys name."""
+        return ()
 
     @property
     def disk_left(self) -> Disk | None:

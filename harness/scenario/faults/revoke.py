@@ -1,0 +1,33 @@
+"""The keys of a vehicle are taken back: it was lost, and nobody knows to whom."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from harness.scenario.faults.fault import KILLED, PAUSED, REBOOTING, RUNNING, SWITCHED_OFF, Fault, Lives
+from harness.scenario.model import VehicleId
+
+Hearers = Annotated[list[VehicleId], Field(min_length=1)]
+
+
+@dataclass(frozen=True)
+class Revoke(Fault):
+    """The authority revokes their keys; those in `heard_by` hear it from the ground, the others from them."""
+
+    heard_by: Hearers
+
+    what = "revoke"
+    needs = (RUNNING, PAUSED, KILLED, REBOOTING, SWITCHED_OFF)
+    leads_to = None
+    needs_keys = True
+    keys_in_words = "`heard_by`, the vehicles in reach of the ground"
+    mark = "M-6 0h12m-9-5l6 10m0-10l-6 10"
+    meaning = "keys revoked"
+
+    @property
+    def also_named(self) -> list[int]:
+        return self.heard_by
+
+    async def strike(self, lives: Lives, agent_id: int) -> None:
+        await lives.revoke(agent_id, self.heard_by)
