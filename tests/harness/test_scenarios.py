@@ -207,6 +207,10 @@ def refused_by_the_third(run: Simulated, seed: int) -> None:
     assert going_round(run) == (21.0, 20.0)
 
 
+def refused_for_ever(run: Simulated, seed: int) -> None:
+    assert going_round(run) == (41.0, 20.0)
+
+
 def by_turns(run: Simulated, seed: int) -> None:
     assert going_round(run) == (26.011, 30.0)
 
@@ -304,6 +308,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         lost_last_commit,
         in_step,
         refused_by_the_third,
+        refused_for_ever,
         by_turns,
         rogue,
         secure,
@@ -315,7 +320,7 @@ PLAYED = [(name, seed) for name in CLAIMS for seed in ((3, 8, 76) if name == "fi
 """Each scenario, and the seeds with which it shows what it says."""
 
 
-LIVELOCKS = ("in_step", "refused_by_the_third", "by_turns")
+LIVELOCKS = ("in_step", "refused_by_the_third", "refused_for_ever", "by_turns")
 BAD = ("rogue", *LIVELOCKS, "missed_commit", "field_test_2020")
 
 RECONCILED = [name for name in CLAIMS if name != "rogue" and load_scenario(SCENARIOS / f"{name}.yaml").final_reconcile]
