@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 from typing import Any, Literal, TypeGuard, get_args
 
-from ucp.block import MAX_AGENT_ID
+from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
 from ucp.dataclass import dataclass
 from ucp.events import DEFAULT_LOG, MAX_MEAN_S, MEAN_TIME_BETWEEN_EVENTS_S, EventKind
 from ucp.features import FEATURES
+from ucp.sealed import SEAL_BYTES, sealed_to
 from ucp.settings import Settings
 from ucp.shown import shown, shown_key
 
@@ -122,19 +123,26 @@ def parse_mission(document: Any) -> Mission:
     store = document.get("store")
     if store is not None and not (isinstance(store, str) and store.isprintable() and store):
         raise MissionError("`store` must be the path of a file, or null to keep nothing on disk")
+    initial_data, settings = _initial_data(document), _settings(document.get("settings", {}))
+    security = _security(document.get("security"))
+    if sealed_to(initial_data) is not None:
+        if security is None:
+            raise MissionError("`initial_data` ends in a depot's key, to which no agent seals without `security`")
+        if settings.max_block_bytes > (most := MAX_EVENT_DATA_BYTES - SEAL_BYTES):
+            raise MissionError(f"`settings.max_block_bytes` is at most {most} where event data is sealed")
     return Mission(
         agent_id=agent_id,
         roster=tuple(roster),
-        initial_data=_initial_data(document),
+        initial_data=initial_data,
         network=_network(_get(document, "network", dict)),
         events=_event_source(_get(document, "events", dict)),
-        settings=_settings(document.get("settings", {})),
+        settings=settings,
         quirks=_quirks(document.get("quirks", {})),
         seed=_integer(document, "seed", 0, 2**64 - 1),
         speedup=_positive(document, "speedup", MAX_SPEEDUP),
         epoch_us=epoch_us,
         store=store,
-        security=_security(document.get("security")),
+        security=security,
     )
 
 

@@ -33,6 +33,10 @@ def secured_agent(
         whose = f"has no keys of agent {without[0]}" if without else f"is agent {bundle.agent_id}'s"
         raise MissionError(f"`security.bundle`: {path} {whose}: hand out the bundle of agent {mission.agent_id}")
 
+    depot = sealed_to(mission.initial_data)
+    if depot is not None and depot != bundle.public.depot:
+        raise MissionError(f"`security.bundle`: {path} seals to another depot than the mission's `initial_data` names")
+
     def keep(newer: Bundle) -> None:
         try:
             write_bundle(path, newer)
@@ -40,5 +44,4 @@ def secured_agent(
             not_erased(error)
 
     boot = boot_of(time.time_ns() // 1000, os.urandom(8))
-    seal = seal_of(bundle) if sealed_to(mission.initial_data) == bundle.public.depot else None
-    return partial(SecuredAgent, Session(bundle, boot, keep), seal=seal)
+    return partial(SecuredAgent, Session(bundle, boot, keep), seal=None if depot is None else seal_of(bundle))

@@ -245,7 +245,8 @@ class ProcessRun:
             await self._capture.begin(epoch_us, self.scenario.speedup)
         await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
         if self._rogue is not None:
-            await self._rogue.begin(epoch_us)
+            captured = self.scenario.security.captured if self.scenario.security else None
+            await self._rogue.begin(epoch_us, None if captured is None else self._keys.hand(captured, kept=True))
         self.clock.start(epoch_us)
 
     async def apply(self, change: Change) -> None:

@@ -6,6 +6,7 @@ It is ours, not under test: if it fails, the machine or the harness has failed, 
 import asyncio
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 from harness.archive.directory import ROGUE_CONTROL, RunDirectory
@@ -57,11 +58,13 @@ class RogueProcess:
                     raise self._failed(f"did not answer within {START_LIMIT_S:g} s of its start") from None
                 await asyncio.sleep(ASK_AGAIN_S)
 
-    async def begin(self, epoch_us: int) -> None:
-        """The mission begins."""
+    async def begin(self, epoch_us: int, captured: Path | None) -> None:
+        """The mission begins; in the file `captured` are a vehicle's keys."""
         scenario = self._scenario
-        roster = list(scenario.roster)
-        await self._ask("start", epoch_us=epoch_us, speedup=scenario.speedup, roster=roster, seed=self._seed)
+        roster, keys = list(scenario.roster), None if captured is None else str(captured)
+        await self._ask(
+            "start", epoch_us=epoch_us, speedup=scenario.speedup, roster=roster, seed=self._seed, captured=keys
+        )
 
     async def inject(self, injected: Injected) -> None:
         await self._ask(

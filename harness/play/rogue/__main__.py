@@ -6,11 +6,13 @@ agents that it imitates. In its working directory it has `rogue.control`, which 
 """
 
 import json
+import os
 import signal
 import socket
 import sys
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
@@ -23,6 +25,9 @@ from ucp.clock import MissionClock
 from ucp.control import CommandError, ControlServer
 from ucp.loop import Loop, Timer
 from ucp.messages import PORT
+
+if TYPE_CHECKING:
+    from harness.play.rogue.captured import CapturedKeys
 
 LINK = "eth0"
 DATAGRAMS_PER_TURN = 64
@@ -101,7 +106,8 @@ class RogueNode:
         epoch_us = request["epoch_us"]
         self._clock = MissionClock(request["speedup"])
         self._clock.start(epoch_us)
-        self._rogue = Rogue(request["roster"], request["seed"], epoch_us)
+        captured = request.get("captured")
+        self._rogue = Rogue(request["roster"], request["seed"], epoch_us, _keys(Path(captured)) if captured else None)
         return {}
 
     def _inject(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -117,6 +123,13 @@ class RogueNode:
 
     def _status(self, request: dict[str, Any]) -> dict[str, Any]:
         return {"sent": dict(self._rogue.sent) if self._rogue is not None else {}}
+
+
+def _keys(path: Path) -> "CapturedKeys":
+    from harness.play.rogue.captured import CapturedKeys  # needs the extra `secure`
+    from ucp.secure.bundle import load_bundle
+
+    return CapturedKeys(load_bundle(path), partial(os.urandom, 8))
 
 
 def main() -> int:

@@ -1,0 +1,75 @@
+"""All secrets of a mission, and whether any is in what a run left, in whatever form somebody may have put it."""
+
+import base64
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from harness.keyring.home import Home
+from ucp.messages import MalformedDatagramError
+from ucp.secure.envelope import CLEAR, MAGIC, VERSION, read_clear
+from ucp.secure.suite import KEY_BYTES, NONCE_BYTES, expand, next_epoch_secret
+
+_SENDER = b"UCP sender\0"
+_CLEAR_START = MAGIC + bytes([VERSION])
+
+
+def secrets(home: Home, epochs: int, boots: Iterable[tuple[int, bytes]] = ()) -> dict[str, bytes]:
+    """What each is -> private keys, the group's secret of each epoch, and what senders derive from it in a life."""
+    documents = {name: json.loads((home.directory / name).read_text()) for name in ("authority.key", "depot.key")}
+    found = {name: bytes.fromhex(document["private_key"]) for name, document in documents.items()}
+    bundles, mission = home.bundles(), home.public().mission
+    found |= {f"private key of {agent_id}": bundle.private_key for agent_id, bundle in bundles.items()}
+    secret = next(iter(bundles.values())).group_secret
+    lives = list(boots)
+    for epoch in range(epochs):
+        found[f"group secret of epoch {epoch}"] = secret
+        for sender, boot in lives:
+            info = _SENDER + mission + epoch.to_bytes(4, "big") + sender.to_bytes(4, "big") + boot
+            derived = expand(secret, info, 2 * KEY_BYTES + NONCE_BYTES)
+            found[f"key of {sender}, epoch {epoch}"] = derived[:KEY_BYTES]
+            found[f"mask of {sender}, epoch {epoch}"] = derived[KEY_BYTES + NONCE_BYTES :]
+        secret = next_epoch_secret(secret, mission)
+    return found
+
+
+def forms(secret: bytes) -> Iterator[bytes]:
+    """Raw, hexadecimal, base64 wherever in it, a whole number, a list of numbers, and as Python shows bytes."""
+    yield secret
+    yield secret.hex().encode()
+    yield secret.hex().upper().encode()
+    for shift in range(3):  # what stands around it moves it; its first and last characters are others' too
+        yield base64.b64encode(bytes(shift) + secret)[4:-4]
+        yield base64.urlsafe_b64encode(bytes(shift) + secret)[4:-4]
+    yield str(int.from_bytes(secret, "big")).encode()
+    yield str(int.from_bytes(secret, "little")).encode()
+    yield ", ".join(map(str, secret)).encode()
+    yield ",".join(map(str, secret)).encode()
+    yield repr(secret)[2:-1].encode()
+
+
+def told(known: dict[str, bytes], contents: Iterable[tuple[str, bytes]]) -> list[str]:
+    """Which secrets are where."""
+    looked_for = [(name, form) for name, secret in known.items() for form in forms(secret)]
+    return [f"{name} in {where}" for where, content in contents for name, form in looked_for if form in content]
+
+
+def left_in(directory: Path) -> Iterator[tuple[str, bytes]]:
+    """All files, by their names."""
+    for path in directory.rglob("*"):
+        if path.is_file() and not path.is_symlink():
+            yield str(path), path.read_bytes()
+
+
+def boots_in(content: bytes) -> set[tuple[int, bytes]]:
+    """Senders and their lives, by the headers of sealed datagrams in a capture."""
+    found, start = set(), content.find(_CLEAR_START)
+    while start >= 0:
+        length = int.from_bytes(content[start + 12 : start + 14], "big")
+        try:
+            clear = read_clear(content[start : start + CLEAR.size + length])
+            found.add((clear.sender, clear.boot))
+        except MalformedDatagramError:
+            pass
+        start = content.find(_CLEAR_START, start + 1)
+    return found

@@ -1,0 +1,121 @@
+"""Nothing that a run leaves has a secret in it, whether it ends well or not; nor has any error message."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.keyring.home import Home
+from tests.harness.command import harness
+from tests.harness.secure.secrets import boots_in, forms, left_in, secrets, told
+
+ROSTER = [1, 2, 3]
+EPOCHS = 14
+"""Those of the mission, and those that vehicles would follow others to."""
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
+    """Keys and bundles of a mission whose epochs are short."""
+    home = Home.new(tmp_path_factory.mktemp("secrets") / "keys", ROSTER, seals=True, epoch_s=30.0)
+    home.write_bundles(home.directory.parent / "bundles")
+    return home
+
+
+def scenario(directory: Path, home: Home, **keys: Any) -> Path:
+    path = directory / "secret.yaml"
+    security = {"keys": str(home.directory.parent / "bundles"), "seal": True, "captured": 3}
+    asked = {
+        "name": "secret",
+        "agents": ROSTER,
+        "duration_s": 120,
+        "events": {"source": "random", "mean_s": 5},
+        "security": security,
+        "capture": True,
+        "timeline": [{"at_s": 60, "forge": {"message": "Commit Block", "sender": 3}}],
+    }
+    path.write_text(json.dumps({**asked, **keys}))
+    return path
+
+
+def run(asked: Path, *options: str) -> tuple[int, list[tuple[str, bytes]]]:
+    """Exit status, and all that the run said and left."""
+    out = asked.parent / "run"
+    done = harness("run", asked, "--seed", "1", "--out", out, *options)
+    left = list(left_in(out)) if out.exists() else []
+    return done.returncode, [("its output", (done.stdout + done.stderr).encode()), *left]
+
+
+def test_what_a_run_leaves_has_no_secret(home: Home, tmp_path: Path) -> None:
+    status, left = run(scenario(tmp_path, home), "--backend", "sim")
+    assert status in (0, 1), left[0]
+    names = {Path(name).name for name, _ in left}
+    assert {"run.json", "report.html", "rogue.jsonl", "1.trace.jsonl", "1.chain.json", "1.pcapng"} <= names
+    boots = {life for name, content in left if name.endswith(".pcapng") for life in boots_in(content)}
+    assert {sender for sender, _ in boots} == {*ROSTER}
+    known = secrets(home, EPOCHS, boots)
+    assert len(known) > len(ROSTER) * EPOCHS
+    assert told(known, left) == []
+
+
+@pytest.mark.lab
+def test_what_a_run_of_processes_that_fails_leaves_has_no_secret(home: Home, tmp_path: Path) -> None:
+    """Agent 2 is a program that tells all that it is given, and dies."""
+    tells = ["sh", "-c", "cat *.mission.json; printenv; exit 3"]
+    asked = scenario(tmp_path, home, agent_command={"2": tells}, capture=False, speedup=20, duration_s=40, timeline=[])
+    status, left = run(asked, "--backend", "process")
+    assert status == 1, left[0]
+    assert any(b"bundle" in content for name, content in left if name.endswith("2.log"))
+    assert told(secrets(home, EPOCHS), left) == []
+
+
+@pytest.mark.lab
+def test_a_captured_vehicles_keys_forge_its_blocks_and_no_others(home: Home, tmp_path: Path) -> None:
+    """As processes: what is in the run's directory has no secret either."""
+    forged = [{"at_s": 60, "forge": {"message": "Commit Block", "sender": sender}} for sender in (3,)]
+    forged += [{"at_s": 80, "forge": {"message": "Commit Block", "sender": 2}}]
+    asked = scenario(tmp_path, home, speedup=20, timeline=forged, capture=False)
+    status, left = run(asked, "--backend", "process")
+    assert status == 1, left[0]
+    record = json.loads(dict(left)[str(tmp_path / "run/run.json")])
+    genuine = record["characteristics"]["4"]
+    assert genuine["verdict"] == "violated"
+    assert all("agent 3 never completed, signed with its key" in finding["detail"] for finding in genuine["evidence"])
+    dropped = [reason for agent in record["agents"].values() for reason in agent["dropped"]]
+    assert "not signed by its sender" in dropped
+    assert told(secrets(home, EPOCHS), left) == []
+
+
+@pytest.mark.parametrize("mistake", ["mode", "swapped", "cut off", "text"])
+def test_no_error_message_has_a_secret(home: Home, tmp_path: Path, mistake: str) -> None:
+    bundles = tmp_path / "bundles"
+    home.write_bundles(bundles)
+    path = bundles / "2.bundle.json"
+    document = json.loads(path.read_text())
+    match mistake:
+        case "mode":
+            path.chmod(0o644)
+        case "swapped":
+            other = json.loads((bundles / "3.bundle.json").read_text())["private_key"]
+            path.write_text(json.dumps({**document, "private_key": other}))
+        case "cut off":
+            path.write_text(path.read_text()[:-20])
+        case "text":
+            path.write_text(json.dumps({**document, "group_secret": [document["group_secret"]], "epoch": "x"}))
+    asked = scenario(tmp_path, home)
+    asked.write_text(asked.read_text().replace(str(home.directory.parent / "bundles"), str(bundles)))
+    done = harness("keys", "inspect", bundles)
+    status, left = run(asked, "--backend", "sim")
+    assert (status, done.returncode) == (2, 2)
+    assert "2.bundle.json" in done.stderr
+    assert told(secrets(home, EPOCHS), [*left, ("inspect", (done.stdout + done.stderr).encode())]) == []
+
+
+def test_each_form_of_a_secret_would_be_found() -> None:
+    secret = os.urandom(32)
+    for number, form in enumerate(forms(secret)):
+        assert told({"it": secret}, [("a file", b"before " + form + b" behind")]), number
+    inside = json.dumps({"data": [1, *secret, 2]}).encode()
+    assert told({"it": secret}, [("a file", inside)])
