@@ -52,6 +52,7 @@ class Interventions(GrowingTimeline):
     ) -> None:
         """In virtual time only: `factor` is as for `set_factor`; `paused`: it stands at second 0, and waits."""
         super().__init__(scenario)
+        self._begun_with = scenario
         self.pace = Pace(factor, paused=paused) if virtual_time else None
         """For the backend's own use."""
         self.taken_down: Callable[[], None] = lambda: None
@@ -77,6 +78,11 @@ class Interventions(GrowingTimeline):
     def closed(self) -> str | None:
         """Why nothing can happen to the swarm any more, or yet; None if it can."""
         return self._closed
+
+    @property
+    def readies_all(self) -> bool:
+        """Whether all agents are made ready for what they may be told: ours are; others may lack what that takes."""
+        return not self._begun_with.foreign
 
     @property
     def now_s(self) -> float:
@@ -241,6 +247,7 @@ class Interventions(GrowingTimeline):
         document["timeline"].append({"at_s": at_s, **entry})
         self._end_what_it_takes_the_place_of(document["timeline"])
         self.retell(document)
+        self._refuse_what_nobody_is_ready_for(self.scenario.timeline[-1])
         self._by_hand[at_s] = self.scenario.timeline[-1]
         try:
             with self.pace.unheeded() if self.pace else nullcontext():
@@ -260,6 +267,27 @@ class Interventions(GrowingTimeline):
             is_under_way = earlier.for_s is not None and earlier.at_s < entry.at_s < earlier.ends_at_s
             if is_under_way and entry.for_s is None and {*changed(earlier)} <= {*changed(entry)}:
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
+
+    def _refuse_what_nobody_is_ready_for(self, entry: TimelineEntry) -> None:
+        """Raises ScenarioError for what agents had to be ready for from the start, where some may not have been."""
+        if self.readies_all:
+            return
+        if entry.injection and self._begun_with.rogue is None:
+            raise ScenarioError(
+                f"`{entry.injection[0]}` needs a rogue node, which there is, among agents of another make, if the "
+                "timeline that the mission begins with injects something"
+            )
+        ready = {
+            agent_id
+            for fault in self._begun_with.faults_in_order()
+            if fault.disk_left == "kept"
+            for agent_id in fault.agents
+        }
+        if (fault := entry.fault) is not None and fault.disk_left == "kept" and (diskless := {*fault.agents} - ready):
+            raise ScenarioError(
+                f"agent {min(diskless)} has no disk: in a swarm with agents of another make only those have one that "
+                "the timeline that the mission begins with reboots so; `disk: lost` can be"
+            )
 
     def as_asked(self, change: Change) -> Change:
         entry = self._by_hand.get(change.at_s)

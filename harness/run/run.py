@@ -79,7 +79,7 @@ def run(
     options: dict[str, Any] = {"delivers_all": delivers_all}
     if interventions is not None:
         story = partial(_by_hand, interventions, recording.directory)
-        options |= {"told": True, "pace": interventions.pace}
+        options |= {"told": interventions.readies_all, "pace": interventions.pace}
         interventions.taken_down = partial(recording.take_down_by_hand, interventions)
     try:
         played = asyncio.run(

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -166,6 +167,23 @@ def test_where_vehicles_fly_it_is_played_again_just_so(tmp_path: Path) -> None:
     run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
     assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
     assert (tmp_path / "again/tracks.jsonl").read_bytes() == (tmp_path / "run/tracks.jsonl").read_bytes()
+
+
+def test_agents_of_another_make_are_asked_for_nothing_that_their_scenario_does_not(tmp_path: Path) -> None:
+    node = [sys.executable, "-m", "ucp.node"]
+    rebooted = [{"at_s": 80, "reboot": [1], "down_s": 5, "disk": "kept"}]
+    asked = scenario(duration_s=100, agents=2, agent_command={2: node}, timeline=rebooted)
+
+    def click(hand: Interventions) -> None:
+        hand.step(20).result(TIMEOUT_S)
+        with pytest.raises(ScenarioError, match="agent 2 has no disk"):
+            hand.ask({"reboot": [1, 2], "down_s": 5, "disk": "kept"}).result(TIMEOUT_S)
+        with pytest.raises(ScenarioError, match="`flood` needs a rogue node"):
+            hand.ask({"flood": {"per_s": 10, "for_s": 1}}).result(TIMEOUT_S)
+        hand.ask({"reboot": [1], "down_s": 5, "disk": "kept"}).result(TIMEOUT_S)
+        hand.ask({"reboot": [2], "down_s": 5, "disk": "lost"}).result(TIMEOUT_S)
+
+    assert played(asked, tmp_path / "run", click).played.outcome == "completed"
 
 
 def test_after_the_end_nothing_happens_and_every_answer_comes(tmp_path: Path) -> None:
