@@ -149,12 +149,12 @@ class SecuredAgent(Agent):
 
     def revoke(self, body: bytes, now: float, came: Mapping[str, Any] | None = None) -> None:
         """The authority says whose keys are revoked. Raises MalformedDatagramError if it does not, or not anew."""
+        if 0 < int.from_bytes(body[:2], "big") <= self._revocations:
+            raise MalformedDatagramError("known already")
         try:
             revocation = Revocation.decode(body, self.session.authority, self.session.mission)
         except RevocationError:
             raise MalformedDatagramError("not signed by the authority") from None
-        if revocation.number <= self._revocations:
-            raise MalformedDatagramError("known already")
         self.revocation = revocation
         request = {"command": "revoke", "revocation": in_base64(body), **(came or {})}
         if self._tracing:

@@ -1,0 +1,306 @@
+"""Forgeries, replays and nonces: `python -m benchmarks.forgeries [--each 1000000] [--only CLASS ...]`.
+
+`--each` forged datagrams of each of ten classes reach an agent that has keys, and that has heard others. How many it
+accepts, whether anything of it changed, and how many it rejects in a second of processor time, making them not counted.
+
+`--replays RUNS`: every datagram of so many simulated missions reaches, at later seconds, an agent that heard it.
+`--nonces RUNS`: so many simulated missions with reboots, with and without disk; how often a key and nonce came twice.
+"""
+
+import argparse
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from itertools import cycle, islice
+from random import Random
+from typing import Any
+
+from harness.play.simulation.air import StrayDatagram, VirtualAir
+from harness.run.simulate import InMemory, simulate, simulate_in_memory
+from harness.scenario import Scenario
+from ucp.block import Block
+from ucp.messages import BlockAddRequest, BlockResponse, ChainContainResponse, CommitBlock, Message, encode
+from ucp.secure.agent import SecuredAgent, boot_of
+from ucp.secure.bundle import KeySet
+from ucp.secure.envelope import CLEAR, SIGNATURE_BYTES
+from ucp.secure.session import Session
+from ucp.secure.suite import SenderKeys
+from ucp.trace import Recorded
+
+ROSTER = (1, 2, 3)
+KEYS = KeySet.derived(b"forgeries".ljust(32, b"\0"), ROSTER)
+OTHERS = KeySet.derived(b"another mission".ljust(32, b"\0"), ROSTER)
+EPOCH = 5
+NOW = EPOCH * KEYS.public.epoch_s
+POOL = 512
+"""Datagrams from which a class makes its forgeries, of those that are dear to make."""
+AT_ONCE = 2000
+RUNS_AT_ONCE = 500
+LATER_S = (1.0, 40.0)
+
+
+def session(agent_id: int, keys: KeySet = KEYS, now: float = NOW) -> Session:
+    begun = Session(keys.bundle(agent_id), boot_of(1_000_000, bytes(8)))
+    begun.epochs.look_at(now)
+    return begun
+
+
+def listener() -> SecuredAgent:
+    """Agent 1, which has heard one datagram of each of the others."""
+    agent = SecuredAgent(session(1), 1, ROSTER, b"test", tracing=False)
+    for other in ROSTER[1:]:
+        agent.receive_datagram(session(other).seal(0, messages(Random(0))[0], None, None, 0), NOW)
+    agent.datagrams_to_send()
+    return agent
+
+
+def messages(draw: Random) -> list[Message]:
+    """A message of each shape."""
+    a, b = draw.randbytes(32), draw.randbytes(32)
+    block = Block(2, draw.randrange(2**40), draw.randbytes(draw.randrange(1, 300)))
+    return [BlockAddRequest(a, b), CommitBlock(block, a), ChainContainResponse(a, True), BlockResponse(block)]
+
+
+def pool(maker: Session, draw: Random, first: int = 1) -> list[bytes]:
+    """Datagrams that nobody has heard."""
+    made = []
+    while len(made) < POOL:
+        for message in messages(draw):
+            signature = draw.randbytes(SIGNATURE_BYTES)
+            made.append(maker.seal(first + len(made), message, None, signature, 0))
+    return made
+
+
+# The ten classes: each goes on for ever
+
+
+def at_random(draw: Random) -> Iterator[bytes]:
+    while True:
+        noise = draw.randbytes(draw.randrange(200))
+        yield noise
+        yield b"UC\2" + noise
+        yield _header(draw, len(noise)) + noise
+
+
+def _header(draw: Random, length: int) -> bytes:
+    numbers = draw.randrange(1, 11), draw.choice(ROSTER), draw.randrange(2**32), length, EPOCH
+    return CLEAR.pack(b"UC", 2, *numbers, boot_of(1_000_000, bytes(8)), 0)
+
+
+def bits_flipped(draw: Random) -> Iterator[bytes]:
+    for good in cycle(pool(session(2), draw)):
+        forged = bytearray(good)
+        for _ in range(draw.choice((1, 1, 2, 3, 8))):
+            forged[draw.randrange(len(forged))] ^= 1 << draw.randrange(8)
+        if forged != good:
+            yield bytes(forged)
+
+
+def truncated(draw: Random) -> Iterator[bytes]:
+    for good in cycle(pool(session(2), draw)):
+        short = good[: draw.randrange(len(good))]
+        yield short
+        if len(short) >= CLEAR.size:
+            yield short[:12] + (len(short) - CLEAR.size).to_bytes(2, "big") + short[14:]
+
+
+def another_sender(draw: Random) -> Iterator[bytes]:
+    for good in cycle(pool(session(2), draw)):
+        yield good[:4] + (3).to_bytes(4, "big") + good[8:]
+        yield good[:4] + draw.randbytes(4) + good[8:]
+
+
+def another_mission(draw: Random) -> Iterator[bytes]:
+    yield from cycle(pool(session(2, OTHERS), draw))
+
+
+def an_old_epoch(draw: Random) -> Iterator[bytes]:
+    old = pool(session(2, now=NOW - 2 * KEYS.public.epoch_s), draw)
+    for datagram in cycle(old):
+        yield datagram
+        yield datagram[:14] + (EPOCH - draw.randrange(2)).to_bytes(4, "big") + datagram[18:]
+
+
+def unsigned(draw: Random) -> Iterator[bytes]:
+    sealed = pool(session(2), draw)
+    for number, good in enumerate(cycle(sealed)):
+        yield encode(2, number, messages(draw)[number % 4])
+        yield good[:-SIGNATURE_BYTES] + bytes(SIGNATURE_BYTES)
+        yield good[:12] + (len(good) - CLEAR.size - SIGNATURE_BYTES).to_bytes(2, "big") + good[14:-SIGNATURE_BYTES]
+
+
+def wrong_private_key(draw: Random) -> Iterator[bytes]:
+    imposter = session(3)
+    imposter.agent_id = 2
+    yield from cycle(pool(imposter, draw))
+
+
+def parts_swapped(draw: Random) -> Iterator[bytes]:
+    heard = pool(session(2), draw) + pool(session(3), draw)
+    while True:
+        one, two, three = draw.sample(heard, 3)
+        yield one[: CLEAR.size] + two[CLEAR.size : -SIGNATURE_BYTES] + three[-SIGNATURE_BYTES:]
+        body = two[CLEAR.size :]
+        yield one[:12] + len(body).to_bytes(2, "big") + one[14 : CLEAR.size] + body
+        yield one[:-SIGNATURE_BYTES] + two[-SIGNATURE_BYTES:]
+
+
+def lengths_that_lie(draw: Random) -> Iterator[bytes]:
+    for good in cycle(pool(session(2), draw)):
+        right, lie = good[12:14], draw.randbytes(2)
+        if lie != right:
+            yield good[:12] + lie + good[14:]
+        yield good + draw.randbytes(draw.randrange(1, 100))
+
+
+CLASSES: dict[str, Callable[[Random], Iterator[bytes]]] = {
+    made.__name__: made
+    for made in (
+        *(at_random, bits_flipped, truncated, another_sender, another_mission),
+        *(an_old_epoch, unsigned, wrong_private_key, parts_swapped, lengths_that_lie),
+    )
+}
+
+
+def all_of(agent: SecuredAgent) -> dict[str, Any]:
+    """Everything that a datagram might change."""
+    state, session = agent.state, agent.session
+    return {
+        "received": agent.received.copy(),
+        "chain": (len(state.chain), state.chain.top_chain_hash, len(state.blocks_to_be_committed)),
+        "reconcile": (state.reconcile_in_progress, len(state.reconcile_stack), state.vote_count.copy()),
+        "timers": [timer.deadline for timer in state.timers],
+        "epoch": session.epochs.current,
+        "keys": len(session.epochs._sender_keys),
+        "signatures": dict(agent.signatures),
+        "revocation": agent.revocation,
+        "heard": {
+            sender: (life.boot, life.window._newest, tuple(life.window._words), dict(life.requests))
+            for sender, life in session._lives.items()
+        },
+    }
+
+
+def forge(
+    make: Callable[[Random], Iterator[bytes]], count: int, seed: int = 1
+) -> tuple[int, bool, float, Counter[str]]:
+    """How many of so many forgeries were accepted, whether anything changed, processor seconds, and why dropped."""
+    agent, forgeries = listener(), make(Random(1))
+    before, seconds, answered = all_of(agent), 0.0, 0
+    for _ in range(-(-count // AT_ONCE)):
+        few = list(islice(forgeries, min(AT_ONCE, count)))
+        began = time.process_time()
+        for datagram in few:
+            agent.receive_datagram(datagram, NOW)
+        seconds += time.process_time() - began
+        answered += len(agent.datagrams_to_send())
+    return (
+        answered + agent.received.total() - before["received"].total(),
+        all_of(agent) != before,
+        seconds,
+        agent.dropped,
+    )
+
+
+def flying(duration_s: float, **more: Any) -> Scenario:
+    fresh = {"keys": "fresh"}
+    return Scenario.model_validate({"name": "flying", "security": fresh, "duration_s": duration_s, **more})
+
+
+class ReplayingAir(VirtualAir):
+    """Everything that is sent reaches everybody else again, `LATER_S` after it was sent."""
+
+    def broadcast(
+        self,
+        now: float,
+        number: int,
+        sequence: int,
+        message: Message,
+        data_bytes: int,
+        datagram: Recorded | None = None,
+        sealed: bytes | None = None,
+    ) -> None:
+        super().broadcast(now, number, sequence, message, data_bytes, datagram, sealed)
+        assert sealed is not None, "all is sealed where everything is delivered"
+        others = [other for other in range(len(self._roster)) if other != number]
+        for later_s in LATER_S:
+            self.inject(now + later_s, StrayDatagram(self._roster[number], sealed), others)
+
+
+def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
+    """Missions with the same chains though all was replayed; datagrams sent again; findings of the checker."""
+    same, dropped, bad = 0, 0, list[str]()
+    for seed in range(runs):
+        request = flying(300, network={"loss": loss}, final_reconcile=True)
+        plain = simulate(request, seed, deliver_all=True)
+        run = simulate_in_memory(InMemory(False), request, seed, deliver_all=True, air=ReplayingAir)
+        same += run.result.chains == plain.result.chains
+        dropped += sum(agent["dropped"].get("replayed", 0) for agent in run.played.agents.values())
+        bad += run.result.bad
+    return same, dropped, bad
+
+
+def nonces(seeds: Iterable[int]) -> tuple[int, int]:
+    """How many datagrams were sealed, and how many with a key and nonce that had been used before in their run."""
+    used: set[tuple[int, int]] = set()
+    sealed = twice = 0
+    sealing = SenderKeys.encrypt
+
+    def taken_down(keys: SenderKeys, sequence: int, body: bytes, clear: bytes) -> bytes:
+        nonlocal sealed, twice
+        sealed += 1
+        nonce = hash((keys._mask, keys._nonce(sequence))), sequence
+        twice += nonce in used
+        used.add(nonce)
+        return sealing(keys, sequence, body, clear)
+
+    SenderKeys.encrypt = taken_down  # type: ignore[method-assign]
+    try:
+        for seed in seeds:
+            used.clear()  # another run has other keys
+            lost = {"at_s": 40, "reboot": [1, 2], "down_s": 5, "disk": "lost"}
+            kept = {"at_s": 60, "reboot": [2, 3], "down_s": 5, "disk": "kept"}
+            again = {"at_s": 80, "reboot": [1], "down_s": 5, "disk": "lost"}
+            simulate(flying(120, agents=3, timeline=[lost, kept, again], events={"mean_s": 3}), seed)
+    finally:
+        SenderKeys.encrypt = sealing  # type: ignore[method-assign]
+    return sealed, twice
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--each", type=int, default=1_000_000)
+    parser.add_argument("--only", nargs="+", choices=CLASSES, default=list(CLASSES))
+    parser.add_argument("--nonces", type=int, metavar="RUNS")
+    parser.add_argument("--replays", type=int, metavar="RUNS")
+    parser.add_argument("--loss", type=float, default=0.0, help="of the missions whose datagrams are replayed")
+    arguments = parser.parse_args()
+    if arguments.nonces is not None:
+        for first in range(0, arguments.nonces, RUNS_AT_ONCE):
+            seeds = range(first, min(first + RUNS_AT_ONCE, arguments.nonces))
+            sealed, twice = nonces(seeds)
+            say(f"{len(seeds)} runs, {sealed} datagrams sealed: a key and nonce came twice {twice} times")
+    elif arguments.replays is not None:
+        same, dropped, bad = replays(arguments.replays, arguments.loss)
+        say(f"{arguments.replays} runs, {dropped} datagrams dropped as replayed, {len(bad)} findings")
+        say(f"{same} have the chains of the run without replays")
+    else:
+        say(f"{'class':20}{'forged':>9}{'accepted':>10}{'changed':>9}{'rejected/s':>12}  why")
+        for name in arguments.only:
+            say(row(name, arguments.each))
+
+
+def row(name: str, each: int) -> str:
+    accepted, changed, seconds, why = forge(CLASSES[name], each)
+    forged, reasons = why.total(), ", ".join(f"{reason} {count}" for reason, count in why.most_common())
+    return f"{name:20}{forged:9}{accepted:10}{'yes' if changed else 'no':>9}{forged / seconds:12.0f}  {reasons}"
+
+
+def say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
