@@ -12,7 +12,7 @@ from harness import prove, specification
 from harness.commands.terminal import Watcher, complain, print_json
 from harness.errors import INTERRUPTED
 from harness.prove import Bounds, BoundsError, Limits, Progress
-from harness.run.sweep import cores
+from harness.run.sweep import cores, terminated_is_interrupted
 
 GIGABYTE = 1e9
 TIMERS = ("duration", "apart", "any")
@@ -82,13 +82,13 @@ def prove_command(
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:
-        with Watcher() as watcher:
+        with Watcher() as watcher, terminated_is_interrupted():
             opinion = specification.second_opinion(
                 bounds, limits, watch=lambda progress: watcher.show(_how_far(progress))
             )
         _say(opinion.to_json(), opinion.in_words(), as_json)
         raise typer.Exit(opinion.exit_status)
-    with Watcher() as watcher:
+    with Watcher() as watcher, terminated_is_interrupted():
         proof = prove.prove(bounds, limits, out, watch=lambda progress: watcher.show(_how_far(progress)))
     _say(proof.to_json(), prove.in_words(proof), as_json)
     if proof.exit_status == INTERRUPTED:

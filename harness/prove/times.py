@@ -42,7 +42,7 @@ def windows_s(count: int, runs: Sequence[Run]) -> list[tuple[float, float]]:
     latest = _longest(begin, [(after, before, least) for before, after, least in later])
     assert earliest is not None, "the way was found"
     assert latest is not None, "the way was found"
-    return [(first + 0.0, -last) for first, last in zip(earliest, latest, strict=True)]
+    return [(first + 0.0, 0.0 - last) for first, last in zip(earliest, latest, strict=True)]
 
 
 def _solved(count: int, runs: Sequence[Run], apart_s: float, *, punctual: bool) -> list[float] | None:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import ucp
 from harness.errors import MachineError
+from harness.run.sweep import terminated_is_interrupted
 
 MODULES = Path(ucp.__file__).parent / "spec"
 JAVA = ("java", "-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xss64m")
@@ -72,10 +73,11 @@ def checked(
 ) -> Iterator[Checked]:
     """What TLC says of a module of ucp/spec; its files are there as long as the context is.
 
-    `others` are more modules, by name. Raises NoCheckerError, CheckerError, and TimeoutError after `most_s`.
+    `others` are more modules, by name. SIGTERM leaves nothing behind, as Ctrl-C.
+    Raises NoCheckerError, CheckerError, and TimeoutError after `most_s`.
     """
     call = command(memory_mb)
-    with tempfile.TemporaryDirectory(prefix="ucp-spec-") as name:
+    with terminated_is_interrupted(), tempfile.TemporaryDirectory(prefix="ucp-spec-") as name:
         folder = Path(name)
         for path in MODULES.glob("*.tla"):
             shutil.copy(path, folder)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,14 @@ def test_the_command_says_it(tmp_path: Path) -> None:
     done = harness("prove", "--faults", "death", "--second-opinion")
     assert done.returncode == 2
     assert sentences(done.stderr) == ["the specification has no faults: leave --faults out"]
+
+
+def test_sigterm_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tlc, "command", lambda memory_mb: ["sh", "-c", "kill -TERM $PPID; exec sleep 60"])
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(KeyboardInterrupt), tlc.checked("Swarm", ""):
+        pass
+    assert not [*tmp_path.iterdir()]
 
 
 def test_without_java_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
