@@ -4,7 +4,7 @@
 import { colour, font, prepared } from "./look.js";
 
 const LABEL = 38;
-const MOST_HEIGHT = 420;
+const SHARE = 0.5;
 
 export class Chains {
   constructor(canvas, story) {
@@ -14,7 +14,8 @@ export class Chains {
 
   draw(swarm) {
     const { run } = this.story, rows = run.roster.length;
-    const row = Math.max(9, Math.min(24, Math.floor(Math.min(MOST_HEIGHT, innerHeight * 0.42) / rows)));
+    const tall = SHARE * document.getElementById("side").clientHeight;
+    const row = Math.max(6, Math.min(24, Math.floor(tall / rows)));
     const { context, width } = prepared(this.canvas, rows * row + 15);
     const size = row >= 14 ? row - 6 : row - 2, step = Math.min(size, 13) + 2;
     const block = step - 2;
@@ -75,8 +76,9 @@ export class Chains {
     }
     context.fillStyle = run.inks[index][0];
     context.fillRect(0, y + 1, 4, row - 2);
+    if (row < 9 && index % 5) return;
     context.fillStyle = colour(agent.state === "up" ? "ink" : "quiet");
-    context.font = font(Math.min(12, row), busy ? 700 : 500);
+    context.font = font(Math.max(9, Math.min(12, row)), busy ? 700 : 500);
     context.textAlign = "right";
     context.textBaseline = "middle";
     context.fillText(String(id), LABEL - 9, y + row / 2 + 0.5);

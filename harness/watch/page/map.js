@@ -138,7 +138,7 @@ export class SwarmMap {
       const track = this.story.tracks.get(id);
       if (!track || swarm.agents.get(id).state === "gone") continue;
       context.strokeStyle = run.inks[index][1];
-      const step = TRAIL_S / 12;
+      const step = TRAIL_S / 20;
       for (let back = TRAIL_S; back > 0; back -= step) {
         if (t - back < track[0][1]) continue;
         const from = this.point(this.story.at(id, t - back)), to = this.point(this.story.at(id, t - back + step));

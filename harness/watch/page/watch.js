@@ -149,7 +149,9 @@ function show() {
     before = slow;
     chains.draw(swarm);
     const heads = swarm.heads, uniform = heads.length <= 1;
-    $("heads").textContent = uniform ? "all the same" : `${heads.length} different: ${heads.slice(0, 5).map((same) => listed(same)).join(" | ")}${heads.length > 5 ? " | …" : ""}`;
+    const few = swarm.run.roster.length <= 12;
+    const groups = heads.map((same) => few ? same.join(" ") : String(same.length)).join(" | ");
+    $("heads").textContent = uniform ? "all the same" : `${heads.length} different${few ? "" : ", held by"}: ${groups}`;
     $("heads").classList.toggle("apart", !uniform);
     verdicts.show(swarm, time, story.end, time >= lastSecond() - 1e-6);
     const drops = swarm.drops ? ` · ${swarm.drops} dropped` : "";

@@ -1,0 +1,122 @@
+"""What watching a live run costs: `python -m benchmarks.watch [--agents 50] [--minutes 4] [--speedup 1]`.
+
+A run in virtual time leaves what real agents leave: with every message that reached them, and vehicles that fly. Then
+its files grow again as they did, and the server's process reads them ten times a second for one browser, which here is
+a client on this machine. Counted are its processor seconds (user and system), not the client's. The goal is a fifth of
+a core for 50 vehicles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import time
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import aiohttp
+
+from harness.play.progress import Silent
+from harness.run.run import run
+from harness.scenario import Scenario
+from harness.watch.feed import Feed
+from harness.watch.server import UPDATE_S, Server
+from harness.watch.story import Story
+
+Written = list[tuple[float, Path, bytes]]
+
+
+def played(directory: Path, agents: int, minutes: float) -> None:
+    flight = {"radio": {"hard_range": {"range_m": 3000}}}
+    keys = {"agents": agents, "duration_s": 60 * minutes, "network": {"loss": 0.1, **flight}}
+    run(Scenario.model_validate({"name": "Watched", **keys}), 1, directory, Silent(), "sim", delivers_all=True)
+
+
+def written(directory: Path) -> Written:
+    """Each line that a run left, and when it was written, in mission seconds."""
+    lines: Written = []
+    for path in directory.rglob("*.jsonl"):
+        at_s = 0.0
+        for line in path.read_bytes().splitlines(keepends=True):
+            document = json.loads(line)
+            at_s = document.get("t", document.get("at_s", at_s))
+            lines.append((at_s, path.relative_to(directory), line))
+    return sorted(lines, key=lambda line: line[0])
+
+
+async def serve(directory: Path, lines: Written, speedup: float, ready: multiprocessing.Queue[object]) -> None:
+    """Let the files grow, and read them; the growing is not counted."""
+    with closing(Feed(directory)) as feed, closing(Story()) as story:
+        async with Server(story, directory, live=True).open(0) as address:
+            ready.put(address)
+            story.tell([feed.first(live=True)])
+            files = {path: (directory / path).open("ab", buffering=0) for _, path, _ in lines}
+            spent = begun = time.process_time()
+            at, end_s, now_s, looks = 0, lines[-1][0], 0.0, 0
+            while now_s < end_s:
+                now_s += UPDATE_S * speedup
+                growing = time.process_time()
+                while at < len(lines) and lines[at][0] <= now_s:
+                    files[lines[at][1]].write(lines[at][2])
+                    at += 1
+                spent += time.process_time() - growing
+                more = True
+                while more:
+                    changes, more = feed.look()
+                    story.tell(changes)
+                looks += 1
+                await asyncio.sleep(UPDATE_S if looks % 10 == 0 else 0.002)
+            cost = time.process_time() - spent
+            del begun
+            ready.put((cost, looks, story.size, at))
+
+
+def read(address: str) -> None:
+    """A browser that reads all, and draws nothing."""
+
+    async def listen() -> None:
+        async with aiohttp.ClientSession() as client, client.ws_connect(f"{address}live", max_msg_size=0) as socket:
+            async for _ in socket:
+                pass
+
+    asyncio.run(listen())
+
+
+def served(directory: Path, lines: Written, speedup: float, ready: multiprocessing.Queue[object]) -> None:
+    asyncio.run(serve(directory, lines, speedup, ready))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--agents", type=int, default=50)
+    parser.add_argument("--minutes", type=float, default=4.0, help="of mission")
+    parser.add_argument("--speedup", type=float, default=1.0)
+    asked = parser.parse_args()
+    with TemporaryDirectory() as place:
+        source, growing = Path(place) / "run", Path(place) / "growing"
+        played(source, asked.agents, asked.minutes)
+        lines = written(source)
+        (growing / "agents").mkdir(parents=True)
+        (growing / "run.json").write_bytes((source / "run.json").read_bytes())
+        for _, path, _ in lines:
+            (growing / path).touch()
+        ready: multiprocessing.Queue[object] = multiprocessing.Queue()
+        server = multiprocessing.Process(target=served, args=(growing, lines, asked.speedup, ready))
+        server.start()
+        browser = multiprocessing.Process(target=read, args=(ready.get(),), daemon=True)
+        browser.start()
+        cost, looks, told, count = ready.get()  # type: ignore[misc]
+        server.join()
+        browser.terminate()
+    live_s = looks * UPDATE_S
+    print(
+        f"{asked.agents} vehicles at {asked.speedup:g}x, {count} lines in {live_s:.0f} s of wall time at 10 updates "
+        f"a second: {cost:.1f} s of processor time, {cost / live_s:.1%} of a core; {told / live_s / 1000:.0f} kB/s told"
+    )
+
+
+if __name__ == "__main__":
+    main()
