@@ -17,8 +17,8 @@ export class Chains {
     const tall = SHARE * document.getElementById("side").clientHeight;
     const row = Math.max(6, Math.min(24, Math.floor(tall / rows)));
     const { context, width } = prepared(this.canvas, rows * row + 15);
-    const size = row >= 14 ? row - 6 : row - 2, step = Math.min(size, 13) + 2;
-    const block = step - 2;
+    const size = row >= 14 ? row - 6 : row - 1.5, step = Math.max(8, Math.min(size, 13) + 2);
+    const block = Math.min(size, 13);
     const room = Math.max(8, Math.floor((width - LABEL - 8) / step) - 5);
     const longest = Math.max(0, ...run.roster.map((id) => swarm.agents.get(id).chain.length));
     const first = Math.max(0, longest - room);
@@ -30,12 +30,13 @@ export class Chains {
       context.globalAlpha = agent.state === "up" || agent.state === "still" ? 1 : 0.3;
       for (let height = first; height < agent.chain.length; height += 1) {
         const key = agent.chain[height], x = LABEL + (height - first) * step;
-        this.block(context, swarm, key, x, middle - block / 2, block);
-        if (usual[height - first] !== key) {
-          context.strokeStyle = colour("lost");
-          context.lineWidth = 2;
-          context.strokeRect(x - 0.5, middle - block / 2 - 0.5, block + 1, block + 1);
-        }
+        context.fillStyle = this.paint(swarm, key);
+        context.fillRect(x, middle - block / 2, step - 2, block);
+        if (usual[height - first] === key) continue;
+        context.strokeStyle = context.fillStyle = colour("lost");
+        context.lineWidth = 2;
+        if (row >= 12) context.strokeRect(x - 0.5, middle - block / 2 - 0.5, step - 1, block + 1);
+        else context.fillRect(x - 1, middle + block / 2 - 0.75, step, 1.5);
       }
       const end = LABEL + (agent.chain.length - first) * step + 3, small = Math.max(4, block * 0.55);
       [...agent.stack].reverse().slice(0, 8).forEach((key, at) => {
@@ -58,11 +59,6 @@ export class Chains {
   paint(swarm, key) {
     const maker = swarm.blocks.get(key);
     return maker ? this.story.run.inks[this.story.index.get(maker.agent)][0] : colour("whole");
-  }
-
-  block(context, swarm, key, x, y, size) {
-    context.fillStyle = this.paint(swarm, key);
-    context.fillRect(x, y, size, size);
   }
 
   label(context, swarm, id, index, y, row) {

@@ -23,7 +23,7 @@ export class Timeline {
   }
 
   draw(t, end, live) {
-    const { run } = this.story, lane = Math.max(1.6, Math.min(11, 110 / run.roster.length));
+    const { run } = this.story, lane = Math.max(1.6, Math.min(11, 90 / run.roster.length));
     const lanes = Math.ceil(run.roster.length * lane), height = TOP + lanes + 6 + HEADS + AXIS;
     const { context, width } = prepared(this.canvas, height);
     this.x = d3.scaleLinear([0, Math.max(end, 1)], [LEFT, width - RIGHT]);

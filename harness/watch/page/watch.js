@@ -157,7 +157,8 @@ function show() {
     const drops = swarm.drops ? ` · ${swarm.drops} dropped` : "";
     $("counts").textContent = `${swarm.blocks.size} blocks · ${swarm.votes} votes · ${swarm.reconciles} reconciles${drops}${shareLost()}`;
     const parts = swarm.parts.length > 1 ? `in ${swarm.parts.length} parts: ${swarm.parts.map(listed).join(" | ")}` : "";
-    $("clock").replaceChildren(clock(time), element("small", [swarm.conditions, parts].filter(Boolean).join(" · ")));
+    const conditions = few ? swarm.conditions : swarm.conditions.replace(/, partition .*/, "");
+    $("clock").replaceChildren(clock(time), element("small", [conditions, parts].filter(Boolean).join(" · ")));
   } else changed = true;
   $("slider").max = end;
   if (!dragged) $("slider").value = time;
