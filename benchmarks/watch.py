@@ -54,7 +54,7 @@ async def serve(directory: Path, lines: Written, speedup: float, ready: multipro
             ready.put(address)
             story.tell([feed.first(live=True)])
             files = {path: (directory / path).open("ab", buffering=0) for _, path, _ in lines}
-            spent = begun = time.process_time()
+            spent = time.process_time()
             at, end_s, now_s, looks = 0, lines[-1][0], 0.0, 0
             while now_s < end_s:
                 now_s += UPDATE_S * speedup
@@ -70,7 +70,6 @@ async def serve(directory: Path, lines: Written, speedup: float, ready: multipro
                 looks += 1
                 await asyncio.sleep(UPDATE_S if looks % 10 == 0 else 0.002)
             cost = time.process_time() - spent
-            del begun
             ready.put((cost, looks, story.size, at))
 
 
@@ -112,7 +111,7 @@ def main() -> None:
         server.join()
         browser.terminate()
     live_s = looks * UPDATE_S
-    print(
+    print(  # noqa: T201
         f"{asked.agents} vehicles at {asked.speedup:g}x, {count} lines in {live_s:.0f} s of wall time at 10 updates "
         f"a second: {cost:.1f} s of processor time, {cost / live_s:.1%} of a core; {told / live_s / 1000:.0f} kB/s told"
     )
