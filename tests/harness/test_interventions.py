@@ -22,6 +22,8 @@ from tests.harness.virtual import scenario
 
 TIMEOUT_S = 60.0
 
+pytestmark = pytest.mark.whoever
+
 
 def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> Run:
     """A run in virtual time that stands at second 0 until `do` has it go on."""

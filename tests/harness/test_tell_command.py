@@ -1,5 +1,6 @@
 """A run that goes on is told what happens, from another terminal."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from harness.play.by_hand import SOCKET
 from tests.harness.command import Running, harness, sentences, write_scenario
 
 
+@pytest.mark.whoever
 def test_virtual_time_stands_still_until_it_is_told_to_go_on(tmp_path: Path) -> None:
     out = tmp_path / "run"
     going = Running(write_scenario(tmp_path), out, "--backend", "sim", "--by-hand", "--seed", "3")
@@ -43,21 +45,24 @@ def test_virtual_time_stands_still_until_it_is_told_to_go_on(tmp_path: Path) -> 
 @pytest.mark.lab
 def test_processes_are_told_and_do_not_stand_still(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    going = Running(write_scenario(tmp_path, duration_s=600, final_reconcile=True), out, "--by-hand")
+    going = Running(write_scenario(tmp_path, duration_s=100_000), out, "--by-hand")
     going.wait_for_mission(1, 2, 3)
     going.wait_for(lambda: harness("tell", out, "partition", "1", "|", "2", "3").returncode == 0, "the mission")
     assert harness("tell", out, "reboot", "3").returncode == 2
     assert harness("tell", out, "{reboot: [3], down_s: 20, disk: kept}").returncode == 0
     assert "real processes cannot stand still" in harness("tell", out, "pause").stderr
     assert harness("tell", out, "heal").returncode == 0
+    going.wait_for(lambda: '"what":"boot"' in (out / "network.jsonl").read_text(), "the end of the reboot")
+    going.process.send_signal(signal.SIGINT)
     status, _, complaints = going.end()
-    assert status == 0, complaints
+    assert status == 130, complaints
     told = [(fault["what"], fault["by_hand"]) for fault in going.record()["faults"]]
     assert [what for what, by_hand in told if by_hand] == ["partition", "reboot", "heal"]
     assert ("boot", False) in told
     assert "by hand" in (out / "replay.yaml").read_text()
 
 
+@pytest.mark.whoever
 def test_a_run_that_nobody_can_tell_anything_is_one_sentence(tmp_path: Path) -> None:
     done = harness("tell", tmp_path, "heal")
     assert done.returncode == 2
