@@ -48,7 +48,7 @@ from ucp.trace import Dropped
 if TYPE_CHECKING:
     from ucp.secure.sealing import Depot
 
-FAULTS, VERDICTS = "faults", "verdicts"
+FAULTS, OPERATOR, VERDICTS = "faults", "operator", "verdicts"
 MAX_LINKED = 100
 """Of so many vehicles the links are told one by one: there are 9900."""
 
@@ -252,6 +252,13 @@ class Recording:
             yield Said(self.time.at(0.0), "info", FAULTS, f"{state.what}: {state.detail}")
         for fault in self.faults:
             yield Said(self.time.at(fault.at_s), "warning", FAULTS, f"{fault.what}: {fault.detail}")
+        record = self.archive.record
+        for command in record.ground_station.commands if record.ground_station else ():
+            who = f"vehicle{'s' if len(command.vehicles) > 1 else ''} {' '.join(map(str, command.vehicles))}"
+            told = f"{command.command or command.message} to {who}"
+            yield Said(self.time.at(command.at_s), "warning", OPERATOR, told)
+        for sentence in record.unmatched_fates:
+            yield Said(self.time.at(self.end_s), "warning", FAULTS, sentence)
         for key, judgement in self.archive.record.judgements.items():
             level: Level = "error" if kind_of(judgement.verdict) == "bad" else "info"
             sentence = f"{key} {judgement.name}: {judgement.verdict}: {judgement.reason}"

@@ -48,6 +48,10 @@ def _fate(agent: AgentRecord | None) -> str:
     return ": no usable export" + (f" ({why})" if why else "")
 
 
+BEFALLEN = "befallen"
+"""Of a vehicle's record."""
+
+
 def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
     """Column labels, and a row (agent ID, ink, cells by column) for each agent and its vehicle."""
     record, exports = archive.record, archive.exports.by_agent
@@ -67,6 +71,9 @@ def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
                 "waiting": len(export.blocks_to_be_committed) + len(export.reconcile_stack),
             }
         for key, value in record.vehicles.get(str(agent_id), {}).items():
+            if key == BEFALLEN:
+                cells[key] = _befallen(value)
+                continue
             label = words.label(key)
             cells[f"vehicle {label}" if label in cells or key == "detail" else label] = value
         cells["detail"] = agent.detail if agent else None
@@ -75,11 +82,23 @@ def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
     return {"columns": sorted(columns, key=lambda label: label == "detail"), "rows": rows}
 
 
+def _befallen(told: Any) -> str:
+    """ "lose_gps at 40 s, wind at 80 s: not simulated": what befell a vehicle, as it is on record."""
+    try:
+        return ", ".join(
+            f"{it['what']} at {it['at_s']:g} s{'' if it['parameters'] else ': not simulated'}" for it in told
+        )
+    except (KeyError, TypeError, ValueError):
+        return words.value(told)
+
+
 def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
     kept = agent.model_dump(mode="json", exclude={"detail", "dropped", "command", "version"})
     cells: dict[str, Any] = {words.label(key): value for key, value in kept.items()}
     cells["completed before"] = len(agent.completed_before) or None
     cells |= {"restarts": agent.restarts or None, "reboots": agent.reboots or None}
+    runs = [life.counted for life in agent.handler_runs if life is not None]
+    cells["handler runs"] = " + ".join(map(words.value, runs)) or None
     if agent.dropped:
         cells["dropped"] = ", ".join(f"{words.value(count)} {reason}" for reason, count in agent.dropped.items())
     return cells

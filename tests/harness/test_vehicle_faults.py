@@ -1,6 +1,7 @@
 """What a timeline can have befall vehicles: their GPS, compasses, motors, batteries, and wind."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -94,4 +95,5 @@ def test_a_run_in_which_vehicles_are_in_trouble_goes_on_and_says_what_they_canno
     report = (out / "report.html").read_text()
     assert "its vehicle is in trouble" in report
     assert "cannot simulate the loss of its compasses" in report
+    assert re.search(r"battery at 25\S* s, lose_compass at 30\S* s: not simulated", report)
     assert record["scenario"]["timeline"][2]["volts"] == 10.4

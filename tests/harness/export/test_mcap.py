@@ -137,6 +137,24 @@ def test_faults_and_verdicts_are_in_the_log(messages: Messages) -> None:
     assert len([text for _, name, text in lines if name == "verdicts"]) == 9
 
 
+def test_what_an_operator_commanded_and_what_came_to_nothing_is_in_the_log(copy: Path, tmp_path: Path) -> None:
+    record = json.loads((copy / "run.json").read_text())
+    command = {
+        "at_s": 7.0,
+        "until_s": 7.0,
+        "vehicles": [1, 2],
+        "message": "COMMAND_LONG",
+        "command": "MAV_CMD_NAV_LAND",
+    }
+    record["ground_station"] = {"address": "127.0.0.1:14550", "commands": [command]}
+    record["unmatched_fates"] = ["wind at 5 s: vehicle 3 cannot simulate it"]
+    (copy / "run.json").write_text(json.dumps(record))
+    assert harness("export", copy, "--mcap", tmp_path / "run.mcap").returncode == 0
+    lines = [(at_ns, line.name, line.message) for at_ns, line in read(tmp_path / "run.mcap")["/log"]]
+    assert (7 * 10**9, "operator", "MAV_CMD_NAV_LAND to vehicles 1 2") in lines
+    assert "wind at 5 s: vehicle 3 cannot simulate it" in [text for _, name, text in lines if name == "faults"]
+
+
 def test_a_damaged_run_is_exported_and_what_is_damaged_is_said(copy: Path, tmp_path: Path) -> None:
     tlog = copy / "vehicles" / "1" / "telemetry.tlog"
     data = tlog.read_bytes()
