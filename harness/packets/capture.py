@@ -19,8 +19,11 @@ from harness.packets.datagram import NotUcpError, unwrap
 from harness.packets.pcap import INBOUND, OUTBOUND, CaptureFile, Frame
 from harness.packets.summary import MessageSummary, summarize
 from ucp.block import MAX_AGENT_ID
-from ucp.messages import MalformedDatagramError, decode
+from ucp.messages import TYPE_CODES, MalformedDatagramError, decode
+from ucp.secure.envelope import REVOCATION, VERSION, read_clear
 
+SECURED = bytes([VERSION])
+NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 _LAST_NS = 2**63 - 1
 
 Name = int | str
@@ -154,11 +157,23 @@ class Capture:
         return direction or (OUTBOUND if sender == self.vehicle else INBOUND)
 
 
+def _plain(payload: bytes) -> Datagram:
+    sender, sequence, message = decode(payload)
+    return Datagram(sender, sequence, summarize(message))
+
+
+def _secured(payload: bytes) -> Datagram:
+    """Of what is sealed, who says it, when, and which message it is, are in the clear."""
+    clear = read_clear(payload)
+    if clear.type == REVOCATION:
+        raise NotUcpError("a revocation of keys")
+    return Datagram(clear.sender, clear.sequence, MessageSummary(NAMES[clear.type], None, None))
+
+
 def _datagram(frame: Frame, datagrams: dict[bytes, Datagram]) -> tuple[Datagram, int]:
     payload, direction = unwrap(frame)
     key = hashlib.blake2b(payload, digest_size=16).digest()
     datagram = datagrams.get(key)
     if datagram is None:
-        sender, sequence, message = decode(payload)
-        datagram = datagrams[key] = Datagram(sender, sequence, summarize(message))
+        datagram = datagrams[key] = _secured(payload) if payload[2:3] == SECURED else _plain(payload)
     return datagram, direction

@@ -28,7 +28,10 @@ TOP_OF_CHAIN = "top of chain"
 
 
 class MessageSummary(NamedTuple):
-    """`message` is its name; `answer` what a response answers: approve, disapprove, yes, no, top of chain, block."""
+    """`message` is its name, all that is known of one that is sealed.
+
+    `answer` is what a response answers: approve, disapprove, yes, no, top of chain, block.
+    """
 
     message: str
     block_hash: bytes | None
@@ -36,10 +39,15 @@ class MessageSummary(NamedTuple):
     answer: str | None = None
 
     @property
+    def is_sealed(self) -> bool:
+        """Whether it is not known what it says: every message names a block or a chain."""
+        return self.block_hash is None and self.chain_hash is None
+
+    @property
     def asks(self) -> tuple[str, bytes | None] | None:
         """The subject of a request, equal to what its responses `answers`; responses do not name the asker."""
         response = RESPONSES.get(self.message)
-        return None if response is None else (response, self._subject)
+        return None if response is None or self.is_sealed else (response, self._subject)
 
     @property
     def answers(self) -> tuple[str, bytes | None] | None:

@@ -57,6 +57,8 @@ class Wording:
         return "  ".join(parts)
 
     def in_words(self, summary: MessageSummary) -> str:
+        if summary.is_sealed:
+            return "sealed"
         block = "" if summary.block_hash is None else f"block {self._names.block(summary.block_hash)}"
         chain = "" if summary.chain_hash is None else f"chain {self._names.chain(summary.chain_hash)}"
         match summary.message:

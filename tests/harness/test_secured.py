@@ -4,6 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from harness.packets.files import read_captures
+from harness.play.progress import Silent
+from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.security import Security
@@ -35,20 +38,29 @@ def test_a_sweep_that_seals_a_share_of_the_datagrams_is_the_run_that_seals_all()
 
 
 def test_a_secured_mission_is_judged_as_a_plain_one() -> None:
-    run = simulate(secured(scenario(network={"loss": 0.1}, duration_s=300)), 2, tracing=True)
-    assert run.result.characteristics["1"].kind == "good"
-    assert not run.result.bad
-    assert not dropped(run)
+    judged = simulate(secured(scenario(network={"loss": 0.1}, duration_s=300)), 2, tracing=True)
+    assert judged.result.characteristics["1"].kind == "good"
+    assert not judged.result.bad
+    assert not dropped(judged)
 
 
 def test_what_comes_twice_is_a_replay_and_on_record() -> None:
-    run = simulate(secured(scenario(network={"duplicate": 0.5}, duration_s=300)), 2, tracing=True)
-    assert not run.result.bad
-    assert dropped(run) == {"replayed"}
+    judged = simulate(secured(scenario(network={"duplicate": 0.5}, duration_s=300)), 2, tracing=True)
+    assert not judged.result.bad
+    assert dropped(judged) == {"replayed"}
 
 
 def test_who_has_no_keys_forges_nothing() -> None:
     rogue = load_scenario(SCENARIOS / "rogue.yaml")
     assert simulate(rogue, 1, tracing=True).result.bad
-    run = simulate(secured(rogue), 1, tracing=True)
-    assert not run.result.bad
+    judged = simulate(secured(rogue), 1, tracing=True)
+    assert not judged.result.bad
+
+
+def test_a_capture_shows_who_said_what_kind_of_thing_and_agrees_with_the_traces(tmp_path: Path) -> None:
+    request = secured(scenario(duration_s=200, capture=True, events={"mean_s": 5}))
+    finished = run(request, 1, tmp_path / "run", Silent(), "sim")
+    assert not finished.result.bad
+    seen = list(read_captures([tmp_path / "run"]).datagrams)
+    assert {datagram.summary.message for datagram in seen} >= {"Block Add Request", "Commit Block"}
+    assert all(datagram.summary.is_sealed for datagram in seen)
