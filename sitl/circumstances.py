@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -71,7 +72,12 @@ async def bring_about(link: Link, circumstance: Circumstance) -> Mapping[str, fl
     def known() -> Mapping[str, float] | None:
         return next((way for way in ways if link.parameters.keys() >= way.keys()), None)
 
+    asked_at = time.monotonic()
     chosen = await _heard(link, known, ask_for_all, limit_s)
+    if link.closed.is_set():
+        raise NotSimulatedError(f"ended its connection before it could simulate {circumstance.what}")
+    if chosen is None and link.heard_at < asked_at:
+        raise NotSimulatedError(f"was silent when it was to simulate {circumstance.what}")
     if chosen is None:
         names = " and no ".join(" with ".join(way) for way in ways)
         raise NotSimulatedError(f"cannot simulate {circumstance.what}: it has no {names}")

@@ -160,3 +160,21 @@ def test_what_a_vehicle_does_not_simulate_is_a_sentence(
                 await pilot.befall(circumstance)
 
     asyncio.run(ask())
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+def test_a_vehicle_that_does_not_answer_is_not_said_to_lack_anything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, leaves: bool
+) -> None:
+    monkeypatch.setattr(sitl.circumstances, "ANSWER_S", 0.2)
+
+    async def ask() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            puppet.tamper = lambda frame: b""
+            await asyncio.sleep(0.1)  # what was under way has come by then
+            if leaves:
+                puppet.leave()
+            with pytest.raises(NotSimulatedError, match="ended its connection before" if leaves else "was silent when"):
+                await pilot.befall(GPS_LOST)
+
+    asyncio.run(ask())
