@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.failsafes import Failsafe, Failsafes
+from sitl.failsafes import WIND, WIND_FROM, Failsafe, Failsafes
 from sitl.kinematics import Course, Fall, Motion, Point, Rest, Segment, end_of
 from sitl.models import MODELS
 from sitl.modes import BOOT_MODES, MODES
@@ -218,6 +218,14 @@ class Autopilot:
 
     # What befalls it
 
+    def simulate(self, name: str, value: float) -> None:
+        """Have a parameter of the simulation be so from now on; wind is felt on the way to a place."""
+        self.failsafes.parameters[name] = value
+        if name in (WIND, WIND_FROM) and self._in_mission and self.current_item < len(self.mission):
+            item = self.mission[self.current_item]
+            if item.command == mavlink.MAV_CMD_NAV_WAYPOINT:
+                self._go_on_to(self.place(item.frame, item.x, item.y, item.z), self.current_item)
+
     def _save(self, failsafe: Failsafe) -> None:
         """Do what ArduPilot does by itself: a copter without a position lands, others fly on or hold."""
         can_land = self.vehicle_type == "copter"
@@ -337,8 +345,7 @@ class Autopilot:
             case mavlink.MAV_CMD_NAV_TAKEOFF:  # again, after a pause
                 self._begin(self._model.take_off(self.motion, item.z), self._item_reached)
             case mavlink.MAV_CMD_NAV_WAYPOINT:
-                way = self._model.go_to(self.motion, place, self._speed_ms, self._place_before(number))
-                self._begin(way, self._item_reached)
+                self._go_on_to(place, number)
             case mavlink.MAV_CMD_NAV_LOITER_TIME:
                 self._begin(self._model.loiter(self.motion, place, self._speed_ms, item.param1), self._item_reached)
             case mavlink.MAV_CMD_NAV_LOITER_UNLIM:
@@ -347,6 +354,13 @@ class Autopilot:
                 self._return_home(self._stay)
             case mavlink.MAV_CMD_NAV_LAND:
                 self._land(place, self._place_before(number))
+
+    def _go_on_to(self, place: Point, number: int) -> None:
+        """From here, in the wind that there is now."""
+        here = self.motion.point
+        bearing_rad = math.atan2(place.east_m - here.east_m, place.north_m - here.north_m)
+        speed_ms = self.failsafes.over_ground(self._speed_ms, bearing_rad)
+        self._begin(self._model.go_to(self.motion, place, speed_ms, self._place_before(number)), self._item_reached)
 
     def _place_before(self, number: int) -> Point | None:
         """Where the item before this one was, if it was a place."""

@@ -163,7 +163,7 @@ class Channel:
         elif name not in vehicle.failsafes.parameters:
             return
         elif math.isfinite(value):
-            vehicle.failsafes.parameters[name] = value
+            vehicle.simulate(name, value)
         self.send(self._parameters()[name])
 
     def _parameters(self) -> dict[str, Any]:

@@ -178,3 +178,22 @@ def test_a_vehicle_that_does_not_answer_is_not_said_to_lack_anything(
                 await pilot.befall(GPS_LOST)
 
     asyncio.run(ask())
+
+
+def test_a_plane_is_slower_against_the_wind_and_faster_with_it() -> None:
+    arrivals = {}
+    for from_deg in (None, 0.0, 180.0):
+        vehicle, _ = airborne("plane")
+        frame, north_e7 = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, round(HOME.offset(5000, 0).lat_deg * 1e7)
+        home = mavlink.MAVLink_mission_item_int_message(3, 1, 0, frame, 16, 0, 1, 0, 0, 0, 0, 0, 0, 0.0)
+        place = (north_e7, round(HOME.lon_deg * 1e7), 50.0)
+        vehicle.load([home, mavlink.MAVLink_mission_item_int_message(3, 1, 1, frame, 16, 0, 1, 0, 0, 0, 0, *place)])
+        vehicle.set_mode(MODES["plane"]["AUTO"])
+        if from_deg is not None:
+            vehicle.simulate("SIM_WIND_DIR", from_deg)
+            vehicle.simulate("SIM_WIND_SPD", 8.0)
+        while vehicle.mode == "AUTO":
+            vehicle.advance(vehicle.now_s + 1.0)
+        arrivals[from_deg] = vehicle.now_s
+    assert arrivals[180.0] < arrivals[None] - 30
+    assert arrivals[0.0] > arrivals[None] + 60
