@@ -1,0 +1,89 @@
+"""The rows: who, what they do, and the scenario in which they do it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from harness.scenario import Scenario
+
+CAPTURED = 3
+LOST_S, REVOKED_S, ATTACK_S = 100, 200, 300
+
+
+@dataclass(frozen=True)
+class Row:
+    """`attack` are entries of the timeline without their times; with `captured` whoever attacks has vehicle 3's keys.
+
+    `revoked`: they are revoked before it begins. `quirks` are those of vehicle 3, which then is a traitor.
+    """
+
+    who: str
+    does: str
+    attack: tuple[dict[str, Any], ...] = ()
+    captured: bool = False
+    revoked: bool = False
+    quirks: tuple[str, ...] = ()
+
+    @property
+    def scenario(self) -> Scenario:
+        """Five agents with keys, for ten minutes, and a final reconcile."""
+        timeline: list[dict[str, Any]] = []
+        if self.captured:
+            timeline.append({"at_s": LOST_S, "kill": [CAPTURED]})
+        if self.revoked:
+            timeline.append({"at_s": REVOKED_S, "revoke": [CAPTURED], "heard_by": [1, 2]})
+        timeline += [{"at_s": ATTACK_S + 50 * number, **entry} for number, entry in enumerate(self.attack)]
+        return Scenario.model_validate(
+            {
+                "name": "threat",
+                "agents": 5,
+                "duration_s": 600,
+                "events": {"mean_s": 20},
+                "security": {"captured": CAPTURED if self.captured else None},
+                "quirks": {name: {"value": True, "agents": [CAPTURED]} for name in self.quirks},
+                "timeline": timeline,
+                "final_reconcile": True,
+            }
+        )
+
+
+def _commit(sender: int) -> dict[str, Any]:
+    return {"forge": {"message": "Commit Block", "sender": sender}}
+
+
+def _answers(sender: int, message: str, **says: bool) -> dict[str, Any]:
+    return {"forge": {"message": message, "sender": sender, "for_s": 40, **says}}
+
+
+_LIES = (
+    _answers(CAPTURED, "Block Add Response", approve=False),
+    _answers(CAPTURED, "Chain Contain Response", approve=False),
+    _answers(CAPTURED, "Next in Sequence Response"),
+)
+_FLOOD = {"flood": {"for_s": 20, "per_s": 20}}
+_AGAIN = (
+    {"duplicate": {"for_s": 40}},
+    {"delay": {"for_s": 20, "by_s": 20}},
+    {"corrupt": {"for_s": 40}},
+    {"replay": {"count": 500}},
+)
+
+ROWS = (
+    Row("outsider", "forges a commit and votes, and floods", (_commit(2), _answers(2, "Block Add Response"), _FLOOD)),
+    Row("replayer", "sends all that it hears again: at once, later, and with a bit flipped", _AGAIN),
+    Row("captor of vehicle 3", "commits a block in vehicle 2's name", (_commit(2),), captured=True),
+    Row("captor of vehicle 3", "commits a block in vehicle 3's name", (_commit(CAPTURED),), captured=True),
+    Row("captor of vehicle 3", "answers all questions with lies", _LIES, captured=True),
+    Row("captor of vehicle 3", "floods, in any name", (_FLOOD,), captured=True),
+    Row(
+        "captor of vehicle 3, revoked",
+        "does all of that",
+        (_commit(2), _commit(CAPTURED), *_LIES, _FLOOD),
+        captured=True,
+        revoked=True,
+    ),
+    Row("traitor, vehicle 3", "disapproves of every block", quirks=("disapprove_everything",)),
+    Row("traitor, vehicle 3", "hides its commits", quirks=("hide_commits",)),
+    Row("traitor, vehicle 3", "commits others' blocks twice", quirks=("commit_others_twice",)),
+    Row("traitor, vehicle 3", "says to contain every chain", quirks=("contain_everything",)),
+    Row("traitor, vehicle 3, revoked", "disapproves of every block", revoked=True, quirks=("disapprove_everything",)),
+)

@@ -1,0 +1,21 @@
+"""The table of threats: each row is what comes of it when it is played."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from harness.threats import ROWS, Row, table
+
+PAGE = (Path(__file__).parents[3] / "docs/security.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: re.sub(r"\W+", "-", f"{row.who} {row.does}"))
+def test_a_threat_comes_to_what_the_table_says(row: Row) -> None:
+    _, line = table([row])
+    assert line in PAGE
+
+
+def test_the_table_has_these_rows_alone() -> None:
+    written = PAGE.split("<!-- table: begin -->")[1].split("<!-- table: end -->")[0]
+    assert len(written.strip().splitlines()) == 2 + len(ROWS)
