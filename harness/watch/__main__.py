@@ -71,9 +71,11 @@ async def _tell(directory: Path, story: Story, ended: asyncio.Event) -> None:
         if ended.is_set():
             return
         await asyncio.sleep(UPDATE_S)
-    feed = Feed(directory)
-    with contextlib.closing(feed):
-        await tell_live(feed, story, ended)
+    try:
+        with contextlib.closing(Feed(directory)) as feed:
+            await tell_live(feed, story, ended)
+    except HarnessError as error:
+        story.tell([["note", str(error)]])  # the run goes on
 
 
 async def _while_looked_at(server: Server) -> None:

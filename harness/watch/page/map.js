@@ -5,7 +5,7 @@ import { LINKS, colour, family, font, partColour, prepared, quality, shape } fro
 
 const TRAIL_S = 60;
 const PULSE_WALL_S = 0.7;
-const MARGIN = 56;
+const MARGIN = 56, LEGEND = 26;
 
 export class SwarmMap {
   constructor(canvas, story) {
@@ -38,8 +38,8 @@ export class SwarmMap {
     }
     if (west > east) [west, south, east, north] = [-1, -1, 1, 1];
     const wide = Math.max(east - west, 30), tall = Math.max(north - south, 30);
-    const scale = Math.min((width - 2 * MARGIN) / wide, (height - 2 * MARGIN) / tall);
-    const target = { scale, x: width / 2 - scale * (west + east) / 2, y: height / 2 + scale * (south + north) / 2 };
+    const scale = Math.min((width - 2 * MARGIN) / wide, (height - 2 * MARGIN - LEGEND) / tall);
+    const target = { scale, x: width / 2 - scale * (west + east) / 2, y: (height - LEGEND) / 2 + scale * (south + north) / 2 };
     const base = this.base;
     if (!base || base.width !== width || base.height !== height) this.base = { ...target, width, height };
     else if (!this.touched) for (const key of ["scale", "x", "y"]) base[key] += 0.08 * (target[key] - base[key]);
