@@ -19,7 +19,7 @@ import json
 import os
 from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import Future
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ from harness.play.interventions import Interventions
 SOCKET = "by-hand"
 MAX_REQUEST_BYTES = 64 * 1024
 MAX_CONNECTIONS = 32
+LAST_WORDS_S = 0.1
+"""For answers that come with the end of the run."""
 
 
 @asynccontextmanager
@@ -43,11 +45,14 @@ async def listening(hand: Interventions, directory: Path) -> AsyncIterator[None]
         task = asyncio.current_task()
         assert task is not None
         connections.add(task)
-        with suppress(OSError, ValueError):  # it went away, or its line has no end
+        try:
             if len(connections) <= MAX_CONNECTIONS:
                 await _serve(hand, reader, writer)
-        connections.discard(task)
-        writer.close()
+        except OSError:
+            pass  # it went away
+        finally:
+            connections.discard(task)
+            writer.close()
 
     inside = os.open(directory, os.O_PATH)  # a socket's address holds 107 bytes, and run directories lie deep
     try:
@@ -61,8 +66,10 @@ async def listening(hand: Interventions, directory: Path) -> AsyncIterator[None]
     finally:
         server.close()
         (directory / SOCKET).unlink(missing_ok=True)
-        for task in connections:
-            task.cancel()
+        if connections:
+            _, silent = await asyncio.wait(connections, timeout=LAST_WORDS_S)
+            for task in silent:
+                task.cancel()
 
 
 async def ask_run(directory: Path, **request: Any) -> dict[str, Any]:
@@ -82,16 +89,29 @@ async def ask_run(directory: Path, **request: Any) -> dict[str, Any]:
 
 
 async def _serve(hand: Interventions, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    while line := await reader.readline():
+    while True:
         try:
-            answer = {"ok": True, **await _answer(hand, line)}
-        except HarnessError as error:
-            answer = {"ok": False, "error": str(error)}
+            line = await reader.readline()
+        except ValueError:
+            line, answer = b"", {"ok": False, "error": f"a line of more than {MAX_REQUEST_BYTES} bytes asks too much"}
+        else:
+            if not line:
+                return
+            answer = await _answer(hand, line)
         writer.write(json.dumps(answer).encode() + b"\n")
         await writer.drain()
+        if not line:
+            return  # where the next one begins, nobody knows
 
 
 async def _answer(hand: Interventions, line: bytes) -> dict[str, Any]:
+    try:
+        return {"ok": True, **await _done(hand, line)}
+    except HarnessError as error:
+        return {"ok": False, "error": str(error)}
+
+
+async def _done(hand: Interventions, line: bytes) -> dict[str, Any]:
     """Raises ScenarioError if it cannot be, or is nothing that can be asked."""
     try:
         request = from_json(line, allow_inf_nan=False)

@@ -231,6 +231,7 @@ def test_another_process_asks_by_the_socket_in_the_runs_directory(tmp_path: Path
     assert [*wrong] == [*LINES[4:]]
     assert wrong[LINES[4]].startswith("kill: agent 2 is killed then")
     assert not (out / SOCKET).exists()
+    assert wrong[LINES[-1]] == "a line of more than 65536 bytes asks too much"
 
 
 LINES = (
@@ -248,4 +249,5 @@ LINES = (
     "pause",
     "[]",
     "null",
+    " " * 70_000,
 )

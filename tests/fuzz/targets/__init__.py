@@ -9,6 +9,7 @@ answer      what somebody's agent answers on its control socket
 virtual     the lines that an agent is given in virtual time
 foreign     the lines that an agent of somebody's answers there, and what becomes of the run
 telemetry   MAVLink from the vehicle, and what is said of its events
+by_hand     what a run that goes on is asked
 scenario    a scenario in YAML: read, written, and a short one played
 story       a story's file
 trace       a trace of either version, by itself, among others and in its run; `events`, what was logged beside it
@@ -32,7 +33,7 @@ from typing import Protocol
 NAMES = (
     *("datagram", "agent", "store", "mission", "control", "answer", "virtual", "foreign"),
     *("telemetry", "scenario", "story", "trace", "events", "export", "run_record", "network"),
-    *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix"),
+    *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix", "by_hand"),
 )
 
 
