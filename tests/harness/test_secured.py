@@ -61,6 +61,6 @@ def test_a_capture_shows_who_said_what_kind_of_thing_and_agrees_with_the_traces(
     request = secured(scenario(duration_s=200, capture=True, events={"mean_s": 5}))
     finished = run(request, 1, tmp_path / "run", Silent(), "sim")
     assert not finished.result.bad
-    seen = list(read_captures([tmp_path / "run"]).datagrams)
+    seen = list(read_captures(sorted((tmp_path / "run" / "capture").iterdir())).datagrams)
     assert {datagram.summary.message for datagram in seen} >= {"Block Add Request", "Commit Block"}
     assert all(datagram.summary.is_sealed for datagram in seen)
