@@ -23,6 +23,7 @@ bag         ROS bags of both versions, by any storage and packing
 packed      a trace that gzip packed
 depot       exports, mission files and manifests at the depot
 matrix      a matrix, an earlier night's record, results
+keys        bundles, public and private keys, revocations
 """
 
 from collections.abc import Iterator
@@ -33,7 +34,7 @@ from typing import Protocol
 NAMES = (
     *("datagram", "agent", "store", "mission", "control", "answer", "virtual", "foreign"),
     *("telemetry", "scenario", "story", "trace", "events", "export", "run_record", "network"),
-    *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix", "by_hand"),
+    *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix", "by_hand", "keys"),
 )
 
 

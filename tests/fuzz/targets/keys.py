@@ -1,0 +1,68 @@
+"""Files of keys: bundles, public keys, private ones, revocations. Refused in a sentence, or read, and written the same.
+
+An input is a file, put in the place of one of those in a directory of good keys; its schema says of which.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from harness.keyring.home import Home, KeysError, load_depot_key
+from harness.keyring.inspection import in_words, inspect
+from tests.fuzz.finding import require, sound
+from ucp.secure.bundle import load_bundle, write_bundle
+from ucp.secure.keyfile import KeyFileError
+
+NAMES = ("7.bundle.json", "public.json", "authority.key", "depot.key", "vehicles.key", "revocation.json")
+_GOOD = TemporaryDirectory(prefix="ucp-keys-")
+
+
+def _home() -> Path:
+    """Keys of three vehicles, one of which is revoked, made once."""
+    home = Path(_GOOD.name) / "home"
+    if not home.exists():
+        made = Home.new(home, [1, 7, 28], seals=True, epoch_s=600.0)
+        made.write_bundles(home, [7])
+        made.revoke([28])
+    return home
+
+
+def run(data: bytes) -> None:
+    with TemporaryDirectory() as directory:
+        for number, name in enumerate(NAMES):
+            home = Path(directory) / str(number)
+            shutil.copytree(_home(), home)
+            path = home / name
+            path.write_bytes(data)
+            _read(home, path)
+
+
+def _read(home: Path, path: Path) -> None:
+    """As all commands do that read it."""
+    kept = Home(home)
+    for read in (lambda: inspect(path), lambda: kept.bundles(), lambda: kept.revoke([1]), lambda: load_depot_key(home)):
+        try:
+            told = read()
+        except KeysError as error:
+            sound(str(error))
+            continue
+        if isinstance(told, list):
+            for facts in told:
+                sound(in_words(facts))
+    try:
+        bundle = load_bundle(path)
+    except KeyFileError as error:
+        sound(str(error))
+        return
+    write_bundle(path, bundle)
+    require(load_bundle(path) == bundle, "a bundle is read otherwise")
+
+
+def seeds(flown: Path) -> Iterator[bytes]:
+    """One of each kind, and a bundle of a later epoch."""
+    for name in NAMES:
+        yield (_home() / name).read_bytes()
+    document = json.loads((_home() / NAMES[0]).read_bytes())
+    yield json.dumps({**document, "epoch": 2**32 - 1, "depot": None}).encode()
