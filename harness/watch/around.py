@@ -122,7 +122,7 @@ class Around:
         named_parts = None if parts == self._parts else [sorted(part) for part in parts]
         self._parts = parts
         agents = [agent for agent in line.agents if agent in self._known]
-        what = "" if line.what == RANGE else line.what
+        what = "" if line.what in (RANGE, "end") else line.what
         detail = str(line.detail)[:MAX_DETAIL]
         self.changes.append(
             ["n", line.at_s, what, detail, agents, _state_after(fault), changed, named_parts, line.by_hand]
