@@ -5,7 +5,7 @@ import ipaddress
 import json
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,11 +13,15 @@ from harness.commands.roster import roster_of
 from harness.commands.terminal import complain, print_json, print_lines
 from harness.depot.mission_files import MissionFileError, Plan, write
 from harness.depot.same_mission import compare
-from harness.errors import WRONG_REQUEST
+from harness.errors import WRONG_REQUEST, MachineError
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import parse
 from harness.scenario.quirks import in_words
 from ucp.messages import PORT
+from ucp.sealed import seal_to
+
+if TYPE_CHECKING:
+    from harness.keyring.home import Home
 
 DIFFERENT = 1
 
@@ -53,23 +57,35 @@ def new_command(
     ] = None,
     broadcast: Annotated[str | None, typer.Option(help="Without it that of the subnet.")] = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="UDP port.")] = PORT,
+    keys: Annotated[
+        Path | None,
+        typer.Option(metavar="HOME", help="Keys, of `keys new`: the mission is secured, with each vehicle's bundle."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of these names.")] = False,
 ) -> None:
     """Write a mission file for each vehicle, all with one inception block, and a manifest of what they share."""
     asked = _scenario(scenario, agents, name)
+    home, data = None if keys is None else _home(keys), _initial_data(initial_data, asked)
+    if home is not None:
+        home.bundles(asked.roster)  # before anything is written that would need them
+        depot = home.public().depot
+        data = data if depot is None else seal_to(data, depot)
     if asked.has_wrong_agents:
         complain(f"{scenario}: its quirks ({', '.join(in_words(asked.quirks))}) are left out: a mission asks for none")
     plan = Plan(
         asked,
-        _initial_data(initial_data, asked),
+        data,
         settings=_pairs("--setting", settings),
         events=_events(_pairs("--event", events)),
         subnet=_subnet(subnet),
         addresses={_agent_id(key): value for key, value in _texts("--address", addresses).items()},
         broadcast=broadcast,
         port=port,
+        secured=home is not None,
     )
     *files, manifest = write(plan, out, overwrite=overwrite)
+    if home is not None:
+        print_lines(map(str, home.write_bundles(out, asked.roster, overwrite=overwrite)))
     print_lines([*map(str, files), str(manifest), compare([*files, manifest]).in_words()])
 
 
@@ -111,6 +127,14 @@ def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenar
         "initial_data": asked.initial_data,
     }
     return parse({**chosen, **kept})
+
+
+def _home(directory: Path) -> "Home":
+    try:
+        from harness.keyring.home import Home
+    except ModuleNotFoundError:
+        raise MachineError("keys take a further package: `pip install ucp-harness[secure]`") from None
+    return Home(directory)
 
 
 def _initial_data(text: str | None, asked: Scenario) -> bytes:

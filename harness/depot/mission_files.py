@@ -16,11 +16,12 @@ from harness.errors import HarnessError, MachineError, RunDirectoryError
 from harness.play.process.mission_file import NO_QUIRKS, mission_file
 from harness.scenario import Scenario
 from netem.addresses import BROADCAST, address
-from ucp.block import hash_digest
+from ucp.block import MAX_EVENT_DATA_BYTES, hash_digest
 from ucp.features import needed
 from ucp.files import write_json_atomically
 from ucp.messages import PORT
 from ucp.mission import MAX_INITIAL_DATA_BYTES, Mission, MissionError, parse_mission
+from ucp.sealed import SEAL_BYTES, sealed_to
 
 SUFFIX = ".mission.json"
 
@@ -35,6 +36,7 @@ class Plan:
 
     A vehicle's address is its place in `subnet`, its ID counted from the first, or what `addresses` says; without a
     subnet it is that of a run's network (`netem.addresses`). `broadcast` goes with it if it is None.
+    `secured`: each vehicle has its bundle of keys beside its mission file.
     """
 
     scenario: Scenario
@@ -45,6 +47,7 @@ class Plan:
     addresses: Mapping[int, str] = field(default_factory=dict)
     broadcast: str | None = None
     port: int = PORT
+    secured: bool = False
 
     def documents(self) -> dict[int, dict[str, Any]]:
         """The mission file of each agent. Raises MissionFileError."""
@@ -77,6 +80,10 @@ class Plan:
         )
         document |= {"quirks": dict(NO_QUIRKS), "speedup": 1.0}
         document["network"]["port"] = self.port
+        if self.secured:
+            document["security"] = {"bundle": f"{agent_id}.bundle.json"}
+        if sealed_to(self.initial_data) is not None:
+            document["settings"]["max_block_bytes"] = MAX_EVENT_DATA_BYTES - SEAL_BYTES
         document["settings"].update(self.settings)
         document["events"].update(self.events)
         document["features"] = needed(document)

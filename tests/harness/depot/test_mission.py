@@ -18,6 +18,8 @@ from ucp.agent import Agent
 from ucp.block import InceptionBlock
 from ucp.export import export_chain
 from ucp.mission import load_mission
+from ucp.sealed import sealed_to
+from ucp.secure.bundle import load_bundle
 from ucp.trace import header_line
 
 ROSTER = [10, 28, 32, 118, 120, 122]
@@ -306,3 +308,18 @@ def test_the_command_says_which_by_its_exit_status(directory: Path, tmp_path: Pa
     assert done.returncode == 2
     assert len(sentences(done.stderr)) == 1
     assert harness("mission", "verify", tmp_path / "nowhere").returncode == 2
+
+
+def test_a_secured_mission_has_each_vehicles_keys_beside_its_file(tmp_path: Path) -> None:
+    home, out = tmp_path / "keys", tmp_path / "mission"
+    assert harness("keys", "new", home, "--agents", "1,7").returncode == 0
+    done = harness("mission", "new", "--agents", "1,7", "--keys", home, "--out", out)
+    assert done.returncode == 0, done.stderr
+    mission = load_mission(out / "7.mission.json")
+    assert mission.security is not None
+    assert load_bundle(out / mission.security.bundle).public.depot == sealed_to(mission.initial_data)
+    assert mission.settings.max_block_bytes == 976
+    assert harness("mission", "verify", out).returncode == 0
+    done = harness("mission", "new", "--agents", "1,8", "--keys", home, "--out", tmp_path / "other")
+    assert (done.returncode, "agent 8 is not of this mission" in done.stderr) == (2, True)
+    assert not (tmp_path / "other").exists()
