@@ -343,7 +343,12 @@ class Node:
         if not self.clock.running:
             raise CommandError("the mission has not started")
         try:
-            self._drive(partial(agent.revoke, base64.b64decode(revocation, validate=True)))  # type: ignore[arg-type]
+            body = base64.b64decode(revocation, validate=True)  # type: ignore[arg-type]
+
+            def tell(now: float) -> None:
+                agent.revoke(body, now)
+
+            self._drive(tell)
         except (TypeError, ValueError) as error:
             why = str(error) if isinstance(error, MalformedDatagramError) else "not in base64"
             raise CommandError(f"no revocation: {why}") from None

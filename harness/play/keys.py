@@ -116,9 +116,7 @@ class Handed:
             return None
         from ucp.secure.bundle import bundle_name, write_bundle
 
-        directory = self.directories[agent_id]
-        directory.mkdir(exist_ok=True)
-        path = directory / bundle_name(agent_id)
+        path = self.directories[agent_id] / bundle_name(agent_id)
         if not (kept and path.exists()):
             write_bundle(path, self.keys.bundles[agent_id])
         return path
@@ -132,4 +130,7 @@ def handed_out(scenario: Scenario) -> Iterator[Handed]:
         yield Handed(None, Path())
         return
     with tempfile.TemporaryDirectory(prefix="ucp-keys-") as directory:
-        yield Handed(keys, Path(directory))
+        handed = Handed(keys, Path(directory))
+        for vehicle in handed.directories.values():
+            vehicle.mkdir()
+        yield handed

@@ -80,7 +80,8 @@ class SecuredAgent(Agent):
             if why := self._why_not_opened(clear):
                 raise MalformedDatagramError(why)
             if clear.type == REVOCATION:
-                self.revoke(data[CLEAR.size :], now, {"from": clear.sender})
+                if not self.revoke(data[CLEAR.size :], now, {"from": clear.sender}):
+                    raise MalformedDatagramError("known already")
                 return
             opened = self.session.open(data, clear)
             if clear.revocations < self._revocations:
@@ -147,10 +148,13 @@ class SecuredAgent(Agent):
     def _revocations(self) -> int:
         return 0 if self.revocation is None else self.revocation.number
 
-    def revoke(self, body: bytes, now: float, came: Mapping[str, Any] | None = None) -> None:
-        """The authority says whose keys are revoked. Raises MalformedDatagramError if it does not, or not anew."""
+    def revoke(self, body: bytes, now: float, came: Mapping[str, Any] | None = None) -> bool:
+        """The authority says whose keys are revoked; whether that is new.
+
+        Raises MalformedDatagramError if the authority does not say so.
+        """
         if 0 < int.from_bytes(body[:2], "big") <= self._revocations:
-            raise MalformedDatagramError("known already")
+            return False
         try:
             revocation = Revocation.decode(body, self.session.authority, self.session.mission)
         except RevocationError:
@@ -161,6 +165,7 @@ class SecuredAgent(Agent):
             self._trace.append(Commanded(now, "revoke", request))
         self._told_at = None
         self._tell(now)
+        return True
 
     def _tell(self, now: float) -> None:
         """Somebody may not know of the newest revocation."""
