@@ -21,8 +21,8 @@ from ucp.messages import Message
 HELD = {"chain", "deque", "stack", "completed", "top_chain_hash"}
 """Keys of the status: what the agent has."""
 
-Branch = tuple[str, str]
-"""Handler and branch."""
+Branch = tuple[str, str, bool]
+"""Handler, branch, and whether it changes there what is held: one branch of Algorithm 20 does so, or does not."""
 
 STARTS = {timer: handler.name for handler in HANDLERS.values() for timer in handler.starts}
 ENDS = {
@@ -88,7 +88,7 @@ class Evidence:
         run = _says_otherwise(seen)
         if run is None and self._began_wrongly(failure):
             return Blamed(ENDS[runs[0].handler], "")
-        run = run or _decided_otherwise(seen) or _holds_otherwise(seen) or self._suspect(runs, failure)
+        run = run or _decided_otherwise(seen) or self._holds_otherwise(seen) or self._suspect(runs, failure)
         return Blamed(run.handler, run.branch)
 
     def _fails_without(self, failure: Failure) -> bool:
@@ -105,6 +105,16 @@ class Evidence:
             return False
         nothing_counted = seen.before.counted[:2] in ((), (0, 0), (1, 0))
         return failure.of_an_earlier_round or bool(nothing_counted and seen.unexpected and self._passed[_branch(first)])
+
+    def _holds_otherwise(self, seen: Seen) -> Run | None:
+        """Who changes what is held, if that is not as it should be; or who never led on to that, where others do."""
+        if not HELD & set(seen.misstated):
+            return None
+        for place, run in enumerate(seen.outcome.runs):
+            if run.changes:
+                never = [before for before in seen.outcome.runs[:place] if not self._passed[_branch(before)]]
+                return never[0] if never and self._passed[_branch(run)] else run
+        return None
 
     @staticmethod
     def _starter(failure: Failure) -> Blamed:
@@ -162,13 +172,8 @@ def _says_otherwise(seen: Seen) -> Run | None:
     return next((run for run in seen.outcome.runs if {message.NAME for message in run.sent} & set(seen.missing)), None)
 
 
-def _holds_otherwise(seen: Seen) -> Run | None:
-    """Who changes what is held, if that is not as it should be."""
-    return next((run for run in seen.outcome.runs if run.changes), None) if HELD & set(seen.misstated) else None
-
-
 def _branch(run: Run) -> Branch:
-    return run.handler, run.branch
+    return run.handler, run.branch, run.changes
 
 
 def _names(sends: Iterable[type[Message]]) -> set[str]:

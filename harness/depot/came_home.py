@@ -375,7 +375,8 @@ def _what_is_whole(path: Path, data: bytes, problems: list[str]) -> Export:
     )
 
 
-_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},]')
+_TOKEN = re.compile(r'"(?:[^"\\]|\\.|\\\Z)*(?:"|\Z)|[\[\]{},]', re.DOTALL)
+"""A string that the text breaks off in goes to its end, whatever brackets are in it."""
 _FLAT_OBJECT = re.compile(r"\{[^{}]*\}")
 
 
