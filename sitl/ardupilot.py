@@ -8,6 +8,7 @@ route in that namespace, or exit with status 1. The vehicle's directory gets its
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import re
@@ -19,11 +20,12 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from sitl.airframes import BINARIES, Airframe, airframe
-from sitl.installed import current, install_command
+from sitl.installed import current, install_command, sha256
 from sitl.parameters import in_lines
 from sitl.places import autotest
 from sitl.setup import USUAL as USUAL_SETUP
 from sitl.setup import Debugger, Setup
+from sitl.state import Version
 from sitl.vehicle import (
     Home,
     Launch,
@@ -69,6 +71,13 @@ class ArduPilot:
     setup: Setup = USUAL_SETUP
     missing: tuple[str, ...] = ()
     name: str = "ardupilot"
+
+    @property
+    def sha256(self) -> str | None:
+        """The hash of its binary, None if that cannot be read."""
+        with contextlib.suppress(OSError):
+            return sha256(self.binary)
+        return None
 
     @property
     def frame(self) -> str:
@@ -146,7 +155,7 @@ class ArduPilot:
             raise UnusableBinaryError(f"{subject} {problem}: {WAY_OUT}")
         if not os.access(binary, os.X_OK):
             raise UnusableBinaryError(f"{subject} is not executable: run chmod +x {binary}")
-        defaults = {name: _defaults(binary, name) for name in airframe(setup.frame, vehicle_type).defaults}
+        defaults = {name: default_parameters(binary, name) for name in airframe(setup.frame, vehicle_type).defaults}
         missing = tuple(name for name, path in defaults.items() if path is None)
         found = tuple(path for path in defaults.values() if path is not None)
         return cls(binary.absolute(), found, vehicle_type, setup, missing)
@@ -182,7 +191,9 @@ class ArduPilot:
         try:
             for path in self.defaults:
                 shutil.copyfile(path, directory / path.name)
-            (directory / OWN_DEFAULTS).write_text(_own_defaults(sysid) + in_lines(self.parameters))
+            (directory / OWN_DEFAULTS).write_text(
+                _own_defaults(sysid) + in_lines({**self._logging(), **self.parameters})
+            )
         except OSError as error:
             raise VehicleError(f"vehicle {sysid}: cannot write its parameters into {directory}: {error}") from None
         return Launch(
@@ -201,16 +212,17 @@ class ArduPilot:
         )
 
     @property
-    def parameters(self) -> dict[str, float]:
-        """What it is given beside its defaults; how much it logs yields to what the user says of it."""
+    def parameters(self) -> Mapping[str, float]:
+        return self.setup.parameters
+
+    def _logging(self) -> dict[str, float]:
         match self.setup.log_mib:
             case None:
-                logging = {}
+                return {}
             case 0:
-                logging = {"LOG_BACKEND_TYPE": 0.0}
+                return {"LOG_BACKEND_TYPE": 0.0}
             case _:
-                logging = {"LOG_FILE_TIMEOUT": PATIENT_S}
-        return {**logging, **self.setup.parameters}
+                return {"LOG_FILE_TIMEOUT": PATIENT_S}
 
     def _bounded(self) -> list[str]:
         """What starts a program of which no file gets longer than its log may.
@@ -245,7 +257,21 @@ def models(binary: Path) -> list[str]:
     return [line.strip() for line in listed.splitlines() if re.fullmatch(r"  [\w+.-]+", line)] if found else []
 
 
-def _defaults(binary: Path, name: str) -> Path | None:
+def build_of(binary: Path) -> Version | None:
+    """Version and commit that stand in a binary, as it tells them at its start; None if they do not."""
+    try:
+        with binary.open("rb") as file:
+            found = _BUILD.search(file.read(MAX_BINARY_BYTES))
+    except OSError:
+        return None
+    return Version(found[1].decode(), found[2].decode()) if found else None
+
+
+_BUILD = re.compile(rb"Ardu(?:Copter|Plane|Rover) V(\d[\w.-]{0,30}) \(([0-9a-f]{7,12})\)", re.ASCII)
+MAX_BINARY_BYTES = 200_000_000  # one with its debugging information has 80 MB
+
+
+def default_parameters(binary: Path, name: str) -> Path | None:
     """A file of default parameters for a binary, where it lies in ArduPilot's source tree or beside the binary."""
     for directory in autotest(binary.resolve().parent):
         for path in (directory / name, directory / "default_params" / name, directory / "models" / name):

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from sitl.autopilot import FRAMES, MAX_ALTITUDE_M, Autopilot
 from sitl.mission_inbox import MissionInbox
 from sitl.modes import MODES
-from sitl.streams import STREAMS
+from sitl.streams import STREAMS, autopilot_version
 
 DEFAULT_INTERVAL_S = 1.0
 MIN_INTERVAL_S = 0.02
@@ -212,9 +212,10 @@ class Channel:
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _request(self, message_id: float) -> int:
-        if message_id not in STREAMS:
+        said = {**STREAMS, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version}
+        if message_id not in said:
             return int(mavlink.MAV_RESULT_FAILED)
-        self.send(STREAMS[int(message_id)](self._autopilot))
+        self.send(said[int(message_id)](self._autopilot))
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
 

@@ -50,6 +50,7 @@ class Embedded:
     name: str = "embedded"
     lack: str | None = None
     frame: str | None = None
+    sha256: str | None = None
 
     @property
     def parameters(self) -> Mapping[str, float]:
@@ -60,6 +61,7 @@ class Embedded:
         frame = self.setup.frame
         asked = {
             f"frame {frame}": frame is not None and frame != USUAL[self.vehicle_type],
+            "wind": any(name.startswith("SIM_WIND_") for name in self.parameters),
             "arguments": bool(self.setup.arguments),
             "debugger": self.setup.debugger is not None,
         }

@@ -36,7 +36,7 @@ class File:
 
     @classmethod
     def of(cls, path: Path, url: str) -> File:
-        return cls(url, path.stat().st_size, _sha256(path))
+        return cls(url, path.stat().st_size, sha256(path))
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Installed:
         for name in (self.binary.name, DEFAULTS[self.vehicle]):
             recorded = self.manifest.files.get(name)
             try:
-                if recorded is None or _sha256(self.directory / name) != recorded.sha256:
+                if recorded is None or sha256(self.directory / name) != recorded.sha256:
                     return f"{name} is not the file that was fetched (SHA-256)"
             except OSError as error:
                 return f"{name} cannot be read ({error.strerror})"
@@ -136,6 +136,6 @@ def install_command(vehicle: VehicleType) -> str:
     return f"`ucp-harness sitl install --vehicle {vehicle}`"
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -14,7 +14,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.state import Battery, Position, VehicleState
+from sitl.parameters import MAX_PARAMETERS
+from sitl.state import Battery, Position, VehicleState, Version
 from sitl.tlog import TelemetryLog
 from sitl.vehicle import Home
 
@@ -61,6 +62,8 @@ class Link(asyncio.Protocol):
         self.foreign_sysid: int | None = None
         self.acks: dict[int, int] = {}  # MAV_CMD: the last MAV_RESULT
         self.parameters: dict[str, float] = {}
+        self.parameter_count: int | None = None
+        self.listed: set[int] = set()  # the places in the vehicle's list of those that have been heard
         self._asked_mode: int | None = None
         self._was_in_asked_mode = self._was_armed = False
         self.on_mission: Callable[[Any], None] | None = None  # hears the messages of the mission protocol
@@ -77,6 +80,7 @@ class Link(asyncio.Protocol):
             "STATUSTEXT": self._on_text,
             "COMMAND_ACK": self._on_ack,
             "PARAM_VALUE": self._on_parameter,
+            "AUTOPILOT_VERSION": self._on_version,
             "MISSION_CURRENT": self._on_item,
             "MISSION_ITEM_REACHED": self._on_item_reached,
             **dict.fromkeys(("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK"), self._on_mission),
@@ -155,6 +159,19 @@ class Link(asyncio.Protocol):
         """As `set_parameter`; a vehicle without it may answer nothing."""
         target = (self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
         self.send(mavlink.MAVLink_param_request_read_message(*target, name.encode(), -1))
+
+    def request_parameter_at(self, index: int) -> None:
+        """That of a place in its list."""
+        target = (self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
+        self.send(mavlink.MAVLink_param_request_read_message(*target, b"", index))
+
+    def request_parameters(self) -> None:
+        """All of them: some 1,300 messages."""
+        self.send(mavlink.MAVLink_param_request_list_message(self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1))
+
+    @property
+    def has_listed_parameters(self) -> bool:
+        return self.parameter_count is not None and len(self.listed) >= self.parameter_count
 
     def send(self, message: Any) -> None:
         if self._transport is not None and not self._transport.is_closing():
@@ -238,6 +255,7 @@ class Link(asyncio.Protocol):
         self.heartbeats += 1
         self.heartbeat_at = self.heard_at
         self.state.mode = message.custom_mode
+        self.state.mav_type = message.type
         self._was_in_asked_mode |= message.custom_mode == self._asked_mode
         self.state.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         self._was_armed |= self.state.armed
@@ -283,7 +301,15 @@ class Link(asyncio.Protocol):
         self.acks[message.command] = message.result
 
     def _on_parameter(self, message: Any) -> None:
+        if message.param_id not in self.parameters and len(self.parameters) >= MAX_PARAMETERS:
+            return
         self.parameters[message.param_id] = message.param_value
+        if message.param_index < message.param_count <= MAX_PARAMETERS:  # not one that was asked for by its name
+            self.parameter_count = message.param_count
+            self.listed.add(message.param_index)
+
+    def _on_version(self, message: Any) -> None:
+        self.state.version = Version.of(message.flight_sw_version, bytes(message.flight_custom_version))
 
     def _on_item(self, message: Any) -> None:
         self.state.item = message.seq

@@ -19,8 +19,10 @@ from pathlib import Path
 from sitl.by_guided import GuidedFlight
 from sitl.by_mission import MissionFlight
 from sitl.circumstances import Circumstance, bring_about
+from sitl.introduction import Introduction
 from sitl.link import Link
 from sitl.modes import mode_name
+from sitl.parameters import ParameterError, unknown
 from sitl.plan import By, Plan
 from sitl.procedure import GettingReady, HopelessError, Procedure, Step
 from sitl.route import route
@@ -84,6 +86,15 @@ class Pilot:
         waypoints = route(plan, self.vehicle_type, self.link.home.heading_deg)
         flight = MissionFlight if by == "mission" else GuidedFlight
         return flight(self.link, self.vehicle_type, waypoints)
+
+    async def introduce(self, given: Mapping[str, float]) -> None:
+        """Have the vehicle say its version and its parameters, of which `given` are to have these values.
+
+        Raises FlightError, and ParameterError for some of these that it does not know.
+        """
+        await self._pursue(Introduction(self.link, given))
+        if phrase := unknown(given, self.link.parameters):
+            raise ParameterError(f"vehicle {self.vehicle_id} knows {phrase}")
 
     async def get_ready(self, flight: Procedure) -> None:
         """Do what comes before arming, and return when nothing else has been left to do for READY_FOR_S.

@@ -31,11 +31,31 @@ class Battery:
     left: float | None
 
 
+@dataclass(frozen=True)
+class Version:
+    """As people write it ("4.7.0-dev"), and the first digits of the git commit that it was built from, if it says."""
+
+    number: str
+    commit: str | None = None
+
+    @classmethod
+    def of(cls, number: int, custom: bytes) -> Version:
+        """From an AUTOPILOT_VERSION: three numbers and a FIRMWARE_VERSION_TYPE, a byte each, and 8 characters."""
+        major, minor, patch, kind = number.to_bytes(4, "big")
+        stages = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc"}
+        stage = next((word for least, word in sorted(stages.items(), reverse=True) if kind >= least), "")
+        commit = custom.rstrip(b"\0").decode("ascii", "replace")
+        is_commit = commit.isalnum() and commit.isascii()
+        return cls(f"{major}.{minor}.{patch}{'' if kind == 255 else stage}", commit if is_commit else None)
+
+
 @dataclass
 class VehicleState:
     """None is "not yet"."""
 
     mode: int | None = None  # ArduPilot's custom_mode
+    mav_type: int | None = None  # MAV_TYPE
+    version: Version | None = None
     armed: bool = False
     ready_to_arm: bool | None = None
     position: Position | None = None  # as it last said while its estimate was good

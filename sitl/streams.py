@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -106,6 +107,17 @@ def global_position_int(vehicle: Autopilot) -> Any:
 
 def mission_current(vehicle: Autopilot) -> Any:
     return mavlink.MAVLink_mission_current_message(vehicle.current_item)
+
+
+def autopilot_version(vehicle: Autopilot) -> Any:
+    """Asked for, not sent at intervals: the version of this package, of which no commit is known."""
+    parts = [min(int(part), 255) for part in version("ucp-harness").split(".")[:3]]
+    number = int.from_bytes([*parts, mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL], "big")
+    capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    none = [0] * 8
+    return mavlink.MAVLink_autopilot_version_message(
+        capabilities, number, 0, 0, 0, none, none, none, 0, 0, vehicle.sysid
+    )
 
 
 def _cms(speed_ms: float) -> int:

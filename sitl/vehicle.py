@@ -122,8 +122,12 @@ class VehicleKind(Protocol):
         """What its program calls its frame, if it has several."""
 
     @property
+    def sha256(self) -> str | None:
+        """The hash of its program, if that is a file of its own."""
+
+    @property
     def parameters(self) -> Mapping[str, float]:
-        """What it is given that it has to know."""
+        """What its user gives it, which it has to know."""
 
     @property
     def lack(self) -> str | None:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import typer
 from rich.console import Console
@@ -15,11 +15,11 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.text import Text
 
 from harness.errors import HarnessError, InterruptedRunError, MachineError
-from sitl.airframes import BINARIES
-from sitl.ardupilot import ENVIRONMENT
+from sitl.airframes import BINARIES, DEFAULTS
+from sitl.ardupilot import ENVIRONMENT, build_of, default_parameters
 from sitl.download import megabytes
 from sitl.firmware import RequestError, install
-from sitl.installed import all_installed, current, install_command
+from sitl.installed import all_installed, current, install_command, sha256
 from sitl.vehicle import VEHICLE_TYPES, VehicleError, VehicleType
 
 app = typer.Typer(no_args_is_help=True, help="Install ArduPilot's SITL binaries, and say which there are.")
@@ -78,7 +78,8 @@ def list_binaries(
         return
     console = Console()
     for offer in offers:
-        what = f"{offer.vehicle:<7} {offer.version or '-':<19} {megabytes(offer.size_bytes):>8}"
+        build = f"{offer.version or '-'}{f' ({offer.commit})' if offer.commit else ''}"
+        what = f"{offer.vehicle:<7} {build:<21} {megabytes(offer.size_bytes):>8}"
         date, source = (offer.fetched_at or "-")[:10], f"{offer.source}{', current' if offer.current else ''}"
         state = Text(offer.problem, style="red") if offer.problem else Text("ok", style="green")
         console.print(Text.assemble(f"{what}  {date:<10}  {source}: {offer.path}  ", state), soft_wrap=True)
@@ -88,13 +89,17 @@ def list_binaries(
 
 @dataclass(frozen=True)
 class _Offer:
-    """A binary that is here; `version` and `fetched_at` are known of installed ones."""
+    """A binary that is here; `fetched_at` is known of installed ones, `commit` by its first digits."""
 
     vehicle: VehicleType
     source: str
     path: str
     size_bytes: int
     version: str | None = None
+    commit: str | None = None
+    sha256: str | None = None
+    defaults: str | None = None
+    """Its default parameters."""
     fetched_at: str | None = None
     current: bool = False
     problem: str | None = None
@@ -107,18 +112,30 @@ def _offers(vehicle: VehicleType) -> Iterator[_Offer]:
     for source, binary in ((ENVIRONMENT, named), ("PATH", on_path and Path(on_path))):
         if binary and binary.is_file():
             problem = None if os.access(binary, os.X_OK) else f"{name} is not executable"
-            yield _Offer(vehicle, source, str(binary), binary.stat().st_size, problem=problem)
+            yield _Offer(
+                vehicle, source, str(binary), binary.stat().st_size, **_built(vehicle, binary), problem=problem
+            )
     for installed in all_installed(vehicle, os.environ):
         yield _Offer(
             vehicle,
             "cache",
             str(installed.directory),
             sum(path.stat().st_size for path in installed.directory.iterdir()),
-            installed.directory.name,
-            installed.manifest.fetched_at if installed.manifest else None,
-            installed.is_current,
-            installed.damage,
+            **{**_built(vehicle, installed.binary), "version": installed.directory.name},
+            fetched_at=installed.manifest.fetched_at if installed.manifest else None,
+            current=installed.is_current,
+            problem=installed.damage,
         )
+
+
+def _built(vehicle: VehicleType, binary: Path) -> dict[str, Any]:
+    build, defaults = build_of(binary), default_parameters(binary, DEFAULTS[vehicle])
+    return {
+        "version": build.number if build else None,
+        "commit": build.commit if build else None,
+        "sha256": sha256(binary) if os.access(binary, os.R_OK) else None,
+        "defaults": str(defaults) if defaults else None,
+    }
 
 
 class _Bar:

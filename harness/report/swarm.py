@@ -14,6 +14,11 @@ from harness.present.colours import Ink, inks
 from harness.report.chain_tree import holders, ranges
 from harness.report.programs import programs
 
+IN_THE_RECORD_ONLY = {"binary_sha256", "parameters_file"}
+"""Of what run.json says of a vehicle."""
+MAX_GIVEN = 10
+"""More parameters that a vehicle was given are not shown."""
+
 
 @dataclass(frozen=True, slots=True)
 class BlockRow:
@@ -74,6 +79,10 @@ def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
             if key == BEFALLEN:
                 cells[key] = _befallen(value)
                 continue
+            if key in IN_THE_RECORD_ONLY:
+                continue
+            if key == "parameters_given" and isinstance(value, dict):
+                value = ", ".join(f"{name} {words.value(given)}" for name, given in list(value.items())[:MAX_GIVEN])
             label = words.label(key)
             cells[f"vehicle {label}" if label in cells or key == "detail" else label] = value
         cells["detail"] = agent.detail if agent else None

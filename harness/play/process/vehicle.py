@@ -15,6 +15,8 @@ from harness.scenario.flight import Flight
 from netem.radio import Place
 from sitl.circumstances import Circumstance
 from sitl.ground_station import GroundStation
+from sitl.modes import mav_type
+from sitl.parameters import in_lines
 from sitl.pilot import Pilot
 from sitl.procedure import Procedure
 from sitl.vehicle import STATION_PORT, Home, Launch, VehicleError, VehicleKind
@@ -25,6 +27,7 @@ ASK_AGAIN_S = 0.05
 STOP_GRACE_S = 3.0
 ENDING_S = 0.5
 LAST_WORDS = 3
+PARAMETERS = "parameters.parm"
 
 
 class VehicleFailedError(HarnessError):
@@ -38,7 +41,7 @@ class VehicleProcess:
         self.vehicle_id = vehicle_id
         self.sysid = sysid
         self.kind = kind
-        self._given_up = False
+        self._given_up = self._introduced = False
         self.pilot: Pilot | None = None
         self._directory = rundir.vehicle(vehicle_id, life)
         self._process: Program | None = None
@@ -117,14 +120,27 @@ class VehicleProcess:
         assert self.pilot is not None
         self._flight = self.pilot.flight(flight.planned(), flight.by) if flight else self.pilot.ascent(altitude_m)
 
+    async def _introduce(self) -> None:
+        """Take down what it says of itself, once. Raises VehicleFailedError, having killed it."""
+        assert self.pilot is not None
+        if self._introduced:
+            return
+        self._introduced = True
+        await self._piloted(self.pilot.introduce(self.kind.parameters))
+        known = self.pilot.link.parameters
+        if known:
+            (self._directory / PARAMETERS).write_text(in_lines(known), encoding="utf-8")
+
     async def get_ready(self) -> None:
         """Up to arming. Raises VehicleFailedError, having killed it."""
         assert self.pilot is not None and self._flight is not None
+        await self._introduce()
         await self._piloted(self.pilot.get_ready(self._flight))
 
     async def fly(self) -> None:
         """And stay in touch with it as long as the mission takes. Raises VehicleFailedError, having killed it."""
         assert self.pilot is not None and self._flight is not None
+        await self._introduce()
         await self._piloted(self.pilot.fly(self._flight))
         await self._piloted(self.pilot.stay_in_touch())
 
@@ -181,6 +197,7 @@ class VehicleProcess:
 
     def to_json(self) -> dict[str, Any]:
         record: dict[str, Any] = {"kind": self.kind.name, "type": self.kind.vehicle_type, "sysid": self.sysid}
+        record |= self._what_flew()
         if self.pilot is not None:
             state, factor = self.pilot.state, self.pilot.real_time_factor
             record["mode"] = state.mode
@@ -197,6 +214,22 @@ class VehicleProcess:
             if state.texts:
                 record["last_text"] = state.texts[-1]
         return record
+
+    def _what_flew(self) -> dict[str, Any]:
+        """As far as it has said; files from the run's directory on."""
+        given: dict[str, Any] = {"frame": self.kind.frame, "binary_sha256": self.kind.sha256}
+        if self.pilot is not None:
+            state, parameters = self.pilot.state, self.pilot.link.parameters
+            if state.mav_type is not None:
+                given["mav_type"] = mav_type(state.mav_type)
+            if state.version is not None:
+                given |= {"version": state.version.number, "commit": state.version.commit}
+            if (self._directory / PARAMETERS).exists():
+                file = f"vehicles/{self._directory.name}/{PARAMETERS}"
+                given |= {"parameters": len(parameters), "parameters_file": file}
+        if self.kind.parameters:
+            given["parameters_given"] = dict(self.kind.parameters)
+        return {key: value for key, value in given.items() if value is not None}
 
     def _ended(self, process: Program) -> VehicleFailedError:
         return VehicleFailedError(

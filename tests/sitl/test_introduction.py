@@ -1,0 +1,67 @@
+"""What a vehicle says of itself: its version, and its list of parameters, of which some get lost."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from sitl.parameters import ParameterError
+from sitl.state import Version
+from tests.sitl.puppet import message_id, on_strings
+
+
+@pytest.mark.parametrize(
+    ("number", "custom", "version"),
+    [
+        (0x04_07_00_00, b"78d42fcf", Version("4.7.0-dev", "78d42fcf")),
+        (0x04_06_03_FF, bytes(8), Version("4.6.3")),
+        (0x04_06_00_C1, b"\xff\xfe\0\0\0\0\0\0", Version("4.6.0-rc")),
+        (0x04_06_00_80, b"abc\0\0\0\0\0", Version("4.6.0-beta", "abc")),
+    ],
+)
+def test_a_version_is_as_people_write_it(number: int, custom: bytes, version: Version) -> None:
+    assert Version.of(number, custom) == version
+
+
+def test_what_gets_lost_of_a_list_is_asked_for_again(tmp_path: Path) -> None:
+    async def introduce() -> None:
+        async with on_strings(tmp_path, "plane") as (pilot, puppet):
+            lost: list[bytes] = []
+
+            def lose_some(frame: bytes) -> bytes:
+                if message_id(frame) == mavlink.MAVLINK_MSG_ID_PARAM_VALUE and len(lost) < 2:
+                    lost.append(frame)
+                    return b""
+                return frame
+
+            puppet.tamper = lose_some
+            await pilot.introduce({"TKOFF_ALT": 33.0})
+            assert len(lost) == 2 and pilot.link.has_listed_parameters
+            assert pilot.link.parameters["TKOFF_ALT"] == puppet.vehicle.take_off_altitude_m == 33
+            assert pilot.state.version is not None and pilot.state.mav_type == mavlink.MAV_TYPE_FIXED_WING
+
+    asyncio.run(introduce())
+
+
+def test_a_parameter_that_the_vehicle_does_not_know_is_named(tmp_path: Path) -> None:
+    async def introduce() -> None:
+        async with on_strings(tmp_path, "plane") as (pilot, _):
+            await pilot.introduce({"TKOFF_ALT": 33.0, "TKOF_ALT": 30.0})
+
+    with pytest.raises(ParameterError, match=r"^vehicle 3 knows no parameter TKOF_ALT: did you mean TKOFF_ALT\?$"):
+        asyncio.run(introduce())
+
+
+def test_a_vehicle_that_says_nothing_of_itself_flies_all_the_same(tmp_path: Path) -> None:
+    silent = {mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION}
+
+    async def introduce() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            puppet.tamper = lambda frame: b"" if message_id(frame) in silent else frame
+            await pilot.introduce({})
+            assert pilot.state.version is None and not pilot.link.parameters
+
+    asyncio.run(introduce())
