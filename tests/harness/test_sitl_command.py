@@ -45,7 +45,10 @@ def test_install_path_list_and_install_again(environ: dict[str, str], tmp_path: 
     (offer,) = json.loads(harness("sitl", "list", "--json", env=environ).stdout)
     assert offer.pop("fetched_at").endswith("Z")
     assert offer.pop("size_bytes") > len(BINARY)
+    assert len(offer.pop("sha256")) == 64
     assert offer == {
+        "commit": None,
+        "defaults": f"{directory}/copter.parm",
         "vehicle": "copter",
         "source": "cache",
         "path": str(directory),
