@@ -237,7 +237,8 @@ class ArduPilot:
 
 _DEBUGGERS: dict[Debugger | None, tuple[str, ...]] = {
     "gdb": (
-        *("gdb", "-q", "-nx", "-batch", "-return-child-result", "-ex", "set pagination off", "-ex", "run"),
+        *("gdb", "-q", "-nx", "-batch", "-return-child-result", "-ex", "set pagination off"),
+        *("-ex", "handle SIGXFSZ SIGPIPE nostop noprint pass", "-ex", "run"),
         *("-ex", "thread apply all backtrace", "--args"),
     ),
     "valgrind": ("valgrind", "--log-file=valgrind.log", "--soname-synonyms=somalloc=nouserintercepts"),
