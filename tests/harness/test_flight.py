@@ -11,10 +11,10 @@ import pytest
 import yaml
 
 from harness.errors import MachineError, ScenarioError
-from harness.play.process.vehicle import system_ids
 from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario, load_scenario
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
+from sitl.system_ids import system_ids
 from tests.harness.command import harness, processes, write_scenario
 
 UP, DOWN = {"take_off": 20}, {"land": True}
