@@ -13,17 +13,27 @@ What is left out is computed: UDP's ports, type and length in the header, an eve
 which is that of its newest event (Section 4.2). Addresses that are left out scapy itself looks up, by ARP for one.
 
 What came over the air becomes a message's layer if and only if the codec accepts the datagram. The body of any other
-is Raw behind the UCP header, and a datagram that does not begin with a header of UCP version 1 is Raw as a whole.
+is Raw behind the UCP header, and a datagram that does not begin with a header of UCP is Raw as a whole.
+
+Datagrams of secured missions have version 2: SecuredUCP is their header, in clear; behind it is what is Sealed, or a
+Revocation. With a vehicle's bundle the former is a plain packet again:
+
+    from ucp.scapy import SecuredUCP, opened
+    from ucp.secure.bundle import load_bundle
+    from ucp.secure.opening import Opener
+
+    opened(rdpcap("7.pcapng")[0], Opener(load_bundle(Path("7.bundle.json")))).show()
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scapy.config import conf
 from scapy.fields import (
     ByteEnumField,
     ByteField,
     FieldLenField,
+    FieldListField,
     IntField,
     LenField,
     LongField,
@@ -31,6 +41,7 @@ from scapy.fields import (
     PacketListField,
     ShortField,
     StrFixedLenField,
+    XStrField,
     XStrFixedLenField,
     XStrLenField,
 )
@@ -51,7 +62,22 @@ from ucp.messages import (
     Message,
     decode,
 )
+from ucp.secure.envelope import (
+    BOOT_BYTES,
+    CLEAR,
+    CLEAR_FIELDS,
+    NAMES,
+    REVOCATION,
+    SEAL_BYTES,
+    SIGNATURE_BYTES,
+    TAG_BYTES,
+    read_clear,
+)
+from ucp.secure.envelope import VERSION as SECURED_VERSION
 from ucp.wire import Fields, Kind
+
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
 
 
 class HashField(XStrFixedLenField):
@@ -84,6 +110,13 @@ class BlockTimestampField(LongField):
         return x or 0
 
 
+class CiphertextField(XStrField):
+    """All but the tag and the signature behind it."""
+
+    def getfield(self, pkt: Packet, s: bytes) -> tuple[bytes, bytes]:
+        return s[-SEAL_BYTES:], s[:-SEAL_BYTES]
+
+
 _FIELDS: dict[Kind, Callable[[str], Any]] = {
     Kind.U8: lambda name: ByteField(name, 0),
     Kind.U16: lambda name: ShortField(name, 0),
@@ -92,6 +125,7 @@ _FIELDS: dict[Kind, Callable[[str], Any]] = {
     Kind.MAGIC: lambda name: StrFixedLenField(name, MAGIC, len(MAGIC)),
     Kind.FLAG: lambda name: ByteEnumField(name, 0, {0: "no", 1: "yes"}),
     Kind.HASH: HashField,
+    Kind.BOOT: lambda name: XStrFixedLenField(name, bytes(BOOT_BYTES), BOOT_BYTES),
     Kind.OPTIONAL_HASH: OptionalHashField,
     Kind.BLOCK: lambda name: PacketField(name, Block(), Block),
 }
@@ -154,9 +188,11 @@ class UCP(Packet):
 
     @classmethod
     def dispatch_hook(cls, _pkt: bytes = b"", *_: Any, **__: Any) -> type[Packet]:
-        if _pkt and (len(_pkt) < HEADER.size or HEADER.unpack_from(_pkt)[:2] != (MAGIC, VERSION)):
-            return conf.raw_layer
-        return cls
+        if not _pkt or (len(_pkt) >= HEADER.size and _pkt[:3] == MAGIC + bytes([VERSION])):
+            return cls
+        return (
+            SecuredUCP if len(_pkt) >= CLEAR.size and _pkt[:3] == MAGIC + bytes([SECURED_VERSION]) else conf.raw_layer
+        )
 
     def guess_payload_class(self, payload: bytes) -> type[Packet]:
         try:
@@ -167,6 +203,57 @@ class UCP(Packet):
 
     def mysummary(self) -> str:
         return self.sprintf("UCP %UCP.sender%: %UCP.type%")
+
+
+class SecuredUCP(Packet):
+    """The clear header of a datagram of a secured mission. `type` and `length` are those of what follows."""
+
+    name = "Secured UCP"
+    fields_desc = _fields(
+        CLEAR_FIELDS,
+        version=ByteField("version", SECURED_VERSION),
+        type=ByteEnumField("type", 0, NAMES | {REVOCATION: "Revocation"}),
+        sender=IntField("sender", 1),
+        length=LenField("length", None),
+    )
+
+    def guess_payload_class(self, payload: bytes) -> type[Packet]:
+        try:
+            clear = read_clear(self.original)
+        except MalformedDatagramError:
+            return conf.raw_layer
+        if clear.type != REVOCATION:
+            return Sealed
+        whole = len(payload) >= 4 and len(payload) == 4 + 4 * int.from_bytes(payload[2:4], "big") + SIGNATURE_BYTES
+        return Revocation if whole else conf.raw_layer
+
+    def mysummary(self) -> str:
+        return self.sprintf("UCP %SecuredUCP.sender%: %SecuredUCP.type%, sealed")
+
+
+class Sealed(Packet):
+    """What only those who have keys can read; `opened` reads it."""
+
+    name = "Sealed"
+    fields_desc = _fields(
+        {},
+        CiphertextField("ciphertext", b""),
+        XStrFixedLenField("tag", bytes(TAG_BYTES), TAG_BYTES),
+        XStrFixedLenField("masked_signature", bytes(SIGNATURE_BYTES), SIGNATURE_BYTES),
+    )
+
+
+class Revocation(Packet):
+    """Which agents' keys are revoked, signed by the authority; `count` is computed if it is left out."""
+
+    name = "Revocation"
+    fields_desc = _fields(
+        {},
+        ShortField("number", 1),
+        FieldLenField("count", None, count_of="revoked"),
+        FieldListField("revoked", [], IntField("agent_id", 0), count_from=lambda revocation: revocation.count),
+        XStrFixedLenField("signature", bytes(SIGNATURE_BYTES), SIGNATURE_BYTES),
+    )
 
 
 class BlockAddRequest(Packet):
@@ -230,6 +317,7 @@ LAYERS: dict[type[Message], type[Packet]] = {
 
 for _message, _layer in LAYERS.items():
     bind_layers(UCP, _layer, type=TYPE_CODES[_message])
+bind_layers(SecuredUCP, Revocation, type=REVOCATION)
 bind_top_down(UDP, UCP, sport=PORT, dport=PORT)
 bind_bottom_up(UDP, UCP, dport=PORT)
 
@@ -237,6 +325,17 @@ bind_bottom_up(UDP, UCP, dport=PORT)
 def to_layer(message: Message) -> Packet:
     """The layer of a codec's message, to put behind a UCP header."""
     return LAYERS[type(message)](message.body())
+
+
+def opened(packet: Packet, opener: "Opener") -> Packet:
+    """The plain packet, UCP and a message, that says what a secured one does.
+
+    Raises MalformedDatagramError for what these keys do not open, and says why.
+    """
+    header = packet.getlayer(SecuredUCP)
+    if header is None:
+        raise MalformedDatagramError("not secured")
+    return UCP(opener.open(header.do_build()).plain)
 
 
 def message_of(packet: Packet) -> tuple[int, int, Message]:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, Field, ValidationError
 
@@ -21,6 +21,9 @@ from harness.packets.summary import MessageSummary, summarize
 from ucp.block import MAX_AGENT_ID
 from ucp.messages import TYPE_CODES, MalformedDatagramError, decode
 from ucp.secure.envelope import REVOCATION, VERSION, read_clear
+
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
 
 SECURED = bytes([VERSION])
 NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
@@ -86,8 +89,13 @@ class Capture:
     def listening(self, time_ns: int) -> bool:
         return self.began_ns is not None and self.ended_ns is not None and self.began_ns <= time_ns <= self.ended_ns
 
-    def read(self, datagrams: dict[bytes, Datagram], most_frames: int | None = None) -> None:
-        """Add what the file saw, or its first frames, to `datagrams`. Raises CaptureError if it is no capture."""
+    def read(
+        self, datagrams: dict[bytes, Datagram], most_frames: int | None = None, opener: "Opener | None" = None
+    ) -> None:
+        """Add what the file saw, or its first frames, to `datagrams`; what is sealed `opener` opens.
+
+        Raises CaptureError if it is no capture.
+        """
         file = CaptureFile(self.path)
         first_ns, last_ns = _LAST_NS, -1
         sent_by: Counter[int] = Counter()
@@ -100,7 +108,7 @@ class Capture:
                 continue
             first_ns, last_ns = min(first_ns, frame.time_ns), max(last_ns, frame.time_ns)
             try:
-                datagram, direction = _datagram(frame, datagrams)
+                datagram, direction = _datagram(frame, datagrams, opener)
             except NotUcpError as not_ucp:
                 self.not_ucp[not_ucp.reason] += 1
             except MalformedDatagramError as malformed:
@@ -162,18 +170,21 @@ def _plain(payload: bytes) -> Datagram:
     return Datagram(sender, sequence, summarize(message))
 
 
-def _secured(payload: bytes) -> Datagram:
+def _secured(payload: bytes, opener: "Opener | None") -> Datagram:
     """Of what is sealed, who says it, when, and which message it is, are in the clear."""
     clear = read_clear(payload)
     if clear.type == REVOCATION:
         raise NotUcpError("a revocation of keys")
+    if opener is not None:
+        sender, sequence, message = opener.open(payload).said
+        return Datagram(sender, sequence, summarize(message))
     return Datagram(clear.sender, clear.sequence, MessageSummary(NAMES[clear.type], None, None))
 
 
-def _datagram(frame: Frame, datagrams: dict[bytes, Datagram]) -> tuple[Datagram, int]:
+def _datagram(frame: Frame, datagrams: dict[bytes, Datagram], opener: "Opener | None") -> tuple[Datagram, int]:
     payload, direction = unwrap(frame)
     key = hashlib.blake2b(payload, digest_size=16).digest()
     datagram = datagrams.get(key)
     if datagram is None:
-        datagram = datagrams[key] = _secured(payload) if payload[2:3] == SECURED else _plain(payload)
+        datagram = datagrams[key] = _secured(payload, opener) if payload[2:3] == SECURED else _plain(payload)
     return datagram, direction

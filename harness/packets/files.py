@@ -2,10 +2,13 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from harness.errors import CaptureError, RunDirectoryError
 from harness.packets.capture import Capture, Datagram
+
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
 
 DIRECTORY = "capture"
 """Of a run directory."""
@@ -60,8 +63,11 @@ def capture_files(paths: Iterable[Path]) -> list[Path]:
     return list({file.resolve(): file for file in files}.values())
 
 
-def read_captures(paths: Iterable[Path]) -> Captures:
-    """All captures of the mission of the first that names one; captures from the field may be of any."""
+def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Captures:
+    """All captures of the mission of the first that names one; captures from the field may be of any.
+
+    `opener` opens what a secured mission sealed.
+    """
     used: list[Capture] = []
     errors: list[str] = []
     datagrams: dict[bytes, Datagram] = {}
@@ -69,7 +75,7 @@ def read_captures(paths: Iterable[Path]) -> Captures:
     for number, path in enumerate(paths):
         capture = Capture(number, path)
         try:
-            capture.read(datagrams)
+            capture.read(datagrams, opener=opener)
         except CaptureError as error:
             errors.append(str(error))
             continue

@@ -90,12 +90,22 @@ class Scene:
         sequence = self.sequences[sender]
         self.sequences[sender] += 1
         datagram = encode(sender, sequence, message)
+        self.crosses(at_s, sender, datagram, reaches)
+        return datagram
+
+    def crosses(
+        self,
+        at_s: float,
+        sender: int,
+        datagram: bytes,
+        reaches: Mapping[int, float | Sequence[float]] | None = None,
+    ) -> None:
+        """Bytes of any kind go the way of a message."""
         self.sees(sender, at_s, OUTBOUND, datagram)
         everybody = {vehicle: 0.01 for vehicle in self.files if vehicle != sender}
         for receiver, delays in (everybody if reaches is None else reaches).items():
             for delay in [delays] if isinstance(delays, float) else delays:
                 self.sees(receiver, at_s + delay, INBOUND, datagram)
-        return datagram
 
     def sees(self, vehicle: int, at_s: float, direction: int, datagram: bytes) -> None:
         """From whomever it comes."""

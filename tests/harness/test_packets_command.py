@@ -10,8 +10,11 @@ import pytest
 from harness.packets.document import PacketsRecord
 from tests.harness.captures import INBOUND, OUTBOUND, PcapNg, Scene, frame, pcap, wall_ns
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
+from tests.ucp.secure.swarm import KEYS, session
 from ucp.block import Block
 from ucp.messages import BlockAddRequest, BlockAddResponse, CommitBlock, encode
+from ucp.secure.bundle import KeySet, write_bundle
+from ucp.secure.session import Request
 
 BLOCK = Block(1, 5, b"events")
 BEFORE, AFTER = bytes(32), bytes(range(32))
@@ -29,6 +32,27 @@ def run_dir(tmp_path: Path) -> Path:
     scene.files[3].packet(wall_ns(21), INBOUND, frame(3, b"anybody", port=53))
     scene.ends(30)
     return scene.write(tmp_path / "run")
+
+
+def test_what_was_sealed_is_opened_with_a_bundle(tmp_path: Path) -> None:
+    asks, answers = session(1), session(2)
+    scene = Scene(1, 2, 3)
+    request, vote = BlockAddRequest(BLOCK.block_hash, BEFORE), BlockAddResponse(BLOCK.block_hash, True)
+    scene.crosses(10, 1, asks.seal(0, request, None, None, 0))
+    scene.crosses(10.02, 2, answers.seal(0, vote, Request(1, asks.boot, 0), None, 0))
+    scene.ends(30)
+    run_dir = scene.write(tmp_path / "run")
+    write_bundle(tmp_path / "3.bundle.json", KEYS.bundle(3))
+    sealed, opened = harness("packets", run_dir), harness("packets", run_dir, "--bundle", tmp_path / "3.bundle.json")
+    assert "Block Add Request" in sealed.stdout and "answers:" not in sealed.stdout
+    assert "answers: approve: 2; no answer: 3" in words(opened.stdout)
+
+    write_bundle(tmp_path / "other.json", KeySet.derived(bytes(31) + b"1", (1, 2, 3)).bundle(3))
+    other = harness("packets", run_dir, "--bundle", tmp_path / "other.json")
+    assert "not authentic" in other.stdout
+    (tmp_path / "3.bundle.json").chmod(0o644)
+    refused = harness("packets", run_dir, "--bundle", tmp_path / "3.bundle.json")
+    assert (refused.returncode, len(sentences(refused.stderr))) == (2, 1)
 
 
 def words(text: str) -> list[str]:

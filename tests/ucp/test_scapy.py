@@ -32,6 +32,7 @@ from ucp.scapy import (
     LoggableEvent,
     NextInSequenceResponse,
     RequestForBlock,
+    SecuredUCP,
     message_of,
     to_layer,
 )
@@ -98,7 +99,7 @@ def test_scapy_finds_a_message_if_and_only_if_the_codec_does(datagram: bytes) ->
     try:
         _, _, message = decode(datagram)
     except MalformedDatagramError:
-        assert type(packet.lastlayer()) in (Raw, UCP)
+        assert type(packet.lastlayer()) in (Raw, UCP, SecuredUCP)
     else:
         assert type(packet.lastlayer()) is LAYERS[type(message)]
 

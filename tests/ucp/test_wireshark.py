@@ -15,6 +15,7 @@ from scapy.packet import Raw
 from scapy.utils import RawPcapWriter
 
 from tests.machine import require_tshark
+from tests.ucp.secure.swarm import session
 from ucp.block import BLOCK_FIELDS, Block
 from ucp.events import EVENT_FIELDS, LoggableEvent, decode_events
 from ucp.messages import (
@@ -35,6 +36,8 @@ from ucp.messages import (
     decode,
     encode,
 )
+from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, read_clear
+from ucp.secure.revocation import Revocation
 from ucp.wireshark import DISSECTOR
 
 TIMEOUT_S = 120.0
@@ -138,6 +141,25 @@ def test_the_list_of_packets_names_message_and_sender(tmp_path: Path) -> None:
         assert line.endswith(f"{message.NAME} from {65535 - place}")
 
 
+def test_of_a_secured_mission_it_shows_what_is_in_clear(tmp_path: Path) -> None:
+    body = Revocation(3, frozenset((2, 9)), bytes(range(64))).encode()
+    sealed, revokes = session(2).seal(7, CommitBlock(LOGGED, A), None, None, 1), session(1).tell(3, body)
+    for datagram, layer in zip((sealed, revokes), layers(tmp_path, (sealed, revokes)), strict=True):
+        header = shown("ucpchain", dict(zip(CLEAR_FIELDS, CLEAR.unpack_from(datagram), strict=True)))
+        assert {name: layer[name] for name in header} == header
+        assert experts(layer) == {}
+    tree, revocation = layers(tmp_path, (sealed, revokes))
+    assert [tree[f"ucpchain.{name}"].replace(":", "") for name in ("ciphertext", "tag", "masked_signature")] == [
+        part.hex() for part in (sealed[CLEAR.size : -80], sealed[-80:-64], sealed[-64:])
+    ]
+    assert (revocation["ucpchain.number"], revocation["ucpchain.revoked"]) == ("3", ["2", "9"])
+    broken = revokes[: CLEAR.size - 24] + (len(body) + 1).to_bytes(2, "big") + revokes[14:] + b"x"
+    assert experts(layers(tmp_path, [broken])[0]) == {"ucpchain.malformed": "wrong length"}
+    assert "Commit Block from 2, secured" in tshark(tmp_path, [frame(sealed)])
+    for captured in (50, 70, 100):
+        assert set(experts(layers(tmp_path, [sealed], captured)[0])) == {"ucpchain.cut_off"}
+
+
 def damaged(rng: Random) -> bytes:
     datagram = bytearray(rng.choice(DATAGRAMS))
     for _ in range(rng.randrange(3)):
@@ -158,7 +180,7 @@ def test_what_the_codec_refuses_is_malformed_for_the_same_reason(tmp_path: Path)
     for datagram, layer in zip(datagrams, layers(tmp_path, datagrams), strict=True):
         reason = None
         try:
-            decode(datagram)
+            read_clear(datagram) if datagram[:3] == b"UC\2" else decode(datagram)
         except MalformedDatagramError as malformed:
             reason = malformed.reason
         assert experts(layer).get("ucpchain.malformed") == reason, datagram.hex()

@@ -30,7 +30,7 @@ from ucp.secure.envelope import (
     Clear,
 )
 from ucp.secure.epochs import Epochs
-from ucp.secure.suite import Signed, verify
+from ucp.secure.suite import SenderKeys, Signed, verify
 from ucp.secure.window import ReplayWindow
 
 _DATAGRAM = b"UCP datagram\0"
@@ -93,7 +93,7 @@ class Session:
         self.private_key = Ed25519PrivateKey.from_private_bytes(bundle.private_key)
         self.verified = verified
         self.epochs = Epochs(bundle, keep)
-        self._domain = _DATAGRAM + self.mission
+        self._domain = domain_of(self.mission)
         self._lives: dict[int, _Life] = {}
         self._asked: dict[int, int] = {}
         """Type of a request -> sequence of the newest of its own."""
@@ -153,18 +153,13 @@ class Session:
             self.epochs.follow(clear.epoch)
         if clear.type in REQUESTS:
             life.requests[clear.type] = max(clear.sequence, life.requests.get(clear.type, 0))
-        return _opened(clear, body)
+        return understood(clear, body)
 
     def _authentic(self, datagram: bytes, clear: Clear) -> bytes:
         """The body, if the group's secret and the sender's signature vouch for it."""
         keys = self.epochs.keys_of(clear.epoch, clear.sender, clear.boot)
-        signed, signature = datagram[:-SIGNATURE_BYTES], datagram[-SIGNATURE_BYTES:]
-        header = signed[: CLEAR.size]
-        body = keys.decrypt(clear.sequence, signed[CLEAR.size :], header)
-        if body is None:
-            raise MalformedDatagramError("not authentic")
-        public_key = self.public_keys[clear.sender]
-        if not self.verified(Signed(public_key, keys.masked(clear.sequence, signature), self._domain + signed)):
+        body, claim = decrypted(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
+        if not self.verified(claim):
             raise MalformedDatagramError("not signed by its sender")
         self.epochs.remember(clear.epoch, clear.sender, clear.boot, keys)
         return body
@@ -185,8 +180,27 @@ class Session:
         return request.boot == life.boot and request.sequence >= life.requests.get(asking, 0)
 
 
-def _opened(clear: Clear, body: bytes) -> Opened:
-    """Raises MalformedDatagramError for a body that no message has."""
+def domain_of(mission: bytes) -> bytes:
+    """What stands before all that is signed of a datagram of this mission."""
+    return _DATAGRAM + mission
+
+
+def decrypted(
+    keys: SenderKeys, datagram: bytes, clear: Clear, domain: bytes, public_key: bytes
+) -> tuple[bytes, Signed]:
+    """What was sealed, and the signature that is still to be verified.
+
+    Raises MalformedDatagramError if the keys do not open it.
+    """
+    signed, signature = datagram[:-SIGNATURE_BYTES], datagram[-SIGNATURE_BYTES:]
+    body = keys.decrypt(clear.sequence, signed[CLEAR.size :], signed[: CLEAR.size])
+    if body is None:
+        raise MalformedDatagramError("not authentic")
+    return body, Signed(public_key, keys.masked(clear.sequence, signature), domain + signed)
+
+
+def understood(clear: Clear, body: bytes) -> Opened:
+    """What a body says that was sealed. Raises MalformedDatagramError for one that no message has."""
     request, block_signature = None, b""
     if clear.type in REQUEST_OF:
         if len(body) < REQUEST.size:

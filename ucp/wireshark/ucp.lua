@@ -1,4 +1,5 @@
--- UCP in Wireshark and tshark: the header, nine messages, blocks and their events, on UDP port 14600.
+-- UCP in Wireshark and tshark: the header, nine messages, blocks and their events, on UDP port 14600. Of a secured
+-- mission, version 2, the header in clear and revocations; what is sealed, `ucp-harness packets --bundle` opens.
 --
 --     wireshark -X lua_script:ucp.lua capture.pcapng
 --
@@ -13,6 +14,12 @@ local PORT = 14600
 local MAGIC = "UC"
 local VERSION = 1
 local HEADER_BYTES = 14
+local SECURED_VERSION = 2
+local CLEAR_BYTES = 36
+local BOOT_BYTES = 16
+local TAG_BYTES = 16
+local SIGNATURE_BYTES = 64
+local REVOCATION = 10
 local MAX_DATAGRAM_BYTES = 1472
 local HASH_BYTES = 32
 local BLOCK_HEADER_BYTES = 12
@@ -31,6 +38,7 @@ local NAMES = {
   [7] = "Next in Sequence Response",
   [8] = "Request for Block",
   [9] = "Block Response",
+  [10] = "Revocation",
 }
 
 local fields = {
@@ -54,6 +62,16 @@ local fields = {
   event_id = ProtoField.uint8("ucpchain.event.event_id", "Event ID"),
   event_length = ProtoField.uint16("ucpchain.event.length", "Length"),
   event_data = ProtoField.bytes("ucpchain.event.data", "Data"),
+  epoch = ProtoField.uint32("ucpchain.epoch", "Epoch"),
+  boot = ProtoField.bytes("ucpchain.boot", "Boot"),
+  revocations = ProtoField.uint16("ucpchain.revocations", "Newest revocation known"),
+  ciphertext = ProtoField.bytes("ucpchain.ciphertext", "Ciphertext"),
+  tag = ProtoField.bytes("ucpchain.tag", "Tag"),
+  masked_signature = ProtoField.bytes("ucpchain.masked_signature", "Masked signature"),
+  number = ProtoField.uint16("ucpchain.number", "Number"),
+  count = ProtoField.uint16("ucpchain.count", "Count"),
+  revoked = ProtoField.uint32("ucpchain.revoked", "Revoked agent"),
+  signature = ProtoField.bytes("ucpchain.signature", "Signature"),
 }
 ucp.fields = fields
 
@@ -178,6 +196,7 @@ local BODIES = {
 
 local function header(reader, info)
   local size = reader.tvb:reported_len()
+  info.header_bytes = HEADER_BYTES
   if size < HEADER_BYTES then
     return "truncated"
   end
@@ -189,27 +208,65 @@ local function header(reader, info)
     return "wrong magic"
   end
   local _, version = reader:add(fields.version, 1)
-  if version:uint() ~= VERSION then
+  info.secured = version:uint() == SECURED_VERSION
+  if info.secured then
+    info.header_bytes = CLEAR_BYTES
+    if size < CLEAR_BYTES then
+      return "truncated"
+    end
+  elseif version:uint() ~= VERSION then
     return "wrong version"
   end
   local _, code = reader:add(fields.type, 1)
   local _, sender = reader:add(fields.sender, 4)
   reader:add(fields.sequence, 4)
   local _, length = reader:add(fields.length, 2)
+  if info.secured then
+    reader:add(fields.epoch, 4)
+    reader:add(fields.boot, BOOT_BYTES)
+    reader:add(fields.revocations, 2)
+  end
   info.name, info.sender, info.code = NAMES[code:uint()] or "Unknown type", sender:uint(), code:uint()
   if info.sender < 1 or info.sender > MAX_AGENT_ID then
     return "impossible sender"
   end
-  if length:uint() ~= size - HEADER_BYTES then
+  if length:uint() ~= size - info.header_bytes then
     return "wrong length"
   end
-  if not BODIES[info.code] then
+  if not BODIES[info.code] and not (info.secured and info.code == REVOCATION) then
     return "unknown type"
   end
 end
 
-local function body(reader, code)
-  for _, part in ipairs(BODIES[code]) do
+local function sealed(reader)
+  if reader:left() < TAG_BYTES + SIGNATURE_BYTES then
+    return "wrong length"
+  end
+  if reader:left() > TAG_BYTES + SIGNATURE_BYTES then
+    reader:add(fields.ciphertext, reader:left() - TAG_BYTES - SIGNATURE_BYTES)
+  end
+  reader:add(fields.tag, TAG_BYTES)
+  reader:add(fields.masked_signature, SIGNATURE_BYTES)
+end
+
+local function revocation(reader)
+  if reader:left() < 4 or reader:left() ~= 4 + 4 * reader.tvb(reader.at + 2, 2):uint() + SIGNATURE_BYTES then
+    return "wrong length"
+  end
+  reader:add(fields.number, 2)
+  reader:add(fields.count, 2)
+  while reader:left() > SIGNATURE_BYTES do
+    reader:add(fields.revoked, 4)
+  end
+  reader:add(fields.signature, SIGNATURE_BYTES)
+end
+
+local function body(reader, info)
+  if info.secured then
+    local read = info.code == REVOCATION and revocation or sealed
+    return read(reader)
+  end
+  for _, part in ipairs(BODIES[info.code]) do
     local read, field = part[1], part[2]
     local reason = read(reader, field)
     if reason then
@@ -227,20 +284,22 @@ function ucp.dissector(tvb, pinfo, root)
   local info = {}
   local whole = tvb:captured_len() == tvb:reported_len()
   pinfo.cols.protocol = "UCP"
-  if not whole and tvb:captured_len() < HEADER_BYTES then
+  local clear = tvb:captured_len() > 2 and tvb(2, 1):uint() == SECURED_VERSION and CLEAR_BYTES or HEADER_BYTES
+  if not whole and tvb:captured_len() < clear then
     tree:add_proto_expert_info(cut_off)
     return
   end
   local reason = header(reader, info)
   if info.name then
-    tree:append_text(", " .. info.name .. " from " .. info.sender)
-    pinfo.cols.info = info.name .. " from " .. info.sender
+    local text = info.name .. " from " .. info.sender .. (info.secured and ", secured" or "")
+    tree:append_text(", " .. text)
+    pinfo.cols.info = text
   end
   if not reason and not whole then
     tree:add_proto_expert_info(cut_off)
     return
   end
-  reason = reason or body(reader, info.code)
+  reason = reason or body(reader, info)
   if reason then
     tree:add_proto_expert_info(malformed, reason)
     pinfo.cols.info:append(" [malformed: " .. reason .. "]")

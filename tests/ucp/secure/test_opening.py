@@ -1,0 +1,99 @@
+"""What crossed the air can be read afterwards by who has keys, in scapy's layers; by nobody else."""
+
+from collections.abc import Iterator
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from hypothesis import given
+from hypothesis import strategies as st
+from scapy.config import conf
+from scapy.layers.inet import IP, UDP
+from scapy.layers.l2 import Ether
+from scapy.packet import Raw
+
+from tests.ucp.datagrams import all_messages
+from tests.ucp.secure.swarm import KEYS, session
+from ucp.messages import ChainContainQuery, Message, encode
+from ucp.scapy import UCP, Revocation, Sealed, SecuredUCP, message_of, opened
+from ucp.secure.agent import boot_of
+from ucp.secure.bundle import KeySet
+from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, MalformedDatagramError, read_clear
+from ucp.secure.opening import EPOCHS_AHEAD, Opener
+from ucp.secure.revocation import Revocation as Signed
+from ucp.secure.session import Session
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _scapy_raises_what_it_would_hide() -> Iterator[None]:
+    conf.debug_dissector, before = True, conf.debug_dissector
+    yield
+    conf.debug_dissector = before
+
+
+def sealed(message: Message, sequence: int = 7, by: Session | None = None) -> bytes:
+    return (by or session(2)).seal(sequence, message, None, None, 0)
+
+
+def opener(keys: KeySet = KEYS) -> Opener:
+    return Opener(keys.bundle(1))
+
+
+@given(all_messages)
+def test_scapy_shows_the_header_in_clear_and_opens_the_rest_with_a_bundle(message: Message) -> None:
+    datagram = sealed(message)
+    air = Ether(src="02:00:00:00:00:02", dst="ff:ff:ff:ff:ff:ff") / IP(src="10.77.0.2", dst="10.77.255.255")
+    packet = Ether(bytes(air / UDP(sport=14600, dport=14600) / Raw(datagram)))
+    header = packet[SecuredUCP]
+    assert [header.getfieldval(name) for name in CLEAR_FIELDS] == list(CLEAR.unpack_from(datagram))
+    assert type(header.payload) is Sealed
+    assert bytes(header) == datagram
+    plain = opened(packet, opener())
+    assert message_of(plain) == (2, 7, message)
+    assert bytes(plain) == encode(2, 7, message)
+
+
+@given(st.data(), all_messages)
+def test_who_lacks_the_keys_opens_nothing_and_what_was_altered_is_told(data: st.DataObject, message: Message) -> None:
+    datagram = sealed(message)
+    with pytest.raises(MalformedDatagramError, match="not authentic"):
+        opener(KeySet.derived(bytes(31) + b"1", (1, 2, 3))).open(datagram)
+    place = data.draw(st.integers(CLEAR.size, len(datagram) - 1))
+    altered = datagram[:place] + bytes([datagram[place] ^ 1]) + datagram[place + 1 :]
+    with pytest.raises(MalformedDatagramError, match=r"not authentic|not signed by its sender"):
+        opener().open(altered)
+
+
+def test_later_epochs_are_opened_and_others_are_not() -> None:
+    kept = [KEYS.bundle(2)]
+    sender, reads = Session(kept[0], boot_of(1, bytes(8)), kept.append), opener()
+    message = ChainContainQuery(bytes(32))
+    datagrams = []
+    for sequence, epoch in enumerate((0, 1, 5)):
+        sender.epochs.look_at(epoch * KEYS.public.epoch_s)
+        datagrams.append(sealed(message, sequence, sender))
+    for sequence, datagram in reversed(list(enumerate(datagrams))):  # in any order, and twice
+        assert reads.open(datagram).said == reads.open(datagram).said == (2, sequence, message)
+    assert kept[-1].epoch == 5
+    with pytest.raises(MalformedDatagramError, match="epoch out of range"):
+        Opener(kept[-1]).open(datagrams[0])
+    far = read_clear(datagrams[0])._replace(epoch=EPOCHS_AHEAD + 1)
+    with pytest.raises(MalformedDatagramError, match="epoch out of range"):
+        reads.open(far.pack(len(datagrams[0]) - CLEAR.size) + datagrams[0][CLEAR.size :])
+
+
+def test_a_revocation_is_read_by_anybody() -> None:
+    authority = Ed25519PrivateKey.from_private_bytes(KEYS.authority)
+    body = Signed.signed(authority, KEYS.public.mission, 3, [2, 9]).encode()
+    datagram = session(1).tell(3, body)
+    packet = UCP(datagram)
+    assert (packet[Revocation].number, packet[Revocation].count, packet[Revocation].revoked) == (3, 2, [2, 9])
+    crafted = SecuredUCP(sender=1, boot=packet.boot, revocations=3) / Revocation(bytes(packet[Revocation]))
+    assert bytes(crafted) == datagram
+    with pytest.raises(MalformedDatagramError, match="not sealed"):
+        opened(packet, opener())
+
+
+@given(st.binary(max_size=200), st.integers(0, 10))
+def test_whatever_claims_to_be_secured_is_shown_and_never_raises(noise: bytes, code: int) -> None:
+    datagram = b"UC\2" + bytes([code]) + noise
+    assert bytes(UCP(datagram)) == datagram
