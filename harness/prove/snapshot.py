@@ -17,8 +17,8 @@ from ucp.timers import Timer
 
 REPORTED = frozenset(("now", "sent", "reconciles", "chain_changed_at", "_sequence"))
 """What an agent only counts or notes; no handler reads it but to make a trace or a datagram's number."""
-FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing"))
-"""What never changes, or is another name of what is there."""
+FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
+"""What never changes (no agent that is looked at seals its events), or is another name of what is there."""
 HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
 LEFT_OUT = REPORTED | FIXED | HANDED_OVER
 

@@ -162,9 +162,9 @@ def test_a_name_that_is_taken(tmp_path: Path) -> None:
         ),
         ({"agent_command": ["/bin/false"]}, 1, "agent 1 ended by itself with status 1; its log is agents/1.log"),
         (
-            {"docker": {"memory_mib": 8}},
+            {"docker": {"memory_mib": 6}},
             1,
-            "agent 1 ended by itself with SIGKILL, out of memory: it may use 8 MiB (`docker.memory_mib`); its log is",
+            "agent 1 ended by itself with SIGKILL, out of memory: it may use 6 MiB (`docker.memory_mib`); its log is",
         ),
     ],
 )  # fmt: skip

@@ -31,7 +31,7 @@ DEADLINE_S = 10.0
 NEEDED = {
     *("agent", "block", "chain", "clock", "commit", "control", "core", "dataclass", "events", "export", "features"),
     *("files", "handler", "loop", "messages", "mission", "reconcile", "request", "settings", "shown", "state"),
-    *("status", "store", "timers", "trace", "wire"),
+    *("sealed", "status", "store", "timers", "trace", "wire"),
 }
 """The modules of `ucp` that every agent loads."""
 
