@@ -198,20 +198,23 @@ class Interventions(GrowingTimeline):
         end_s = self.scenario.duration_s
         while self._played_s < end_s:
             until_s = min([end_s, *(change.at_s for change in self._coming())])
-            await self._until_asked(swarm, until_s)
+            is_reached = await self._goes_on_until(swarm, until_s)
             if self._asked:
                 await self._intervene(swarm, *self._asked.popleft())
-            else:
+            elif is_reached:
                 await self.until(swarm, until_s)
                 self._played_s = until_s
 
     def _coming(self) -> list[Change]:
         return [change for change in timeline_of(self.scenario) if change.at_s > self._played_s]
 
-    async def _until_asked(self, swarm: Swarm, mission_s: float) -> None:
-        """Go on until then, or until something is asked for."""
+    async def _goes_on_until(self, swarm: Swarm, mission_s: float) -> bool:
+        """Go on until then, or until something is asked for; whether it is then.
+
+        It may also be woken up for what it has done already, as that had been asked for before it could fall asleep.
+        """
         if self._asked:
-            return
+            return False
         self._something_is_asked.clear()
         asked = asyncio.create_task(self._something_is_asked.wait())
         going = asyncio.create_task(_until(swarm, mission_s))
@@ -221,8 +224,10 @@ class Interventions(GrowingTimeline):
             asked.cancel()
             going.cancel()
             await asyncio.wait({asked, going})
-        if not going.cancelled():
-            going.result()
+        if going.cancelled():
+            return False
+        going.result()
+        return True
 
     async def _intervene(self, swarm: Swarm, entry: Entry, answer: Future[float]) -> None:
         if not answer.set_running_or_notify_cancel():

@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +186,21 @@ def test_agents_of_another_make_are_asked_for_nothing_that_their_scenario_does_n
         hand.ask({"reboot": [2], "down_s": 5, "disk": "lost"}).result(TIMEOUT_S)
 
     assert played(asked, tmp_path / "run", click).played.outcome == "completed"
+
+
+def test_who_is_refused_at_once_and_asks_again_is_answered(tmp_path: Path) -> None:
+    def click(hand: Interventions) -> None:
+        hand.step(20).result(TIMEOUT_S)
+        refused = hand.ask({"kill": [99]})
+        refused.add_done_callback(lambda _: again.append(hand.ask({"kill": [98]})))  # in the run's own thread
+        for answer in (refused, *again):
+            with pytest.raises(ScenarioError):
+                answer.result(TIMEOUT_S)
+        threading.Event().wait(0.2)  # the run has gone to sleep again
+        hand.ask({"kill": [2]}).result(TIMEOUT_S)
+
+    again: list[Future[float]] = []
+    assert played(scenario(duration_s=40), tmp_path / "run", click).played.outcome == "completed"
 
 
 def test_after_the_end_nothing_happens_and_every_answer_comes(tmp_path: Path) -> None:
