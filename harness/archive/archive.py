@@ -149,6 +149,11 @@ class RunArchive:
         paths = [path for directory in self._agents for path in directory.glob(f"*{SUFFIX}")]
         return sorted(paths, key=lambda path: (len(path.name), path.name))
 
+    @property
+    def _never_began(self) -> bool:
+        """Whether the mission may have ended before its first second."""
+        return self.record.outcome in ("not supported", "failed")
+
     @cached_property
     def _read_traces(self) -> tuple[dict[int, Trace], list[str], list[str]]:
         """The traces, and their problems and gaps."""
@@ -163,6 +168,8 @@ class RunArchive:
                 )
                 continue
             trace = read_trace(path, skim=skim)
+            if trace is None and self._never_began and not path.stat().st_size:
+                continue  # an agent that was ready, and whose mission did not begin
             if trace is None:
                 problems.append(f"{path}: {why_none(path)}; it is left out")
                 continue

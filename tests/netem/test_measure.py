@@ -209,7 +209,10 @@ def test_whatever_is_wrong_is_found(condition: str) -> None:
 
 @pytest.mark.lab
 def test_real_packets_fare_as_asked(engine: EngineName) -> None:
-    measured = measure(engine, studies(engine), in_lab(engine))
+    for _ in range(2):  # a machine that was busy for a while is not an engine that is wrong
+        measured = measure(engine, studies(engine), in_lab(engine))
+        if measured.ok:
+            break
     assert [row.to_json() for row in measured.rows if not row.ok] == []
     # A busy machine is sent packets so slowly that few wait for a rate.
     assert all(row.answer.packets >= 5000 for row in measured.rows if row.question.quantity != "rate")
