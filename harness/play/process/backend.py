@@ -18,10 +18,10 @@ from harness.play.control import AgentRefusedError, Status
 from harness.play.keys import Handed, handed_out
 from harness.play.mission import RunOutcome, Sought
 from harness.play.process.agent import AgentProcess, reboots_with_disk
+from harness.play.process.fleet import Fleet
 from harness.play.process.lab import MissionLab, OpenLab
 from harness.play.process.preflight import on_the_air
 from harness.play.process.rogue import RogueProcess
-from harness.play.process.vehicle import VehicleProcess
 from harness.play.process.watchers import Watchers, unless_interrupted
 from harness.play.progress import Progress, Snapshot
 from harness.play.radio_range import TRACK_S, RadioRange
@@ -33,10 +33,7 @@ from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import CaptureError, LabUnavailable, NetemError
-from sitl.address import Address
-from sitl.ground_station import GroundStation
-from sitl.system_ids import system_ids
-from sitl.vehicle import Home, VehicleError, VehicleKind
+from sitl.vehicle import VehicleKind
 from ucp.clock import MICROSECONDS, MissionClock
 
 POLL_S = 0.25
@@ -74,11 +71,8 @@ class ProcessRun:
         self.progress = progress
         self.interrupted = interrupted
         self.played = RunOutcome()
-        self._kinds = kinds
         self._open_lab = open_lab
         self._keeps_disks = keeps_disks
-        self._system_ids = system_ids(scenario.roster)
-        self.vehicles = [self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds]
         self._rogue = RogueProcess(scenario.rogue, scenario, seed, rundir) if scenario.rogue else None
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
@@ -88,19 +82,16 @@ class ProcessRun:
         ]
         self._keys: Handed
         self._capture: LiveCapture | None = None
-        self._station: GroundStation | None = None
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()
         self._watchers = Watchers()
+        self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers)
         self._injected: list[Injected] = []
         """What the rogue node was told."""
         self._passed_s = 0.0
         """When it had last gone on for as long as it was asked to."""
         self._starting: dict[int, asyncio.Task[None]] = {}
         """Agents that begin again and do not answer yet."""
-
-    def _vehicle(self, vehicle_id: int, life: int = 1) -> VehicleProcess:
-        return VehicleProcess(vehicle_id, self._system_ids[vehicle_id], self._kinds[vehicle_id], self.rundir, life)
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Self]:
@@ -155,7 +146,7 @@ class ProcessRun:
         self.stage = stage
 
     async def begin(self, first: Change) -> None:
-        await self._start_vehicles(self._lab)
+        await self._fleet.start(self._lab, self._show)
         await self._start_agents(self._lab)
         await self.apply(first)
         if self.scenario.capture:
@@ -164,63 +155,21 @@ class ProcessRun:
         await self._start_clock()
         self._watchers.start(self._poll_agents())
         self._watchers.start(self._log_script(), of="script")
-        if self.vehicles:
+        if self._fleet:
             self._watchers.start(self._follow_flight())
-        for vehicle in self.vehicles:
-            self._fly(vehicle)
+            self._fleet.take_off()
 
     async def _log_script(self) -> None:
         """Have the agents that run log what the scenario's script says."""
         for event in sorted(self.scenario.events.script, key=lambda event: event.at_s):
             await self.until(event.at_s)
-            agent = self.agents[self._number(event.agent)]
+            agent = self._agent(event.agent)
             if agent.awake:
                 data = base64.b64encode(event.event_data).decode("ascii")
                 try:
                     await agent.ask("log", event_id=event.event_id, data=data)
                 except AgentRefusedError as error:
                     raise AgentRefusedError(f"{error}; scripted events need that command (ucp/CONTRACT.md)") from None
-
-    def _fly(self, vehicle: VehicleProcess) -> None:
-        self._watchers.start(vehicle.fly(), of=f"flight {vehicle.vehicle_id}")
-
-    def _home(self, number: int) -> Home:
-        return self.scenario.vehicles.home_of(self.scenario.roster[number], number)
-
-    async def _start_vehicles(self, lab: MissionLab) -> None:
-        if not self.vehicles:
-            return
-        self._show("starting vehicles")
-        speedup = self.scenario.speedup
-        await asyncio.gather(
-            *(vehicle.start(lab, self._home(number), speedup) for number, vehicle in enumerate(self.vehicles))
-        )
-        if self.scenario.gcs:
-            self._station = await self._open_station(Address.parse(self.scenario.gcs))
-        for vehicle in self.vehicles:
-            await self._take_charge_of(vehicle)
-        readied = [self._watchers.task(vehicle.get_ready()) for vehicle in self.vehicles]
-        for ready, next_one in enumerate(asyncio.as_completed(readied)):
-            self._show(f"vehicles get ready, {ready} of {len(readied)} are")
-            await next_one
-
-    async def _open_station(self, address: Address) -> GroundStation:
-        try:
-            return await GroundStation.open(address, self.clock.now, self._hand_over)
-        except VehicleError as error:
-            raise ScenarioError(str(error)) from None
-
-    def _hand_over(self, vehicle_ids: Sequence[int]) -> None:
-        for vehicle_id in vehicle_ids:
-            self.vehicles[self._number(vehicle_id)].hand_over()
-
-    async def _take_charge_of(self, vehicle: VehicleProcess) -> None:
-        """Of one that has just been started."""
-        self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
-        flight = self.scenario.flight_of(vehicle.vehicle_id)
-        vehicle.prepare(flight, self.scenario.vehicles.takeoff_altitude_m)
-        if self._station is not None:
-            await vehicle.join(self._station, self._lab)
 
     async def _start_agents(self, lab: MissionLab) -> None:
         self._show("starting agents")
@@ -231,7 +180,7 @@ class ProcessRun:
 
     async def _start_agent(self, agent: AgentProcess, lab: MissionLab) -> None:
         """Start it, into the mission if that is under way."""
-        with_vehicle = bool(self.vehicles)
+        with_vehicle = bool(self._fleet)
         keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
         epoch_us = self.clock.epoch_us
         await agent.start(
@@ -276,33 +225,29 @@ class ProcessRun:
     # What faults do to an agent, and to its vehicle if it has one: harness.scenario.faults.Lives
 
     async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
-        number = self._number(agent_id)
-        shot_down = [self._shoot_down(self.vehicles[number])] if with_vehicle and self.vehicles else []
-        await asyncio.gather(self._kill(self.agents[number], disk_kept=disk_kept), *shot_down)
+        shot_down = [self._fleet.shoot_down(agent_id)] if with_vehicle else []
+        await asyncio.gather(self._kill(self._agent(agent_id), disk_kept=disk_kept), *shot_down)
 
     async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
-        number = self._number(agent_id)
-        agent = self.agents[number]
-        start = self._start_again(agent, number) if new_vehicle else self._start_agent(agent, self._lab)
+        agent = self._agent(agent_id)
+        start = self._start_again(agent) if new_vehicle else self._start_agent(agent, self._lab)
         self._starting[agent_id] = self._watchers.task(start)
 
     async def fall(self, agent_id: int) -> None:
-        self._watchers.start(self.vehicles[self._number(agent_id)].fall(), of=f"flight {agent_id}")
+        self._fleet.fall(agent_id)
 
     async def pause(self, agent_id: int) -> None:
-        await self.agents[self._number(agent_id)].pause()
+        await self._agent(agent_id).pause()
 
     async def resume(self, agent_id: int) -> None:
-        await self.agents[self._number(agent_id)].resume()
+        await self._agent(agent_id).resume()
 
     async def stop_logging(self, agent_id: int) -> None:
-        await self.agents[self._number(agent_id)].ask("stop_events")
+        await self._agent(agent_id).ask("stop_events")
 
     async def switch_off(self, agent_id: int) -> None:
-        number = self._number(agent_id)
         self._watchers.stop(f"agent {agent_id}")
-        landed = [self._shoot_down(self.vehicles[number])] if self.vehicles else []
-        await asyncio.gather(self.agents[number].switch_off(), *landed)
+        await asyncio.gather(self._agent(agent_id).switch_off(), self._fleet.shoot_down(agent_id))
 
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
         assert self._keys.keys is not None, "was refused"
@@ -311,37 +256,24 @@ class ProcessRun:
         await asyncio.gather(*(agent.ask("revoke", revocation=revocation) for agent in hearers))
 
     async def befall(self, agent_id: int, fault: VehicleFault) -> None:
-        if not self.vehicles:
+        if not self._fleet:
             raise ScenarioError(f"`{fault.what}` needs vehicles, and this run has none")
         self._watchers.task(self._befall(agent_id, fault, round(self.clock.now(), 3)))
 
     async def _befall(self, agent_id: int, fault: VehicleFault, at_s: float) -> None:
-        vehicle = self.vehicles[self._number(agent_id)]
-        if problem := await vehicle.befall(fault.what, fault.circumstance, at_s):
+        if problem := await self._fleet.befall(agent_id, fault, at_s):
             self.played.unmatched_fates.append(problem)
 
-    def _number(self, agent_id: int) -> int:
-        return self.scenario.roster.index(agent_id)
+    def _agent(self, agent_id: int) -> AgentProcess:
+        return self.agents[self.scenario.roster.index(agent_id)]
 
     async def _kill(self, agent: AgentProcess, *, disk_kept: bool = False) -> None:
         self._watchers.stop(f"agent {agent.agent_id}")
         await agent.kill(disk_kept=disk_kept)
 
-    async def _shoot_down(self, vehicle: VehicleProcess) -> None:
-        self._watchers.stop(f"flight {vehicle.vehicle_id}")
-        self._watchers.stop(f"vehicle {vehicle.vehicle_id}")
-        await vehicle.kill()
-
-    async def _start_again(self, agent: AgentProcess, number: int) -> None:
+    async def _start_again(self, agent: AgentProcess) -> None:
         """A new agent, on a new vehicle in the place of the one that was lost."""
-        if self._kinds:
-            await self._shoot_down(self.vehicles[number])  # a wreck still holds its ports
-            life = agent.lives + 1
-            vehicle = self._vehicle(agent.agent_id, life)
-            self.vehicles[number] = vehicle
-            await vehicle.start(self._lab, self._home(number), self.scenario.speedup)
-            await self._take_charge_of(vehicle)
-            self._fly(vehicle)
+        await self._fleet.replace(agent.agent_id, self._lab, life=agent.lives + 1)
         await self._start_agent(agent, self._lab)
 
     async def _put_into_force(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
@@ -365,10 +297,10 @@ class ProcessRun:
 
     async def _follow_flight(self) -> None:
         """Write down where the vehicles are, and have the network follow them."""
-        field, radio = self.scenario.vehicles.field, self.scenario.network.radio
+        radio = self.scenario.network.radio
         every_s = max(FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
         while True:
-            places = {vehicle.vehicle_id: vehicle.place(field) for vehicle in self.vehicles}
+            places = self._fleet.places()
             self.rundir.append_tracks(self.clock.now(), places)
             if change := self._reach.move(self.clock.now(), places):
                 await self._put_into_force(change)
@@ -419,7 +351,7 @@ class ProcessRun:
         self.rundir.keep_exports_before_final_reconcile()
 
     async def reconcile(self, agent_id: int) -> None:
-        await next(agent for agent in self.agents if agent.agent_id == agent_id).ask("reconcile")
+        await self._agent(agent_id).ask("reconcile")
 
     async def top_chain_hashes(self) -> dict[int, str]:
         return {agent_id: status.top_chain_hash for agent_id, status in (await self._statuses()).items()}
@@ -464,18 +396,14 @@ class ProcessRun:
                 raise error
             if error is not None and self.played.outcome == "completed":
                 self._ended_early(error)
-        self.played.vehicles = {str(vehicle.vehicle_id): vehicle.to_json() for vehicle in self.vehicles}
-        if self._station is not None:
-            self.played.ground_station = self._station.to_json()
-            self._station.close()
+        self.played.vehicles = self._fleet.to_json()
+        self.played.ground_station = self._fleet.close_station()
         try:
             if self._rogue is not None:
                 await self._stop_rogue(self._rogue)
             self.played.counters = self._of_the_swarm(await lab.read())
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
-            await asyncio.gather(
-                *(agent.stop() for agent in self.agents), *(vehicle.stop() for vehicle in self.vehicles)
-            )
+            await asyncio.gather(*(agent.stop() for agent in self.agents), self._fleet.stop())
             for agent in self.agents:
                 agent.put_together()
         except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed
