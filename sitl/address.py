@@ -36,17 +36,26 @@ class Address:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-def find(address: Address) -> None:
-    """See whether there is a way to the address; nothing is sent. Raises VehicleError if there is none."""
+def connected(address: Address) -> socket.socket:
+    """A UDP socket that is for this address alone; nothing is sent. Raises VehicleError if there is no way to it.
+
+    Of a name that has both, the address of IPv4: that is what ground stations listen on.
+    """
     try:
-        (family, kind, protocol, _, place), *_ = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM)
-        with socket.socket(family, kind, protocol) as probe:
-            probe.connect(place)
+        ways = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM)
+        family, kind, protocol, _, place = min(ways, key=lambda way: way[0] != socket.AF_INET)
+        sock = socket.socket(family, kind, protocol)
+        try:
+            sock.connect(place)
+        except OSError:
+            sock.close()
+            raise
     except (OSError, UnicodeError) as error:
-        raise no_way_to(address, error) from None
+        raise _no_way_to(address, error) from None
+    return sock
 
 
-def no_way_to(address: Address, error: OSError | UnicodeError) -> VehicleError:
+def _no_way_to(address: Address, error: OSError | UnicodeError) -> VehicleError:
     """The error, for people, that nothing can be sent there."""
     reason = getattr(error, "strerror", None) or str(error)
     return VehicleError(

@@ -15,7 +15,7 @@ from typing import Any, Self, cast
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.address import Address, no_way_to
+from sitl.address import Address, connected
 from sitl.frames import FrameSplitter
 from sitl.operator import CommandLog
 
@@ -49,12 +49,10 @@ class GroundStation(asyncio.DatagramProtocol):
     @classmethod
     async def open(cls, address: Address, now: Callable[[], float], taken_over: Callable[[list[int]], None]) -> Self:
         """As `GroundStation`. Raises VehicleError if there is no way to the address."""
-        loop = asyncio.get_running_loop()
         station = cls(address, now, taken_over)
-        try:
-            await loop.create_datagram_endpoint(lambda: station, remote_addr=(address.host, address.port))
-        except (OSError, UnicodeError) as error:
-            raise no_way_to(address, error) from None
+        sock = await asyncio.to_thread(connected, address)  # a name may have to be looked up
+        sock.setblocking(False)
+        await asyncio.get_running_loop().create_datagram_endpoint(lambda: station, sock=sock)
         return station
 
     async def attach(self, vehicle_id: int, sysid: int, sock: socket.socket) -> None:

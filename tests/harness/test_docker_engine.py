@@ -8,6 +8,7 @@ import socket
 import struct
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ import yaml
 from harness.play.containers import engine, images, ownership, preflight
 from harness.play.containers.container import STDERR, STDOUT, Output
 from harness.play.containers.images import Image
+from harness.scenario import Scenario
 from tests.harness.command import harness, sentences, write_scenario
 
 
@@ -128,6 +130,17 @@ def test_only_root_can_lay_cables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with pytest.raises(engine.DockerError, match="use sudo"):
         preflight.require_root()
+
+
+def test_a_debugger_has_to_be_in_the_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    document = {"name": "gdb", "vehicles": {"each": {2: {"debugger": "gdb"}}}}
+    with pytest.raises(engine.DockerError, match=r"the project's image has no gdb: use .*--image-from-host"):
+        preflight.refuse_debuggers_that_are_not_in_the_image(Scenario.model_validate(document))
+    from_host = Scenario.model_validate({**document, "docker": {"image_from_host": True}})
+    for place, shared in ((tmp_path, False), (Path(sys.prefix, "bin"), True)):
+        monkeypatch.setattr("shutil.which", lambda name, place=place: str(place / name))
+        with nullcontext() if shared else pytest.raises(engine.DockerError, match="in no directory that containers"):
+            preflight.refuse_debuggers_that_are_not_in_the_image(from_host)
 
 
 def test_user_mode_linux_has_no_engine(tmp_path: Path) -> None:

@@ -100,4 +100,5 @@ def test_a_ground_station_to_which_there_is_no_way_is_one_sentence(tmp_path: Pat
     options = ["--out", tmp_path / "run", "--backend", "sim", "--gcs", "255.255.255.255:1"]
     done = harness("run", write_scenario(tmp_path), *options)
     assert done.returncode == 2
+    assert not (tmp_path / "run").exists()
     assert "the ground station at 255.255.255.255:1 cannot be sent anything" in " ".join(done.stderr.split())

@@ -20,9 +20,13 @@ class Containers(Processes):
     not_in_uml = "there is no Docker engine in User Mode Linux: leave out --kernel uml, or --backend docker"
 
     def refuse(self, scenario: Scenario) -> None:
-        from harness.play.containers.preflight import refuse_what_docker_cannot
+        from harness.play.containers.preflight import (
+            refuse_debuggers_that_are_not_in_the_image,
+            refuse_what_docker_cannot,
+        )
         from harness.play.process.preflight import refuse_what_programs_cannot
 
+        refuse_debuggers_that_are_not_in_the_image(scenario)
         refuse_what_programs_cannot(scenario)
         refuse_what_docker_cannot(scenario)
         self.agent_commands(scenario)

@@ -15,6 +15,7 @@ from harness.errors import RunDirectoryError, ScenarioError
 from harness.play.containers import images, ownership
 from harness.play.containers.backend import Containers
 from harness.play.containers.images import Image
+from harness.play.containers.preflight import refuse_debuggers_that_are_not_in_the_image
 from harness.play.process.mission_file import mission_file
 from harness.scenario import Scenario
 from netem import addresses
@@ -42,6 +43,9 @@ def write_compose(
     """Write `file` and the directory beside it, which is returned. Raises RunDirectoryError if one is there already."""
     if scenario.security:
         raise ScenarioError("`security` needs keys, which no compose file hands out: leave it out, or --emit-compose")
+    if scenario.gcs:
+        raise ScenarioError("`gcs` needs a run, which no compose file is: leave it out, or --emit-compose")
+    refuse_debuggers_that_are_not_in_the_image(scenario)
     beside = file.with_suffix("")
     for path in (file, beside):
         if path.exists():

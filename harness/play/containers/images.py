@@ -75,6 +75,12 @@ def host_image() -> Image:
     return Image(HOST_IMAGE, sys.executable, tuple(outermost(_host_directories())))
 
 
+def is_shared(program: Path) -> bool:
+    """Whether a program of this machine is also one of an image from the host."""
+    mounted = host_image().mounted
+    return all(any(path.is_relative_to(outer) for outer in mounted) for path in (program, program.resolve()))
+
+
 def named(engine: Engine, name: str) -> Image:
     """Raises DockerError if it is not here."""
     if not _exists(engine, name):

@@ -5,6 +5,7 @@ import tempfile
 from pathlib import Path
 
 from harness.errors import MachineError, ScenarioError
+from harness.play.ground_station import refuse_what_no_ground_station_sees
 from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario
 from harness.scenario.changes import NetworkChange, timeline_of
@@ -13,26 +14,14 @@ from netem.errors import ConditionsError, EngineError, LabUnavailable, NetemErro
 from netem.lab import Lab
 from netem.radio import over_the_air
 from netem.tc import may_refuse
-from sitl.address import Address, find
-from sitl.vehicle import VehicleError
 
 
 def refuse_what_programs_cannot(scenario: Scenario) -> None:
     """Raises HarnessError for what neither processes nor containers can play, or not on this machine."""
     refuse_what_needs_virtual_time(scenario)
     refuse_what_this_machine_cannot(scenario)
-    kinds = choose_vehicles(scenario)
-    if scenario.gcs is not None:
-        _refuse_ground_station(Address.parse(scenario.gcs), bool(kinds))
-
-
-def _refuse_ground_station(address: Address, are_there_vehicles: bool) -> None:
-    if not are_there_vehicles:
-        raise ScenarioError("a ground station sees vehicles, and `vehicles.kind` is none: leave out one of them")
-    try:
-        find(address)
-    except VehicleError as error:
-        raise ScenarioError(str(error)) from None
+    choose_vehicles(scenario)
+    refuse_what_no_ground_station_sees(scenario)
 
 
 def refuse_what_needs_virtual_time(scenario: Scenario) -> None:

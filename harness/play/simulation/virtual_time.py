@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from harness.archive.directory import RunDirectory
 from harness.errors import InterruptedRunError, MachineError, ScenarioError
 from harness.play.backend import Backend
+from harness.play.ground_station import refuse_what_no_ground_station_sees
 from harness.play.pace import Pace
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
@@ -42,6 +43,7 @@ class VirtualTime(Backend):
         befall = {fault.what: fault for fault in scenario.faults_in_order() if isinstance(fault, VehicleFault)}
         if befall:
             raise ScenarioError(no_vehicles([*befall]))
+        refuse_what_no_ground_station_sees(scenario)
         if scenario.foreign:
             _refuse_what_foreign_agents_cannot(scenario)
 
