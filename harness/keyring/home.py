@@ -89,10 +89,10 @@ class Home:
         """What this vehicle is given, in epoch 0. A revoked one is given nothing."""
         return self.bundles([agent_id])[agent_id]
 
-    def bundles(self, agents: Sequence[int] | None = None) -> dict[int, Bundle]:
+    def bundles(self, agents: Sequence[int] | None = None, *, also_revoked: bool = False) -> dict[int, Bundle]:
         """What these vehicles are given, or all that are not revoked."""
         public, path = self.public(), self.directory / VEHICLES_NAME
-        revocation = self.revocation()
+        revocation = None if also_revoked else self.revocation()
         revoked = revocation.revoked if revocation else frozenset[int]()
         wanted = sorted({*public.vehicles} - revoked) if agents is None else agents
         for agent_id in wanted:
@@ -136,10 +136,10 @@ class Home:
             raise _refused(directory, error) from None
         return [*paths.values()]
 
-    def revocation(self) -> Revocation | None:
-        """The last one that was made here; None if nobody is revoked."""
+    def revocation(self, public: PublicKeys | None = None) -> Revocation | None:
+        """The last one that was made here, with these `public` keys or those that are here; None if nobody is."""
         path = self.directory / REVOCATION_NAME
-        return load_revocation(path, self.public()) if path.exists() else None
+        return load_revocation(path, public or self.public()) if path.exists() else None
 
     def revoke(self, agents: Sequence[int]) -> Revocation:
         """Revoke these, too: a new revocation, one number on, which says all that are revoked so far."""
@@ -150,11 +150,11 @@ class Home:
         if strangers:
             raise _stranger(strangers[0], public)
         if revoked == before:
-            raise KeysError(f"{_listed(agents)}: revoked already, as {self.directory / REVOCATION_NAME} says")
+            raise KeysError(f"{listed(agents)}: revoked already, as {self.directory / REVOCATION_NAME} says")
         number = last.number + 1 if last else 1
         if len(revoked) > MAX_REVOKED or number > LAST_NUMBER:
             raise KeysError(f"more than {MAX_REVOKED} vehicles fit into no revocation: make new keys for the others")
-        authority = Ed25519PrivateKey.from_private_bytes(self._authority(public))
+        authority = Ed25519PrivateKey.from_private_bytes(self.authority(public))
         revocation = Revocation.signed(authority, public.mission, number, revoked)
         try:
             write_revocation(self.directory / REVOCATION_NAME, revocation, public)
@@ -162,7 +162,9 @@ class Home:
             raise _refused(self.directory, error) from None
         return revocation
 
-    def _authority(self, public: PublicKeys) -> bytes:
+    def authority(self, public: PublicKeys) -> bytes:
+        """The authority's private key, which is that of these public ones."""
+
         def parse(document: dict[str, Any]) -> bytes:
             key = key_in(document, "private_key", KEY_BYTES)
             if public_key_of(key) != public.authority:
@@ -222,10 +224,11 @@ def _refused(directory: Path, error: OSError) -> MachineError:
 
 
 def _stranger(agent_id: int, public: PublicKeys) -> KeysError:
-    return KeysError(f"agent {agent_id} is not of this mission, which has {_listed(public.vehicles)}")
+    return KeysError(f"agent {agent_id} is not of this mission, which has {listed(public.vehicles)}")
 
 
-def _listed(agents: Iterable[int]) -> str:
+def listed(agents: Iterable[int]) -> str:
+    """Some agents, in words."""
     first, *others = sorted({*agents})
     shown = ", ".join(map(str, [first, *others[:MOST_NAMED]])) + (", ..." if len(others) > MOST_NAMED else "")
     return f"agents {shown}" if others else f"agent {shown}"

@@ -28,6 +28,7 @@ from pydantic import ValidationError
 from harness.errors import ScenarioError
 from harness.play import mission
 from harness.play.growing import GrowingTimeline
+from harness.play.keys import refuse_revocations
 from harness.play.mission import Swarm
 from harness.play.pace import NEXT_RUN, Pace
 from harness.scenario import Scenario
@@ -274,7 +275,12 @@ class Interventions(GrowingTimeline):
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
     def _refuse_what_nobody_is_ready_for(self, entry: TimelineEntry) -> None:
-        """Raises ScenarioError for what agents had to be ready for from the start, where some may not have been."""
+        """Raises ScenarioError for what agents had to be ready for from the start, where some may not have been.
+
+        Also for a revocation that nobody here can sign.
+        """
+        if entry.fault is not None and entry.fault.needs_keys:
+            refuse_revocations(self.scenario)
         if self.readies_all:
             return
         if entry.injection and self._begun_with.rogue is None:

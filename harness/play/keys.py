@@ -5,7 +5,7 @@ Programs find theirs outside of the run directory, which holds no secret, and on
 
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,38 +16,20 @@ from harness.scenario import Scenario
 from ucp.sealed import seal_to
 
 if TYPE_CHECKING:
+    from harness.keyring.authority import Authority
     from ucp.secure.bundle import Bundle, PublicKeys
 
 FRESH = "fresh"
 FRESH_BYTES = 32
 
 
-class Authority:
-    """Who takes keys back: each revocation says all that were revoked so far."""
-
-    def __init__(self, private_key: bytes, mission: bytes) -> None:
-        self._private_key = private_key
-        self._mission = mission
-        self._revoked: list[int] = []
-
-    def revoke(self, agent_id: int) -> bytes:
-        """The next revocation, as a message's body."""
-        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-        from ucp.secure.revocation import Revocation
-
-        self._revoked.append(agent_id)
-        signer = Ed25519PrivateKey.from_private_bytes(self._private_key)
-        return Revocation.signed(signer, self._mission, len(self._revoked), self._revoked).encode()
-
-
 @dataclass(frozen=True)
 class MissionKeys:
-    """The keys of a secured mission: each vehicle's bundle, and who revokes them, if that is known here."""
+    """The keys of a secured mission: each vehicle's bundle, and who revokes them."""
 
     bundles: Mapping[int, "Bundle"]
-    authority: Authority | None = None
-    seals: bool = False
+    authority: "Authority"
+    seals: bool
 
     @property
     def public(self) -> "PublicKeys":
@@ -59,8 +41,7 @@ class MissionKeys:
         return seal_to(initial_data, self.public.depot) if self.seals and self.public.depot else initial_data
 
     def revoke(self, agent_id: int) -> bytes:
-        """The next revocation, as a message's body."""
-        assert self.authority is not None, "a scenario that revokes has fresh keys"
+        """The revocation of this vehicle, as a message's body."""
         return self.authority.revoke(agent_id)
 
 
@@ -71,36 +52,76 @@ def keys_of(scenario: Scenario, secret: bytes) -> MissionKeys | None:
     """
     if scenario.security is None:
         return None
+    security = scenario.security
     try:
-        from ucp.secure.bundle import KeySet, bundle_name, load_bundle
-        from ucp.secure.keyfile import KeyFileError
+        from harness.keyring.authority import Authority
+        from ucp.secure.bundle import KeySet
     except ModuleNotFoundError:
         raise MachineError(
             "a secured mission needs the package cryptography, which comes with the extra `secure`: install that, or "
             "leave out `security`"
         ) from None
-    if scenario.security.keys == FRESH:
-        fresh = KeySet.derived(secret, scenario.roster, seals=scenario.security.seal)
+    if security.keys == FRESH:
+        fresh = KeySet.derived(secret, scenario.roster, seals=security.seal)
         handed = {agent_id: fresh.bundle(agent_id) for agent_id in scenario.roster}
-        return MissionKeys(handed, Authority(fresh.authority, fresh.public.mission), scenario.security.seal)
-    if any(fault.needs_keys for fault in scenario.faults_in_order()):
-        raise ScenarioError("the timeline revokes keys, for which only `security.keys: fresh` has the authority's here")
-    directory = Path(scenario.security.keys)
-    try:
-        bundles = {agent_id: load_bundle(directory / bundle_name(agent_id)) for agent_id in scenario.roster}
-    except KeyFileError as error:
-        raise ScenarioError(f"`security.keys`: {error}; make keys with `ucp-harness keys new`") from None
-    if scenario.security.seal and any(bundle.public.depot is None for bundle in bundles.values()):
+        return MissionKeys(handed, Authority.of(fresh), security.seal)
+    directory = Path(security.keys)
+    bundles = _bundles_in(directory, scenario.roster)
+    if security.seal and any(bundle.public.depot is None for bundle in bundles.values()):
         raise ScenarioError(
             f"`security.seal`: the keys in {directory} have no depot's: `ucp-harness keys new` makes one"
         )
+    return MissionKeys(bundles, _authority_in(directory, bundles, scenario), security.seal)
+
+
+def refuse_revocations(scenario: Scenario) -> None:
+    """Raises ScenarioError if its timeline revokes what nobody here can."""
+    keys_of(scenario, bytes(FRESH_BYTES))
+
+
+def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
+    """By vehicle, from the home of the keys, or from where bundles were handed out. Raises ScenarioError."""
+    from harness.keyring.home import VEHICLES_NAME, Home, KeysError
+    from ucp.secure.bundle import bundle_name, load_bundle
+    from ucp.secure.keyfile import KeyFileError
+
+    try:
+        if (directory / VEHICLES_NAME).exists():
+            return Home(directory).bundles(roster, also_revoked=True)
+        bundles = {agent_id: load_bundle(directory / bundle_name(agent_id)) for agent_id in roster}
+    except (KeyFileError, KeysError) as error:
+        raise ScenarioError(f"`security.keys`: {error}; make keys with `ucp-harness keys new`") from None
     for agent_id, bundle in bundles.items():
-        if bundle.agent_id != agent_id or not {*scenario.roster} <= bundle.public.vehicles.keys():
+        if bundle.agent_id != agent_id or not {*roster} <= bundle.public.vehicles.keys():
             raise ScenarioError(
                 f"`security.keys`: {directory / bundle_name(agent_id)} is not of agent {agent_id} in a mission of "
-                f"{len(scenario.roster)} such agents: make keys for this roster with `ucp-harness keys new`"
+                f"{len(roster)} such agents: make keys for this roster with `ucp-harness keys new`"
             )
-    return MissionKeys(bundles, seals=scenario.security.seal)
+    if len({bundle.public.mission for bundle in bundles.values()}) > 1:
+        raise ScenarioError(
+            f"`security.keys`: the bundles in {directory} are of several missions, whose vehicles do not hear each "
+            "other: hand out those of one with `ucp-harness keys bundle`"
+        )
+    return bundles
+
+
+def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "Authority":
+    """Who revokes what the timeline says, when it says so. Raises ScenarioError if nobody can."""
+    from harness.keyring.authority import Authority
+    from harness.keyring.home import REVOCATION_NAME, Home, KeysError, listed
+
+    revoking = [fault.agents for fault in scenario.faults_in_order() if fault.needs_keys]
+    try:
+        authority = Authority.in_directory(Home(directory), next(iter(bundles.values())).public)
+        authority.refuse((agent_id for agents in revoking for agent_id in agents), directory)
+    except KeysError as error:
+        raise ScenarioError(f"`security.keys`: {error}") from None
+    if early := authority.revoked.intersection(scenario.roster).difference(*revoking[:1]):
+        raise ScenarioError(
+            f"`security.keys`: {directory / REVOCATION_NAME} revokes {listed(early)}, and nobody would hear it: leave "
+            "it out of `agents`, or revoke it by the first `revoke` of the timeline"
+        )
+    return authority
 
 
 class Handed:

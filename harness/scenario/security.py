@@ -11,7 +11,7 @@ class Security(Model):
     """The mission is secured: datagrams are authentic, confidential and fresh, blocks signed by their makers."""
 
     keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
-    """`fresh`: each run has keys of its own. Else the directory with the vehicles' bundles (`ucp-harness keys new`)."""
+    """`fresh`: each run has keys of its own. Else the directory that `ucp-harness keys new` made, or one of bundles."""
     captured: VehicleId | None = None
     """The vehicle whose keys the rogue node has: what it injects is sealed with them."""
     seal: bool = False

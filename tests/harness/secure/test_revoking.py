@@ -1,0 +1,105 @@
+"""Whose keys a run revokes: by the authority's key at home, or by the message that was made there before."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import ScenarioError
+from harness.keyring.home import Home, write_revocation
+from harness.run.simulate import simulate
+from harness.scenario import Scenario
+from tests.harness.command import harness
+from tests.harness.secure.secrets import left_in, secrets, told
+from tests.harness.virtual import scenario
+
+ROSTER = [1, 2, 3]
+REVOKED = {"timeline": [{"at_s": 60, "kill": [3]}, {"at_s": 70, "revoke": [3], "heard_by": [1]}]}
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Home:
+    home = Home.new(tmp_path / "home", ROSTER, seals=True, epoch_s=600.0)
+    home.write_bundles(tmp_path / "bundles")
+    return home
+
+
+def asked(directory: Path, **keys: Any) -> Scenario:
+    return scenario(agents=ROSTER, duration_s=200, security={"keys": str(directory)}, **{**REVOKED, **keys})
+
+
+def test_the_home_of_the_keys_revokes_and_stays_as_it_was(home: Home, tmp_path: Path) -> None:
+    before = {path.name: path.read_bytes() for path in home.directory.iterdir()}
+    path = tmp_path / "asked.yaml"
+    path.write_text(json.dumps(asked(home.directory).model_dump(mode="json", exclude_defaults=True)))
+    done = harness("run", path, "--backend", "sim", "--seed", "1", "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stdout + done.stderr
+    told_by = [
+        agent_id
+        for agent_id in ROSTER
+        if '"command":"revoke"' in (tmp_path / f"run/agents/{agent_id}.trace.jsonl").read_text().replace(" ", "")
+    ]
+    assert told_by == [1, 2]
+    assert {path.name: path.read_bytes() for path in home.directory.iterdir()} == before
+    assert told(secrets(home, 2), left_in(tmp_path / "run")) == []
+
+
+def test_bundles_revoke_by_the_message_that_was_made_at_home(home: Home, tmp_path: Path) -> None:
+    done = harness("keys", "revoke", home.directory, "3", "--out", tmp_path / "bundles/revocation.json")
+    assert done.returncode == 0, done.stderr
+    played = simulate(asked(tmp_path / "bundles"), 1)
+    assert played.result.chains == simulate(asked(home.directory), 1).result.chains
+
+
+Break = Callable[[Home, Path], None]
+MISTAKES: list[tuple[Break, dict[str, Any], str]] = [
+    (lambda home, bundles: None, {}, "takes the authority's key, or a revocation made before, and none is there"),
+    (
+        lambda home, bundles: write_revocation(bundles / "revocation.json", home.revoke([2]), home.public()),
+        {},
+        "to revoke agent 3 takes the authority's key.* there revokes agent 2 alone",
+    ),
+    (
+        lambda home, bundles: write_revocation(bundles / "revocation.json", home.revoke([2, 3]), home.public()),
+        {},
+        "revocation.json revokes agent 2, and nobody would hear it",
+    ),
+    (
+        lambda home, bundles: write_revocation(bundles / "revocation.json", home.revoke([3]), home.public()),
+        {"timeline": []},
+        "revocation.json revokes agent 3, and nobody would hear it",
+    ),
+    (
+        lambda home, bundles: (bundles / "revocation.json").write_text("{"),
+        {"timeline": []},
+        "revocation.json: not JSON",
+    ),
+    (
+        lambda home, bundles: other(home, bundles).write_bundles(bundles, [2], overwrite=True) and None,
+        {"timeline": []},
+        "of several missions",
+    ),
+]
+
+
+def other(home: Home, bundles: Path) -> Home:
+    return Home.new(bundles / "other", ROSTER, seals=True, epoch_s=600.0)
+
+
+@pytest.mark.parametrize(("mistake", "keys", "sentence"), MISTAKES)
+def test_what_nobody_can_revoke_is_refused(
+    home: Home, tmp_path: Path, mistake: Break, keys: dict[str, Any], sentence: str
+) -> None:
+    mistake(home, tmp_path / "bundles")
+    with pytest.raises(ScenarioError, match=sentence):
+        simulate(asked(tmp_path / "bundles", **keys), 1)
+
+
+def test_what_was_revoked_at_home_is_the_first_that_the_timeline_revokes(home: Home) -> None:
+    assert home.revoke([3]).number == 1
+    assert not simulate(asked(home.directory), 1).result.bad
+    later = [{"at_s": 60, "revoke": [2], "heard_by": [1]}, *REVOKED["timeline"][1:]]
+    with pytest.raises(ScenarioError, match="revokes agent 3, and nobody would hear it"):
+        simulate(asked(home.directory, timeline=later), 1)
