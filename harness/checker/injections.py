@@ -3,6 +3,10 @@
 A forged message has a sequence number that no agent uses, so every run of a handler that it triggered is the rogue's. A
 copy looks as its original does: of the runs that agent and message have in common, the last are the copies', as many as
 were sent before them.
+
+A secured agent handles a datagram once, and none that was altered. So nobody handled what was corrupted, whatever the
+traces have of its original; a copy that is sent at once is not told from it; and one that is sent later was handled by
+whom the original had not reached.
 """
 
 from collections import Counter, defaultdict
@@ -53,7 +57,7 @@ class _Tally:
     sent: Counter[str] = field(default_factory=Counter)
     bytes: int = 0
     refused: Counter[str] = field(default_factory=Counter)
-    untraced: int = 0
+    untraced: Counter[str] = field(default_factory=Counter)
     handled: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     changed: Counter[str] = field(default_factory=Counter)
     reached: dict[str, set[tuple[_Key, int]]] = field(default_factory=lambda: defaultdict(set))
@@ -72,7 +76,7 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
     copies: dict[_Key, list[tuple[float, int]]] = defaultdict(list)
     for line in archive.injected(_Line):
         if line.injection in tallies:
-            _take_down(line, tallies[line.injection], copies)
+            _take_down(line, tallies[line.injection], copies, secured=scenario.security is not None)
     for trace in archive.traces.values():
         for key, runs in _triggered_by(trace, copies).items():
             for number, copy, run in _paired(copies.get(key), key, runs):
@@ -95,6 +99,8 @@ def in_words(injection: RogueInjection) -> str:
         done.append(f"and {sum(count for _, count in branches[BRANCHES_NAMED:])} more")
     of_them = [f"{sum(injection.refused.values())} of them malformed"] if injection.refused else []
     of_them += [f"{injection.untraced} not told from their originals"] if injection.untraced else []
+    if unhandled := sum(of.unhandled or 0 for of in injection.messages):
+        done.append(f"{unhandled} handled by nobody")
     counts = "; ".join([f"{injection.sent} sent", *of_them, *([", ".join(done)] if done else [])])
     return f"{injection.what} at {injection.at_s:g} s, {injection.detail}: {counts}"
 
@@ -105,18 +111,20 @@ def done_with(messages: InjectedMessages) -> str:
     return ", ".join([*done, *([f"{messages.unhandled} handled by nobody"] if messages.unhandled else [])]) or "unknown"
 
 
-def _take_down(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]]) -> None:
+def _take_down(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]], *, secured: bool) -> None:
     tally.bytes += line.bytes
-    if line.message is not None:
-        tally.sent[line.message] += 1
-        copies[line.sender, line.sequence, line.message].append((line.at_s, line.injection))
-    elif isinstance(line.refused, str):
+    if isinstance(line.refused, str):
         tally.refused[line.refused] += 1
+        return
+    sent = line.messages if line.message is None else {line.message: 1}
+    tally.sent.update(sent)
+    tally.refused.update(line.refused or {})
+    if line.what in ("forge", "flood") or (secured and line.what == "corrupt"):
+        return
+    if line.message is None or (secured and line.what == "duplicate"):
+        tally.untraced.update(sent)
     else:
-        tally.sent.update(line.messages)
-        tally.refused.update(line.refused or {})
-        if line.what not in ("forge", "flood"):
-            tally.untraced += sum(line.messages.values())
+        copies[line.sender, line.sequence, line.message].append((line.at_s, line.injection))
 
 
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
@@ -153,7 +161,7 @@ def _told(at_s: float, what: str, detail: str, tally: _Tally, named_otherwise: b
             sent=sent,
             handled=dict(tally.handled[message].most_common()),
             changed=tally.changed[message],
-            unhandled=None if named_otherwise else max(0, sent - len(tally.reached[message]) - tally.untraced),
+            unhandled=None if named_otherwise else max(0, sent - len(tally.reached[message]) - tally.untraced[message]),
         )
         for message, sent in tally.sent.most_common()
     ]
@@ -165,5 +173,5 @@ def _told(at_s: float, what: str, detail: str, tally: _Tally, named_otherwise: b
         bytes=tally.bytes,
         messages=messages,
         refused=dict(tally.refused.most_common()),
-        untraced=tally.untraced,
+        untraced=tally.untraced.total(),
     )

@@ -66,7 +66,7 @@ def test_who_has_not_heard_a_copy_is_not_said_to_have(tmp_path: Path) -> None:
     assert (first.messages[0].handled, second.messages[0].handled) == ({"first": 2}, {"second": 1})
     (nobody, _) = told(tmp_path, TWICE, [copy(20, 1), copy(20, 1)], died_before)
     assert (nobody.sent, nobody.messages[0].unhandled, nobody.messages[0].handled) == (2, 2, {})
-    assert in_words(nobody) == "replay at 20 s, the last 1 of every message: 2 sent"
+    assert in_words(nobody) == "replay at 20 s, the last 1 of every message: 2 sent; 2 handled by nobody"
 
 
 def test_what_is_forged_is_known_by_its_sequence_number_without_a_line(tmp_path: Path) -> None:
@@ -83,3 +83,22 @@ def test_counted_copies_are_not_told_from_the_others_and_that_is_said(tmp_path: 
     first, _ = told(tmp_path, TWICE, [counted], trace(2, (20.1, 7, "first")))
     assert (first.sent, first.untraced, first.messages[0].handled, first.messages[0].unhandled) == (2, 2, {}, 0)
     assert in_words(first).endswith("2 sent; 2 not told from their originals")
+
+
+def test_what_cannot_be_told_of_one_type_is_nothing_of_another(tmp_path: Path) -> None:
+    counted = line(20, 1, count=2, messages={"Block Response": 2}, refused={})
+    first, _ = told(tmp_path, TWICE, [counted, copy(20, 1)], trace(2, (10, 7, "original")))
+    unhandled = {of.message: of.unhandled for of in first.messages}
+    assert unhandled == {"Block Response": 0, "Commit Block": 1}
+
+
+def test_with_keys_what_was_corrupted_is_handled_by_nobody_whatever_became_of_its_original(tmp_path: Path) -> None:
+    for_s = {"for_s": 10}
+    secured = scenario(security={"keys": "fresh"}, timeline=[{"at_s": 20, "corrupt": for_s}])
+    corrupted = line(20, 1, what="corrupt", message="Commit Block", sender=1, sequence=7)
+    (alone,) = told(tmp_path, secured, [corrupted], trace(2, (20, 7, "committed"), changes=True))
+    assert (alone.messages[0].handled, alone.messages[0].changed, alone.messages[0].unhandled) == ({}, 0, 1)
+    twice = scenario(security={"keys": "fresh"}, timeline=[{"at_s": 20, "duplicate": for_s}])
+    duplicate = corrupted | {"what": "duplicate"}
+    (copied,) = told(tmp_path, twice, [duplicate], trace(2, (20, 7, "committed")))
+    assert (copied.untraced, copied.messages[0].handled, copied.messages[0].unhandled) == (1, {}, 0)
