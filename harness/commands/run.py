@@ -124,9 +124,13 @@ def run_command(
         finally:
             shown.close()
         _show(console, finished)
-        if page is not None and page.run_is_over() and finished.played.outcome != "interrupted":
-            console.print("The page stays until it is closed, or Ctrl-C.", style="dim")
-            page.wait()
+        if page is not None:
+            is_looked_at = page.run_is_over()
+            if page.problem is not None:
+                complain(page.problem)
+            if is_looked_at and finished.played.outcome != "interrupted":
+                console.print("The page stays until it is closed, or Ctrl-C.", style="dim")
+                page.wait()
     raise typer.Exit(finished.exit_status)
 
 

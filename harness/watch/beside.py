@@ -5,26 +5,37 @@ up comes first the page's address, and then `[page, number, what somebody there 
 """
 
 import json
+import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from harness.errors import HarnessError, MachineError
 from harness.play.interventions import Interventions
 from harness.play.progress import Progress, Snapshot
 
 STATE_EVERY_S = 0.1
+LAST_LOOK_S = 60.0
+"""Wall time after a run in which the server has read the rest of it, and says whether anybody looks."""
+ENDING_S = 5.0
+MOST_WAITING = 10_000
+"""Lines that the server has not taken yet; it hangs, and further ones are lost."""
+_LAST_LINES = 20
 _NO_REASON = "it does not say why"
 
 
 class Beside:
-    """The server's process, and what pages ask of the run through it. `address` is that of the page."""
+    """The server's process, and what pages ask of the run through it. `address` is that of the page.
+
+    The run waits for none of it: to the server, and to what it says, listen threads of their own.
+    """
 
     def __init__(self, directory: Path, port: int, hand: Interventions) -> None:
         """Raises MachineError if there can be none: a package is missing, or the port cannot be had."""
@@ -35,24 +46,24 @@ class Beside:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
+            encoding="utf-8",
+            errors="replace",
             start_new_session=True,  # Ctrl-C ends the run first
         )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        self._to, self._from = self._process.stdin, self._process.stdout
-        self.address = self._from.readline().strip()
+        self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
+        self._complaining = _thread(self._hear_complaints)
+        self.address = _of(self._process.stdout).readline().strip()
         if not self.address:
-            last_words = self._process.stderr.read().strip().splitlines() or [_NO_REASON]
-            raise MachineError(last_words[-1])
-        self._writing = threading.Lock()
+            self.close()
+            raise MachineError(self._last_words)
         self._ended = threading.Event()
+        self._unsaid: queue.Queue[list[Any] | None] = queue.Queue(MOST_WAITING)
         self._readers: int | None = None
         self._snapshot: Snapshot | None = None
-        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._hear, self._tell_state)]
-        for thread in self._threads:
-            thread.start()
+        self._saying, self._hearing = _thread(self._say_all), _thread(self._hear)
+        self._telling_state = _thread(self._tell_state)
+        self.problem: str | None = None
+        """Why the page ended before anybody closed it, in a sentence, once the run is over; None if it did not."""
 
     def overhears(self, progress: Progress) -> Progress:
         """`progress`, of which the page hears."""
@@ -64,9 +75,16 @@ class Beside:
     def run_is_over(self) -> bool:
         """Tell the page; whether anybody looks at it."""
         self._ended.set()
-        self._threads[1].join()
+        self._telling_state.join()
         self._say(["over"])
-        self._threads[0].join()
+        self._hearing.join(LAST_LOOK_S)
+        if self._hearing.is_alive():
+            self.problem = f"the page hung: {LAST_LOOK_S:g} s after the run its server had not answered"
+        elif self._readers is None:
+            from netem.lab import in_words  # which takes its time to import
+
+            end = in_words(self._process.wait())
+            self.problem = f"the page's server ended by itself with {end} ({self._last_words}), and the run went on"
         return bool(self._readers)
 
     def wait(self) -> None:
@@ -75,24 +93,47 @@ class Beside:
             self._process.wait()
 
     def close(self) -> None:
-        self._ended.set()
         self._process.terminate()
-        self._process.wait()
-        for thread in self._threads:
-            thread.join()
-        for stream in (self._to, self._from, self._process.stderr):
+        try:
+            self._process.wait(ENDING_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._complaining.join()
+        if self.address:
+            self._ended.set()
+            self._telling_state.join()
+            self._unsaid.put(None)
+            self._saying.join()
+            self._hearing.join()
+        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
             with suppress(OSError):
-                assert stream is not None
-                stream.close()
+                _of(stream).close()
+
+    @property
+    def _last_words(self) -> str:
+        return self._last_lines[-1] if self._last_lines else _NO_REASON
+
+    def _hear_complaints(self) -> None:
+        """A pipe that nobody reads would stop whoever writes into it."""
+        for line in _of(self._process.stderr):
+            if line.strip():
+                self._last_lines.append(line.strip())
 
     def _say(self, what: list[Any]) -> None:
-        """A server that has failed is no affair of the run's."""
-        with self._writing, suppress(OSError, ValueError):
-            self._to.write(json.dumps(what) + "\n")
-            self._to.flush()
+        """A server that has failed, or hangs, is no affair of the run's."""
+        with suppress(queue.Full):
+            self._unsaid.put_nowait(what)
+
+    def _say_all(self) -> None:
+        to = _of(self._process.stdin)
+        while (what := self._unsaid.get()) is not None:
+            with suppress(OSError, ValueError):
+                to.write(json.dumps(what) + "\n")
+                to.flush()
 
     def _hear(self) -> None:
-        for line in self._from:
+        for line in _of(self._process.stdout):
             heard = json.loads(line)
             if isinstance(heard, int):
                 self._readers = heard
@@ -140,6 +181,17 @@ class _Overheard:
 
     def close(self) -> None:
         self._progress.close()
+
+
+def _thread(run: Callable[[], None]) -> threading.Thread:
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def _of(stream: IO[str] | None) -> IO[str]:
+    assert stream is not None, "we asked for a pipe"
+    return stream
 
 
 def _do(hand: Interventions, asked: dict[str, Any]) -> Future[float]:
