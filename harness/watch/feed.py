@@ -33,6 +33,7 @@ from harness.archive.record_file import read_record
 from harness.errors import RunDirectoryError
 from harness.play.backends import in_virtual_time
 from harness.present.colours import inks
+from harness.scenario.faults import ASKED_FOR, VehicleFault
 from harness.scenario.verdicts import kind_of
 from harness.watch.around import Around
 from harness.watch.course import Change, Course, Heard, Sent
@@ -102,8 +103,16 @@ class Feed:
                 "seed": record.seed,
                 "live": live,
                 "all_heard": self._all_heard,
+                "flown": self._is_flown(),
+                "troubles": [[kind.what, kind.unless_told] for kind in ASKED_FOR if issubclass(kind, VehicleFault)],
             },
         ]
+
+    def _is_flown(self) -> bool:
+        """Whether the vehicles are programs, which something can befall."""
+        record, scenario = self._record, self._record.scenario
+        has_vehicles = scenario is not None and scenario.vehicles.kind != "none"
+        return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
 
     def look(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
         """What is new, up to a mission second; and whether there is more up to then, for which to look again."""

@@ -212,10 +212,19 @@ class ProcessRun:
             self.played.record(change.to_json(round(max(change.at_s, self.clock.now()), 3)))
             await self._rogue.inject(change)
             return
-        await asyncio.gather(*(self._strike(change, agent_id) for agent_id in change.agents))
+        await self._strike_all(change)
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
         self.played.record(record)
         self.rundir.append_network(record)
+
+    async def _strike_all(self, fault: Fault) -> None:
+        """Raises ScenarioError if it can happen to none of them; to whom it could not is on record otherwise."""
+        strikes = [self._strike(fault, agent_id) for agent_id in fault.agents]
+        problems = [problem for problem in await asyncio.gather(*strikes, return_exceptions=True) if problem]
+        for problem in problems:
+            if not isinstance(problem, ScenarioError) or len(problems) == len(strikes):
+                raise problem
+        self.played.unmatched_fates += map(str, problems)
 
     async def _strike(self, fault: Fault, agent_id: int) -> None:
         if agent_id in self._starting:
@@ -258,7 +267,11 @@ class ProcessRun:
     async def befall(self, agent_id: int, fault: VehicleFault) -> None:
         if not self._fleet:
             raise ScenarioError(f"`{fault.what}` needs vehicles, and this run has none")
-        self._watchers.task(self._befall(agent_id, fault, round(self.clock.now(), 3)))
+        at_s = round(self.clock.now(), 3)
+        if not fault.by_hand:
+            self._watchers.task(self._befall(agent_id, fault, at_s))
+        elif problem := await self._fleet.befall(agent_id, fault, at_s):
+            raise ScenarioError(problem)  # whoever asked for it waits for an answer
 
     async def _befall(self, agent_id: int, fault: VehicleFault, at_s: float) -> None:
         if problem := await self._fleet.befall(agent_id, fault, at_s):

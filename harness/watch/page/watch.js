@@ -40,6 +40,7 @@ function begin() {
   if (run.live) {
     hand = new Hand($("hand"), (asked) => socket.send(JSON.stringify(asked)), () => { changed = true; });
     hand.roster = run.roster;
+    hand.befall(run);
     map.chosen = hand.chosen;
     $("map").addEventListener("click", (event) => {
       const id = story.end ? null : map.nearest(event.offsetX, event.offsetY);

@@ -1,4 +1,4 @@
-"""The server of a page as a process beside the run: one that fails, hangs or has much to say is no affair of the run's."""
+"""The server of a page, beside the run: one that fails, hangs or has much to say is no affair of the run's."""
 
 import sys
 from pathlib import Path

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import pytest
+import yaml
 
 from harness.archive.record_file import read_record
-from tests.harness.command import DEADLINE_S
+from tests.harness.command import DEADLINE_S, write_scenario
 from tests.harness.report.browser import Browser
 from tests.harness.watch.pages import page_of, until
 
@@ -84,15 +86,17 @@ def test_what_a_page_asks_for_happens_and_is_on_record(tmp_path: Path) -> None:
     assert (out / "report.html").is_file()
 
 
-def test_buttons_of_the_page(browser: Browser, tmp_path: Path) -> None:
-    def button(label: str) -> str:
-        return f"[...document.querySelectorAll('#hand button')].find(each => each.textContent === '{label}')"
+def button(label: str) -> str:
+    return f"[...document.querySelectorAll('#hand button')].find(each => each.textContent === '{label}')"
 
+
+def test_buttons_of_the_page(browser: Browser, tmp_path: Path) -> None:
     out = tmp_path / "run"
     with page_of("run", scenario(tmp_path), "--backend", "sim", "--watch", "--out", out) as (_, address):
         browser.show(address, width=1280, scheme="dark")
         until(browser, f"watch.hand && !{button('Heal')}.disabled")
         assert browser.evaluate(f"{button('Kill')}.disabled && {button('Kill')}.title").startswith("choose vehicles")
+        assert browser.evaluate(f"{button('Befall')}.disabled && {button('Befall')}.title").startswith("needs vehicles")
         browser.evaluate("watch.hand.choose(2)")
         browser.evaluate(f"{button('Part')}.click()")
         until(browser, "document.getElementById('events').textContent.includes('partition 2 | 1 3 4')")
@@ -101,3 +105,34 @@ def test_buttons_of_the_page(browser: Browser, tmp_path: Path) -> None:
         until(browser, f"{button('Go on')} !== undefined")
         until(browser, "document.getElementById('status').textContent === '● live: held'")
         assert browser.complaints == []
+
+
+@pytest.mark.lab
+def test_what_befalls_vehicles_by_hand(browser: Browser, tmp_path: Path) -> None:
+    def befall(vehicle: int, what: str) -> None:
+        browser.evaluate(f"watch.hand.choose({vehicle})")
+        browser.evaluate(f"watch.hand.trouble.querySelector('select').value = '{what}'")
+        browser.evaluate("watch.hand.trouble.querySelector('select').dispatchEvent(new Event('change'))")
+        browser.evaluate(f"{button('Befall')}.click()")
+
+    out = tmp_path / "run"
+    asked = write_scenario(tmp_path, agents=2, duration_s=100_000, speedup=10, vehicles={"kind": "embedded"})
+    with page_of("run", asked, "--watch", "--out", out) as (process, address):
+        browser.show(address, width=1280, scheme="light")
+        until(browser, f"watch.hand && !{button('Heal')}.disabled")
+        befall(1, "battery")
+        until(browser, "document.querySelector('#hand output').textContent.startsWith('battery at ')")
+        befall(2, "lose_compass")
+        until(browser, "document.querySelector('#hand .refused') !== null")
+        refused = browser.evaluate("document.querySelector('#hand output').textContent")
+        assert "vehicle 2 (embedded copter) cannot simulate the loss of its compasses" in refused
+        assert browser.complaints == []
+        process.send_signal(signal.SIGINT)
+        assert process.wait(DEADLINE_S) == 130
+    record = read_record(out / "run.json").record
+    assert [(fault.what, fault.detail, fault.by_hand) for fault in record.faults] == [
+        ("battery", "vehicle 1, 10.4 V", True)
+    ]
+    assert record.unmatched_fates == []
+    (entry,) = yaml.safe_load((out / "replay.yaml").read_text())["timeline"]
+    assert (entry["battery"], entry["volts"]) == ([1], 10.4)
