@@ -200,7 +200,9 @@ class RunArchive:
         beside = [*([self.directory] if self.directory else []), *self._agents]
         path = next((place / PUBLIC_KEYS_FILE for place in beside if (place / PUBLIC_KEYS_FILE).exists()), None)
         if path is None:
-            return None, []
+            secured = self.record.scenario is not None and self.record.scenario.security is not None
+            missing = f"{PUBLIC_KEYS_FILE} is missing, which a secured run leaves: signatures of blocks are not checked"
+            return None, [missing] if secured and not self._never_began else []
         try:
             from ucp.secure.bundle import load_public
             from ucp.secure.keyfile import KeyFileError

@@ -128,9 +128,10 @@ def check(evidence: Evidence) -> Judgement:
             f"neither export nor trace tells what {agents(unknown)} completed, so who made their blocks is unknown",
         )
     made = "signed" if signatures else "completed"
-    return Judgement(
-        NAME, "holds", f"all hashes recompute, and each of {blocks} blocks was {made} by the agent that it names"
-    )
+    reason = f"all hashes recompute, and each of {blocks} blocks was {made} by the agent that it names"
+    if not signatures and any(block.signature for export in evidence.exports.values() for block in export.blocks()):
+        reason += "; their signatures were not checked, for there is no public.json beside the exports"
+    return Judgement(NAME, "holds", reason)
 
 
 def _since(trace: Trace | None, block_hash: str) -> str:

@@ -70,6 +70,18 @@ def test_without_public_keys_nobody_knows(home: Path) -> None:
     assert genuine(home)["verdict"] == "not applicable"
 
 
+def test_signatures_that_were_not_checked_are_not_passed_over(run: Path, tmp_path: Path) -> None:
+    whole = shutil.copytree(run, tmp_path / "whole")
+    (whole / "public.json").unlink()
+    judgement = genuine(whole)
+    assert judgement["verdict"] == "holds", "by the makers' own records"
+    assert "signatures were not checked" in judgement["reason"]
+    done = harness("check", whole)
+    assert done.returncode == 2
+    assert "public.json is missing, which a secured run leaves" in done.stderr
+    assert "signatures were not checked" not in genuine(run)["reason"]
+
+
 def test_public_keys_that_are_damaged_are_told(home: Path) -> None:
     (home / "public.json").write_text("{")
     done = harness("check", home)
