@@ -54,6 +54,18 @@ class SecuredState:
         if (revocation := entry.get("revocation")) is not None:
             self.revocation = base64.b64decode(revocation)
 
+    def entry(self, before: "SecuredState | None" = None) -> dict[str, Any]:
+        """What of it is new since `before`, as an entry has it."""
+        new: dict[str, Any] = {}
+        if before is None:
+            new["started_us"] = self.started_us
+            before = SecuredState(self.started_us)
+        if signed := self.signatures.keys() - before.signatures.keys():
+            new["signatures"] = {name.hex(): _base64(self.signatures[name]) for name in sorted(signed)}
+        if self.revocation is not None and self.revocation != before.revocation:
+            new["revocation"] = _base64(self.revocation)
+        return new
+
 
 @dataclass(slots=True)
 class StoredState:
@@ -183,7 +195,8 @@ class Store:
         """
         if self.problem is not None:
             return
-        beside = {} if secured is None else self._new_of(secured)
+        beside = {} if secured is None else secured.entry(self._secured)
+        self._secured = secured
         if not (changes or beside):
             return
         new = dict.fromkeys(block_hash for _, block_hash in changes if block_hash not in self._written)
@@ -201,19 +214,6 @@ class Store:
         except OSError as error:
             self.problem = error.strerror or str(error)
         self._written.update(new)
-
-    def _new_of(self, secured: SecuredState) -> dict[str, Any]:
-        """What an entry has of it."""
-        before, self._secured = self._secured, secured
-        new: dict[str, Any] = {}
-        if before is None:
-            new["started_us"] = secured.started_us
-            before = SecuredState(secured.started_us)
-        if signed := secured.signatures.keys() - before.signatures.keys():
-            new["signatures"] = {name.hex(): _base64(secured.signatures[name]) for name in sorted(signed)}
-        if secured.revocation is not None and secured.revocation != before.revocation:
-            new["revocation"] = _base64(secured.revocation)
-        return new
 
     def _begin(self, lines: bytes) -> BinaryIO:
         """A journal that begins with these lines, in the place of what was there."""

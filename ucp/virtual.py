@@ -13,18 +13,22 @@ import math
 import sys
 from collections.abc import Callable
 from random import Random
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from ucp.agent import Agent
 from ucp.block import Block
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.export import export_chain
-from ucp.mission import MAX_MISSION_BYTES, MissionError, UnsupportedMissionError, is_epoch, parse_mission
+from ucp.messages import MalformedDatagramError
+from ucp.mission import MAX_MISSION_BYTES, Mission, MissionError, UnsupportedMissionError, is_epoch, parse_mission
 from ucp.request import check_request
 from ucp.status import status_of
-from ucp.store import StoredState, block_on_disk
+from ucp.store import SecuredState, StoredState, block_on_disk
 from ucp.trace import Commanded, HandlerRun, in_base64
+
+if TYPE_CHECKING:
+    from ucp.secure.agent import SecuredAgent
 
 LATEST_S = 1e12
 """Mission seconds; the timestamp of no event would have room for more."""
@@ -68,15 +72,14 @@ class VirtualAgent:
             self._mission = mission = parse_mission(given["mission"])
         except MissionError as error:
             raise InputError(str(error), unsupported=isinstance(error, UnsupportedMissionError)) from None
-        if mission.security is not None:
-            raise InputError("in virtual time this agent takes no keys", unsupported=True)
         if mission.epoch_us is None:
             raise InputError("`epoch_us` of the mission must be a whole number: in virtual time nobody says `start`")
         self._epoch_us = mission.epoch_us
         self._tracing = given.get("trace", True) is True
         self._lots = Random(mission.seed)
         """Of what is random about its quirks."""
-        self._agent = Agent(
+        make, self._secured = _maker(mission, given), mission.security is not None
+        self._agent = make(
             mission.agent_id,
             mission.roster,
             mission.initial_data,
@@ -93,7 +96,7 @@ class VirtualAgent:
         self._noted: list[Commanded] = []
         now = self._advance(given)
         if given.get("store") is not None:
-            self._agent.boot(_stored(given["store"]), now)
+            self._agent.boot(_stored(given["store"], secured=self._secured), now)
 
     def give(self, given: dict[str, Any]) -> None:
         """One input. Raises InputError."""
@@ -156,9 +159,10 @@ class VirtualAgent:
             check_request(given)
         except ValueError:
             raise InputError("not a line of JSON") from None
-        command = _COMMANDS.get(name) if isinstance(name, str) else None
+        commands = _COMMANDS | ({"revoke": VirtualAgent._revoke} if self._secured else {})
+        command = commands.get(name) if isinstance(name, str) else None
         if command is None:
-            error = f"unknown command {str(name)[:40]!r}: there are {', '.join(_COMMANDS)}"
+            error = f"unknown command {str(name)[:40]!r}: there are {', '.join(commands)}"
             return {"ok": False, "unsupported": True, "error": error}
         return command(self, given, now)
 
@@ -173,10 +177,24 @@ class VirtualAgent:
     def _export(self, given: dict[str, Any], now: float) -> dict[str, Any]:
         self._note(given, now)
         exported_at_us = max(0, self._epoch_us + round(now * MICROSECONDS))
-        return export_chain(self._agent.state, exported_at_us)
+        signatures = cast("SecuredAgent", self._agent).signatures if self._secured else None
+        return export_chain(self._agent.state, exported_at_us, signatures)
 
     def _store(self, given: dict[str, Any], now: float) -> dict[str, Any]:
-        return {"ok": True, "store": _to_store(StoredState.of(self._agent.state))}
+        stored = StoredState.of(self._agent.state)
+        if self._secured:
+            stored.secured = cast("SecuredAgent", self._agent).secured_state()
+        return {"ok": True, "store": _to_store(stored)}
+
+    def _revoke(self, given: dict[str, Any], now: float) -> dict[str, Any]:
+        agent = cast("SecuredAgent", self._agent)
+        try:
+            agent.revoke(_decoded(given, "revocation"), now)
+        except InputError as error:
+            return {"ok": False, "error": str(error)}
+        except MalformedDatagramError as malformed:
+            return {"ok": False, "error": f"no revocation: {malformed.reason}"}
+        return {"ok": True, "revoked": sorted(agent.revocation.revoked) if agent.revocation else []}
 
     def _stop_events(self, given: dict[str, Any], now: float) -> dict[str, Any]:
         self._generating = False
@@ -221,6 +239,21 @@ _COMMANDS: dict[str, Callable[[VirtualAgent, dict[str, Any], float], dict[str, A
 }
 
 
+def _maker(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
+    """What makes the mission's agent; all arguments are Agent's. Raises InputError."""
+    if mission.security is None:
+        return Agent
+    try:
+        from ucp.secure.vehicle import secured_in_virtual_time  # needs the extra `secure`
+    except ModuleNotFoundError as error:
+        why = f"this mission needs the feature 'secured', and {error.name} is not installed here"
+        raise InputError(why, unsupported=True) from None
+    try:
+        return secured_in_virtual_time(mission, given.get("bundle"), given.get("boot"))
+    except MissionError as error:
+        raise InputError(str(error)) from None
+
+
 def _read(line: bytes) -> dict[str, Any]:
     try:
         given = json.loads(line)
@@ -250,10 +283,11 @@ def _to_store(stored: StoredState) -> dict[str, Any]:
         "chain": listed(stored.chain),
         "deque": listed(stored.deque),
         "stack": listed(stored.stack),
+        **({} if stored.secured is None else {"secured": stored.secured.entry()}),
     }
 
 
-def _stored(value: Any) -> StoredState:
+def _stored(value: Any, *, secured: bool) -> StoredState:
     """Raises InputError."""
 
     def blocks(place: str) -> list[Block]:
@@ -265,9 +299,12 @@ def _stored(value: Any) -> StoredState:
     try:
         completed = [bytes.fromhex(block_hash) for block_hash in value["completed"]]
         stored = StoredState(completed, blocks("chain"), blocks("deque"), blocks("stack"))
+        if secured:
+            stored.secured = SecuredState(0)
+            stored.secured.replay(value["secured"])
         stored.check()
         return stored
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, AttributeError):
         raise InputError("`store` is not what this agent answered to the command `store`") from None
 
 

@@ -6,7 +6,7 @@ The checker is that of any other run; the evidence comes straight from the agent
 from collections.abc import Coroutine, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from harness import checker
 from harness.archive.exports import Export, ExportMaker
@@ -25,6 +25,9 @@ from harness.play.simulation.virtual_time import VirtualTime
 from harness.scenario import Scenario
 from netem.radio import Place
 from ucp.trace import SCHEMA, Entry, in_base64
+
+if TYPE_CHECKING:
+    from ucp.secure.agent import SecuredAgent
 
 Result = TypeVar("Result")
 
@@ -165,7 +168,9 @@ class InMemory:
             life.agent.agent_id: Export.model_validate(simulation.export_of(life))
             if life.state is None
             else self._maker.export(
-                life.state, simulation.timestamp_us(life), life.secured.signatures if life.secured else None
+                life.state,
+                simulation.timestamp_us(life),
+                cast("SecuredAgent", life.secured).signatures if life.secured else None,
             )
             for life in simulation.exporting()
         }

@@ -11,6 +11,7 @@ REQUESTS: dict[str, Schema] = {
     "reconcile": {},
     "export": {},
     "quirk": {"name": {"type": "string"}, "value": {"type": ["boolean", "number"]}},
+    "revoke": {"revocation": BASE64},
 }
 """Command -> the keys that come with it."""
 

@@ -6,7 +6,7 @@ from ucp.schemas.parts import BASE64, EVENT_ID, FLAG, SECONDS, TIMESTAMP, Schema
 
 EVENT_TIMESTAMP: Schema = TIMESTAMP | {"maximum": LATEST_EPOCH_US}
 
-COMMANDS = ("status", "stop_events", "reconcile", "export", "quirk")
+COMMANDS = ("status", "stop_events", "reconcile", "export", "quirk", "revoke")
 """Those of the control socket; besides there is `store`."""
 
 
@@ -22,8 +22,15 @@ def inputs() -> Schema:
         "required": ["epoch_us"],
     }
     life = record(
-        {"t": SECONDS, "mission": {"allOf": [mission.schema(), in_virtual_time]}, "trace": FLAG, "store": True},
-        optional=("trace", "store"),
+        {
+            "t": SECONDS,
+            "mission": {"allOf": [mission.schema(), in_virtual_time]},
+            "trace": FLAG,
+            "store": True,
+            "bundle": {"type": "object"},
+            "boot": {"type": "string", "pattern": "^[0-9a-f]{32}$"},
+        },
+        optional=("trace", "store", "bundle", "boot"),
     )
     commands = (*COMMANDS, "store")
     keys = control.REQUESTS | {"store": {}}

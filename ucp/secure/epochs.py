@@ -28,6 +28,11 @@ class Epochs:
         self._sender_keys: dict[tuple[int, int, bytes], SenderKeys] = {}
 
     @property
+    def bundle(self) -> Bundle:
+        """The vehicle's, with the secret of the current epoch."""
+        return self._bundle
+
+    @property
     def current(self) -> int:
         """What is sent now is sent in this one."""
         return self._bundle.epoch

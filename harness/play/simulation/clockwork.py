@@ -17,7 +17,7 @@ from harness.play.simulation.agents import OwnAgent, Stored, VirtualAgent
 from harness.play.simulation.air import Happening, InFlight, Logged, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, NameOf
 from harness.play.simulation.late_timers import LateTimers
-from harness.play.simulation.lives import BlockNames, Incarnation
+from harness.play.simulation.lives import BlockNames, Incarnation, Secured
 from harness.play.simulation.recorder import Recorder
 from harness.play.simulation.recurrence import Recurrence
 from harness.scenario import Scenario
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from harness.play.simulation.foreign.foreigners import Foreigners
     from harness.play.simulation.foreign.programs import Programs
     from harness.play.simulation.rogue import VirtualRogue
-    from harness.play.simulation.secured import Keys, SecuredOwnAgent
+    from harness.play.simulation.secured import Keys
     from ucp.secure.bundle import PublicKeys
 
 ANY_LIFE = 0
@@ -107,7 +107,9 @@ class Clockwork:
     def _foreign_agents(self, programs: "Programs | None") -> "Foreigners":
         from harness.play.simulation.foreign.foreigners import Foreigners  # most scenarios have none
 
-        return Foreigners(self.scenario, self.seed, self._initial_data, programs, tracing=self._tracing)
+        return Foreigners(
+            self.scenario, self.seed, self._initial_data, programs, tracing=self._tracing, keys=self._keys
+        )
 
     @property
     def public_keys(self) -> "PublicKeys | None":
@@ -259,7 +261,7 @@ class Clockwork:
             elif self._on_the_air is not None:
                 self._on_the_air.append((life.agent.agent_id, sequence, message, self._now))
 
-    def _say_sealed(self, number: int, life: Incarnation, agent: "SecuredOwnAgent") -> None:
+    def _say_sealed(self, number: int, life: Incarnation, agent: Secured) -> None:
         """Send what the agent has to say, sealed. Who comes upon the mission late has heard nothing of it."""
         for sealed, sequence, message, plain, length in agent.sealed_to_send():
             if message is None:
@@ -337,11 +339,11 @@ class Clockwork:
         local_s = self._now if clock is None else clock.shows(self._now)
         agent: VirtualAgent
         if self._foreigners is not None and agent_id in self._foreigners:
-            agent = self._foreigners.begin(agent_id, len(lives) + 1, local_s, stored)
+            agent = self._foreigners.begin(agent_id, len(lives) + 1, local_s, stored, born_at=self._now)
         else:
             agent = self._own_agent(agent_id, seed, len(lives) + 1)
         state = agent.state if isinstance(agent, OwnAgent) else None
-        secured = cast("SecuredOwnAgent", agent) if self._keys is not None and isinstance(agent, OwnAgent) else None
+        secured = cast(Secured, agent) if self._keys is not None else None
         life = Incarnation(agent, source, clock, self._now, state, secured, stored is not None)
         lives.append(life)
         self._alive[number] = life

@@ -1,8 +1,8 @@
 """The lives of agents in virtual time, and what people call the blocks that they complete."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from harness.play.simulation.agents import VirtualAgent
 from harness.play.simulation.air import Happening
@@ -11,7 +11,17 @@ from ucp.events import RandomEvents
 from ucp.state import AgentState
 
 if TYPE_CHECKING:
-    from harness.play.simulation.secured import SecuredOwnAgent
+    from ucp.secure.agent import Outgoing
+
+
+class Secured(Protocol):
+    """An agent with keys, whoever made it."""
+
+    def sealed_to_send(self) -> "Iterable[Outgoing]":
+        """What it broadcasts since it was last asked, in order."""
+
+    def revoke(self, body: bytes, now: float) -> object:
+        """The authority says whose keys are revoked."""
 
 
 @dataclass(slots=True)
@@ -25,7 +35,7 @@ class Incarnation:
     born_at: float
     state: AgentState | None = None
     """What it holds, asks and counts; None of an agent into which nobody sees."""
-    secured: "SecuredOwnAgent | None" = None
+    secured: Secured | None = None
     """The agent, if it has keys."""
     rebooted: bool = False
     """It came back from a brown-out with what was on its disk."""

@@ -113,12 +113,20 @@ class Keys:
         def keep(bundle: Bundle) -> None:
             self._bundles[agent_id] = bundle
 
-        boot = boot_of(round(now * MICROSECONDS) + life, _of_seed(self._seed, f"boot {agent_id} {life}")[:8])
-        self.boots[agent_id] = boot
+        boot = self._boot(agent_id, life, now)
         bundle = self._bundles[agent_id]
         session = Session(bundle, boot, keep, self._verified)
         make = partial(SampledAgent, self) if self.sampled else SecuredOwnAgent
         return partial(make, session, seal=seal_of(bundle) if self.mission.seals else None)
+
+    def handed(self, agent_id: int, life: int, now: float) -> dict[str, Any]:
+        """What an agent of another make is told of its keys when a life begins."""
+        return {"bundle": self.mission.bundles[agent_id].to_json(), "boot": self._boot(agent_id, life, now).hex()}
+
+    def _boot(self, agent_id: int, life: int, now: float) -> bytes:
+        boot = boot_of(round(now * MICROSECONDS) + life, _of_seed(self._seed, f"boot {agent_id} {life}")[:8])
+        self.boots[agent_id] = boot
+        return boot
 
     def signature(self, block: Block) -> bytes:
         """Its maker's."""
@@ -135,7 +143,8 @@ def _drops_nothing(scenario: Scenario) -> bool:
     """
     timers = scenario.settings
     return not (
-        scenario.fates
+        scenario.foreign
+        or scenario.fates
         or scenario.datagrams
         or scenario.clocks
         or scenario.lateness

@@ -172,10 +172,6 @@ def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["Programs | 
 def _refuse_what_foreign_agents_cannot(scenario: Scenario) -> None:
     from harness.play.simulation.foreign.foreigners import commands_of
 
-    if scenario.security:
-        raise ScenarioError(
-            "`security` gives keys to our own agents alone in virtual time: leave it out, or `agent_command`"
-        )
     commands_of(scenario)
     late = sorted(agent_id for agent_id in scenario.lateness if agent_id in scenario.foreign)
     if late:

@@ -1,6 +1,7 @@
 """Our own agent, driven by lines as any other, does to the byte what it does in the simulation itself."""
 
 import json
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,22 @@ def test_behind_lines_it_does_what_it_does_in_the_simulation() -> None:
         within, outside = both(scenario(**EVENTFUL), seed)
         assert within == outside
         assert within["agents"][0]["restarts"] == within["agents"][2]["reboots"] == 1
+
+
+def test_so_it_does_with_keys() -> None:
+    """It seals and opens, boots with what it heard of revocations, and drops what the simulation's own drops."""
+    revoked = {"at_s": 200, "revoke": [1], "heard_by": [2]}
+    forged = {"at_s": 120, "forge": {"message": "Commit Block", "sender": 2}}
+    keys = {
+        **EVENTFUL,
+        "quirks": {},
+        "timeline": sorted([*EVENTFUL["timeline"], revoked, forged], key=itemgetter("at_s")),
+    }
+    for security in ({"captured": 2}, {"captured": 2, "seal": True}):
+        within, outside = both(scenario(**keys, security=security), 1)
+        assert within == outside
+        dropped = {reason for agent in within["agents"] for reason in agent["dropped"]}
+        assert dropped >= {"replayed", "revoked sender"}
 
 
 def test_a_run_directory_has_what_a_run_in_memory_has(tmp_path: Path) -> None:

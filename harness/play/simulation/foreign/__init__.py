@@ -6,5 +6,6 @@ answer.py    what a line of theirs says
 failure.py   how one ends a mission
 foreigners.py  whose program plays whom
 agent.py     one life of such an agent, as the simulation drives it
+secured.py   the same with keys
 again.py     whether it is the same twice
 """

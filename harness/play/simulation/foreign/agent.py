@@ -6,7 +6,7 @@ own questions, and no part of the mission: what the agent's trace says of them i
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,7 +74,7 @@ class LifeRecord:
 class ForeignAgent:
     """The agent of a `mission` (`ucp-mission/1`), played by `program`. Raises AgentFailedError, AgentLacksError.
 
-    With a `store` it boots from that: (what an earlier life answered,).
+    With a `store` it boots from that: (what an earlier life answered,). `handed` is what it is told of its keys.
     """
 
     def __init__(
@@ -87,6 +87,7 @@ class ForeignAgent:
         *,
         tracing: bool,
         store: Stored | None = None,
+        handed: Mapping[str, Any] | None = None,
         record_bytes: int,
     ) -> None:
         self.agent_id: int = mission["agent_id"]
@@ -115,6 +116,7 @@ class ForeignAgent:
             "mission": mission,
             "trace": tracing,
             **({"store": store[0]} if isinstance(store, tuple) else {}),
+            **(handed or {}),
         }
         self._give(json.dumps(first, separators=(",", ":")), "its mission", now)
 

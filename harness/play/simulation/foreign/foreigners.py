@@ -1,8 +1,9 @@
 """The agents of a swarm that are not ours: whose program plays whom, in which life."""
 
 import errno
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from harness.errors import MachineError, ScenarioError
 from harness.play.process.agent import agent_command, reboots_with_disk
@@ -14,6 +15,9 @@ from harness.play.simulation.foreign.programs import SHARED, Programs
 from harness.scenario import Scenario
 from netem import addresses
 
+if TYPE_CHECKING:
+    from harness.play.simulation.secured import Keys
+
 MAX_RECORD_BYTES = 128 * 1024 * 1024
 """Of all that agents are given and answer in a mission, so much is kept, to be given to them again."""
 
@@ -24,10 +28,20 @@ def commands_of(scenario: Scenario) -> dict[int, list[str]]:
 
 
 class Foreigners:
-    """Those of `scenario`. `programs` play them, by default those that all missions in this process share."""
+    """Those of `scenario`. `programs` play them, by default those that all missions in this process share.
+
+    `keys` are the mission's, if it is secured.
+    """
 
     def __init__(
-        self, scenario: Scenario, seed: int, initial_data: bytes, programs: Programs | None, *, tracing: bool
+        self,
+        scenario: Scenario,
+        seed: int,
+        initial_data: bytes,
+        programs: Programs | None,
+        *,
+        tracing: bool,
+        keys: "Keys | None" = None,
     ) -> None:
         self.records: list[LifeRecord] = []
         self._scenario = scenario
@@ -35,6 +49,7 @@ class Foreigners:
         self._initial_data = initial_data
         self._programs = programs or SHARED
         self._tracing = tracing
+        self._keys = keys
         self._commands: Mapping[int, list[str]] = commands_of(scenario)
         self._playing: dict[int, Program] = {}
 
@@ -61,12 +76,22 @@ class Foreigners:
                 ) from None
             raise ScenarioError(f"`agent_command`: {command[0]} cannot be started: {error.strerror}") from None
 
-    def begin(self, agent_id: int, life: int, now: float, stored: Stored | None) -> ForeignAgent:
-        """A life of the agent, which goes on from what is `stored` of an earlier one. Raises HarnessError."""
+    def begin(self, agent_id: int, life: int, now: float, stored: Stored | None, *, born_at: float) -> ForeignAgent:
+        """A life of the agent, which goes on from what is `stored` of an earlier one. Raises HarnessError.
+
+        It is `now` by the agent's clock, and in mission seconds it is `born_at`.
+        """
         if agent_id not in self._playing:
             self._start(agent_id)
         program = self._playing[agent_id]
-        agent = ForeignAgent(
+        make: Callable[..., ForeignAgent] = ForeignAgent
+        handed = None
+        if self._keys is not None:
+            from harness.play.simulation.foreign.secured import SecuredForeignAgent  # needs the extra `secure`
+
+            make = partial(SecuredForeignAgent, self._keys.mission.bundles[agent_id])
+            handed = self._keys.handed(agent_id, life, born_at)
+        agent = make(
             self._mission(agent_id, life),
             self._initial_data,
             self._scenario.settings_of(agent_id),
@@ -74,6 +99,7 @@ class Foreigners:
             now,
             tracing=self._tracing,
             store=stored,
+            handed=handed,
             record_bytes=MAX_RECORD_BYTES // len(self._commands),
         )
         self.records.append(agent.record)
@@ -103,6 +129,7 @@ class Foreigners:
             life=life,
             epoch_us=0,
             store="store" if reboots_with_disk(agent_id, self._scenario) else None,
+            bundle=f"{agent_id}.bundle.json" if self._keys else None,
         )
         mission["events"]["source"] = "none"
         return {**mission, "speedup": 1, "store": None}  # that it may be asked for one `features` says
