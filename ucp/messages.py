@@ -303,10 +303,15 @@ def decode(datagram: bytes) -> Datagram:
         raise MalformedDatagramError("impossible sender")
     if length != len(datagram) - HEADER.size:
         raise MalformedDatagramError("wrong length")
+    return Datagram(sender, sequence, decode_body(code, datagram[HEADER.size :]))
+
+
+def decode_body(code: int, body: bytes) -> Message:
+    """The message of this type with this body. Raises MalformedDatagramError if there is none."""
     from_body = _FROM_BODY.get(code)
     if from_body is None:
         raise MalformedDatagramError("unknown type")
-    return Datagram(sender, sequence, from_body(datagram[HEADER.size :]))
+    return from_body(body)
 
 
 def _hashes(body: bytes, count: int) -> list[bytes]:

@@ -335,7 +335,7 @@ def opened(packet: Packet, opener: "Opener") -> Packet:
     header = packet.getlayer(SecuredUCP)
     if header is None:
         raise MalformedDatagramError("not secured")
-    return UCP(opener.open(header.do_build()).plain)
+    return UCP(opener.open(header.do_build()).said.encode())
 
 
 def message_of(packet: Packet) -> tuple[int, int, Message]:

@@ -48,7 +48,13 @@ class Recorded:
         return self._text
 
     def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, Recorded) and self.text == other.text)
+        if self is other:
+            return True
+        if not isinstance(other, Recorded):
+            return False
+        if type(self.content) is type(other.content) is not type(None) and self.content == other.content:
+            return True
+        return self.text == other.text
 
     def __hash__(self) -> int:
         return hash(self.text)

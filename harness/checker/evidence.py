@@ -28,6 +28,7 @@ from ucp.trace import HandlerRun, Sent
 if TYPE_CHECKING:
     from harness.checker.records import Examination
     from ucp.secure.bundle import PublicKeys
+    from ucp.secure.suite import Signed
 
 Sending = tuple[tuple[float, Sent], ...]
 """What an agent sent when with one type and sequence number: one message in each of its lives, at most."""
@@ -112,6 +113,8 @@ class Evidence:
     captures: Captures | None = None
     public_keys: "PublicKeys | None" = None
     """Of a secured mission, by which blocks are told to be their makers'."""
+    verified: "Callable[[Signed], bool] | None" = None
+    """Whether a signature is good, of who knows it better than by verifying it: a swarm played in this process."""
     watch: Watch | None = None
     """Is shown each step that the step judge follows."""
 

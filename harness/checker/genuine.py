@@ -11,7 +11,10 @@ from harness.checker.judgement import Finding, Judgement, agents, violated
 from ucp.block import Block, InceptionBlock, next_chain_hash
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ucp.secure.bundle import PublicKeys
+    from ucp.secure.suite import Signed
 
 NAME = "genuine"
 
@@ -50,8 +53,11 @@ class _Recomputed:
 class _Signatures:
     """Signatures of blocks, each of which is checked once."""
 
-    def __init__(self, keys: "PublicKeys") -> None:
+    def __init__(self, keys: "PublicKeys", verified: "Callable[[Signed], bool] | None") -> None:
+        from ucp.secure.suite import verify
+
         self._keys = keys
+        self._verified = verified or verify
         self._checked: dict[tuple[_Content, str | None], str | None] = {}
 
     def what_is_wrong(self, block: ExportedBlock) -> str | None:
@@ -62,7 +68,7 @@ class _Signatures:
         return self._checked[claim]
 
     def _look(self, block: ExportedBlock) -> str | None:
-        from ucp.secure.block_signature import is_signed
+        from ucp.secure.block_signature import claim_of_block
 
         public_key = self._keys.vehicles.get(block.agent_id)
         if public_key is None:
@@ -70,7 +76,7 @@ class _Signatures:
         if block.signature is None:
             return "without a signature: it was made or edited by somebody without keys"
         data = Block(block.agent_id, block.timestamp_us, block.event_bytes).block_data()
-        if not is_signed(base64.b64decode(block.signature), public_key, self._keys.mission, data):
+        if not self._verified(claim_of_block(public_key, self._keys.mission, data, base64.b64decode(block.signature))):
             return f"whose signature is not agent {block.agent_id}'s of this block: it was forged or edited"
         return None
 
@@ -91,7 +97,7 @@ def check(evidence: Evidence) -> Judgement:
     unknown: set[int] = set()
     blocks = 0
     recomputed = _Recomputed()
-    signatures = _Signatures(evidence.public_keys) if evidence.public_keys else None
+    signatures = _Signatures(evidence.public_keys, evidence.verified) if evidence.public_keys else None
     for agent_id, export in evidence.exports.items():
         findings += _hashes_that_do_not_recompute(agent_id, export, evidence, recomputed)
         for block in export.blocks():

@@ -161,6 +161,7 @@ class InMemory:
             self._kept,
             self._injected,
             public_keys=simulation.public_keys,
+            verified=simulation.verified,
         )
 
     def _exports(self, simulation: Simulation) -> dict[int, Export]:

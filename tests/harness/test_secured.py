@@ -30,7 +30,7 @@ def test_a_secured_mission_has_the_chains_of_the_plain_one(name: str) -> None:
     assert simulate(secured(plain), 1).result.chains == simulate(plain, 1).result.chains
 
 
-def test_a_sweep_that_seals_a_share_of_the_datagrams_is_the_run_that_seals_all() -> None:
+def test_a_sweep_that_delivers_what_matters_is_the_run_that_delivers_all() -> None:
     request = secured(scenario(network={"loss": 0.2}, timeline=[{"at_s": 300, "partition": [[1, 2]]}], duration_s=600))
     sweep, whole = simulate(request, 3), simulate(request, 3, deliver_all=True)
     assert sweep.result.chains == whole.result.chains

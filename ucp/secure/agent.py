@@ -9,15 +9,16 @@ were dropped are there as they came.
 """
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
 from ucp.agent import Agent, why_not_handled
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
-from ucp.secure.envelope import BOOT_BYTES, CLEAR, LAST_SEQUENCE, REQUESTS, REVOCATION, Clear, read_clear
+from ucp.secure.datagrams import Opened, Request
+from ucp.secure.envelope import BOOT_BYTES, CLEAR, LAST_SEQUENCE, REQUESTS, REVOCATION, Clear
 from ucp.secure.revocation import Revocation, RevocationError
-from ucp.secure.session import Opened, Request, Session
+from ucp.secure.session import Session
 from ucp.secure.signatures import BlockSignatures
 from ucp.store import SecuredState, StoredState
 from ucp.trace import Commanded, Recorded, in_base64
@@ -28,16 +29,12 @@ _BOOT_TIME = struct.Struct("!Q")
 
 
 class Outgoing(NamedTuple):
-    """A datagram to broadcast: as it goes on the air, and what it says, unless it is a revocation.
+    """A datagram to broadcast: as it goes on the air, and what it says, unless it is a revocation."""
 
-    In a simulation that knows what it would say it need not be sealed.
-    """
-
-    sealed: bytes | None
+    sealed: bytes
     sequence: int = 0
     message: Message | None = None
     plain: Recorded | None = None
-    length: int = 0
 
 
 def boot_of(started_us: int, chance: bytes) -> bytes:
@@ -76,7 +73,7 @@ class SecuredAgent(Agent):
     def receive_datagram(self, data: bytes, now: float) -> None:
         self.session.epochs.look_at(now)
         try:
-            clear = read_clear(data)
+            clear = self.session.arithmetic.read(data)
             if why := self._why_not_opened(clear):
                 raise MalformedDatagramError(why)
             if clear.type == REVOCATION:
@@ -114,7 +111,7 @@ class SecuredAgent(Agent):
     def _handle_opened(self, opened: Opened, now: float) -> None:
         clear, (sender, sequence, message) = opened.clear, opened.said
         waiting = len(self._core.outbox)
-        super().receive_message(sender, sequence, message, now, Recorded(in_base64(opened.plain)))
+        super().receive_message(sender, sequence, message, now, opened.recorded)
         if clear.type in REQUESTS:
             request = Request(sender, clear.boot, sequence)
             self._answers.update((answer, request) for answer, _, _ in self._core.outbox[waiting:])
@@ -124,15 +121,17 @@ class SecuredAgent(Agent):
     # To the air
 
     def datagrams_to_send(self) -> list[bytes]:
-        return [outgoing.sealed for outgoing in self.sealed_to_send() if outgoing.sealed is not None]
+        return [outgoing.sealed for outgoing in self.sealed_to_send()]
 
-    def sealed_to_send(self) -> Iterator[Outgoing]:
+    def sealed_to_send(self) -> Sequence[Outgoing]:
         """What to broadcast, in order; empties the outbox."""
+        if not self._tells and not self._core.outbox:
+            return ()
         self.session.epochs.look_at(self.state.now)
+        outgoing = []
         if self._tells and self.revocation is not None:
             self._tells = False
-            told = self.session.tell(self.revocation.number, self.revocation.encode())
-            yield Outgoing(told, length=len(told))
+            outgoing.append(Outgoing(self.session.tell(self.revocation.number, self.revocation.encode())))
         for sequence, message, plain in self._taken_from_outbox():
             if sequence > LAST_SEQUENCE:
                 self.problem = "it has used all sequence numbers of this life: it sends no more until it starts anew"
@@ -140,7 +139,8 @@ class SecuredAgent(Agent):
             signature = self.signatures.get(message.block.block_hash) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
             request = self._answers.pop(sequence, None)
             sealed = self.session.seal(sequence, message, request, signature, self._revocations)
-            yield Outgoing(sealed, sequence, message, plain, len(sealed))
+            outgoing.append(Outgoing(sealed, sequence, message, plain))
+        return outgoing
 
     # Revocations
 

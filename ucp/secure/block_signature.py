@@ -4,14 +4,13 @@ Ed25519 (RFC 8032) over a domain tag, the mission's ID and BD (eq. 3.5): nothing
 another mission, passes for it.
 """
 
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-from ucp.secure.suite import Signed, verify
+from ucp.secure.datagrams import Signer
+from ucp.secure.suite import Signed
 
 _TAG = b"UCP block\0"
 
 
-def sign_block(maker: Ed25519PrivateKey, mission: bytes, block_data: bytes) -> bytes:
+def sign_block(maker: Signer, mission: bytes, block_data: bytes) -> bytes:
     """The signature of the block with this BD, 64 bytes."""
     return maker.sign(_TAG + mission + block_data)
 
@@ -19,8 +18,3 @@ def sign_block(maker: Ed25519PrivateKey, mission: bytes, block_data: bytes) -> b
 def claim_of_block(public_key: bytes, mission: bytes, block_data: bytes, signature: bytes) -> Signed:
     """That the maker with this public key signed the block with this BD in this mission."""
     return Signed(public_key, signature, _TAG + mission + block_data)
-
-
-def is_signed(signature: bytes, public_key: bytes, mission: bytes, block_data: bytes) -> bool:
-    """Whether the maker with this public key signed the block in this mission. Never raises, whatever the bytes are."""
-    return verify(claim_of_block(public_key, mission, block_data, signature))

@@ -6,8 +6,8 @@ see all of it; what is not authentic is told here, too.
 
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle
+from ucp.secure.datagrams import Opened, decrypted, domain_of, understood
 from ucp.secure.envelope import REVOCATION, read_clear
-from ucp.secure.session import Opened, decrypted, domain_of, understood
 from ucp.secure.suite import SenderKeys, next_epoch_secret, verify
 
 EPOCHS_AHEAD = 4096

@@ -9,16 +9,11 @@ its signature.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-from ucp.messages import HEADER, MAGIC, TYPE_CODES, Datagram, MalformedDatagramError, Message, decode
-from ucp.messages import VERSION as PLAIN_VERSION
+from ucp.messages import TYPE_CODES, MalformedDatagramError, Message
 from ucp.secure.bundle import Bundle
+from ucp.secure.datagrams import ARITHMETIC, NOTHING_ASKED, Arithmetic, Opened, Request, domain_of
 from ucp.secure.envelope import (
-    BOOT_BYTES,
-    CLEAR,
     LAST_SEQUENCE,
     REQUEST,
     REQUEST_OF,
@@ -30,34 +25,7 @@ from ucp.secure.envelope import (
     Clear,
 )
 from ucp.secure.epochs import Epochs
-from ucp.secure.suite import SenderKeys, Signed, verify
 from ucp.secure.window import ReplayWindow
-
-_DATAGRAM = b"UCP datagram\0"
-
-
-class Request(NamedTuple):
-    """A datagram that asks something, as a response names it."""
-
-    sender: int
-    boot: bytes
-    sequence: int
-
-
-NOTHING_ASKED = Request(0, bytes(BOOT_BYTES), 0)
-"""What a response names that answers nothing. No request is like that."""
-
-
-class Opened(NamedTuple):
-    """What a datagram said that proved authentic."""
-
-    clear: Clear
-    plain: bytes
-    """The datagram of version 1 that says the same."""
-    said: Datagram
-    request: Request | None
-    """What it answers; None if it is no response."""
-    block_signature: bytes
 
 
 class _Life:
@@ -75,7 +43,7 @@ class _Life:
 class Session:
     """One vehicle's life. `boot` is when it began, in microseconds UTC (8 bytes), and 8 bytes of chance.
 
-    `keep` is given the bundle whenever old secrets are gone from it. `verified` says whether a signature is good.
+    `keep` is given the bundle whenever old secrets are gone from it.
     """
 
     def __init__(
@@ -83,16 +51,16 @@ class Session:
         bundle: Bundle,
         boot: bytes,
         keep: Callable[[Bundle], None] = lambda _: None,
-        verified: Callable[[Signed], bool] = verify,
+        arithmetic: Arithmetic = ARITHMETIC,
     ) -> None:
         self.agent_id = bundle.agent_id
         self.boot = boot
         self.mission = bundle.public.mission
         self.authority = bundle.public.authority
         self.public_keys = bundle.public.vehicles
-        self.private_key = Ed25519PrivateKey.from_private_bytes(bundle.private_key)
-        self.verified = verified
-        self.epochs = Epochs(bundle, keep)
+        self.arithmetic = arithmetic
+        self.private_key = arithmetic.signer(bundle.private_key)
+        self.epochs = Epochs(bundle, keep, arithmetic.sender_keys)
         self._domain = domain_of(self.mission)
         self._lives: dict[int, _Life] = {}
         self._asked: dict[int, int] = {}
@@ -153,13 +121,13 @@ class Session:
             self.epochs.follow(clear.epoch)
         if clear.type in REQUESTS:
             life.requests[clear.type] = max(clear.sequence, life.requests.get(clear.type, 0))
-        return understood(clear, body)
+        return self.arithmetic.understood(clear, body)
 
     def _authentic(self, datagram: bytes, clear: Clear) -> bytes:
         """The body, if the group's secret and the sender's signature vouch for it."""
         keys = self.epochs.keys_of(clear.epoch, clear.sender, clear.boot)
-        body, claim = decrypted(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
-        if not self.verified(claim):
+        body, claim = self.arithmetic.decrypted(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
+        if not self.arithmetic.verified(claim):
             raise MalformedDatagramError("not signed by its sender")
         self.epochs.remember(clear.epoch, clear.sender, clear.boot, keys)
         return body
@@ -178,38 +146,3 @@ class Session:
         if life is None or request.boot > life.boot:
             return True
         return request.boot == life.boot and request.sequence >= life.requests.get(asking, 0)
-
-
-def domain_of(mission: bytes) -> bytes:
-    """What stands before all that is signed of a datagram of this mission."""
-    return _DATAGRAM + mission
-
-
-def decrypted(
-    keys: SenderKeys, datagram: bytes, clear: Clear, domain: bytes, public_key: bytes
-) -> tuple[bytes, Signed]:
-    """What was sealed, and the signature that is still to be verified.
-
-    Raises MalformedDatagramError if the keys do not open it.
-    """
-    signed, signature = datagram[:-SIGNATURE_BYTES], datagram[-SIGNATURE_BYTES:]
-    body = keys.decrypt(clear.sequence, signed[CLEAR.size :], signed[: CLEAR.size])
-    if body is None:
-        raise MalformedDatagramError("not authentic")
-    return body, Signed(public_key, keys.masked(clear.sequence, signature), domain + signed)
-
-
-def understood(clear: Clear, body: bytes) -> Opened:
-    """What a body says that was sealed. Raises MalformedDatagramError for one that no message has."""
-    request, block_signature = None, b""
-    if clear.type in REQUEST_OF:
-        if len(body) < REQUEST.size:
-            raise MalformedDatagramError("wrong length")
-        request, body = Request(*REQUEST.unpack_from(body)), body[REQUEST.size :]
-    if clear.type in WITH_BLOCK:
-        if len(body) < SIGNATURE_BYTES:
-            raise MalformedDatagramError("wrong length")
-        body, block_signature = body[:-SIGNATURE_BYTES], body[-SIGNATURE_BYTES:]
-    header = HEADER.pack(MAGIC, PLAIN_VERSION, clear.type, clear.sender, clear.sequence, len(body))
-    plain = header + body
-    return Opened(clear, plain, decode(plain), request, block_signature)

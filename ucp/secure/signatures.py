@@ -35,7 +35,7 @@ class BlockSignatures:
             return True
         session = self._session
         claim = claim_of_block(session.public_keys[block.agent_id], session.mission, block.block_data(), signature)
-        if not session.verified(claim):
+        if not session.arithmetic.verified(claim):
             return False
         self._by_hash[block.block_hash] = signature
         return True

@@ -14,7 +14,6 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from ucp.secure.envelope import SIGNATURE_BYTES
 
-HASH_BYTES = 32
 KEY_BYTES = 32
 NONCE_BYTES = 12
 PUBLIC_KEYS_KEPT = 1024
@@ -26,9 +25,11 @@ _EPOCH = b"UCP epoch\0"
 
 def expand(key: bytes, info: bytes, length: int) -> bytes:
     """HKDF-Expand (RFC 5869, Section 2.3)."""
-    output, block = b"", b""
-    for counter in range(1, -(-length // HASH_BYTES) + 1):
-        block = hmac.digest(key, block + info + bytes([counter]), "sha256")
+    output = block = hmac.digest(key, info + b"\1", "sha256")
+    counter = 1
+    while len(output) < length:
+        counter += 1
+        block = hmac.digest(key, block + info + bytes((counter,)), "sha256")
         output += block
     return output[:length]
 
@@ -63,8 +64,11 @@ class SenderKeys:
 
     def masked(self, sequence: int, signature: bytes) -> bytes:
         """A signature as it is on the air, or one from the air as it was made."""
-        keystream = expand(self._mask, _MASK + sequence.to_bytes(4, "big"), SIGNATURE_BYTES)
-        return (int.from_bytes(signature, "big") ^ int.from_bytes(keystream, "big")).to_bytes(SIGNATURE_BYTES, "big")
+        return (int.from_bytes(signature, "big") ^ self.keystream(sequence)).to_bytes(SIGNATURE_BYTES, "big")
+
+    def keystream(self, sequence: int) -> int:
+        """What masks the signature of the datagram with this sequence."""
+        return int.from_bytes(expand(self._mask, _MASK + sequence.to_bytes(4, "big"), SIGNATURE_BYTES), "big")
 
     def _nonce(self, sequence: int) -> bytes:
         return (self._iv ^ sequence).to_bytes(NONCE_BYTES, "big")

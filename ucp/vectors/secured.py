@@ -8,8 +8,9 @@ from ucp.messages import CARRY_A_BLOCK, TYPE_CODES, BlockAddResponse, CommitBloc
 from ucp.secure.agent import SecuredAgent, boot_of
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet
+from ucp.secure.datagrams import Request
 from ucp.secure.envelope import CLEAR, REQUEST_OF
-from ucp.secure.session import Request, Session
+from ucp.secure.session import Session
 from ucp.secure.suite import expand
 from ucp.vectors.hashes import BLOCKS
 from ucp.vectors.messages import BLOCK_HASH, MESSAGES

@@ -12,8 +12,9 @@ from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure.agent import boot_of
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import Bundle
+from ucp.secure.datagrams import Request
 from ucp.secure.envelope import read_clear
-from ucp.secure.session import Request, Session
+from ucp.secure.session import Session
 
 
 class CapturedKeys:

@@ -38,7 +38,7 @@ from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
     from harness.play.rogue.captured import CapturedKeys
-    from ucp.secure.session import Request
+    from ucp.secure.datagrams import Request
 
 REMEMBERED = 10_000
 """Datagrams that it keeps to replay."""

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from harness.play.simulation.rogue import VirtualRogue
     from harness.play.simulation.secured import Keys
     from ucp.secure.bundle import PublicKeys
+    from ucp.secure.suite import Signed
 
 ANY_LIFE = 0
 REMEMBERED = 10_000
@@ -74,10 +75,10 @@ class Clockwork:
         self._tracing = recorder.tracing
         self._anybody_is_unknown = scenario.has_wrong_agents or bool(scenario.foreign)
         """Whether anybody may do what no right agent of ours does."""
-        self._keys = self._keys_of_agents(watched=told or deliver_all) if scenario.security else None
+        self._keys = self._keys_of_agents(told=told) if scenario.security else None
         if self._keys is not None:
             self._initial_data = self._keys.mission.sealed_to_depot(initial_data)
-        anything_counts = self._anybody_is_unknown or (self._keys is not None and not self._keys.sampled)
+        anything_counts = self._anybody_is_unknown or (self._keys is not None and not self._keys.nothing_is_dropped)
         self._deliver_all = deliver_all = deliver_all or anything_counts
         self._now = 0.0
         self._generating = True
@@ -116,10 +117,15 @@ class Clockwork:
         """Those of the vehicles; None of a mission that is not secured."""
         return self._keys.mission.public if self._keys else None
 
-    def _keys_of_agents(self, *, watched: bool) -> "Keys":
+    @property
+    def verified(self) -> "Callable[[Signed], bool] | None":
+        """Whether a signature that may have been made here is good; None of a mission that is not secured."""
+        return self._keys.arithmetic.verified if self._keys else None
+
+    def _keys_of_agents(self, *, told: bool) -> "Keys":
         from harness.play.simulation.secured import Keys  # needs the extra `secure`
 
-        return Keys(self.scenario, self.seed, sampled=not (self._tracing or watched))
+        return Keys(self.scenario, self.seed, told=told)
 
     def _rogue_node(self) -> "VirtualRogue":
         from harness.play.simulation.rogue import VirtualRogue  # scapy takes long to import
@@ -167,7 +173,7 @@ class Clockwork:
     def _arrive(self, number: int, life: Incarnation, flight: InFlight) -> None:
         """A message reaches the agent."""
         sender, message = flight.sender, flight.message
-        if self._tracing or type(message) in ONLY_COUNTED:
+        if self._tracing or life.secured is not None or type(message) in ONLY_COUNTED:
             self._hear(number, life)
         if flight.sent_at < life.born_at:
             return
@@ -263,14 +269,13 @@ class Clockwork:
 
     def _say_sealed(self, number: int, life: Incarnation, agent: Secured) -> None:
         """Send what the agent has to say, sealed. Who comes upon the mission late has heard nothing of it."""
-        for sealed, sequence, message, plain, length in agent.sealed_to_send():
+        for sealed, sequence, message, plain in agent.sealed_to_send():
             if message is None:
-                assert sealed is not None, "a revocation is always there"
                 self._send_stray(number, life, sealed)
                 continue
-            life.bytes_sent += length
-            self._air.broadcast(self._now, number, sequence, message, length, plain, sealed)
-            if self._rogue is not None and sealed is not None:
+            life.bytes_sent += len(sealed)
+            self._air.broadcast(self._now, number, sequence, message, len(sealed), plain, sealed)
+            if self._rogue is not None:
                 self._rogue.hears_datagram(sealed, self._now)
 
     def _send_stray(self, number: int, life: Incarnation, datagram: bytes) -> None:

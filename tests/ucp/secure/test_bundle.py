@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from ucp.secure.block_signature import is_signed, sign_block
+from ucp.secure.block_signature import claim_of_block, sign_block
 from ucp.secure.bundle import KeySet, load_bundle, load_public, write_bundle, write_public
 from ucp.secure.keyfile import MAX_FILE_BYTES, KeyFileError
 from ucp.secure.revocation import Revocation, RevocationError
+from ucp.secure.suite import verify
 
 KEYS = KeySet.derived(b"a seed".ljust(32), (1, 7, 28), seals=True)
 BUNDLE = KEYS.bundle(7)
@@ -118,12 +119,12 @@ def test_a_block_is_its_makers_in_its_mission_alone() -> None:
     maker = Ed25519PrivateKey.from_private_bytes(BUNDLE.private_key)
     mission, public = KEYS.public.mission, KEYS.public.vehicles
     signature = sign_block(maker, mission, b"BD")
-    assert is_signed(signature, public[7], mission, b"BD")
-    assert not is_signed(signature, public[1], mission, b"BD")
-    assert not is_signed(signature, public[7], bytes(16), b"BD")
-    assert not is_signed(signature, public[7], mission, b"BE")
-    assert not is_signed(signature[:-1], public[7], mission, b"BD")
-    assert not is_signed(signature, b"short", mission, b"BD")
+    assert verify(claim_of_block(public[7], mission, b"BD", signature))
+    assert not verify(claim_of_block(public[1], mission, b"BD", signature))
+    assert not verify(claim_of_block(public[7], bytes(16), b"BD", signature))
+    assert not verify(claim_of_block(public[7], mission, b"BE", signature))
+    assert not verify(claim_of_block(public[7], mission, b"BD", signature[:-1]))
+    assert not verify(claim_of_block(b"short", mission, b"BD", signature))
 
 
 def test_a_revocation_is_the_authoritys_alone() -> None:

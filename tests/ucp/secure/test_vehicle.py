@@ -15,9 +15,10 @@ from tests.ucp.secure.swarm import KEYS, ROSTER, agent, completes_a_block, secre
 from tests.ucp.test_node import AgentUnderTest, mission
 from ucp.export import export_chain
 from ucp.mission import Mission, MissionError, parse_mission
-from ucp.secure.block_signature import is_signed
+from ucp.secure.block_signature import claim_of_block
 from ucp.secure.bundle import bundle_name, load_bundle, write_bundle
 from ucp.secure.revocation import Revocation
+from ucp.secure.suite import verify
 from ucp.secure.vehicle import secured_agent
 from ucp.store import SecuredState, Store
 
@@ -85,7 +86,7 @@ def test_an_export_has_the_makers_signatures() -> None:
     (exported,) = export_chain(one.state, 0, one.signatures)["blocks_to_be_committed"]
     (block,) = one.state.blocks_to_be_committed
     signature = base64.b64decode(exported["signature"])
-    assert is_signed(signature, KEYS.public.vehicles[1], KEYS.public.mission, block.block_data())
+    assert verify(claim_of_block(KEYS.public.vehicles[1], KEYS.public.mission, block.block_data(), signature))
 
 
 def test_a_secured_program_serves_and_leaves_no_secret(tmp_path: Path) -> None:

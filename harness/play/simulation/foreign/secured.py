@@ -11,7 +11,7 @@ from ucp.secure.agent import Outgoing
 from ucp.secure.bundle import Bundle
 from ucp.secure.envelope import REVOCATION, read_clear
 from ucp.secure.opening import Opener
-from ucp.trace import Recorded, in_base64
+from ucp.trace import in_base64
 
 HIDDEN = "(a secret)"
 _DIGITS = re.compile("[0-9a-fA-F]{8,}")
@@ -33,11 +33,11 @@ class SecuredForeignAgent(ForeignAgent):
                 self.messages_sent -= read_clear(data).type == REVOCATION  # which is none of its messages
                 opened = self._opener.open(data)
             except MalformedDatagramError:
-                yield Outgoing(data, length=len(data))
+                yield Outgoing(data)
                 continue
-            said, plain = opened.said, Recorded(in_base64(opened.plain), opened.said)
+            said = opened.said
             is_its_own = said.sender == self.agent_id
-            yield Outgoing(data, said.sequence, said.message if is_its_own else None, plain, len(data))
+            yield Outgoing(data, said.sequence, said.message if is_its_own else None, opened.recorded)
 
     def revoke(self, body: bytes, now: float) -> None:
         """The authority says whose keys are revoked."""
