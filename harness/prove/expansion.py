@@ -4,9 +4,12 @@ from collections.abc import Callable
 from itertools import chain
 from typing import NamedTuple
 
+from harness.prove.instant import Action
 from harness.prove.swarm import State, Swarm
 
 NumberOf = Callable[[State], int]
+_Following = dict[tuple[Action, ...], dict[int, None]]
+"""The states that may follow, in order, by what happens."""
 
 
 class Expansion(NamedTuple):
@@ -25,17 +28,22 @@ def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
     """All that can follow this state; `number_of` is asked for all of it, in order."""
     lossy = swarm.bounds.network == "lossy"
     ways = 0
+    losing_nothing: _Following = {}
     for actions in swarm.actions(state):
-        for after in swarm.after(state, actions, lossy):
-            ways += 1
-            number_of(after)
-    return quiet(swarm, state, number_of)._replace(ways=ways)
+        numbers = [number_of(after) for after in swarm.after(state, actions, lossy)]
+        ways += len(numbers)
+        if not lossy:
+            losing_nothing[actions] = dict.fromkeys(numbers)
+    return quiet(swarm, state, number_of, losing_nothing)._replace(ways=ways)
 
 
-def quiet(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
-    """Where the state goes on when nothing is lost and no new block comes."""
+def quiet(swarm: Swarm, state: State, number_of: NumberOf, known: _Following | None = None) -> Expansion:
+    """Where the state goes on when nothing is lost and no new block comes; some of that may be known."""
+    known = known or {}
     after = {
-        actions: dict.fromkeys(map(number_of, swarm.after(state, actions, lossy=False)))
+        actions: known[actions]
+        if actions in known
+        else dict.fromkeys(map(number_of, swarm.after(state, actions, lossy=False)))
         for actions in swarm.ending(state)
     }
     by_timer = []

@@ -58,6 +58,10 @@ _Choice = tuple[int, Started, tuple[tuple[int, int], ...], tuple[int, ...]]
 """Of one agent: its local state, what it has started, what it says, and what it has heard, in order."""
 
 
+_Outcome = tuple[Step, tuple[int, ...]]
+"""What becomes of an agent, and an order in which it hears what it does: positions in what reaches it."""
+
+
 class Instants:
     """What instants make of agents."""
 
@@ -65,7 +69,7 @@ class Instants:
         self._local = local
         self._bounds = bounds
         self._twice = "duplicate" in bounds.faults
-        self._outcomes: dict[tuple[int, Heard, bool, bool], list[tuple[Step, tuple[int, ...]]]] = {}
+        self._outcomes: dict[tuple[int, Heard, bool, bool], list[_Outcome]] = {}
         self._choices_of: dict[tuple[int, int, Started, tuple[tuple[int, int], ...], bool, bool], list[_Choice]] = {}
         self._places = range(bounds.agents)
 
@@ -106,7 +110,7 @@ class Instants:
                 if not said or not flawed.isdisjoint(there.locals):
                     silent.setdefault(there, way)
                     continue
-                for heard, answers, orders in self._hear(there, said, lossy, rounds):
+                for heard, answers, orders in self._hear(there, said, lossy, rounds, tell=tell):
                     if (heard, answers) not in after:
                         after[heard, answers] = Wave(way, said, orders) if tell else None
             waiting = after
@@ -127,13 +131,31 @@ class Instants:
         return Step(DEAD, (), ())
 
     def _hear(
-        self, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, rounds: int
+        self, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, rounds: int, *, tell: bool
     ) -> Iterator[tuple[Agents, tuple[tuple[int, int], ...], tuple[tuple[int, ...], ...]]]:
         answered = rounds >= ANSWERED
-        choices = [self._choices(place, there, said, lossy, answered) for place in self._places]
+        choices = [
+            [(self._settled(local, answered), there.started[place], (), ())]
+            if not tell and self._lets_be(local, place, said)
+            else self._choices(place, there, said, lossy, answered)
+            for place, local in enumerate(there.locals)
+        ]
         for chosen in product(*choices):
             locals_, started, answers, orders = zip(*chosen, strict=True)
             yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders
+
+    def _settled(self, local: int, answered: bool) -> int:
+        return self._local.settled(local) if answered and self._bounds.reduced else local
+
+    def _lets_be(self, local: int, place: int, said: tuple[tuple[int, int], ...]) -> bool:
+        """Whether nothing of what is said makes any difference to the agent at `place`, so that no order of it does."""
+        if local == DEAD:
+            return True
+        lets_be = self._local.lets_be
+        for sender, message in said:
+            if sender != place and not lets_be(local, self.name_of(sender, place), message):
+                return False
+        return True
 
     def _choices(
         self, place: int, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, answered: bool
@@ -169,14 +191,15 @@ class Instants:
         running = self._local.known[step.local].running
         return tuple(sorted(item for item in {**dict(before), **dict(step.started)}.items() if item[0] in running))
 
-    def _outcomes_of(self, local: int, heard: Heard, lossy: bool, answered: bool) -> list[tuple[Step, tuple[int, ...]]]:
+    def _outcomes_of(self, local: int, heard: Heard, lossy: bool, answered: bool) -> list[_Outcome]:
         """What can become of an agent that hears these, each with an order in which it does: positions in `heard`."""
         key = local, heard, lossy, answered
         outcomes = self._outcomes.get(key)
         if outcomes is None:
             names = self._local.first_names(local, [sender for sender, _ in heard])
             if names is None:
-                outcomes = list(self._work_out(local, heard, lossy, in_order=not answered))
+                counted = self._when_counting(local, heard, lossy)
+                outcomes = list(self._in_any_order(local, heard, lossy, not answered)) if counted is None else counted
             else:
                 called = tuple((names[sender - 2], message) for sender, message in heard)
                 outcomes = [
@@ -198,9 +221,33 @@ class Instants:
             self._outcomes[key] = outcomes
         return outcomes
 
-    def _work_out(
-        self, local: int, heard: Heard, lossy: bool, in_order: bool
-    ) -> Iterator[tuple[Step, tuple[int, ...]]]:
+    def _when_counting(self, local: int, heard: Heard, lossy: bool) -> list[_Outcome] | None:
+        """If the agent only counts what it hears, each of another sender: in which order makes no difference then.
+
+        None if it does more. Whether an answer is counted depends on what is no tally, and on whether its sender is in
+        the tally already (docs/proof.md).
+        """
+        hear, only_counts, lets_be = self._local.hear, self._local.only_counts, self._local.lets_be
+        matter, others = [], []
+        for position, (sender, message) in enumerate(heard):
+            if lets_be(local, sender, message):
+                others.append(position)
+            elif self._bounds.reduced and not self._twice and only_counts(local, sender, message):
+                matter.append(position)
+            else:
+                return None
+        if len({heard[position][0] for position in matter}) < len(matter):
+            return None
+        ways: dict[int, tuple[int, ...]] = {local: ()}
+        for position in matter:
+            sender, message = heard[position]
+            if not all(only_counts(at, sender, message) for at in ways):
+                return None
+            counted = {hear(at, sender, message).local: (*way, position) for at, way in ways.items()}
+            ways = ways | counted if lossy else counted
+        return [(Step(at, (), ()), (*way, *others)) for at, way in ways.items()]
+
+    def _in_any_order(self, local: int, heard: Heard, lossy: bool, in_order: bool) -> Iterator[_Outcome]:
         matter = self._that_matter(local, heard)
         copies = 2 if self._twice else 1
         earlier = {  # of the same sender
@@ -262,7 +309,7 @@ class Instants:
         return sorted(matter)
 
 
-def _is_covered(step: Step, outcomes: Sequence[tuple[Step, tuple[int, ...]]]) -> bool:
+def _is_covered(step: Step, outcomes: Sequence[_Outcome]) -> bool:
     """Whether another outcome is the same but for saying more: what it says more may be lost by everybody."""
     return any(
         other.local == step.local

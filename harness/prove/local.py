@@ -86,6 +86,8 @@ FLAWS_OF_STEPS = ("crash", "steps")
 """Kinds that the state after a step does not show."""
 NAMES_OF_OTHERS = ("voters", "reconcile_responders")
 """Parts of the state that are sets of other agents."""
+TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))
+"""Parts of the state in which answers are counted, and nothing else is done with them until a timer ends."""
 
 
 class ReductionError(Exception):
@@ -141,9 +143,11 @@ class LocalStates:
         self.messages: list[Message] = []
         self._message_numbers: dict[Message, int] = {}
         self._steps: dict[tuple[int, int, int], Step] = {}
+        self._lets_be: dict[tuple[int, int, int], bool] = {}
+        self._counts: dict[tuple[int, int, int], bool] = {}
         self._settled: dict[int, int] = {}
         self._renamed: dict[tuple[int, tuple[int, ...]], int] = {}
-        self.initial = {agent_id: self._intern(agent) for agent_id, agent in self._agents.items()}
+        self.initial = {agent_id: self._intern(agent, take(agent)) for agent_id, agent in self._agents.items()}
 
     def _agent(self, agent_id: int, right: bool = False, after_each: Callable[[], None] | None = None) -> Agent:
         """A new one; it traces its handler runs if `after_each` is to be called after each."""
@@ -199,6 +203,32 @@ class LocalStates:
     def renamed_back(self, local: int, names: Names) -> int:
         """The agent that was `renamed` by these names as it was."""
         return self.renamed(local, _back(names))
+
+    def lets_be(self, local: int, sender: int, message: int) -> bool:
+        """Whether it makes no difference at all that the agent hears this."""
+        if self.bounds.alike and not self.known[local].names_others:
+            sender = FIRST_OTHER  # it is one to the agent who says it
+        key = local, sender, message
+        lets_be = self._lets_be.get(key)
+        if lets_be is None:
+            step = self.hear(local, sender, message)
+            lets_be = self._lets_be[key] = step.local == local and not step.sent and not step.started
+        return lets_be
+
+    def only_counts(self, local: int, sender: int, message: int) -> bool:
+        """Whether all that the agent does when it hears this is to count it, or to let it be."""
+        key = local, sender, message
+        counts = self._counts.get(key)
+        if counts is None:
+            step = self.hear(local, sender, message)
+            before, after = self.known[local], self.known[step.local]
+            counts = self._counts[key] = (
+                not step.sent
+                and not step.started
+                and after.flaw is None
+                and all(after.snapshot[name] is part or name in TALLIES for name, part in before.snapshot.items())
+            )
+        return counts
 
     def end_timer(self, local: int, timer: int) -> Step:
         """A timer of the agent ends."""
@@ -279,11 +309,15 @@ class LocalStates:
         )
         for number, _ in started:
             agent.state.timers[number].start(RUNNING_S, 0.0)
+        after = take(agent, {} if boots else before.snapshot)
+        if flaw is None and all(after[name] is part for name, part in before.snapshot.items()):
+            self._loaded[before.agent_id] = after
+            return Step(local, sent, started)
         if self.bounds.reduced:
             if hears and any(self.timers[timer] == "voting" for timer, _ in started):
                 raise ReductionError("an agent begins a vote because of a message: try again with --whole")
             self._check_that_nothing_is_lost(before.snapshot, agent.state)
-        return Step(self._intern(agent, before, flaw, keep=not boots), sent, started)
+        return Step(self._intern(agent, after, before, flaw, keep=not boots), sent, started)
 
     def _has_completed(self, agent: Agent, completed: int, ordinal: int) -> None:
         """The agent had `completed` blocks before; what it has completed now is the `ordinal`th of all."""
@@ -351,12 +385,22 @@ class LocalStates:
             self.known.append(replace(known, snapshot=snapshot, anonymous=anonymous, names_others=names_others))
         return number
 
-    def _intern(self, agent: Agent, before: Known | None = None, flaw: Flaw | None = None, *, keep: bool = True) -> int:
-        """The number of the state that the agent is in; it was in `before`. `keep`: it will be given more inputs."""
+    def _intern(
+        self,
+        agent: Agent,
+        taken: Snapshot,
+        before: Known | None = None,
+        flaw: Flaw | None = None,
+        *,
+        keep: bool = True,
+    ) -> int:
+        """The number of the state that the agent is in, as it was `taken`; it was in `before`.
+
+        `keep`: it will be given more inputs.
+        """
         like = {} if before is None else before.snapshot
         snapshot = {
-            name: value if like.get(name, self) is value else self._part(name, value)
-            for name, value in take(agent, like).items()
+            name: value if like.get(name, self) is value else self._part(name, value) for name, value in taken.items()
         }
         if keep:
             self._loaded[agent.agent_id] = snapshot
@@ -401,7 +445,7 @@ class LocalStates:
         agent = self._agents[agent_id]
         self._loaded.pop(agent_id, None)
         put_back(agent, snapshot)
-        return self._intern(agent, None, flaw)
+        return self._intern(agent, take(agent), None, flaw)
 
     def _part(self, name: str, value: Any) -> Any:
         """The one part that stands for all that are equal."""

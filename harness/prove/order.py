@@ -62,13 +62,16 @@ class Order:
     def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[tuple[int, ...]]) -> Iterator[Places]:
         """All orders of the agents by what can be said of each; those of whom the same can be said in any."""
 
-        def alone(place: int) -> tuple[Any, ...]:
-            if locals_[place] == DEAD:
-                return (DEAD,)
-            bounds = [self._zones.bounds(zone, timer) for timer in timers[place]] if zone else []
-            return (self._local.known[locals_[place]].anonymous, *bounds)
-
-        looks = [alone(place) for place in range(len(locals_))]
+        bounds = self._zones.bounds(zone)
+        looks: list[tuple[Any, ...]] = [
+            (DEAD,)
+            if local == DEAD
+            else (self._local.known[local].anonymous, *(bounds[timer] for timer in timers[place] if zone))
+            for place, local in enumerate(locals_)
+        ]
+        if len(set(looks)) == len(looks):
+            yield tuple(sorted(range(len(locals_)), key=looks.__getitem__))
+            return
         named: list[list[set[int]]] = []
         if any(local != DEAD and self._local.known[local].names_others for local in locals_):
             named = [self._named(local, place) for place, local in enumerate(locals_)]
@@ -86,10 +89,22 @@ class Order:
         groups = [
             list(group) for _, group in groupby(sorted(range(len(locals_)), key=looks.__getitem__), looks.__getitem__)
         ]
-        matter = [bool(named) or (zone and timers[group[0]]) for group in groups]  # or they are one as the other
+        matter = [not self._change_places_freely(group, timers, named) for group in groups]
         orders = [permutations(group) if many else (tuple(group),) for group, many in zip(groups, matter, strict=True)]
         for chosen in product(*orders):
             yield tuple(place for group in chosen for place in group)
+
+    def _change_places_freely(
+        self, group: Sequence[int], timers: Sequence[tuple[int, ...]], named: Sequence[Sequence[set[int]]]
+    ) -> bool:
+        """Whether agents that look alike are one as the other: without timers, and in nobody's tally or in the same."""
+        if timers[group[0]]:
+            return False
+        return all(
+            not part if place in group else part.issuperset(group) or part.isdisjoint(group)
+            for place, parts in enumerate(named)
+            for part in parts
+        )
 
     def _named(self, local: int, place: int) -> list[set[int]]:
         """For each kind of tally whom the agent at `place` has in it, by their places."""

@@ -20,6 +20,7 @@ class Zones:
         self._numbers: dict[Matrix, int] = {}
         self._after: dict[tuple[int, tuple[int, ...], tuple[int, ...]], int | None] = {}
         self._tied: dict[int, list[tuple[int, ...]]] = {}
+        self._bounds: dict[int, list[tuple[int, ...]]] = {}
         self._permuted: dict[tuple[int, tuple[int, ...]], int] = {}
         self._coincidences: dict[tuple[int, tuple[int, ...]], int] = {}
         self._intern(((0,),))
@@ -51,10 +52,16 @@ class Zones:
             ]
         return tied
 
-    def bounds(self, zone: int, timer: int) -> tuple[int, ...]:
-        """Tells timers apart, whatever their places."""
-        matrix = self._matrices[zone]
-        return (matrix[timer][0], matrix[0][timer], *sorted(matrix[timer]), *sorted(row[timer] for row in matrix))
+    def bounds(self, zone: int) -> list[tuple[int, ...]]:
+        """Of each timer, from 1, what tells it apart, whatever their places."""
+        bounds = self._bounds.get(zone)
+        if bounds is None:
+            matrix = self._matrices[zone]
+            bounds = self._bounds[zone] = [
+                (row[0], matrix[0][timer], *sorted(row), *sorted(other[timer] for other in matrix))
+                for timer, row in enumerate(matrix)
+            ]
+        return bounds
 
     def after(self, zone: int, ended: tuple[int, ...], running: tuple[int, ...]) -> int | None:
         """The zone when all of `ended` have ended in one instant; None if they cannot.
