@@ -27,6 +27,8 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_AHRS
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
+NOT_ILL = mavlink.MAV_SYS_STATUS_GEOFENCE
+"""What a vehicle does not have is well all the same, as ArduPilot says it: MAVProxy tells of a breach of the fence else."""
 NOT_YET = mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_AHRS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 
@@ -55,7 +57,7 @@ def _health(vehicle: Autopilot) -> int:
     """The sensors that are well, and what depends on them."""
     low = any(failsafe.startswith("battery") for failsafe in vehicle.failsafes.acting)
     unwell = (0 if vehicle.ready else NOT_YET) | (mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if low else 0)
-    return int(SENSORS & ~unwell)
+    return int((SENSORS | NOT_ILL) & ~unwell)
 
 
 def sys_status(vehicle: Autopilot) -> Any:
