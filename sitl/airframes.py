@@ -125,3 +125,10 @@ def _table() -> dict[str, Airframe]:
 
 
 _TABLE = _table()
+
+
+def stacked(vehicle_type: VehicleType) -> list[str]:
+    """The names of all files of default parameters that frames of the type's usual program need beyond its own."""
+    program, own = BINARIES[vehicle_type], DEFAULTS[vehicle_type]
+    frames = (frame for frame in _TABLE.values() if frame.program == program)
+    return sorted({name for frame in frames for name in frame.defaults} - {own})

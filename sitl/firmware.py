@@ -4,8 +4,9 @@ What the firmware server has, at VEHICLE/RELEASE/BOARD/: the binary, statically 
 names the commit and the version that it was built from. RELEASE is stable, beta, latest, or stable-4.6.3; BOARD is
 SITL_x86_64_linux_gnu or SITL_arm_linux_gnueabihf, and there are no others (ArduPilot's Tools/scripts/board_list.py): an
 aarch64 takes the latter, if it runs programs of 32 bits. The vehicle's default parameters are taken from ArduPilot's
-source tree at that very commit: a tag would not do, for `latest` has none, and the binary of 4.6.3 was built from the
-commit before its tag. A mirror (`base`) replaces both hosts; the paths stay as they are.
+source tree at that very commit, and those that its frames stack on top: a tag would not do, for `latest` has none, and
+the binary of 4.6.3 was built from the commit before its tag. A mirror (`base`) replaces both hosts; the paths stay as
+they are.
 
 This was written without a way to the server, from ArduPilot's build scripts and from files and listings of the server
 that others have published. Not verified, hence not relied on: which validators the server sends (a download is resumed
@@ -30,7 +31,7 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
-from sitl.airframes import BINARIES, DEFAULTS
+from sitl.airframes import BINARIES, DEFAULTS, stacked
 from sitl.download import STALL_S, DownloadError, NotThereError, UnreachableError, download, fetch_text
 from sitl.installed import CURRENT, File, Installed, Manifest, cache
 from sitl.vehicle import VehicleError, VehicleType
@@ -120,6 +121,8 @@ def install(
 ) -> Outcome:
     """Fetch a vehicle's binary and default parameters into the cache, unless they are there, and make them current.
 
+    What its frames need goes with it, as far as that version has it.
+
     `version` is `stable`, `beta`, `latest` or a number such as 4.6.3, which asks no server if it is here. An install
     that was interrupted, in whatever way, goes on where it stopped.
 
@@ -146,10 +149,8 @@ def install(
             return _use(Installed(vehicle, place), already=True)
         part = home / f".{build.name}.part"
         part.mkdir(exist_ok=True)
-        files = {
-            BINARIES[vehicle]: server.fetch_binary(part, watcher),
-            DEFAULTS[vehicle]: server.fetch_parameters(part, build),
-        }
+        binary = server.fetch_binary(part, watcher)
+        files = {BINARIES[vehicle]: binary, **server.fetch_parameters(part, build)}
         fetched_at = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
         Manifest(vehicle, build.version, build.commit, fetched_at, files).write(part)
         shutil.rmtree(place, ignore_errors=True)  # damaged
@@ -201,11 +202,25 @@ class _Server:
             _refuse_what_does_not_run(path)
         return File.of(path, url)
 
-    def fetch_parameters(self, directory: Path, build: _Build) -> File:
-        """The default parameters at the commit of the binary."""
-        path = directory / DEFAULTS[self._vehicle]
-        for name in _PARAMETERS[self._vehicle]:
-            url = f"{self._source}/ArduPilot/ardupilot/{build.commit}/{_AUTOTEST}/{name}"
+    def fetch_parameters(self, directory: Path, build: _Build) -> dict[str, File]:
+        """The vehicle's default parameters at the commit of the binary, and those of its frames that there are."""
+        own = DEFAULTS[self._vehicle]
+        places = {own: _PARAMETERS[self._vehicle]}
+        for name in stacked(self._vehicle):
+            places[name] = f"default_params/{name}", f"models/{name}"
+        fetched = {name: self._fetch_parameters(directory / name, build, paths) for name, paths in places.items()}
+        files = {name: file for name, file in fetched.items() if file is not None}
+        if own not in files:
+            raise DownloadError(f"{self._tree(build)}/{places[own][-1]} does not exist: install another --version")
+        return files
+
+    def _tree(self, build: _Build) -> str:
+        return f"{self._source}/ArduPilot/ardupilot/{build.commit}/{_AUTOTEST}"
+
+    def _fetch_parameters(self, path: Path, build: _Build, places: tuple[str, ...]) -> File | None:
+        """A file of parameters, from the first place where it is; None if it is in none."""
+        for place in places:
+            url = f"{self._tree(build)}/{place}"
             try:
                 text = fetch_text(url, TEXT_LIMIT, self._stall_s)
             except NotThereError:
@@ -214,7 +229,7 @@ class _Server:
                 raise DownloadError(f"{url} has no ArduPilot parameters in it: does a proxy answer for it?")
             path.write_text(text, encoding="utf-8")
             return File.of(path, url)
-        raise DownloadError(f"{url} does not exist: install another --version")
+        return None
 
     def _no_such_version(self) -> RequestError:
         """The error for a release that is not there, with those that are if the server lists them."""

@@ -2,6 +2,7 @@
 
     $XDG_CACHE_HOME/ucp-harness/sitl/copter/4.6.3/arducopter      (XDG Base Directory Specification; else ~/.cache)
                                                   copter.parm     ArduPilot's default parameters of that commit
+                                                  copter-hexa.parm, ...                    and those of its frames
                                                   manifest.json   `Manifest`
                                            current -> 4.6.3       the one that runs use
 
@@ -93,7 +94,7 @@ class Installed:
         """What is no longer as it was fetched, or None. Reads every file."""
         if self.manifest is None:
             return f"{MANIFEST} is missing or cannot be read"
-        for name in (self.binary.name, DEFAULTS[self.vehicle]):
+        for name in dict.fromkeys((self.binary.name, DEFAULTS[self.vehicle], *self.manifest.files)):
             recorded = self.manifest.files.get(name)
             try:
                 if recorded is None or sha256(self.directory / name) != recorded.sha256:

@@ -28,7 +28,7 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
 NOT_ILL = mavlink.MAV_SYS_STATUS_GEOFENCE
-"""What a vehicle does not have is well all the same, as ArduPilot says it: MAVProxy tells of a breach of the fence else."""
+"""What a vehicle lacks is well, as ArduPilot has it, too: MAVProxy tells of a breach of the fence otherwise."""
 NOT_YET = mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_AHRS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 

@@ -21,6 +21,7 @@ from sitl.ardupilot import ArduPilot
 from sitl.download import DownloadError, NotThereError, StayEncrypted, UnreachableError, download, fetch_text
 from sitl.firmware import CacheError, Outcome, RequestError, install
 from sitl.installed import Installed, all_installed, cache, current
+from sitl.setup import Setup
 from sitl.vehicle import NoBinaryError, UnusableBinaryError, VehicleError
 from tests.sitl.firmware_server import (
     BINARY,
@@ -593,3 +594,18 @@ def test_what_is_installed_and_damaged_does_not_fly(server: FirmwareServer, envi
     install_copter(server, environ).installed.binary.write_bytes(BINARY[:-1])
     with pytest.raises(UnusableBinaryError, match="is damaged, arducopter is not the file that was fetched"):
         ArduPilot.find(None, environ)
+
+
+def test_what_frames_need_comes_along_as_far_as_that_version_has_it(
+    server: FirmwareServer, environ: dict[str, str]
+) -> None:
+    tree = PARAMETERS_PATH.removesuffix("default_params/copter.parm")
+    for name in ("default_params/copter-hexa.parm", "models/copter-single.parm"):
+        server.files[f"{tree}{name}"] = Resource(b"FRAME_CLASS 2\n")
+    directory = install("copter", "stable", environ, Onlooker(), server.url).installed.directory
+    hexa = ArduPilot.find(directory / "arducopter", {}, "copter", Setup(frame="hexa"))
+    assert [path.name for path in hexa.defaults] == ["copter.parm", "copter-hexa.parm"]
+    assert ArduPilot.find(directory / "arducopter", {}, "copter", Setup(frame="octa")).missing == ("copter-octa.parm",)
+    assert (directory / "copter-single.parm").exists()
+    (directory / "copter-hexa.parm").write_text("FRAME_CLASS 3\n")
+    assert Installed("copter", directory).damage == "copter-hexa.parm is not the file that was fetched (SHA-256)"
