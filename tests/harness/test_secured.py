@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
 from harness.packets.files import read_captures
 from harness.play.progress import Silent
 from harness.run.run import run
@@ -22,12 +20,6 @@ def dropped(run: Simulated) -> set[str]:
 
 def secured(plain: Scenario) -> Scenario:
     return plain.model_copy(update={"security": Security()})
-
-
-@pytest.mark.parametrize("name", ["attrition", "late_joiner", "loss_30", "rolling_partitions"])
-def test_a_secured_mission_has_the_chains_of_the_plain_one(name: str) -> None:
-    plain = load_scenario(SCENARIOS / f"{name}.yaml")
-    assert simulate(secured(plain), 1).result.chains == simulate(plain, 1).result.chains
 
 
 def test_a_sweep_that_delivers_what_matters_is_the_run_that_delivers_all() -> None:
