@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.failsafes import WIND, WIND_FROM, Failsafe, Failsafes
 from sitl.kinematics import Course, Fall, Motion, Point, Rest, Segment, end_of
-from sitl.models import MODELS
+from sitl.models import AT_ONCE, MODELS, MotionModel
 from sitl.modes import BOOT_MODES, MODES
 from sitl.vehicle import READY_S, Home, VehicleType
 
@@ -62,12 +62,15 @@ class Autopilot:
         self.mission: Sequence[Any] = ()  # MISSION_ITEM_INTs; the first is home, as ArduPilot has it
         self.current_item = 0
         self.failsafes = Failsafes(vehicle_type)
-        self._model = MODELS[vehicle_type]
         self._speed_ms = self._model.cruise_ms
         self._in_mission = False
         self._then: Callable[[], None] = self._stand
         self._goal: tuple[Point, float] | None = None  # in GUIDED: where it was sent, and how fast
         self._course = Course(0.0, [Rest(Motion(yaw_rad=math.radians(home.heading_deg)))])
+
+    @property
+    def _model(self) -> MotionModel:
+        return (MODELS if self.mode == "AUTO" else AT_ONCE)[self.vehicle_type]
 
     @property
     def has_booted(self) -> bool:
@@ -148,7 +151,7 @@ class Autopilot:
         return ACCEPTED
 
     def take_off(self, altitude_m: float) -> int:
-        """MAV_CMD_NAV_TAKEOFF of a copter; what it does then, until told otherwise, is the model's `idle`."""
+        """MAV_CMD_NAV_TAKEOFF of a copter."""
         if self.vehicle_type != "copter":
             return self._refuse(f"Take-off refused: a {self.vehicle_type} does not take off in GUIDED")
         if not self.armed:
@@ -159,7 +162,7 @@ class Autopilot:
             return self._refuse("Take-off refused: already flying")
         if not 0 < altitude_m <= MAX_ALTITUDE_M:
             return self._refuse("Take-off refused: no such altitude")
-        self._lift_off(altitude_m, self._idle)
+        self._ascend(altitude_m)
         return ACCEPTED
 
     def set_mode(self, number: float) -> int:
@@ -265,7 +268,7 @@ class Autopilot:
             case "AUTO" if self.airborne or self.vehicle_type != "copter":
                 self._begin_item(max(1, self.current_item))
             case "TAKEOFF" if not self.airborne:
-                self._lift_off(self.take_off_altitude_m, self._idle)
+                self._ascend(self.take_off_altitude_m)
             case "RTL":
                 self._return_home(self._stay)
             case "LAND" if self.airborne:
@@ -273,12 +276,9 @@ class Autopilot:
             case _:
                 self._stay()
 
-    def _lift_off(self, altitude_m: float, then: Callable[[], None]) -> None:
+    def _ascend(self, altitude_m: float) -> None:
         self.airborne = True
-        self._begin(self._model.take_off(self.motion, altitude_m), then)
-
-    def _idle(self) -> None:
-        self._begin(self._model.idle(self.motion), self._stand)
+        self._begin(self._model.ascent(self.motion, altitude_m), self._stand)
 
     def _stay(self) -> None:
         if self.airborne:
@@ -340,14 +340,15 @@ class Autopilot:
         self.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {number} {ITEM_NAMES[item.command]}")
         place = self.place(item.frame, item.x, item.y, item.z)
         match item.command:
-            case mavlink.MAV_CMD_NAV_TAKEOFF if not self.airborne:
-                self._lift_off(item.z, self._item_reached)
-            case mavlink.MAV_CMD_NAV_TAKEOFF:  # again, after a pause
+            case mavlink.MAV_CMD_NAV_TAKEOFF:
+                self.airborne = True
                 self._begin(self._model.take_off(self.motion, item.z), self._item_reached)
             case mavlink.MAV_CMD_NAV_WAYPOINT:
                 self._go_on_to(place, number)
             case mavlink.MAV_CMD_NAV_LOITER_TIME:
-                self._begin(self._model.loiter(self.motion, place, self._speed_ms, item.param1), self._item_reached)
+                after = self._place_after(number)
+                circling = self._model.loiter(self.motion, place, self._speed_ms, item.param1, after)
+                self._begin(circling, self._item_reached)
             case mavlink.MAV_CMD_NAV_LOITER_UNLIM:
                 self._begin(self._model.loiter(self.motion, place, self._speed_ms, math.inf), self._item_reached)
             case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
@@ -372,6 +373,12 @@ class Autopilot:
                     continue
             return None
         return None
+
+    def _place_after(self, number: int) -> Point | None:
+        """Where the next item after this one that is a place leads."""
+        places = (item for item in self.mission[number + 1 :] if item.command != mavlink.MAV_CMD_DO_CHANGE_SPEED)
+        item = next(places, None)
+        return None if item is None else self.place(item.frame, item.x, item.y, item.z)
 
     def _item_reached(self) -> None:
         number = self.current_item

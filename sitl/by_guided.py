@@ -11,18 +11,16 @@ from collections.abc import Sequence
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.by_mission import MissionFlight
+from sitl.kinematics import Point
 from sitl.link import Link
 from sitl.mission import SPEED_TYPES, on_earth
 from sitl.procedure import Commander, HopelessError, Step
-from sitl.route import Waypoint, limit_s
+from sitl.route import Waypoint, is_near, landing_begins, limit_s
 from sitl.take_off import TakeOff
 from sitl.vehicle import VehicleType
 
 GUIDED = Step("mode GUIDED")
 
-NEAR_M: dict[VehicleType, float] = {"copter": 2.0, "plane": 120.0, "rover": 5.0}
-"""How close is there: WPNAV_RADIUS, a circle of WP_LOITER_RAD and half as much, WP_RADIUS and a little more."""
-NEAR_UP_M = 10.0
 STANDING_MS = 0.3
 POSITION_ONLY = (
     mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
@@ -48,8 +46,7 @@ class GuidedFlight:
         self._home = link.home
         self._take_off: TakeOff | None = TakeOff(link, vehicle_type, waypoints[0].place.up_m)
         self._landing: MissionFlight | None = None
-        lands = vehicle_type == "plane" and waypoints[-1].kind == "land"
-        self._landing_begins = len(waypoints) - 2 if lands else None  # waypoint
+        self._landing_begins = landing_begins(waypoints, vehicle_type)
         self._done = 0 if vehicle_type == "rover" else 1  # waypoints; the first is the take-off
         self._sent_to: int | None = None  # the waypoint that the vehicle was last sent to
         self._there_s: float | None = None  # since when it has been there
@@ -103,12 +100,11 @@ class GuidedFlight:
         return self._to.state.time_s - self._there_s >= waypoint.seconds
 
     def _is_at(self, waypoint: Waypoint) -> bool:
-        position, near_m = self._to.state.position, NEAR_M[self._to.vehicle_type]
+        position = self._to.state.position
         if position is None:
             return False
-        north_m, east_m, _ = self._home.metres_to(position.lat_deg, position.lon_deg, position.alt_m)
-        level = self._to.vehicle_type == "rover" or abs(position.relative_alt_m - waypoint.place.up_m) <= NEAR_UP_M
-        return level and math.dist((north_m, east_m), waypoint.place[:2]) <= near_m
+        place = Point(*self._home.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
+        return is_near(place, waypoint, self._to.vehicle_type)
 
     def _on_its_way(self) -> bool:
         """Whether the vehicle has taken the place that it was sent; a plane says so, of others one sees it."""

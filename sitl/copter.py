@@ -1,9 +1,10 @@
-"""How a copter moves. The figures are ArduCopter's defaults, parameters by name."""
+"""How a copter moves. The figures are ArduCopter's defaults, parameters by name, or measured with ArduCopter 4.7."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from sitl.kinematics import NEAR_M, Line, Motion, Point, Rest, Segment, end_of
 
@@ -14,13 +15,18 @@ ACCEL_MS2 = 2.5  # WPNAV_ACCEL
 VERTICAL_ACCEL_MS2 = 1.0  # WPNAV_ACCEL_Z
 LAND_SLOWLY_M = 10.0  # LAND_ALT_LOW
 LANDING_MS = 0.5  # LAND_SPEED
-SPIN_UP_S = 3.0  # from arming to the first movement, as measured with 4.7
-TURNING_S = 1.2  # before it leaves a place: with 4.7 none in GUIDED, 2 s in AUTO, where it smooths (WPNAV_JERK)
-SETTLING_S = 3.0  # before it comes down, as measured with 4.7
+TURNING_S = 1.2  # before it leaves a place: measured, 1 s in GUIDED and 2 s in AUTO, where it smooths (WPNAV_JERK)
+SPIN_UP_S = 3.0  # from arming to the first movement, measured
 
 
+@dataclass(frozen=True)
 class Copter:
-    """The `MotionModel` of a copter: it stops at every place, and goes straight from one to the next."""
+    """The `MotionModel` of a copter: it stops at every place, and goes straight from one to the next.
+
+    `settling_s` goes by before it comes down; what is given is measured, in AUTO.
+    """
+
+    settling_s: float = 3.0
 
     cruise_ms = CRUISE_MS
 
@@ -43,14 +49,16 @@ class Copter:
         accel = min(limit * length_m / part_m for part_m, _, limit in limits)
         return [Rest(start, TURNING_S), Line(start, place, speed, accel)]
 
-    def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
+    def loiter(
+        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+    ) -> Sequence[Segment]:
         there = self.go_to(start, place, speed_ms)
         return [*there, Rest(end_of(there), seconds)]
 
     def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
         there = self.go_to(start, place._replace(up_m=start.up_m), CRUISE_MS)
         above = end_of(there)
-        segments: list[Segment] = [*there, Rest(above, SETTLING_S)]
+        segments: list[Segment] = [*there, Rest(above, self.settling_s)]
         if above.up_m > LAND_SLOWLY_M:
             low = place._replace(up_m=LAND_SLOWLY_M)
             segments.append(Line(above, low, DESCENT_MS, VERTICAL_ACCEL_MS2, to_ms=LANDING_MS))
@@ -58,6 +66,7 @@ class Copter:
         segments.append(Line(end_of(segments), ground, LANDING_MS, VERTICAL_ACCEL_MS2, LANDING_MS, LANDING_MS))
         return [*segments, Rest(end_of(segments), 0.0)]
 
-    def idle(self, start: Motion) -> Sequence[Segment]:
+    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
         """It stays where it took off."""
-        return [Rest(start, math.inf)]
+        climb = self.take_off(start, altitude_m)
+        return [*climb, Rest(end_of(climb), math.inf)]

@@ -195,6 +195,17 @@ class Course:
         return segment.at(min(max(0.0, now_s - self._begin_s[index]), segment.duration_s))
 
 
+class Part:
+    """A part of a course, from `begin_s` to `end_s` on its clock."""
+
+    def __init__(self, course: Course, begin_s: float, end_s: float) -> None:
+        self._course, self._begin_s = course, begin_s
+        self.duration_s = end_s - begin_s
+
+    def at(self, since_s: float) -> Motion:
+        return self._course.at(self._begin_s + since_s)
+
+
 def end_of(segments: Sequence[Segment]) -> Motion:
     """The motion where the last of these segments ends."""
     return segments[-1].at(segments[-1].duration_s)

@@ -27,14 +27,27 @@ class MotionModel(Protocol):
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
         """A plane comes back to the line that leads there from `before`, the place that it was sent to before."""
 
-    def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
-        """Stay at `place` for so many seconds after having come there, which may be infinite."""
+    def loiter(
+        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+    ) -> Sequence[Segment]:
+        """Stay at `place` for so many seconds after having come there, which may be infinite.
+
+        A plane circles on until it heads for `after`, the place that it is sent to then.
+        """
 
     def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
         """Come down at `place`, and stand there; `before` as in `go_to`."""
 
-    def idle(self, start: Motion) -> Sequence[Segment]:
-        """What it does in the air when it has taken off and has been told nothing since, for ever."""
+    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        """Take off by itself, without a mission, and do what it does then when it is told nothing, for ever."""
 
 
 MODELS: dict[VehicleType, MotionModel] = {"copter": Copter(), "plane": Plane(), "rover": Rover()}
+"""As they fly missions, in AUTO."""
+
+AT_ONCE: dict[VehicleType, MotionModel] = {
+    "copter": Copter(settling_s=0.0),
+    "plane": Plane(),
+    "rover": Rover(start_s=0.0),
+}
+"""As they do what they are told outside of a mission: in GUIDED, and when they are to land."""

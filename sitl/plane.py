@@ -19,20 +19,28 @@ OVER_GROUND = (
     1.06  # metres over the ground for each that its airspeed sensor counts, measured: the air is thin up there
 )
 CLIMB_MS = 5.0  # TECS_CLMB_MAX
-LOITER_RADIUS_M = 94.0  # clockwise; measured, of WP_LOITER_RAD 80, which grows in thin air
-JOIN_RAD = 0.65  # measured: how far to the left of straight ahead it leaves a place that it is to circle
+LOITER_RADIUS_M = 96.0  # clockwise, at CRUISE_MS; measured, of WP_LOITER_RAD 80, which grows in thin air
+LOITER_RADIUS_M_PER_MS = 1.25  # measured: so much smaller for each metre per second less
+ROLL_S = 1.4  # measured: before it turns to a circle
+SWING_M = 120.0  # measured: how far before a place it begins to swing out for its circle
+JOIN_RAD = 1.1  # measured: how far to the left of straight ahead it leaves a place that it is to circle
 REACHED_M = 40.0  # measured: 20 to 28, and 52 before it turns round
 TURN_RADIUS_M = 55.0  # measured
 WIDE_TURN_RADIUS_M, WIDE_TURN_RAD = 110.0, 1.0  # measured: small turns are flown less tightly
-RATHER_RIGHT_M = 20.0  # measured: where it is about as far, it turns to the right
+RATHER_RIGHT_M, STILL_RIGHT_M = (
+    20.0,
+    80.0,
+)  # measured: where it is about as far, it turns to the right, if it does already
 LINE_AHEAD_M = 150.0  # how far ahead, on the line between two places, it aims at to come back to it
+HEADING_RAD = math.radians(10.0)  # as near as it heads for the next place when it leaves a circle
 LOW_M = 10.0  # low enough to land from a circle of LOITER_RADIUS_M
 
 SPOOL_UP_S = 0.7  # the take-off, measured
 RUNWAY_ACCEL_MS2 = 8.0
 RUNWAY_M = CRUISE_MS**2 / (2 * RUNWAY_ACCEL_MS2)  # from standing to flying
 TAKE_OFF_CLIMB_MS, TAKE_OFF_MS = 10.0, 26.5
-LEVEL_OFF_M = 40.0  # straight on, before it turns
+LEVEL_M = 25.0  # in its mode TAKEOFF it turns once it is so high,
+AHEAD_M = 200.0  # TKOFF_DIST: to circle a place so far ahead of where it stood
 
 LANDING_MS = 17.5  # the landing, measured
 ROLL_OUT_M, PAST_M = 60.0, 9.0  # how far before its place it touches down, and behind it stands
@@ -45,29 +53,39 @@ class Plane:
     cruise_ms = CRUISE_MS
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
-        run = Line(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
-        path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
-        path.straight(TAKE_OFF_MS * max(0.0, altitude_m - start.up_m) / TAKE_OFF_CLIMB_MS)
-        return [Rest(start, SPOOL_UP_S), run, *path.segments]
+        run, path = _lift_off(start, altitude_m, altitude_m)
+        return [*run, *path.segments]
+
+    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        """As in its mode TAKEOFF: to the left side of a circle ahead, and round that for ever."""
+        run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
+        place = _ahead(start, AHEAD_M)._replace(up_m=altitude_m)
+        path.straight_to(_on_circle(place, LOITER_RADIUS_M, start.yaw_rad - math.pi / 2))
+        circle = _Path(end_of(path.segments), CRUISE_MS * OVER_GROUND, altitude_m, TAKE_OFF_CLIMB_MS)
+        circle.arc(place[:2], math.inf)
+        return [*run, *path.segments, *circle.segments]
 
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
         return _back_and_on(start, place, before, speed_ms * OVER_GROUND, CLIMB_MS, REACHED_M)
 
-    def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
+    def loiter(
+        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+    ) -> Sequence[Segment]:
         """Clockwise round the place, for so many seconds from when it has come to the circle.
 
-        From inside it crosses the circle straight; from outside it flies from one clockwise circle, the turn that
-        begins here, along the tangent to the other.
+        From inside it crosses the circle straight; from outside it flies towards the place, and passes it on its left.
         """
-        path = _Path(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS)
-        if math.dist(start.point[:2], place[:2]) < LOITER_RADIUS_M:
-            path.straight_to(_on_circle(place, start.yaw_rad - JOIN_RAD))
+        path, radius_m = _Path(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS), loiter_radius_m(speed_ms)
+        if math.dist(start.point[:2], place[:2]) < radius_m:
+            path.straight_to(_on_circle(place, radius_m, start.yaw_rad - JOIN_RAD))
         else:
-            turning = _beside(start, LOITER_RADIUS_M)
-            north, east = place.north_m - turning[0], place.east_m - turning[1]
-            path.arc(turning, (math.atan2(east, north) - start.yaw_rad) % math.tau)
-            path.straight(math.hypot(north, east))
-        path.arc(place[:2], seconds * path.speed_ms / LOITER_RADIUS_M)
+            if not start.yaw_rate_rads:
+                path.straight(ROLL_S * path.speed_ms)
+            path.fly_by(place, SWING_M)
+            path.straight_to(_on_circle(place, radius_m, path.bearing_rad(place) - math.pi / 2))
+        path.arc(place[:2], seconds * path.speed_ms / radius_m)
+        if after is not None and math.isfinite(seconds):
+            path.arc(place[:2], _until_heading_for(after, place, end_of(path.segments)))
         return path.segments
 
     def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
@@ -83,8 +101,24 @@ class Plane:
         stand = _ahead(ground, ROLL_OUT_M + PAST_M)
         return [*glide, Line(ground, stand, LANDING_MS, ROLL_OUT_ACCEL_MS2, from_ms=LANDING_MS)]
 
-    def idle(self, start: Motion) -> Sequence[Segment]:
-        return self.loiter(start, start.point, CRUISE_MS, math.inf)
+
+def _until_heading_for(there: Point, centre: Point, here: Motion) -> float:
+    """How far, in radians, to go on round a circle until it heads for a place, as near as ArduPlane wants it.
+
+    The place may be so near that it never does, which is as good at once.
+    """
+    away_m, radius_m = math.dist(centre[:2], there[:2]), math.dist(centre[:2], here.point[:2])
+    if away_m < 1.05 * radius_m:
+        return 0.0
+    bearing_rad = math.atan2(there.east_m - centre.east_m, there.north_m - centre.north_m)
+    leaves_rad = bearing_rad - math.acos(radius_m / away_m) - HEADING_RAD
+    turn_rad = (leaves_rad - math.atan2(here.east_m - centre.east_m, here.north_m - centre.north_m)) % math.tau
+    return 0.0 if turn_rad > math.tau - 2 * HEADING_RAD else turn_rad
+
+
+def loiter_radius_m(speed_ms: float) -> float:
+    """Of the circle that it flies round a place at this speed through the air."""
+    return LOITER_RADIUS_M + LOITER_RADIUS_M_PER_MS * (speed_ms - CRUISE_MS)
 
 
 def _duration_s(segments: Sequence[Segment]) -> float:
@@ -109,10 +143,39 @@ class _Path:
     def arc(self, centre: tuple[float, float], turn_rad: float) -> None:
         self._add(Arc(self._end, centre, turn_rad, self.speed_ms))
 
+    def fly_by(self, place: Point, reached_m: float) -> None:
+        """Turn towards `place`, whichever way is shorter, and go straight until it is `reached_m` away."""
+        here = self._end
+        if math.dist(here.point[:2], place[:2]) <= max(reached_m, NEAR_M):
+            self.straight(0.0)
+            return
+        turn = _turn_towards(here, place, WIDE_TURN_RADIUS_M)
+        if turn is None or abs(turn.turn_rad) > WIDE_TURN_RAD:
+            turn = _turn_towards(here, place, TURN_RADIUS_M)
+        if turn is None:  # neither way: it is beside and too close, so first get away from it
+            self.straight(2 * TURN_RADIUS_M)
+            self.fly_by(place, reached_m)
+            return
+        if abs(turn.turn_rad) > NEAR_M:
+            self.arc(turn.centre, turn.turn_rad)
+        self.straight(max(0.0, turn.ahead_m - reached_m))
+
+    def bearing_rad(self, place: Point) -> float:
+        """Of a place as seen from the end of the path."""
+        return math.atan2(place.east_m - self._end.east_m, place.north_m - self._end.north_m)
+
     def _add(self, level: Segment) -> None:
         self.segments.append(Climbing(level, self._up_m, self._rate_ms))
         if math.isfinite(level.duration_s):
             self._end = end_of(self.segments)
+
+
+def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[Sequence[Segment], _Path]:
+    """The run, and the climb to `altitude_m` begun: straight on up to `straight_to_m`."""
+    run = Line(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
+    path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
+    path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
+    return [Rest(start, SPOOL_UP_S), run], path
 
 
 def _back_and_on(
@@ -127,20 +190,8 @@ def _back_and_on(
 
 
 def _fly_by(start: Motion, place: Point, speed_ms: float, rate_ms: float, reached_m: float) -> Sequence[Segment]:
-    """Turn towards `place`, whichever way is shorter, and go straight until it is `reached_m` away."""
     path = _Path(start, speed_ms, place.up_m, rate_ms)
-    if math.dist(start.point[:2], place[:2]) > max(reached_m, NEAR_M):
-        turn = _turn_towards(start, place, WIDE_TURN_RADIUS_M)
-        if turn is None or abs(turn.turn_rad) > WIDE_TURN_RAD:
-            turn = _turn_towards(start, place, TURN_RADIUS_M)
-        if turn is None:  # neither way: it is beside and too close, so first get away from it
-            path.straight(2 * TURN_RADIUS_M)
-            return [*path.segments, *_fly_by(end_of(path.segments), place, speed_ms, rate_ms, reached_m)]
-        if abs(turn.turn_rad) > NEAR_M:
-            path.arc(turn.centre, turn.turn_rad)
-        path.straight(max(0.0, turn.ahead_m - reached_m))
-    else:
-        path.straight(0.0)
+    path.fly_by(place, reached_m)
     return path.segments
 
 
@@ -168,7 +219,8 @@ def _turn_towards(start: Motion, place: Point, radius_m: float) -> _Turn | None:
             turn_rad = 0.0
         ways.append(_Turn(centre, side * turn_rad, math.sqrt(away_m**2 - radius_m**2)))
     lengths_m = {way: abs(way.turn_rad) * radius_m + way.ahead_m for way in ways}
-    return min(ways, key=lambda way: lengths_m[way] + (0.0 if way.turn_rad >= 0 else RATHER_RIGHT_M), default=None)
+    right_m = STILL_RIGHT_M if start.yaw_rate_rads > 0 else RATHER_RIGHT_M
+    return min(ways, key=lambda way: lengths_m[way] + (0.0 if way.turn_rad >= 0 else right_m), default=None)
 
 
 def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
@@ -184,9 +236,9 @@ def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
     return Point(before.north_m + part * north, before.east_m + part * east, place.up_m)
 
 
-def _on_circle(place: Point, bearing_rad: float) -> Point:
+def _on_circle(place: Point, radius_m: float, bearing_rad: float) -> Point:
     """The point of the circle round a place in this direction from it."""
-    north_m, east_m = LOITER_RADIUS_M * math.cos(bearing_rad), LOITER_RADIUS_M * math.sin(bearing_rad)
+    north_m, east_m = radius_m * math.cos(bearing_rad), radius_m * math.sin(bearing_rad)
     return Point(place.north_m + north_m, place.east_m + east_m, place.up_m)
 
 

@@ -19,6 +19,11 @@ SLOWEST = 0.25  # who is this much slower than asked for will not come
 SLOWEST_CLIMB_MS = 0.25
 GRACE_S = 120.0
 
+CLIMBED = 0.95  # of the altitude asked for is up there, as ArduPilot's own tests have it
+NEAR_M: dict[VehicleType, float] = {"copter": 2.0, "plane": 120.0, "rover": 5.0}
+"""How close is there, in GUIDED: WPNAV_RADIUS, a circle of WP_LOITER_RAD and half as much, and about WP_RADIUS."""
+NEAR_UP_M = 10.0
+
 APPROACH_SLOPE = 0.1  # of a plane: it begins to land ten times as far away as it is high
 
 Kind = Literal["take_off", "go_to", "loiter", "land"]
@@ -67,6 +72,22 @@ def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
     way_s = math.dist(start[:2], waypoint.place[:2]) / (SLOWEST * waypoint.speed_ms)
     climb_s = abs(waypoint.place.up_m - start.up_m) / SLOWEST_CLIMB_MS
     return GRACE_S + way_s + climb_s + waypoint.seconds / SLOWEST
+
+
+def is_near(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> bool:
+    """Whether who is led in GUIDED has come to the waypoint."""
+    level = vehicle_type == "rover" or abs(place.up_m - waypoint.place.up_m) <= NEAR_UP_M
+    return level and to_go_m(place, waypoint, vehicle_type) <= 0
+
+
+def to_go_m(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
+    """How far over the ground it is until there; less than 0 is past that."""
+    return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
+
+
+def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> int | None:
+    """Which waypoint begins a plane's landing, which is a mission even where the rest is flown in GUIDED."""
+    return len(waypoints) - 2 if vehicle_type == "plane" and waypoints[-1].kind == "land" else None
 
 
 def _approach(place: Point, heading_deg: float) -> Point:

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from sitl.kinematics import Line, Motion, Point, Rest, Segment, end_of
 
 CRUISE_MS = 5.0  # CRUISE_SPEED
 ACCEL_MS2 = 1.0  # ATC_ACCEL_MAX
-START_S = 1.5  # before it moves, as measured with 4.7
 TURN_RATE_RADS = math.radians(45.0)  # what it takes to turn round first, as measured with 4.7
 
 
+@dataclass(frozen=True)
 class Rover:
-    """The `MotionModel` of a rover: straight from place to place on level ground, with a stop at each."""
+    """The `MotionModel` of a rover: straight from place to place on level ground, with a stop at each.
+
+    `start_s` goes by before it moves; what is given is measured with 4.7, in AUTO.
+    """
+
+    start_s: float = 1.5
 
     cruise_ms = CRUISE_MS
 
@@ -27,9 +33,11 @@ class Rover:
         if not there.duration_s:
             return [there]
         turn_rad = abs((there.at(0.0).yaw_rad - start.yaw_rad + math.pi) % math.tau - math.pi)
-        return [Rest(start, START_S + turn_rad / TURN_RATE_RADS), there]
+        return [Rest(start, self.start_s + turn_rad / TURN_RATE_RADS), there]
 
-    def loiter(self, start: Motion, place: Point, speed_ms: float, seconds: float) -> Sequence[Segment]:
+    def loiter(
+        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+    ) -> Sequence[Segment]:
         there = self.go_to(start, place, speed_ms)
         return [*there, Rest(end_of(there), seconds)]
 
@@ -37,5 +45,5 @@ class Rover:
         """It never left the ground, and stays."""
         return [Rest(start, 0.0)]
 
-    def idle(self, start: Motion) -> Sequence[Segment]:
+    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
         return [Rest(start, math.inf)]

@@ -10,9 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.link import Link
 from sitl.procedure import ARM, HEARTBEAT, Commander, Step
+from sitl.route import CLIMBED
 from sitl.vehicle import VehicleType
 
-ARRIVED = 0.95  # of the altitude asked for, as ArduPilot's own tests have it
 SLOWEST_CLIMB_MS = 0.5
 LOW_M = 2.0  # who is not higher lies on the ground
 
@@ -51,7 +51,7 @@ class TakeOff:
             return None
         if self._to.vehicle_type == "copter" and not self._to.accepted(mavlink.MAV_CMD_NAV_TAKEOFF):
             return TAKE_OFF
-        if state.position is None or state.position.relative_alt_m < ARRIVED * self._altitude_m:
+        if state.position is None or state.position.relative_alt_m < CLIMBED * self._altitude_m:
             return self._climb
         return None
 

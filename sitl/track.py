@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sitl.kinematics import Course, Motion, Rest, Segment, end_of
-from sitl.models import MODELS, MotionModel
-from sitl.plan import Plan
-from sitl.route import Waypoint, route
+from sitl.leg_by_leg import leg_by_leg
+from sitl.models import AT_ONCE, MODELS, MotionModel
+from sitl.plan import By, Plan
+from sitl.route import Waypoint, landing_begins, route
 from sitl.vehicle import VehicleType
 
 
@@ -42,33 +43,49 @@ def track(
     *,
     heading_deg: float = 0.0,
     takeoff_altitude_m: float = 20.0,
+    by: By = "mission",
 ) -> Track:
-    """The track of a vehicle that is ready at mission second `begin_s`, and begins to fly `plan` then.
+    """The track of a vehicle that is ready at mission second `begin_s`, and begins to fly `plan` then, in that way.
 
     It stands at home until then; after the plan it stays, a plane circling, unless it has landed. `home_offset` is the
     home's place in the field (metres north, east and up from its centre), `heading_deg` the home's heading. A `plan`
     of None is that of a vehicle in no plan: a copter takes off to `takeoff_altitude_m` and stays there, a plane
     circles, a rover stands. Raises PlanError if the type cannot fly the plan.
     """
-    model = MODELS[vehicle_type]
-    segments: list[Segment] = [Rest(Motion(yaw_rad=math.radians(heading_deg)), 0.0)]
+    start = Motion(yaw_rad=math.radians(heading_deg))
+    segments: Sequence[Segment]
     if plan is None:
-        segments += model.take_off(end_of(segments), takeoff_altitude_m)
-        segments += model.idle(end_of(segments))
+        segments = AT_ONCE[vehicle_type].ascent(start, takeoff_altitude_m)
     else:
-        waypoints = route(plan, vehicle_type, heading_deg)
-        for waypoint, before in zip(waypoints, (None, *waypoints), strict=False):
-            segments += manoeuvre(model, waypoint, end_of(segments), before)
-        last = waypoints[-1]
-        if last.kind != "land":
-            segments += model.loiter(end_of(segments), last.place, last.speed_ms, math.inf)
+        fly = _mission if by == "mission" else _guided
+        segments = fly(route(plan, vehicle_type, heading_deg), vehicle_type, start)
     return Track(Course(begin_s, segments), home_offset)
 
 
-def manoeuvre(
-    model: MotionModel, waypoint: Waypoint, start: Motion, before: Waypoint | None = None
+def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
+    """Waypoint after waypoint in AUTO, and what comes after the last, for ever."""
+    model, last = MODELS[vehicle_type], waypoints[-1]
+    segments: list[Segment] = [Rest(start, 0.0)]
+    for before, waypoint, after in zip((None, *waypoints), waypoints, (*waypoints[1:], None), strict=False):
+        segments += _manoeuvre(model, waypoint, end_of(segments), before, after)
+    if last.kind != "land":
+        segments += model.loiter(end_of(segments), last.place, last.speed_ms, math.inf)
+    return segments
+
+
+def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
+    """Leg by leg, but for the landing of a plane, which is a mission."""
+    begins = landing_begins(waypoints, vehicle_type)
+    led, staying = leg_by_leg(waypoints[:begins], vehicle_type, start)
+    if begins is None or len(led) < begins:
+        return [*led, staying]
+    return [*led, *_mission(waypoints[begins:], vehicle_type, end_of(led))]
+
+
+def _manoeuvre(
+    model: MotionModel, waypoint: Waypoint, start: Motion, before: Waypoint | None, after: Waypoint | None
 ) -> Sequence[Segment]:
-    """How a vehicle does what one waypoint of a route asks for, from where it is, after the waypoint `before`."""
+    """How a vehicle does what one waypoint of a route asks for, from where it is, between two others."""
     led = before.place if before is not None and before.kind in ("go_to", "loiter") else None
     match waypoint.kind:
         case "take_off":
@@ -76,6 +93,7 @@ def manoeuvre(
         case "go_to":
             return model.go_to(start, waypoint.place, waypoint.speed_ms, led)
         case "loiter":
-            return model.loiter(start, waypoint.place, waypoint.speed_ms, waypoint.seconds)
+            next_place = None if after is None else after.place
+            return model.loiter(start, waypoint.place, waypoint.speed_ms, waypoint.seconds, next_place)
         case "land":
             return model.land(start, waypoint.place, led)

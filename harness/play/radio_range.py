@@ -84,4 +84,5 @@ def _track(scenario: Scenario, vehicle: int, index: int) -> Track:
         (north_m, east_m, up_m),
         heading_deg=home.heading_deg,
         takeoff_altitude_m=vehicles.takeoff_altitude_m,
+        by=flight.by if flight else "mission",
     )

@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl.vehicle import Home
 
 RECORDINGS = Path(__file__).parent / "recordings"
-Name = Literal["copter-mission", "plane-mission", "plane-guided", "rover-mission"]
+Name = Literal["copter-mission", "copter-guided", "plane-mission", "plane-guided", "rover-mission", "rover-guided"]
 
 EVERYTHING_S = 50.0
 EVERY_S = 2.0

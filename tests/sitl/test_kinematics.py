@@ -79,7 +79,7 @@ def test_a_course_is_its_segments_one_after_another() -> None:
 
 FASTEST_MS = 28.4  # a plane that climbs
 STEPS = 50
-WISHES = ("go_to", "loiter", "land", "idle")
+WISHES = ("go_to", "loiter", "land", "ascent")
 
 
 @settings(max_examples=50)
@@ -100,8 +100,8 @@ def test_nothing_jumps_nor_goes_underground(
             segments = model.go_to(motion, place, model.cruise_ms)
         elif wish == "loiter":
             segments = model.loiter(motion, place, model.cruise_ms, seconds)
-        elif wish == "idle":
-            segments = model.idle(motion)
+        elif wish == "ascent":
+            segments = model.ascent(motion, place.up_m)
         else:
             segments = model.land(motion, motion.point)
         course = Course(now, segments)

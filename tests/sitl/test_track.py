@@ -11,7 +11,7 @@ from typing import Literal
 
 import pytest
 
-from sitl.plan import GoTo, Land, Loiter, Plan, PlanError, TakeOff
+from sitl.plan import By, GoTo, Land, Loiter, Plan, PlanError, TakeOff
 from sitl.plane import LOITER_RADIUS_M
 from sitl.track import Track, track
 from sitl.vehicle import VehicleType
@@ -115,26 +115,29 @@ OUT_AND_BACK = {
     "copter": (TakeOff(30), GoTo(200, 100, speed_ms=8), Loiter(60), GoTo(0, 0), Land()),
     "rover": (GoTo(150, 50, speed_ms=4), Loiter(60), GoTo(0, 0)),
 }
+WAYS: list[By] = ["mission", "guided"]
 
 
+@pytest.mark.parametrize("by", WAYS)
 @pytest.mark.parametrize("vehicle_type", OUT_AND_BACK)
 def test_a_vehicle_of_today_is_at_each_place_within_5_s_of_the_computed_one(
-    vehicle_type: Literal["copter", "rover"],
+    vehicle_type: Literal["copter", "rover"], by: By
 ) -> None:
     """Seconds count from arming. Whatever it is computed to be at some second, it is within 5 s of that, to 3 m."""
-    flown = flight(f"{vehicle_type}-mission")  # type: ignore[arg-type]
-    computed = track(vehicle_type, Plan(OUT_AND_BACK[vehicle_type]), heading_deg=355.4)
+    flown = flight(f"{vehicle_type}-{by}")  # type: ignore[arg-type]
+    computed = track(vehicle_type, Plan(OUT_AND_BACK[vehicle_type]), heading_deg=355.4, by=by)
     for second, *place in flown:
         nearby = (computed.at(second + tenth / 10) for tenth in range(-50, 51))
         assert min(math.dist(place, near) for near in nearby) < 3.0, f"{second:.1f} s after arming"
 
 
-def test_a_plane_of_today_is_near_the_computed_one() -> None:
+@pytest.mark.parametrize("by", WAYS)
+def test_a_plane_of_today_is_near_the_computed_one(by: By) -> None:
     """Within 80 m at the same second after arming, and within 30 m of the computed path over the ground."""
     plan = Plan((TakeOff(50), GoTo(600, 350, speed_ms=20), Loiter(120), GoTo(0, 0), Land()))
-    computed = track("plane", plan, heading_deg=353.0)
+    computed = track("plane", plan, heading_deg=353.0, by=by)
     path = [computed.at(quarter / 4)[:2] for quarter in range(1200)]
-    flown = flight("plane-mission")
+    flown = flight(f"plane-{by}")  # type: ignore[arg-type]
     assert max(math.dist(place, computed.at(second)) for second, *place in flown) < 80.0
     assert max(min(math.dist(place[:2], near) for near in path) for _, *place in flown) < 30.0
 
