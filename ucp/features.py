@@ -25,6 +25,7 @@ FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "vote_names_chain": lambda mission: mission["settings"]["vote_names_chain"],
     "changed_before_tally": lambda mission: mission["settings"]["changed_before_tally"],
     "asks_after_commit": lambda mission: mission["settings"].get("asks_after_commit", False),
+    "top_needs_majority": lambda mission: mission["settings"].get("top_needs_majority", False),
     "phase1_tie=pop": lambda mission: mission["settings"]["phase1_tie"] == "pop",
     "phase2_tie=block": lambda mission: mission["settings"]["phase2_tie"] == "block",
 }

@@ -5,6 +5,8 @@ block, what the majority has on top of that, and commit it. Finalize puts the re
 everybody. While `reconcile_in_progress` is set the agent answers nobody.
 """
 
+from collections.abc import Mapping, Sequence
+
 from ucp.core import Core
 from ucp.handler import event_handler
 from ucp.messages import (
@@ -163,10 +165,20 @@ def receive_response_next_in_sequence(core: Core, sender: int, message: NextInSe
     return "counted"
 
 
-def most_named(candidates: dict[bytes, list[int]]) -> list[bytes]:
+def most_named(candidates: Mapping[bytes, Sequence[int]]) -> list[bytes]:
     """The candidates of phase 2 that most responders name: none if nobody has answered, more than one in a tie."""
     most = max((count for count, _ in candidates.values()), default=0)
     return [candidate for candidate, (count, _) in candidates.items() if count == most]
+
+
+def without_minority_top(candidates: Mapping[bytes, Sequence[int]]) -> Mapping[bytes, Sequence[int]]:
+    """The candidates of phase 2; without "Is Top Of Chain" where as many name a block as, with whoever asks, do not.
+
+    That is when they would refuse the block that is proposed next, on top of this chain (Algorithms 3 and 5).
+    """
+    with_us = 1 + candidates.get(IS_TOP_OF_CHAIN, (0,))[0]
+    blocks = {candidate: counted for candidate, counted in candidates.items() if candidate != IS_TOP_OF_CHAIN}
+    return candidates if with_us > sum(count for count, _ in blocks.values()) else blocks
 
 
 @event_handler(
@@ -183,12 +195,15 @@ def reconcile_phase_2_timer_expiration(core: Core) -> str:
     """Algorithm 15, Reconcile Phase 2 Timer Expiration: choose the plurality's answer.
 
     A tie goes to the oldest timestamp, equal timestamps to the lowest hash. With the setting `phase2_tie` "block", a
-    tie never ends the search while a block is on offer.
+    tie never ends the search while a block is on offer. With `top_needs_majority` nothing less than what a vote needs
+    does: without it whoever is refused may be told that nothing follows, propose again, and so on for ever.
     """
-    candidates = core.reconcile_response_dictionary
+    candidates: Mapping[bytes, Sequence[int]] = core.reconcile_response_dictionary
     if not candidates:
         core.trigger("Reconcile Finalize")
         return "no response"
+    if core.settings.top_needs_majority:
+        candidates = without_minority_top(candidates)
     tied = most_named(candidates)
     tie = "tie: " if len(tied) > 1 else ""
     if tie and core.settings.phase2_tie == "block":

@@ -11,7 +11,7 @@ from ucp.shown import shown
 MAX_TIMER_S = 1e9
 """Thirty years."""
 
-ADDED = ("asks_after_commit",)
+ADDED = ("asks_after_commit", "top_needs_majority")
 """Settings that the first agents of contract 2 do not have."""
 
 Phase1Tie = Literal["phase2", "pop"]
@@ -38,6 +38,8 @@ class Settings:
     """Algorithm 5 looks for a changed chain before it tallies, instead of after."""
     asks_after_commit: bool = False
     """Algorithm 5 asks, a finalize gap after its commit, who does not follow: who has diverged then reconciles."""
+    top_needs_majority: bool = False
+    """Algorithm 15 ends the search only where a vote would be approved: more than half have this very chain."""
     phase1_tie: Phase1Tie = "phase2"
     """Algorithm 11 on a tie: go on to phase 2 as printed, or pop another block."""
     phase2_tie: Phase2Tie = "oldest"
@@ -49,7 +51,7 @@ class Settings:
         self._check("finalize_gap_s", f"0..{MAX_TIMER_S:g} seconds", (int, float), 0, MAX_TIMER_S)
         self._check("max_block_bytes", f"1..{MAX_EVENT_DATA_BYTES}", (int,), 1, MAX_EVENT_DATA_BYTES)
         self._check("max_event_bytes", "1..max_block_bytes", (int,), 1, self.max_block_bytes)
-        for name in ("vote_names_chain", "changed_before_tally", "asks_after_commit"):
+        for name in ("vote_names_chain", "changed_before_tally", "asks_after_commit", "top_needs_majority"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be true or false, not {shown(getattr(self, name))}")
         for name, allowed in (("phase1_tie", get_args(Phase1Tie)), ("phase2_tie", get_args(Phase2Tie))):

@@ -50,6 +50,7 @@ VARIANTS: dict[str, Variant] = {
         Variant("vote_names_chain", _settings(vote_names_chain=True), ("vote_names_chain",)),
         Variant("changed_before_tally", _settings(changed_before_tally=True), ("changed_before_tally",)),
         Variant("asks_after_commit", _settings(asks_after_commit=True), ("asks_after_commit",)),
+        Variant("top_needs_majority", _settings(top_needs_majority=True), ("top_needs_majority",)),
         Variant("phase1_tie=pop", _settings(phase1_tie="pop"), ("phase1_tie=pop",)),
         Variant("phase2_tie=block", _settings(phase2_tie="block"), ("phase2_tie=block",)),
     )

@@ -38,6 +38,15 @@ CURES: dict[str, dict[str, dict[str, object]]] = {
         "settings": {"asks_after_commit": True},
         "stagger": {"phase1_timeout_s": TIMER_S},
     },
+    "`top_needs_majority: true`": {"settings": {"top_needs_majority": True}},
+    "`top_needs_majority`, phase 1 staggered": {
+        "settings": {"top_needs_majority": True},
+        "stagger": {"phase1_timeout_s": TIMER_S},
+    },
+    "all three": {
+        "settings": {"top_needs_majority": True, "asks_after_commit": True},
+        "stagger": {"phase1_timeout_s": TIMER_S},
+    },
     "`phase1_tie: pop`": {"settings": {"phase1_tie": "pop"}},
     "`phase2_tie: block`": {"settings": {"phase2_tie": "block"}},
 }

@@ -84,7 +84,10 @@ def test_the_reference_does_what_the_reference_does(honest: Evidence) -> None:
         {"clocks": {2: {"offset_s": -2, "drift": 0.01}, 3: {"offset_s": 5, "drift": -0.01}}},
         {"settings": {"phase1_tie": "pop", "phase2_tie": "block", "vote_names_chain": True, "finalize_gap_s": 0}},
         {"settings": {"changed_before_tally": True, "vote_timeout_s": 3, "max_block_bytes": 300}},
-        {"settings": {"asks_after_commit": True, "max_block_bytes": 300}, "network": {"loss": 0.2}},
+        {
+            "settings": {"asks_after_commit": True, "top_needs_majority": True, "max_block_bytes": 300},
+            "network": {"loss": 0.2},
+        },
         {"timeline": [{"at_s": 200, "reboot": [2], "down_s": 30, "disk": "kept"}, {"at_s": 250, "kill": [3]}]},
         {"timeline": [{"at_s": 200, "kill": [2]}, {"at_s": 300, "restart": [2]}]},
         {"timeline": [{"at_s": 200, "pause": [4]}, {"at_s": 300, "resume": [4]}]},

@@ -121,7 +121,7 @@ WHEN: dict[str, dict[str, str]] = {
     },
     "reconcile_phase_2_timer_expiration": {
         "no response": "nobody answered",
-        "top of chain": "most say that the chain ends here",
+        "top of chain": "most say that the chain ends here (`top_needs_majority`: and a vote would be approved)",
         "block": "most name one and the same block",
         "tie: top of chain": "a tie, and the oldest answer is that the chain ends here",
         "tie: block": "a tie, and the oldest answer is a block (`phase2_tie: block`: some answer is)",

@@ -147,6 +147,7 @@ def test_mission_files_fit_their_schema_and_name_the_features_that_they_need() -
                 "vote_names_chain": True,
                 "changed_before_tally": True,
                 "asks_after_commit": True,
+                "top_needs_majority": True,
                 "phase1_tie": "pop",
                 "phase2_tie": "block",
             },

@@ -299,6 +299,25 @@ def test_a_tie_never_ends_the_search_while_a_block_is_on_offer_if_so_set() -> No
     assert air.agents[1].state.majority_response_block_hash == A
 
 
+@pytest.mark.parametrize(
+    ("answers", "branch", "chosen"),
+    [
+        pytest.param([(None, 0), (B, 9), (A, 5)], "tie: block", A, id="as many would refuse as approve"),
+        pytest.param([(None, 0), (None, 0), (A, 9), (A, 9), (B, 5)], "block", A, id="the most of those who refuse"),
+        pytest.param([(None, 0), (A, 5)], "tie: top of chain", None, id="two to one"),
+        pytest.param([(None, 0), (None, 0), (A, 5), (B, 5)], "top of chain", None, id="three to two"),
+        pytest.param([(None, 0)], "top of chain", None, id="nobody has a block"),
+        pytest.param([(B, 9)], "block", B, id="one to one"),
+    ],
+)
+def test_top_of_chain_ends_the_search_only_with_what_a_vote_needs_if_so_set(
+    answers: list[tuple[bytes | None, int]], branch: str, chosen: bytes | None
+) -> None:
+    air, taken = phase_2(answers, top_needs_majority=True)
+    assert taken == branch
+    assert air.agents[1].state.majority_response_block_hash == chosen
+
+
 @takes("receive_response_next_in_sequence", "counted already", "another chain")
 def test_a_responder_of_phase_2_counts_once_and_only_for_the_chain_asked_about() -> None:
     """One for A and one for B, who is older: not two or three for A."""

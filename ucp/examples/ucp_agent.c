@@ -465,7 +465,7 @@ static void put_object(Buf *b, Json *j, uint32_t object, const char *without) {
 typedef struct {
     double vote_timeout, phase1_timeout, phase2_timeout, phase3_timeout, finalize_gap;
     uint64_t max_block_bytes, max_event_bytes;
-    bool vote_names_chain, changed_before_tally, asks_after_commit, phase1_tie_pop, phase2_tie_block;
+    bool vote_names_chain, changed_before_tally, asks_after_commit, top_needs_majority, phase1_tie_pop, phase2_tie_block;
 } Settings;
 
 typedef struct {
@@ -498,7 +498,7 @@ __attribute__((format(printf, 3, 4))) static bool fail(Fault *fault, int status,
 /* Features come before all values: one that is lacking may be the reason why a value is not known. */
 static bool mission_features(Json *j, uint32_t root, Fault *fault) {
     static const char *const has[] = {"store", "vote_names_chain", "changed_before_tally", "asks_after_commit",
-                                      "phase1_tie=pop", "phase2_tie=block"};
+                                      "top_needs_majority", "phase1_tie=pop", "phase2_tie=block"};
     uint32_t list = member(j, root, "features"), quirks = member(j, root, "quirks");
     if (list != 0 && kind(j, list) != '[') return fail(fault, STATUS_WRONG, "features is no list of strings.");
     for (uint32_t i = list + 1; list != 0 && i < j->node[list].end; i = j->node[i].end) {
@@ -527,7 +527,7 @@ static bool mission_features(Json *j, uint32_t root, Fault *fault) {
 }
 
 static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault) {
-    *s = (Settings){10.0, 5.0, 5.0, 5.0, 0.1, 1024, 267, false, false, false, false, false};
+    *s = (Settings){10.0, 5.0, 5.0, 5.0, 0.1, 1024, 267, false, false, false, false, false, false};
     if (object != 0 && kind(j, object) != '{') return fail(fault, STATUS_WRONG, "settings is no object.");
     struct { const char *key; double *value; bool zero; } numbers[] = {
         {"vote_timeout_s", &s->vote_timeout, false}, {"phase1_timeout_s", &s->phase1_timeout, false},
@@ -537,7 +537,7 @@ static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault
         {"max_block_bytes", &s->max_block_bytes}, {"max_event_bytes", &s->max_event_bytes}};
     struct { const char *key; bool *value; } switches[] = {
         {"vote_names_chain", &s->vote_names_chain}, {"changed_before_tally", &s->changed_before_tally},
-        {"asks_after_commit", &s->asks_after_commit}};
+        {"asks_after_commit", &s->asks_after_commit}, {"top_needs_majority", &s->top_needs_majority}};
     struct { const char *key, *usual, *other; bool *value; } choices[] = {
         {"phase1_tie", "phase2", "pop", &s->phase1_tie_pop}, {"phase2_tie", "oldest", "block", &s->phase2_tie_block}};
     for (uint32_t i = 0, at; object != 0 && i < 5; i++)
@@ -545,7 +545,7 @@ static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault
             && (!json_double(j, at, numbers[i].value) || *numbers[i].value < 0 || *numbers[i].value > 1e9
                 || (*numbers[i].value == 0 && !numbers[i].zero)))
             return fail(fault, STATUS_WRONG, "The setting %s is out of range.", numbers[i].key);
-    for (uint32_t i = 0, at; object != 0 && i < 3; i++)
+    for (uint32_t i = 0, at; object != 0 && i < 4; i++)
         if ((at = member(j, object, switches[i].key)) != 0) {
             if (kind(j, at) != 't' && kind(j, at) != 'f')
                 return fail(fault, STATUS_WRONG, "The setting %s is no boolean.", switches[i].key);
@@ -1209,9 +1209,13 @@ static const char *reconcile_phase_2_timer_expiration(Agent *a) {
         trigger(a, RECONCILE_FINALIZE);
         return "no response";
     }
-    uint64_t highest = 0;
+    uint64_t highest = 0, with_us = 1, others = 0;
     size_t tied = 0;
+    for (size_t i = 0; i < a->candidates_len; i++)
+        *(a->candidates[i].is_top ? &with_us : &others) += a->candidates[i].count;
+    bool never_top = a->m.settings.top_needs_majority && with_us <= others;
     for (size_t i = 0; i < a->candidates_len; i++) {
+        if (a->candidates[i].is_top && never_top) continue;
         if (a->candidates[i].count > highest) {
             highest = a->candidates[i].count;
             tied = 0;
@@ -1221,7 +1225,7 @@ static const char *reconcile_phase_2_timer_expiration(Agent *a) {
     bool tie = tied > 1;
     const Candidate *chosen = NULL;
     for (const Candidate *c = a->candidates; c < a->candidates + a->candidates_len; c++)
-        if (c->count == highest && !(tie && a->m.settings.phase2_tie_block && c->is_top)
+        if (c->count == highest && !(c->is_top && (never_top || (tie && a->m.settings.phase2_tie_block)))
             && (chosen == NULL || goes_before(c, chosen)))
             chosen = c;
     if (chosen->is_top) {
@@ -1569,9 +1573,10 @@ static void put_header(Buf *b, const Agent *a) {
                "\"phase3_timeout_s\":%.17g,\"finalize_gap_s\":%.17g,", s->vote_timeout, s->phase1_timeout,
                s->phase2_timeout, s->phase3_timeout, s->finalize_gap);
     put_format(b, "\"max_block_bytes\":%" PRIu64 ",\"max_event_bytes\":%" PRIu64 ",\"vote_names_chain\":%s,"
-               "\"changed_before_tally\":%s,%s\"phase1_tie\":\"%s\",\"phase2_tie\":\"%s\"}", s->max_block_bytes,
+               "\"changed_before_tally\":%s,%s%s\"phase1_tie\":\"%s\",\"phase2_tie\":\"%s\"}", s->max_block_bytes,
                s->max_event_bytes, truth(s->vote_names_chain), truth(s->changed_before_tally),
-               s->asks_after_commit ? "\"asks_after_commit\":true," : "", s->phase1_tie_pop ? "pop" : "phase2",
+               s->asks_after_commit ? "\"asks_after_commit\":true," : "",
+               s->top_needs_majority ? "\"top_needs_majority\":true," : "", s->phase1_tie_pop ? "pop" : "phase2",
                s->phase2_tie_block ? "block" : "oldest");
     put_format(b, ",\"clock\":{\"epoch_us\":%" PRIu64 ",\"speedup\":%.17g}}\n", a->m.epoch_us, a->m.speedup);
 }

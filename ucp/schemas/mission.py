@@ -27,6 +27,7 @@ SETTINGS: dict[str, Schema] = {
     "vote_names_chain": FLAG,
     "changed_before_tally": FLAG,
     "asks_after_commit": FLAG,
+    "top_needs_majority": FLAG,
     "phase1_tie": {"enum": list(get_args(Phase1Tie))},
     "phase2_tie": {"enum": list(get_args(Phase2Tie))},
 }

@@ -314,6 +314,22 @@ def asks_after_commit() -> Story:
     return story
 
 
+def top_needs_majority() -> Story:
+    """With the setting `top_needs_majority`: what follows is taken unless, with us, more say that nothing does."""
+    story = Story(top_needs_majority=True)
+    old, young = others_block(B, 1, at_s=10), others_block(C, 2, at_s=20)
+    story.command("reconcile")
+    story.contain((A, True))
+    story.wait()
+    story.name((A, None), (B, old), (C, young))
+    story.wait()
+    story.hear(B, BlockResponse(old))
+    story.name((A, None), (B, None), (C, young), top_us=10_000_000)
+    story.wait()
+    story.command("export")
+    return story
+
+
 def votes_name_chains() -> Story:
     """With the settings `vote_names_chain` and `changed_before_tally`."""
     story = Story(vote_names_chain=True, changed_before_tally=True)
@@ -422,6 +438,7 @@ MISSIONS: dict[str, Callable[[], Story]] = {
         ties,
         ties_read_otherwise,
         asks_after_commit,
+        top_needs_majority,
         votes_name_chains,
         offered_what_it_holds,
         reboot,
