@@ -12,6 +12,9 @@ swarm.py      global states, and all that may happen next
 expansion.py  what may follow one state
 crew.py       other processes that look at states, too
 explore.py    all of them, breadth first
+attractor.py  from which states a goal is come to, whichever timer is the next to end
+cycles.py     ways that lead back to where they began
+votes.py      how many more votes it takes until there is one chain
 liveness.py   whether there is always a way to rest with one chain, and whether one goes round for ever
 livelock.py   the forms of going round, each with a scenario and what it takes to get there
 times.py      mission seconds for a way through the graph

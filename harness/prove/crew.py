@@ -1,4 +1,4 @@
-"""All cores look at states: forked processes, each with the agents and the memory of steps that it has at its birth.
+"""All cores look at states, and at what more votes do: forked processes, with the agents and steps known by then.
 
 Each goes on to number local states and zones as it comes upon them. So what one tells another it tells by the other's
 number where it knows it, and else by its own, the first time with what that number stands for. Who is told of states
@@ -12,12 +12,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from harness.errors import HarnessError
+from harness.prove.attractor import Check
 from harness.prove.expansion import Expansion, expanded
 from harness.prove.local import DEAD
 from harness.prove.progress import memory_bytes
 from harness.prove.swarm import AGENTS, ZONE, State, Swarm
+from harness.prove.votes import UndecidedError, Votes
 from harness.run.sweep import Failed, Worker
 
+WORTH_A_CREW = 500
+"""So many states that have not been looked at are shared among the cores."""
 CHUNK = 100
 """So many states, at most, are looked at before they are told of."""
 
@@ -34,7 +38,13 @@ class Told(NamedTuple):
     states: "array[int]"
 
 
-class Answer(NamedTuple):
+class Forks(NamedTuple):
+    """States at rest with several chains, to be told how many more votes they need."""
+
+    told: Told
+
+
+class Following(NamedTuple):
     """What follows some states. `told` has those that follow and that this process has not told of before, in order.
 
     `expansions` has for each state how many of them are its own, and what follows it, by where that was told.
@@ -42,6 +52,18 @@ class Answer(NamedTuple):
 
     told: Told
     expansions: list[tuple[int, Expansion]]
+
+
+class Needed(NamedTuple):
+    """How many more votes some forks need, as `Votes` says it; None if that is not decided."""
+
+    votes: list[int | None] | None
+
+
+class Answer(NamedTuple):
+    """And what the process has taken until now."""
+
+    answer: Following | Needed
     memory_bytes: float
     processor_s: float
     steps: int
@@ -122,8 +144,13 @@ class _Hand:
         self._swarm = swarm
         self._line = _Line(swarm)
         self._told: dict[State, int] = {}
+        self._votes = Votes(swarm)
 
-    def __call__(self, task: Told) -> Answer:
+    def __call__(self, task: Told | Forks) -> Answer:
+        answer = self._needed(task) if isinstance(task, Forks) else self._following(task)
+        return Answer(answer, memory_bytes(), time.process_time(), self._swarm.local.steps)
+
+    def _following(self, task: Told) -> Following:
         fresh: list[State] = []
 
         def number_of(state: State) -> int:
@@ -138,7 +165,14 @@ class _Hand:
             known = len(fresh)
             expansion = expanded(self._swarm, state, number_of)
             expansions.append((len(fresh) - known, expansion))
-        return Answer(self._line.told(fresh), expansions, memory_bytes(), time.process_time(), self._swarm.local.steps)
+        return Following(self._line.told(fresh), expansions)
+
+    def _needed(self, task: Forks) -> Needed:
+        self._told.clear()  # nobody asks what follows any more
+        try:
+            return Needed([self._votes.needed(fork) for fork in self._line.heard(task.told)])
+        except UndecidedError:
+            return Needed(None)
 
 
 class _Other:
@@ -150,14 +184,17 @@ class _Other:
         self.steps = 0
         self._born_with = swarm.local.steps
         self._line = _Line(swarm)
-        self._worker: Worker[Told, Answer] = Worker(_Hand(swarm))
+        self._worker: Worker[Told | Forks, Answer] = Worker(_Hand(swarm))
         self._numbers: list[int] = []
         """Of each state that it has told of, here."""
 
     def give(self, states: Sequence[State]) -> None:
         self._worker.connection.send(self._line.told(states))
 
-    def receive(self) -> Answer:
+    def give_forks(self, states: Sequence[State]) -> None:
+        self._worker.connection.send(Forks(self._line.told(states)))
+
+    def receive(self) -> Following | Needed:
         try:
             answer = self._worker.connection.recv()
         except EOFError:
@@ -172,9 +209,9 @@ class _Other:
         self.memory_bytes = answer.memory_bytes
         self.processor_s = answer.processor_s
         self.steps = answer.steps - self._born_with
-        return answer
+        return answer.answer
 
-    def taken_in(self, answer: Answer, first: int, add: Callable[[State, int], int]) -> Iterator[Expansion]:
+    def taken_in(self, answer: Following, first: int, add: Callable[[State, int], int]) -> Iterator[Expansion]:
         """What follows each of the states from number `first` on; new states are added with `add`."""
         fresh = iter(self._line.heard(answer.told))
         numbers = self._numbers
@@ -191,11 +228,23 @@ class _Other:
         self._worker.stop()
 
 
+Give = Callable[["_Other", Sequence[State]], None]
+
+
 class Crew:
-    """So many processes; to be stopped."""
+    """So many processes, from when they are first asked; a context at whose end they are stopped."""
 
     def __init__(self, swarm: Swarm, size: int) -> None:
-        self._others = [_Other(swarm) for _ in range(size)]
+        self._swarm = swarm
+        self._size = size
+        self._others: list[_Other] = []
+
+    def __enter__(self) -> "Crew":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for other in self._others:
+            other.stop()
 
     @property
     def memory_bytes(self) -> float:
@@ -210,32 +259,53 @@ class Crew:
         """That they have computed."""
         return sum(other.steps for other in self._others)
 
+    def is_worth_it(self, waiting: int) -> bool:
+        """Whether to ask it, if so many states wait."""
+        return self._size > 1 and waiting >= WORTH_A_CREW
+
     def expansions(self, states: Sequence[State], first: int, add: Callable[[State, int], int]) -> Iterator[Expansion]:
         """What follows each of `states` from number `first` on, in order, also of those that are added meanwhile."""
+        for other, number, answer in self._answers(_Other.give, states, first):
+            assert isinstance(answer, Following)
+            yield from other.taken_in(answer, number, add)
+
+    def needed(self, forks: Sequence[State], check: Check) -> list[int | None]:
+        """How many more votes these states need, as `Votes` says it. Raises UndecidedError."""
+        votes: list[int | None] = []
+        for _, _, answer in self._answers(_Other.give_forks, forks):
+            assert isinstance(answer, Needed)
+            check()
+            if answer.votes is None:
+                raise UndecidedError
+            votes += answer.votes
+        return votes
+
+    def _answers(
+        self, give: Give, states: Sequence[State], first: int = 0
+    ) -> Iterator[tuple[_Other, int, Following | Needed]]:
+        """Each with whose it is and the first state that it is of; in order, also of states added meanwhile."""
+        if not self._others:
+            self._others = [_Other(self._swarm) for _ in range(self._size)]
         idle = deque(self._others)
         busy: deque[tuple[_Other, int]] = deque()
         given = first
+
+        def give_some() -> None:
+            nonlocal given
+            size = min(CHUNK, max(1, (len(states) - given) // (2 * len(self._others))))
+            other = idle.popleft()
+            give(other, states[given : given + size])
+            busy.append((other, given))
+            given += size
+
         while True:
             while idle and given < len(states):
-                given += self._give(idle, busy, states, given)
+                give_some()
             if not busy:
                 return
             other, number = busy.popleft()
             answer = other.receive()
             idle.append(other)
             if given < len(states):  # it need not wait until this is taken in
-                given += self._give(idle, busy, states, given)
-            yield from other.taken_in(answer, number, add)
-
-    def _give(
-        self, idle: "deque[_Other]", busy: "deque[tuple[_Other, int]]", states: Sequence[State], given: int
-    ) -> int:
-        size = min(CHUNK, max(1, (len(states) - given) // (2 * len(self._others))))
-        other = idle.popleft()
-        other.give(states[given : given + size])
-        busy.append((other, given))
-        return size
-
-    def stop(self) -> None:
-        for other in self._others:
-            other.stop()
+                give_some()
+            yield other, number, answer

@@ -9,13 +9,11 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from harness.prove.crew import Crew
-from harness.prove.expansion import Expansion, expanded, quiet
+from harness.prove.expansion import Expansion, expanded
 from harness.prove.local import Flaw
 from harness.prove.progress import LOOK_EVERY, Budget, Ended, Progress
 from harness.prove.swarm import State, Swarm
 
-WORTH_A_CREW = 500
-"""So many states that have not been looked at are shared among the cores."""
 NO_PARENT = -1
 
 
@@ -36,8 +34,6 @@ class Graph:
     transitions: int = 0
     depth: int = 0
     seconds: float = 0.0
-    reached: int = 0
-    """States that were reached; `liveness.py` adds others, with more blocks."""
     looked_at: int = 0
     ended: Ended = "complete"
     flawed: int | None = None
@@ -50,20 +46,14 @@ class Graph:
     def flaw(self) -> Flaw | None:
         return None if self.flawed is None else self.swarm.flaw(self.states[self.flawed])
 
-    def add(self, state: State, parent: int) -> int:
-        """Its number; a new one if it is new."""
+    def reach(self, state: State, parent: int) -> int:
+        """Its number; a new one if it is new. It should have no flaw."""
         number = self.number.setdefault(state, len(self.states))
         if number == len(self.states):
             self.states.append(state)
             self.parents.append(parent)
-        return number
-
-    def reach(self, state: State, parent: int) -> int:
-        """The same of a state that can be reached: it should have no flaw."""
-        known = len(self.states)
-        number = self.add(state, parent)
-        if number == known and self.flawed is None and self.swarm.flaw(state) is not None:
-            self.flawed = number
+            if self.flawed is None and self.swarm.flaw(state) is not None:
+                self.flawed = number
         return number
 
     def take_in(self, expansion: Expansion) -> None:
@@ -87,16 +77,16 @@ def explore(
     *,
     most_bytes: float,
     most_s: float,
-    cores: int = 1,
+    crew: Crew | None = None,
     watch: Callable[[Progress], None] = lambda progress: None,
 ) -> Graph:
-    """All states, or as many as memory and time allow, or up to the first that has a flaw; on so many cores.
+    """All states, or as many as memory and time allow, or up to the first that has a flaw.
 
-    What comes out is the same on any number of cores.
+    What comes out is the same whether there is a crew or not.
     """
     graph, budget = Graph(swarm), Budget(most_bytes, most_s)
     try:
-        for progress in _all(graph, budget, cores):
+        for progress in _all(graph, budget, crew):
             watch(progress)
             ended = "flaw" if graph.flawed is not None else budget.ended(graph.crew_bytes)
             if ended is not None:
@@ -105,14 +95,13 @@ def explore(
     except KeyboardInterrupt:
         graph.ended = "interrupted"
     graph.seconds = budget.seconds
-    graph.reached = len(graph.states)
     return graph
 
 
-def _all(graph: Graph, budget: Budget, cores: int) -> Iterator[Progress]:
+def _all(graph: Graph, budget: Budget, crew: Crew | None) -> Iterator[Progress]:
     graph.reach(graph.swarm.initial, NO_PARENT)
     layer_ends = 1
-    for looked_at, expansion in enumerate(_expansions(graph, cores), 1):
+    for looked_at, expansion in enumerate(_expansions(graph, crew), 1):
         graph.take_in(expansion)
         graph.looked_at = looked_at
         if looked_at == layer_ends:
@@ -122,23 +111,14 @@ def _all(graph: Graph, budget: Budget, cores: int) -> Iterator[Progress]:
             yield Progress(len(graph.states), looked_at, graph.transitions, graph.depth, budget.seconds)
 
 
-def _expansions(graph: Graph, cores: int) -> Iterator[Expansion]:
+def _expansions(graph: Graph, crew: Crew | None) -> Iterator[Expansion]:
     """What follows each state, in order, also of those that are reached meanwhile; by a crew if it is many."""
     swarm, states, looked_at = graph.swarm, graph.states, 0
     while looked_at < len(states):
-        if cores > 1 and len(states) - looked_at >= WORTH_A_CREW:
-            crew = Crew(swarm, cores)
-            try:
-                for expansion in crew.expansions(states, looked_at, graph.reach):
-                    graph.crew_bytes, graph.crew_s, graph.crew_steps = crew.memory_bytes, crew.processor_s, crew.steps
-                    yield expansion
-            finally:
-                crew.stop()
+        if crew is not None and crew.is_worth_it(len(states) - looked_at):
+            for expansion in crew.expansions(states, looked_at, graph.reach):
+                graph.crew_bytes, graph.crew_s, graph.crew_steps = crew.memory_bytes, crew.processor_s, crew.steps
+                yield expansion
             return
         yield expanded(swarm, states[looked_at], partial(graph.reach, parent=looked_at))
         looked_at += 1
-
-
-def quieten(graph: Graph, number: int) -> None:
-    """Where a state goes on that was added to those that can be reached."""
-    graph.take_in(quiet(graph.swarm, graph.states[number], lambda state: graph.add(state, number)))

@@ -68,10 +68,10 @@ class Budget:
             return "memory"
         return "time" if self.seconds > self._most_s else None
 
-    def check(self) -> None:
+    def check(self, elsewhere_bytes: float = 0.0) -> None:
         """Raises GivenUpError if it is used up; to be called again and again, for it mostly does not look."""
         self._calls += 1
-        if self._calls % LOOK_EVERY == 0 and (ended := self.ended()) is not None:
+        if self._calls % LOOK_EVERY == 0 and (ended := self.ended(elsewhere_bytes)) is not None:
             raise GivenUpError(ended)
 
 

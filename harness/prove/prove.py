@@ -11,6 +11,7 @@ from harness.errors import INTERRUPTED, VIOLATED, HarnessError
 from harness.prove import livelock, liveness
 from harness.prove.alone import collect
 from harness.prove.bounds import Bounds, BoundsError
+from harness.prove.crew import Crew
 from harness.prove.example import Example, keep, play
 from harness.prove.explore import Graph, explore
 from harness.prove.livelock import Livelock
@@ -52,7 +53,7 @@ class Limits:
 
     @property
     def of_exploring(self) -> dict[str, Any]:
-        return {"most_bytes": self.most_bytes, "most_s": self.most_s, "cores": self.cores}
+        return {"most_bytes": self.most_bytes, "most_s": self.most_s}
 
 
 @dataclass
@@ -160,7 +161,9 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Pr
     proof = Proof(bounds, figures, found.ended, found.flaw, way=found.way)
     if found.flaw is not None:
         limits = replace(limits, most_s=min(RUN_LOOKED_FOR_S, limits.most_s - found.seconds))
-        graph = explore(Swarm(_with_instants(bounds)), **limits.of_exploring, watch=watch)
+        swarm = Swarm(_with_instants(bounds))
+        with Crew(swarm, limits.cores) as crew:
+            graph = explore(swarm, **limits.of_exploring, crew=crew, watch=watch)
         if graph.flawed is not None and graph.flaw is not None and graph.flaw.kind == found.flaw.kind:
             proof.example = _example(graph, graph.flawed, graph.flaw.sentence, path, name)
     return proof
@@ -181,27 +184,28 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
     name, path = _claimed(bounds, out)
     began_s = time.process_time()
     swarm = Swarm(bounds)
-    graph = explore(swarm, **limits.of_exploring, watch=watch)
-    figures = Figures(
-        graph.reached,
-        graph.looked_at,
-        graph.transitions,
-        len({local for state in graph.states for local in state[AGENTS:]}),
-        swarm.local.steps + graph.crew_steps,
-        len({state[ZONE] for state in graph.states}),
-        graph.depth,
-        round(graph.seconds, 3),
-        round(time.process_time() - began_s + graph.crew_s, 3),
-    )
-    proof = Proof(bounds, figures, graph.ended, graph.flaw)
-    if proof.complete:
-        try:
+    with Crew(swarm, limits.cores) as crew:
+        graph = explore(swarm, **limits.of_exploring, crew=crew, watch=watch)
+        figures = Figures(
+            len(graph.states),
+            graph.looked_at,
+            graph.transitions,
+            len({local for state in graph.states for local in state[AGENTS:]}),
+            swarm.local.steps + graph.crew_steps,
+            len({state[ZONE] for state in graph.states}),
+            graph.depth,
+            round(graph.seconds, 3),
+            round(time.process_time() - began_s + graph.crew_s, 3),
+        )
+        proof = Proof(bounds, figures, graph.ended, graph.flaw)
+        if proof.complete:
             budget = Budget(limits.most_bytes, limits.most_s - graph.seconds)
-            proof.liveness = liveness.look(graph, budget.check)
-        except GivenUpError as given_up:
-            proof.whole_ended = given_up.ended
-        except KeyboardInterrupt:
-            proof.whole_ended = "interrupted"
+            try:
+                proof.liveness = liveness.look(graph, lambda: budget.check(crew.memory_bytes), crew)
+            except GivenUpError as given_up:
+                proof.whole_ended = given_up.ended
+            except KeyboardInterrupt:
+                proof.whole_ended = "interrupted"
     _show(proof, graph, path, name)
     return proof
 

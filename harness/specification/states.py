@@ -87,7 +87,7 @@ def _of_record(agent: dict[str, Any]) -> Plain:
 def real(graph: Graph) -> Iterator[Plain]:
     """All states that `harness.prove` has found, without how long their timers have yet to run."""
     translator = _Translator(graph.swarm.local)
-    for state in graph.states[: graph.reached]:
+    for state in graph.states:
         yield tuple(map(translator.plain, state[AGENTS:]))
 
 

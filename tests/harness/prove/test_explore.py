@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from harness.prove import Bounds
+from harness.prove import Bounds, liveness
+from harness.prove.crew import Crew
 from harness.prove.explore import Graph, explore
 from harness.prove.local import DEAD
 from harness.prove.snapshot import key_of, put_back, take
@@ -67,9 +68,13 @@ def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, fa
 
 
 def test_on_two_cores_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.prove.explore.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.prove.crew.WORTH_A_CREW", 10)
     bounds = Bounds(3, 2, "lossy", ("reboot",))
-    alone, shared = (explore(Swarm(bounds), most_bytes=8e9, most_s=60, cores=cores) for cores in (1, 2))
+    alone = explore(Swarm(bounds), most_bytes=8e9, most_s=60)
+    swarm = Swarm(bounds)
+    with Crew(swarm, 2) as crew:
+        shared = explore(swarm, most_bytes=8e9, most_s=60, crew=crew)
+        assert liveness.look(shared, crew=crew) == liveness.look(alone)
     assert shared.crew_steps > 0
     assert shared.ended == alone.ended == "complete"
     assert shared.parents == alone.parents

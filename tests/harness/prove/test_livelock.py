@@ -5,6 +5,9 @@ from pathlib import Path
 import pytest
 
 from harness.prove import Bounds, in_words, prove
+from harness.prove.explore import explore
+from harness.prove.swarm import Swarm
+from harness.prove.votes import Votes
 from harness.prove.zones import NOTHING_RUNS, Zones
 
 
@@ -61,6 +64,17 @@ def test_what_needs_more_than_one_vote_is_a_scenario(tmp_path: Path) -> None:
     assert proof.reluctant is not None
     assert (proof.reluctant.path.name, proof.reluctant.chains) == ("four_votes.yaml", 3)
     assert any("needs more than one vote" in line for line in in_words(proof))
+
+
+def test_one_way_that_is_found_says_what_all_that_may_follow_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = explore(Swarm(Bounds(4, 2, "lossy")), most_bytes=8e9, most_s=60)
+    forks = [state for state in graph.states if graph.swarm.is_idle(state) and len(graph.swarm.chains(state)) > 1]
+    lazy = Votes(graph.swarm)
+    needed = [lazy.needed(fork) for fork in forks]
+    assert {*needed} == {1, 2}
+    monkeypatch.setattr(Votes, "_some_way", lambda *_: False)
+    thorough = Votes(graph.swarm)
+    assert [thorough.needed(fork) for fork in forks] == needed
 
 
 def test_a_coincidence_is_a_difference_that_was_open() -> None:

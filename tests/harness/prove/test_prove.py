@@ -14,6 +14,7 @@ import pytest
 from harness.errors import INTERRUPTED
 from harness.prove import INCOMPLETE, Bounds, BoundsError, Limits, Progress, in_words, prove
 from harness.prove.alone import collect
+from harness.prove.crew import Crew
 from harness.prove.explore import LOOK_EVERY, explore
 from harness.prove.swarm import Swarm
 from tests.harness.command import COMMAND, harness, sentences
@@ -148,8 +149,10 @@ def test_nobody_goes_on_who_was_interrupted(monkeypatch: pytest.MonkeyPatch) -> 
         assert multiprocessing.active_children()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("harness.prove.explore.WORTH_A_CREW", 10)
-    graph = explore(Swarm(Bounds(3, 3, "lossy")), most_bytes=8e9, most_s=60, cores=2, watch=interrupt)
+    monkeypatch.setattr("harness.prove.crew.WORTH_A_CREW", 10)
+    swarm = Swarm(Bounds(3, 3, "lossy"))
+    with Crew(swarm, 2) as crew:
+        graph = explore(swarm, most_bytes=8e9, most_s=60, crew=crew, watch=interrupt)
     assert graph.ended == "interrupted"
     assert graph.looked_at == LOOK_EVERY
     assert not multiprocessing.active_children()
