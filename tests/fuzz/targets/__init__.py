@@ -23,6 +23,8 @@ bag         ROS bags of both versions, by any storage and packing
 packed      a trace that gzip packed
 depot       exports, mission files and manifests at the depot
 matrix      a matrix, an earlier night's record, results
+secured     an agent with keys driven by a program: others with keys and without, the authority, in any epoch and life
+signed      a secured run's export with signatures, or its public keys
 keys        bundles, public and private keys, revocations
 """
 
@@ -35,6 +37,7 @@ NAMES = (
     *("datagram", "agent", "store", "mission", "control", "answer", "virtual", "foreign"),
     *("telemetry", "scenario", "story", "trace", "events", "export", "run_record", "network"),
     *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix", "by_hand", "keys"),
+    *("secured", "signed"),
 )
 
 

@@ -1,0 +1,276 @@
+"""An agent with keys, driven by a program: an input is a run of operations, each a byte and what it takes.
+
+Others with keys say to it what they like, well sealed and signed, or sealed with what they do not have, damaged,
+again, of any epoch and any life; the authority revokes anybody. The agent raises nothing, keeps no more than there are
+vehicles and blocks, what is dropped before its signature is verified changes nothing, and it does as one that shares
+its arithmetic with others in virtual time.
+"""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from harness.play.simulation.remembered import remembered
+from tests.fuzz.finding import require
+from ucp.block import Block
+from ucp.events import LoggableEvent
+from ucp.messages import (
+    MAX_DATAGRAM_BYTES,
+    BlockAddRequest,
+    BlockResponse,
+    ChainContainResponse,
+    CommitBlock,
+    MalformedDatagramError,
+    Message,
+    NextInSequenceResponse,
+)
+from ucp.secure.agent import SecuredAgent, boot_of
+from ucp.secure.block_signature import sign_block
+from ucp.secure.bundle import KeySet
+from ucp.secure.datagrams import ARITHMETIC, NOTHING_ASKED, Arithmetic, Request, domain_of
+from ucp.secure.envelope import CLEAR, MAGIC, SEAL_BYTES, VERSION, read_clear
+from ucp.secure.epochs import AHEAD, SENDERS_KEPT
+from ucp.secure.opening import Opener
+from ucp.secure.revocation import Revocation
+from ucp.secure.session import Session
+from ucp.secure.suite import SenderKeys, next_epoch_secret
+from ucp.settings import Settings
+from ucp.store import StoredState
+
+ROSTER = (1, 2, 3, 4)
+KEYS = KeySet.derived(b"fuzz".ljust(32, b"\0"), ROSTER, epoch_s=60.0)
+SETTINGS = Settings(max_block_bytes=64, max_event_bytes=64)
+MOST_OPERATIONS = 120
+KEPT = 32
+"""Datagrams that may come again."""
+BLOCKS = [Block(2, 1_000_000, b"of two"), Block(3, 1_000_000, b"of three"), Block(9, 7, b"of nobody")]
+BEFORE_ITS_SIGNATURE = {
+    *("truncated", "oversized", "wrong magic", "not secured", "wrong version", "impossible sender", "unknown type"),
+    *("own sender", "sender not on the roster", "revoked sender", "not signed by the authority", "known already"),
+    *("epoch out of range", "old boot", "replayed", "not authentic", "not signed by its sender"),
+}
+
+
+class _Program:
+    """The bytes of an input, one after another; zeros follow its end."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._position = data, 0
+
+    @property
+    def over(self) -> bool:
+        return self._position >= len(self._data)
+
+    def byte(self) -> int:
+        return int.from_bytes(self.take(1), "big")
+
+    def take(self, count: int) -> bytes:
+        self._position += count
+        return self._data[self._position - count : self._position]
+
+
+class _Driven:
+    """The agent, and what others have said to it."""
+
+    def __init__(self, arithmetic: Arithmetic) -> None:
+        self.now = 0.0
+        self._arithmetic = arithmetic
+        self._life = 0
+        self.agent = self._born()
+        self._said: list[bytes] = [b""]
+        self._sequence = 0
+        self._number = 0
+        self._secrets = [KEYS.group_secret]
+        for _ in range(64):
+            self._secrets.append(next_epoch_secret(self._secrets[-1], KEYS.public.mission))
+
+    def _born(self) -> SecuredAgent:
+        self._life += 1
+        session = Session(KEYS.bundle(1), boot_of(self._life, bytes(8)), arithmetic=self._arithmetic)
+        return SecuredAgent(session, 1, ROSTER, b"fuzz", SETTINGS)
+
+    def operate(self, program: _Program) -> None:
+        operation = program.byte() % 16
+        if operation == 0:
+            self._receive(program.take(program.byte() * 6))
+        elif operation < 5:
+            self._receive(self._sealed(program, self._body(program)))
+        elif operation < 7:
+            self._receive(self._sealed(program, program.take(program.byte() * 6)))
+        elif operation == 7:
+            self._receive(self._said[program.byte() % len(self._said)])
+        elif operation == 8:
+            self._receive(self._damaged(program))
+        elif operation < 11:
+            self._receive(self._revocation(program))
+        elif operation < 13:
+            self._wait(program.byte() / (4 if operation == 11 else 0.25))
+        elif operation == 13:
+            event = LoggableEvent(round(self.now * 1e6), 1 + program.byte() % 254, bytes(program.byte() % 50))
+            self.agent.add_event(event, self.now)
+        elif operation == 14:
+            self.agent.begin_reconcile(self.now)
+        else:
+            self._reboot()
+
+    def _sealed(self, program: _Program, said: tuple[int, bytes] | bytes) -> bytes:
+        """Of one of the others, signed by it or by another, in any epoch and life."""
+        who, lies = program.byte(), program.byte()
+        sender, signer = 2 + who % 3, 2 + (who if lies % 8 else who + 1) % 3
+        epoch = min(len(self._secrets) - 1, max(0, int(self.now // KEYS.public.epoch_s) + lies // 8 % 16 - 3))
+        boot = boot_of(lies // 128, bytes(8))
+        self._sequence += 1
+        sequence = program.byte() if lies % 32 == 31 else self._sequence
+        code, body = said if isinstance(said, tuple) else (who // 4 % 16, said)
+        header = code, sender, sequence, len(body) + SEAL_BYTES, epoch, boot, lies % 3
+        clear = CLEAR.pack(MAGIC, VERSION, *header)
+        keys = SenderKeys(self._secrets[epoch], KEYS.public.mission, epoch, sender, boot)
+        signed = clear + keys.encrypt(sequence, body, clear)
+        private_key = Ed25519PrivateKey.from_private_bytes(KEYS.vehicles[signer])
+        datagram = signed + keys.masked(sequence, private_key.sign(domain_of(KEYS.public.mission) + signed))
+        self._said = [*self._said, datagram][-KEPT:]
+        return datagram
+
+    def _body(self, program: _Program) -> tuple[int, bytes]:
+        """A message as it should be, which answers what it likes."""
+        code, choice = 1 + program.byte() % 9, program.byte()
+        state = self.agent.state
+        blocks = [*BLOCKS, *state.blocks_to_be_committed, *state.chain]
+        block, chain_hash = blocks[choice % len(blocks)], state.chain.top_chain_hash
+        asked = Request(1, self.agent.session.boot, self.agent.session._asked.get(code - 1, 0))
+        messages: dict[int, Message] = {
+            1: BlockAddRequest(block.block_hash, chain_hash),
+            3: CommitBlock(block, chain_hash),
+            5: ChainContainResponse(chain_hash, bool(choice & 1)),
+            7: NextInSequenceResponse(chain_hash, block.block_hash if choice & 2 else None, choice),
+            9: BlockResponse(block),
+        }
+        body = messages[code].body() if code in messages else block.block_hash
+        if code == 2:
+            body = bytes([choice & 1]) + block.block_hash
+        if code in (2, 5, 7, 9):
+            request = asked if choice & 64 else NOTHING_ASKED
+            body = request.sender.to_bytes(4, "big") + request.boot + request.sequence.to_bytes(4, "big") + body
+        if code in (3, 9):
+            maker = Ed25519PrivateKey.from_private_bytes(KEYS.vehicles.get(block.agent_id, bytes(32)))
+            body += sign_block(maker, KEYS.public.mission, block.block_data()) if choice & 128 else bytes(64)
+        return code, body
+
+    def _damaged(self, program: _Program) -> bytes:
+        datagram = bytearray(self._said[program.byte() % len(self._said)])
+        if datagram:
+            datagram[program.byte() * 5 % len(datagram)] ^= program.byte() or 1
+        return bytes(datagram)
+
+    def _revocation(self, program: _Program) -> bytes:
+        who = program.byte()
+        authority = KEYS.authority if who % 8 else bytes(32)
+        self._number += 1
+        body = Revocation.signed(
+            Ed25519PrivateKey.from_private_bytes(authority), KEYS.public.mission, self._number, {1 + who // 8 % 6}
+        ).encode()
+        if who % 4 == 3:
+            body = program.take(program.byte())
+        header = 10, 2 + who % 3, program.byte(), len(body), program.byte(), bytes(16), self._number % 2**16
+        return CLEAR.pack(MAGIC, VERSION, *header) + body
+
+    def _receive(self, data: bytes) -> None:
+        agent, before = self.agent, _of(self.agent)
+        dropped, handled = agent.dropped.copy(), agent.received.total()
+        epoch = agent.session.epochs.current
+        agent.receive_datagram(data, self.now)
+        reasons = agent.dropped - dropped
+        has_moved_on = agent.session.epochs.current != epoch
+        if reasons and set(reasons) <= BEFORE_ITS_SIGNATURE and not has_moved_on:
+            require(_of(agent) == before, f"dropped as {list(reasons)}, and the agent is another")
+        if not reasons and agent.received.total() == handled:
+            require(read_clear(data).type == 10, "neither dropped nor handled")
+        self.look()
+
+    def _wait(self, seconds: float) -> None:
+        until = self.now + seconds
+        while (ends := self.agent.next_timer()) is not None and ends <= until:
+            self.now = ends
+            self.agent.handle_timer(ends)
+            self.look()
+        self.now = until
+
+    def _reboot(self) -> None:
+        stored = StoredState.of(self.agent.state)
+        stored.secured = self.agent.secured_state()
+        self.agent = self._born()
+        self.agent.boot(stored, self.now)
+
+    def look(self) -> None:
+        """What it sends is opened by others, what it keeps is bounded, and its trace can be written."""
+        agent, session = self.agent, self.agent.session
+        for datagram in agent.datagrams_to_send():
+            require(len(datagram) <= MAX_DATAGRAM_BYTES, "it sends what no datagram holds")
+            if read_clear(datagram).type != 10:
+                Opener(KEYS.bundle(2)).open(datagram)
+        for entry in agent.trace():
+            entry.to_line()
+        state = agent.state
+        held = len(state.chain) + len(state.blocks_to_be_committed) + len(state.reconcile_stack)
+        require(len(session._lives) < len(ROSTER), "it remembers senders that there are not")
+        require(all(len(life.requests) <= 4 for life in session._lives.values()), "it remembers too many requests")
+        require(len(session.epochs._sender_keys) <= SENDERS_KEPT, "it keeps too many keys")
+        require(len(agent._answers) == 0, "it keeps what its answers answered")
+        require(len(agent.signatures) <= held + len(state.completed), "it keeps signatures of what it does not hold")
+        ahead = session.epochs.current - max(0, int(self.now // KEYS.public.epoch_s))
+        require(ahead <= AHEAD, "others have driven it too far")
+
+
+def _of(agent: SecuredAgent) -> dict[str, Any]:
+    """All that a datagram might change."""
+    state, session = agent.state, agent.session
+    return {
+        "received": agent.received.copy(),
+        "chain": (len(state.chain), state.chain.top_chain_hash, len(state.blocks_to_be_committed)),
+        "reconcile": (state.reconcile_in_progress, len(state.reconcile_stack), state.vote_count.copy()),
+        "timers": [timer.deadline for timer in state.timers],
+        "keys": {*session.epochs._sender_keys},
+        "signatures": dict(agent.signatures),
+        "revocation": agent.revocation,
+        "heard": {
+            sender: (life.boot, life.window._newest, tuple(life.window._words), dict(life.requests))
+            for sender, life in session._lives.items()
+        },
+    }
+
+
+def _driven(data: bytes, arithmetic: Arithmetic) -> tuple[object, ...]:
+    program, driven = _Program(data), _Driven(arithmetic)
+    for _ in range(MOST_OPERATIONS):
+        if program.over:
+            break
+        driven.operate(program)
+    agent = driven.agent
+    return _of(agent), agent.dropped, agent.session.epochs.current
+
+
+def run(data: bytes) -> None:
+    require(_driven(data, ARITHMETIC) == _driven(data, remembered()), "with remembered arithmetic it does otherwise")
+    with suppress(MalformedDatagramError):
+        Opener(KEYS.bundle(1)).open(data)
+
+
+def seeds(flown: Path) -> Iterator[bytes]:
+    """A block that is voted on; commits, signed and not; a reconcile; epochs, lives and revocations; a reboot."""
+    block = bytes([13, 1, 40, 13, 1, 40, 13, 1, 40])
+    commit, unsigned = bytes([1, 2, 128, 0, 24 + 1]), bytes([1, 2, 0, 0, 24 + 1])
+    vote = bytes([1, 1, 67, 0, 24 + 1])
+    yield block + vote + vote + bytes([11, 60])
+    yield commit + unsigned + bytes([7, 0, 7, 1, 8, 1, 3, 9])
+    yield bytes([14, 1, 4, 65, 0, 25, 11, 60, 1, 6, 67, 1, 25, 11, 60, 1, 8, 193, 2, 25, 11, 60])
+    yield bytes([12, 20, 1, 0, 0, 0, 25, 1, 0, 0, 1, 25 + 8, 1, 0, 0, 1, 255, 7, 1])
+    yield bytes([9, 9, 0, 0, 9, 17, 0, 0, 1, 2, 128, 0, 25, 9, 8, 0, 0, 9, 11, 5, 1, 2, 3, 4, 5, 0, 0])
+    yield (
+        block
+        + bytes([15])
+        + commit
+        + bytes([5, 3, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 4, 25])
+    )
