@@ -15,12 +15,15 @@ from sitl.address import Address
 from sitl.channel import Channel
 from sitl.ground_station import GroundStation
 from sitl.shown import ShownVehicle
+from sitl.streams import heartbeat
 from sitl.system_ids import system_ids
 from sitl.track import Track
 from sitl.vehicle import VehicleError
 
 SHOW_S = 0.25
 """Wall time between two looks at the tracks, at least: what that costs must not grow with the speedup."""
+SILENT_S = 1.0
+"""Of wall time: who stands still says that it is there, or a ground station takes it for lost."""
 READ_BYTES = 65_536
 
 
@@ -29,6 +32,7 @@ class _OnAir:
     vehicle: ShownVehicle
     channel: Channel
     sock: socket.socket
+    said_at: float = 0.0
 
 
 class TracksOnStation:
@@ -70,8 +74,12 @@ class TracksOnStation:
             with contextlib.suppress(BlockingIOError, ConnectionError):
                 on_air.channel.receive(on_air.sock.recv(READ_BYTES))
             on_air.channel.send_due()
-            with contextlib.suppress(BlockingIOError, ConnectionError):  # whoever reads too slowly misses something
-                on_air.sock.send(on_air.channel.take())
+            if at - on_air.said_at >= SILENT_S:
+                on_air.channel.send(heartbeat(on_air.vehicle))
+            if data := on_air.channel.take():
+                on_air.said_at = at
+                with contextlib.suppress(BlockingIOError, ConnectionError):  # whoever reads too slowly misses something
+                    on_air.sock.send(data)
 
     def close(self) -> dict[str, Any]:
         """End all connections; what passed over them, for the record."""
