@@ -41,6 +41,13 @@ def prove_command(
     quirk: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="A mistake that all agents make; may be repeated.")
     ] = None,
+    captured: Annotated[
+        int | None,
+        typer.Option(metavar="ID", help="Somebody has this agent's keys, and says anything with them."),
+    ] = None,
+    lies: Annotated[
+        int | None, typer.Option(help="How much of that is heard, by one agent each; any number with --network any.")
+    ] = None,
     whole: Annotated[
         bool, typer.Option("--whole", help="Take no two states for one, though they behave alike.")
     ] = False,
@@ -67,6 +74,8 @@ def prove_command(
     if timers not in TIMERS:
         raise BoundsError(f"--timers must be one of {', '.join(TIMERS)}, not {timers!r}")
     quirks = _pairs("--quirk", quirk)
+    if lies is not None and (captured is None or network == "any"):
+        raise BoundsError("--lies is for --captured, and not for --network any, where any number is heard")
     bounds = Bounds(
         agents,
         blocks,
@@ -79,6 +88,8 @@ def prove_command(
         reduced=not whole and not quirks,
         steps=steps,
         stagger=_pairs("--stagger", stagger),  # type: ignore[arg-type]  # it is checked
+        captured=captured,
+        lies=1 if lies is None else lies,
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:

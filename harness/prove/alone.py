@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from harness.prove.bounds import Bounds
+from harness.prove.captor import Heard
+from harness.prove.letters import Material
 from harness.prove.local import DEAD, Flaw, LocalStates, Step
 from harness.prove.progress import Ended, Progress, memory_bytes
 from harness.prove.zones import NOTHING_RUNS, Zones
@@ -42,6 +44,8 @@ class Collected:
     flaw: Flaw | None = None
     way: list[str] = field(default_factory=list)
     """What the agent with the flaw did and heard before."""
+    shown: set[str] = field(default_factory=set)
+    """Characteristics that a captor violates though no agent does anything wrong."""
 
 
 def collect(
@@ -58,7 +62,7 @@ def collect(
     """
     collected, began = Collected(bounds), time.monotonic()
     try:
-        for makers in divisions(bounds.agents, bounds.blocks):
+        for makers in divisions(bounds.agents, bounds.blocks, bounds.captured):
             collected.divisions += 1
             division = _Division(collected, makers)
             for progress in division.collect(began):
@@ -80,12 +84,15 @@ def collect(
     return collected
 
 
-def divisions(agents: int, blocks: int) -> Iterator[tuple[int, ...]]:
-    """Who completes which block, in the order of the blocks; agents are numbered as they come."""
+def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator[tuple[int, ...]]:
+    """Who completes which block, in the order of the blocks; agents are numbered as they come, but for the captured."""
+    others = [agent_id for agent_id in range(1, agents + 1) if agent_id != captured]
     begun: list[tuple[int, ...]] = [()]
     for _ in range(blocks):
         begun = [
-            (*makers, maker) for makers in begun for maker in range(1, min(agents, max(makers, default=0) + 1) + 1)
+            (*makers, maker)
+            for makers in begun
+            for maker in (*others[: len({*makers} - {captured}) + 1], *([captured] if captured is not None else []))
         ]
     return iter(begun)
 
@@ -105,13 +112,18 @@ class _Division:
         self._came_from: dict[Alone, tuple[Alone, str] | None] = {}
         self._said: dict[Said, None] = {}
         self._names: dict[int, frozenset[int]] = {}
-        self._by_agent: dict[int, list[Alone]] = {agent_id: [] for agent_id in self._own}
+        self._by_agent: dict[int, list[Alone]] = {agent_id: [] for agent_id in self._own if agent_id != bounds.captured}
+        self._heard = None if bounds.captured is None else Heard(bounds, self._own[bounds.captured])
+        """What a captor has heard, who can speak at any moment; the blocks of its vehicle it has from the beginning."""
+        self._lied: dict[int, tuple[Material, int]] = {}
+        """Of each agent: with what the captor spoke to it last, and to how many of its states."""
 
     def collect(self, began: float) -> Iterator[Progress]:
         """Until there is no more."""
         collected = self._collected
         before = collected.states, collected.said, collected.local_states, collected.steps, collected.zones
-        for agent_id, local in self.local.initial.items():
+        for agent_id in self._by_agent:
+            local = self.local.initial[agent_id]
             self._add((agent_id, local, NOTHING_RUNS, 0), None)
         acted = dict.fromkeys(self._by_agent, 0)
         heard: dict[Said, int] = {}
@@ -132,6 +144,7 @@ class _Division:
                         busy = True
                         self._hear(states[position], said)
                     heard[key] = len(states)
+                    self._captor_hears(said)
                     collected.states = before[0] + len(self._came_from)
                     yield Progress(
                         collected.states,
@@ -140,6 +153,8 @@ class _Division:
                         collected.divisions,
                         time.monotonic() - began,
                     )
+                busy |= self._lied_to(agent_id, states)
+        collected.states = before[0] + len(self._came_from)
         collected.looked_at += looked_at
         collected.said = before[1] + len(self._said)
         collected.local_states = before[2] + len(self.local.known)
@@ -151,15 +166,15 @@ class _Division:
             return
         self._came_from[state] = came_from
         self._by_agent[state[0]].append(state)
-        flaw = self.local.known[state[1]].flaw
-        if flaw is not None and self._collected.flaw is None:
-            self._collected.flaw = flaw
-            way = []
+        known, collected = self.local.known[state[1]], self._collected
+        if known.flaw is not None and collected.flaw is None:
+            collected.flaw = known.flaw
             while came_from is not None:
                 before, what = came_from
-                way.append(what)
+                collected.way.insert(0, what)
                 came_from = self._came_from[before]
-            self._collected.way = way[::-1]
+        if known.deceived:
+            collected.shown.add("4")
 
     def _act(self, state: Alone) -> None:
         """What the agent may do of its own."""
@@ -187,6 +202,32 @@ class _Division:
         self._collected.transitions += 1
         if step.local != local or step.sent or step.started:
             self._go(state, step, f"it hears a {self.local.messages[said[1]].NAME} from agent {said[0]}")
+
+    def _captor_hears(self, said: Said) -> None:
+        if self._heard is not None:
+            self._heard.hears(said[0], self.local.messages[said[1]])
+
+    def _lied_to(self, agent_id: int, states: list[Alone]) -> bool:
+        """The captor says all that it can to the agent in each of these states; whether it had not done so before."""
+        if self._heard is None:
+            return False
+        material, before = self._heard.material(agent_id), self._lied.get(agent_id)
+        told = 0 if before is None or before[0] != material else before[1]
+        for state in states[told:]:
+            for message in self._heard.letters(self.local.state(state[1]), material):
+                self._lie(state, self.local.message(message))
+        self._lied[agent_id] = material, len(states)
+        return told < len(states)
+
+    def _lie(self, state: Alone, message: int) -> None:
+        agent_id, local, _, completed = state
+        if self._known_flaw(local) or not self._named(message).isdisjoint(self._own[agent_id][completed:]):
+            return
+        step = self.local.lie(local, message)
+        self._collected.transitions += 1
+        if step.local != local or step.sent or step.started:
+            self._collected.shown.add("1")
+            self._go(state, step, f"it hears a {self.local.messages[message].NAME} of the captor's")
 
     def _known_flaw(self, local: int) -> bool:
         return self.local.known[local].flaw is not None

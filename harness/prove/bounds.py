@@ -15,6 +15,7 @@ Network = Literal["lossless", "lossy", "any"]
 FAULTS = ("reboot", "death", "duplicate")
 MAX_AGENTS = 9
 MAX_BLOCKS = 9
+MAX_LIES = 9
 EVENT_FILLS_BLOCK = {"max_block_bytes": 267}
 """An event completes a block."""
 
@@ -30,7 +31,8 @@ class Bounds:
     `timers_any`: a timer may end whenever it runs, however long it should. `apart`: no two things happen at the same
     moment by chance, but those only whose distance is fixed, as one began by the other. `reduced`: states that behave
     alike are one. `steps`: each step of the agents is held against that of right ones, too. `stagger`: agents' timers
-    differ, as a scenario's `stagger` says.
+    differ, as a scenario's `stagger` says. `captured`: somebody has this agent's keys, and after a moment of his choice
+    speaks in its name; `lies` such messages are heard, or any number in the network "any".
     """
 
     agents: int = 2
@@ -44,6 +46,8 @@ class Bounds:
     reduced: bool = True
     steps: bool = False
     stagger: Stagger = field(default_factory=dict)
+    captured: int | None = None
+    lies: int = 1
 
     def __post_init__(self) -> None:
         for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):
@@ -54,6 +58,7 @@ class Bounds:
         for fault in self.faults:
             if fault not in FAULTS:
                 raise BoundsError(f"--faults must be some of {', '.join(FAULTS)}, not {fault!r}")
+        self._check_captured()
         if self.stagger and self.network == "any":
             raise BoundsError("--stagger is not for --network any, where each agent is looked at by itself")
         for name, step_s in self.stagger.items():
@@ -71,10 +76,25 @@ class Bounds:
         except (TypeError, ValueError) as error:
             raise BoundsError(f"{error}") from None
 
+    def _check_captured(self) -> None:
+        if self.captured is None:
+            return
+        if not (self.agents > 1 and 1 <= self.captured <= self.agents):
+            raise BoundsError(f"--captured must be one of 2 or more agents, not {self.captured} of {self.agents}")
+        if not 0 <= self.lies <= MAX_LIES:
+            raise BoundsError(f"--lies must be 0..{MAX_LIES}, not {self.lies}")
+        if self.quirks or "death" in self.faults:
+            raise BoundsError("--captured is for right agents that stay: leave out --quirk and the fault death")
+
     @property
     def alike(self) -> bool:
         """Whether it makes no difference who is who."""
-        return self.reduced and not self.stagger
+        return self.reduced and not self.stagger and self.captured is None
+
+    @property
+    def settles(self) -> bool:
+        """Whether all answers to a question have come, or are lost, when the instant of the question is over."""
+        return self.reduced and self.captured is None
 
     def agent_settings(self, agent_id: int = 1) -> Settings:
         return staggered(Settings(**{**EVENT_FILLS_BLOCK, **self.settings}), self.stagger, agent_id - 1)
@@ -85,6 +105,9 @@ class Bounds:
             f"{self.blocks} block{'s' if self.blocks > 1 else ''}",
             f"network {self.network}",
         ]
+        if self.captured is not None:
+            lies = "as many lies as it likes" if self.network == "any" else f"{self.lies} lie{'s' * (self.lies != 1)}"
+            parts.append(f"agent {self.captured} captured, {lies}")
         parts += [f"faults {', '.join(self.faults)}"] if self.faults else []
         parts += ["timers in any order"] if self.timers_any else ["nothing at once by chance"] if self.apart else []
         parts += [f"{name} {value}" for name, value in self.settings.items()]

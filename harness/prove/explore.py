@@ -37,6 +37,8 @@ class Graph:
     looked_at: int = 0
     ended: Ended = "complete"
     flawed: int | None = None
+    shown: dict[str, int] = field(default_factory=dict)
+    """The first state, by characteristic, after each of what a captor can do that is no flaw of the agents."""
     crew_bytes: float = 0.0
     crew_s: float = 0.0
     crew_steps: int = 0
@@ -54,6 +56,9 @@ class Graph:
             self.parents.append(parent)
             if self.flawed is None and self.swarm.flaw(state) is not None:
                 self.flawed = number
+            if self.swarm.bounds.captured is not None:
+                for key in self.swarm.violated(state):
+                    self.shown.setdefault(key, number)
         return number
 
     def take_in(self, expansion: Expansion) -> None:

@@ -29,7 +29,10 @@ MOST_SEEN = 500
 
 
 class Action(NamedTuple):
-    """What an agent does of its own: "timer" and its number, "complete" and the block's ordinal, or a fault."""
+    """What an agent does of its own: "timer" and its number, "complete" and the block's ordinal, or a fault.
+
+    Or what befalls it: it is "captured", or hears a "lie", a message with this number.
+    """
 
     place: int
     what: str
@@ -94,7 +97,7 @@ class Instants:
             place = action.place
             step = self._act(agents[place], action)
             agents[place] = step.local
-            if action.what in ("death", "reboot"):
+            if action.what in ("death", "reboot", "captured"):
                 started[place] = ()
             started[place] = self._still(started[place], step)
             air += [(place, message) for message in step.sent]
@@ -114,7 +117,7 @@ class Instants:
                     if (heard, answers) not in after:
                         after[heard, answers] = Wave(way, said, orders) if tell else None
             waiting = after
-        if not self._bounds.reduced:
+        if not self._bounds.settles:
             return silent
         settled: dict[Agents, Wave | None] = {}
         for there, way in silent.items():
@@ -128,6 +131,8 @@ class Instants:
             return self._local.complete(local, action.number)
         if action.what == "reboot":
             return self._local.reboot(local)
+        if action.what == "lie":
+            return self._local.lie(local, action.number)
         return Step(DEAD, (), ())
 
     def _hear(
@@ -145,7 +150,7 @@ class Instants:
             yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders
 
     def _settled(self, local: int, answered: bool) -> int:
-        return self._local.settled(local) if answered and self._bounds.reduced else local
+        return self._local.settled(local) if answered and self._bounds.settles else local
 
     def _lets_be(self, local: int, place: int, said: tuple[tuple[int, int], ...]) -> bool:
         """Whether nothing of what is said makes any difference to the agent at `place`, so that no order of it does."""
@@ -209,7 +214,7 @@ class Instants:
                 self._outcomes[key] = outcomes
                 return outcomes
             if self._bounds.reduced:
-                if answered:
+                if answered and self._bounds.settles:
                     settled = {
                         step._replace(local=self._local.settled(step.local)): way for step, way in reversed(outcomes)
                     }

@@ -8,11 +8,13 @@ looked at once, when it gets its number.
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import blake2b
 from random import Random
 from typing import Any, NamedTuple
 
 from harness.prove.bounds import Bounds
+from harness.prove.gate import Gate
 from harness.prove.reference import Give, Reference
 from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, dead, keyed, put_back, take
 from ucp.agent import HANDLERS, Agent
@@ -20,7 +22,7 @@ from ucp.block import Block, next_chain_hash
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.handler import EventHandler
-from ucp.messages import Message
+from ucp.messages import CARRY_A_BLOCK, Message
 from ucp.quirks import wrong_handlers
 from ucp.state import AgentState
 from ucp.store import StoredState
@@ -53,7 +55,8 @@ class Step(NamedTuple):
 class Flaw:
     """Something that must never be: of which characteristic ("2", "3", "4"), or "hang", "crash" or "steps"; a sentence.
 
-    `handler` is that of a wrong step.
+    Or of a captor: what is heard in another's "name", or of a vehicle that is "revoked", and a block in the name of an
+    "honest" one. `handler` is that of a wrong step.
     """
 
     kind: str
@@ -63,7 +66,10 @@ class Flaw:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A local state. `waits` says whether the agent reconciles, `chain` is the number of its chain."""
+    """A local state. `waits` says whether the agent reconciles, `chain` is the number of its chain.
+
+    `deceived`: it holds a block in the captured vehicle's name which that never completed.
+    """
 
     agent_id: int
     snapshot: Snapshot
@@ -75,6 +81,7 @@ class Known:
     anonymous: int
     """The same for states that differ only in who has voted and answered; the same number on any machine."""
     names_others: bool
+    deceived: bool
 
 
 WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us": -1}
@@ -82,7 +89,7 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 
 
 Content = tuple[int, Snapshot, "Flaw | None"]
-FLAWS_OF_STEPS = ("crash", "steps")
+FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
 """Kinds that the state after a step does not show."""
 NAMES_OF_OTHERS = ("voters", "reconcile_responders")
 """Parts of the state that are sets of other agents."""
@@ -113,8 +120,11 @@ class LocalStates:
         roster = range(1, bounds.agents + 1)
         settings = bounds.agent_settings()
         self.settings, self._roster = settings, roster
+        self._gate = None if bounds.captured is None else Gate(roster, bounds.captured)
         self._others = tuple(range(FIRST_OTHER, bounds.agents + 1))
         self._agents = {agent_id: self._agent(agent_id) for agent_id in roster}
+        self._revoked = {agent_id: self._agent(agent_id, revoked=True) for agent_id in roster if self._gate is not None}
+        """Agents to whom the captured vehicle is revoked."""
         self._reference = Reference(self._agent) if bounds.steps else None
         self.timers = [timer.name for timer in self._agents[1].state.timers]
         durations = (
@@ -149,13 +159,16 @@ class LocalStates:
         self._renamed: dict[tuple[int, tuple[int, ...]], int] = {}
         self.initial = {agent_id: self._intern(agent, take(agent)) for agent_id, agent in self._agents.items()}
 
-    def _agent(self, agent_id: int, right: bool = False, after_each: Callable[[], None] | None = None) -> Agent:
+    def _agent(
+        self, agent_id: int, right: bool = False, after_each: Callable[[], None] | None = None, *, revoked: bool = False
+    ) -> Agent:
         """A new one; it traces its handler runs if `after_each` is to be called after each."""
         handlers = [] if right else wrong_handlers(self.bounds.quirks, Random(0))
         if after_each is not None:
             handlers = [_calling(handler, after_each) for handler in handlers or HANDLERS.values()]
         settings, tracing = self.bounds.agent_settings(agent_id), after_each is not None
-        return Agent(agent_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
+        make = Agent if self._gate is None else partial(self._gate.agent, revoked=revoked)
+        return make(agent_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
 
     # Steps
 
@@ -257,6 +270,39 @@ class LocalStates:
             step = self._steps[key] = self._computed(local, lambda agent: agent.boot(stored, NOW_S), boots=True)
         return step
 
+    def lie(self, local: int, message: int) -> Step:
+        """The agent hears a datagram that is sealed with the captured vehicle's keys, which the real gate opens."""
+        key = local, -4, message
+        step = self._steps.get(key)
+        if step is None:
+            flaw = self._got_in(local, message)
+            step = self._steps[key] = self._computed(
+                local, lambda agent: agent.receive_datagram(self._sealed(message), NOW_S), hears=True, flaw=flaw
+            )
+        return step
+
+    def _got_in(self, local: int, message: int) -> Flaw | None:
+        """What must not: the same of a vehicle known to be revoked, in another's name, or with another's block."""
+        assert self._gate is not None, "a vehicle is captured"
+        known, said = self.known[local], self.messages[message]
+        revoked = self._revoked[known.agent_id]
+        put_back(revoked, known.snapshot)
+        if _is_heard(revoked, self._sealed(message), known.snapshot):
+            return Flaw("revoked", f"a {said.NAME} of a vehicle that is known to be revoked is heard")
+        for datagram in self._gate.forged(said, known.agent_id, NOW_S):
+            agent = self._restored(local)
+            if _is_heard(agent, datagram, known.snapshot):
+                return Flaw("name", f"a {said.NAME} is heard that only another vehicle could have signed")
+            self._loaded[known.agent_id] = known.snapshot
+        return None
+
+    def _sealed(self, message: int) -> bytes:
+        """A new datagram of the captor's that says this."""
+        assert self._gate is not None, "a vehicle is captured"
+        said = self.messages[message]
+        genuine = type(said) in CARRY_A_BLOCK and said.block.block_hash in self._blocks  # type: ignore[union-attr]
+        return self._gate.sealed(said, NOW_S, genuine=genuine)
+
     def state(self, local: int) -> AgentState:
         """The whole of a local state, to look at before the next step is computed."""
         return self._restored(local).state
@@ -279,7 +325,14 @@ class LocalStates:
         return agent
 
     def _computed(
-        self, local: int, give: Give, *, hears: bool = False, boots: bool = False, completes: int | None = None
+        self,
+        local: int,
+        give: Give,
+        *,
+        hears: bool = False,
+        boots: bool = False,
+        completes: int | None = None,
+        flaw: Flaw | None = None,
     ) -> Step:
         self.steps += 1
         before = self.known[local]
@@ -297,11 +350,12 @@ class LocalStates:
             wrong = self._reference.deviation(agent, crashed, snapshot, give, self._block_in_words)
         if crashed is None:
             crashed = _end_at_once(agent)
-        flaw = Flaw("crash", f"a handler ended by {crashed}") if crashed else None
+        if crashed is not None:
+            flaw = Flaw("crash", f"a handler ended by {crashed}")
         if wrong is not None:
             handler, sentence = wrong
             flaw = Flaw("steps", sentence, handler)
-        sent = tuple(self._message(message) for _, message in agent.messages_to_send())
+        sent = tuple(self.message(message) for _, message in agent.messages_to_send())
         started = tuple(
             (number, round((timer.deadline - NOW_S) * MICROSECONDS))
             for number, timer in enumerate(agent.state.timers)
@@ -323,6 +377,10 @@ class LocalStates:
         """The agent had `completed` blocks before; what it has completed now is the `ordinal`th of all."""
         self.note_completed((digest, agent.agent_id, ordinal) for digest in agent.state.completed[completed:])
 
+    def completed_by(self, agent_id: int, ordinal: int) -> bytes:
+        """The hash of the `ordinal`th block of all, which this agent has completed."""
+        return next(made for made, maker, number in self.completed if (maker, number) == (agent_id, ordinal))
+
     def note_completed(self, blocks: Iterable[tuple[bytes, int, int]]) -> None:
         """These blocks were completed, here or in another process."""
         for block_hash, agent_id, ordinal in blocks:
@@ -335,7 +393,8 @@ class LocalStates:
         ordinals = sorted(self._ordinals.get(bytes.fromhex(block_hash), ()))
         return f"#{ordinals[-1]}" if ordinals else block_hash[:12]
 
-    def _message(self, message: Message) -> int:
+    def message(self, message: Message) -> int:
+        """Its number."""
         number = self._message_numbers.setdefault(message, len(self.messages))
         if number == len(self.messages):
             self.messages.append(message)
@@ -427,6 +486,7 @@ class LocalStates:
                     flaw or self._flaw(state),
                     self._anonymous(agent.agent_id, flaw, snapshot),
                     any(snapshot[name] for name in NAMES_OF_OTHERS),
+                    self._is_deceived(state),
                 )
             )
             if self.known[number].flaw is not None:
@@ -481,10 +541,10 @@ class LocalStates:
             return Flaw("2", "an idle agent holds a completed block that is not in its chain")
         if any(count > 1 for count in Counter([*chain, *aside]).values()):
             return Flaw("3", "an agent holds a block twice")
-        makers = {block.block_hash: block.agent_id for block in (*state.chain, *state.blocks_to_be_committed)}
-        makers |= {block.block_hash: block.agent_id for block in state.reconcile_stack}
-        if any(self._blocks.get(block_hash) != maker for block_hash, maker in makers.items()):
-            return Flaw("4", "an agent holds a block that the agent that it names never completed")
+        makers = self._makers(state)
+        if any(self._blocks.get(made) != maker != self.bounds.captured for made, maker in makers.items()):
+            kind = "4" if self.bounds.captured is None else "honest"
+            return Flaw(kind, "an agent holds a block that the agent that it names never completed")
         chain_hash = state.chain.inception.chain_hash
         for block, said in state.chain.with_chain_hashes():
             chain_hash = next_chain_hash(chain_hash, block.block_hash)
@@ -493,6 +553,19 @@ class LocalStates:
         if state.reconcile_in_progress and all(timer.deadline is None for timer in state.reconcile_timers):
             return Flaw("hang", "an agent reconciles, and no timer of the reconcile runs: it answers nobody for ever")
         return None
+
+    def _makers(self, state: AgentState) -> dict[bytes, int]:
+        """Who made the blocks that an agent holds, as these say."""
+        held = (*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack)
+        return {block.block_hash: block.agent_id for block in held}
+
+    def _is_deceived(self, state: AgentState) -> bool:
+        if self.bounds.captured is None:
+            return False
+        return any(
+            maker == self.bounds.captured and block_hash not in self._blocks
+            for block_hash, maker in self._makers(state).items()
+        )
 
     def _check_that_nothing_is_lost(self, before: Snapshot, state: AgentState) -> None:
         """Blocks stay: without that the completed ones could not be forgotten (characteristic 2)."""
@@ -506,6 +579,14 @@ def _back(names: Names) -> Names:
     """The names by which everybody has the name again that he had."""
     before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
     return tuple(before[name] for name in sorted(names))
+
+
+def _is_heard(agent: Agent, datagram: bytes, before: Snapshot) -> bool:
+    """Whether anything comes of a datagram that the agent is given in this state: it should drop it."""
+    dropped = agent.dropped.total()
+    agent.receive_datagram(datagram, NOW_S)
+    unchanged = all(value is before[name] for name, value in take(agent, before).items())
+    return not (unchanged and agent.dropped.total() == dropped + 1 and not vars(agent.state)["outbox"])
 
 
 def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:

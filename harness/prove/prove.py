@@ -33,9 +33,34 @@ CLAIMS = {
     "steps": "every step is that of a right agent",
 }
 """What is looked at in every state; "steps" where it is asked for."""
+OF_CAPTORS = {
+    "1": "every message that is believed was sent by the vehicle that it names",
+    "4": "every block is genuine",
+}
+"""What a captor may violate though no agent does anything wrong: looked at where somebody is captured."""
+SHOWN = {
+    "1": "an agent believes what the captured vehicle never sent",
+    "4": "an agent holds a block in the captured vehicle's name that it never completed",
+}
+OF_OTHERS = {
+    "honest": "every block in the name of another than the captured vehicle is genuine",
+    "name": "nothing is heard in another's name, and no block that its maker did not sign",
+    "revoked": "nothing is heard of the captured vehicle by who knows that it is revoked",
+}
+"""What it must not, whatever it says."""
 RUN_LOOKED_FOR_S = 60.0
 """For so long, at most, a run is looked for that has the flaw that an agent by itself has."""
-PLAYED = {"2": "2", "3": "3", "4": "4", "hang": "liveness", "crash": "liveness", "steps": "steps"}
+PLAYED = {
+    "honest": "4",
+    "name": "1",
+    "revoked": "1",
+    "2": "2",
+    "3": "3",
+    "4": "4",
+    "hang": "liveness",
+    "crash": "liveness",
+    "steps": "steps",
+}
 """Kinds of flaws, and by what a simulated run shows them."""
 
 
@@ -79,6 +104,16 @@ class Proof:
     livelocks: list[Livelock] = field(default_factory=list)
     """The first of each form, those that were played."""
     way: list[str] = field(default_factory=list)
+    shown: dict[str, Example | None] = field(default_factory=dict)
+    """By characteristic of `OF_CAPTORS`: the nearest of what a captor does; None in the network `any`."""
+
+    @property
+    def claims(self) -> dict[str, str]:
+        """What is looked at in every state."""
+        claims = CLAIMS if self.bounds.steps else {kind: claim for kind, claim in CLAIMS.items() if kind != "steps"}
+        if self.bounds.captured is None:
+            return claims
+        return {**dict(sorted({**claims, **OF_CAPTORS}.items())), **OF_OTHERS}
 
     @property
     def complete(self) -> bool:
@@ -87,7 +122,7 @@ class Proof:
     @property
     def exit_status(self) -> int:
         live = self.liveness
-        if self.flaw or (live is not None and (live.cycles or live.lost is not None)):
+        if self.flaw or self.shown or (live is not None and (live.cycles or live.lost is not None)):
             return VIOLATED
         if "interrupted" in (self.ended, self.whole_ended):
             return INTERRUPTED
@@ -105,6 +140,7 @@ class Proof:
             "timers": "any" if bounds.timers_any else "apart" if bounds.apart else "duration",
             "settings": dict(bounds.settings),
             "stagger": dict(bounds.stagger),
+            **(self._captors_json() if bounds.captured is not None else {}),
             "quirks": dict(bounds.quirks),
             "reduced": bounds.reduced,
             "steps_judged": bounds.steps,
@@ -121,6 +157,13 @@ class Proof:
             "livelocks": None if live is None else len(live.cycles),
             "livelock_forms": [each.to_json() for each in self.livelocks],
             "example": None if self.example is None else self.example.to_json(),
+        }
+
+    def _captors_json(self) -> dict[str, Any]:
+        return {
+            "captured": self.bounds.captured,
+            "lies": None if self.bounds.network == "any" else self.bounds.lies,
+            "shown": {key: None if example is None else example.to_json() for key, example in self.shown.items()},
         }
 
 
@@ -158,7 +201,7 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Pr
         round(found.seconds, 3),
         round(time.process_time() - began_s, 3),
     )
-    proof = Proof(bounds, figures, found.ended, found.flaw, way=found.way)
+    proof = Proof(bounds, figures, found.ended, found.flaw, way=found.way, shown=dict.fromkeys(found.shown))
     if found.flaw is not None:
         limits = replace(limits, most_s=min(RUN_LOOKED_FOR_S, limits.most_s - found.seconds))
         swarm = Swarm(_with_instants(bounds))
@@ -213,6 +256,9 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
 def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
     """Write what was found as scenarios: the first to `path`."""
     live = proof.liveness
+    for key, number in graph.shown.items():
+        beside = path.with_stem(f"{path.stem}_characteristic_{key}")
+        proof.shown[key] = _example(graph, number, SHOWN[key], beside, f"{name} characteristic {key}")
     if proof.flaw is not None and graph.flawed is not None:
         proof.example = _example(graph, graph.flawed, proof.flaw.sentence, path, name)
     elif live is not None and live.cycles:

@@ -18,9 +18,13 @@ from harness.prove.instant import Action, Wave
 from harness.prove.local import DEAD, Step
 from harness.prove.swarm import AGENTS, Move
 from harness.prove.times import Run, instants_s, windows_s
+from harness.prove.wording import Wording
 from harness.scenario.numbered import in_text
+from netem.medium import LATENCY
 
 LATENCY_S = 0.02
+HEARD_AFTER_S = LATENCY.mean_s
+"""What a rogue node sends is heard so much later."""
 MOMENT_S = 0.001
 """Between two things of which one has to be the first."""
 SOON_S = 0.1
@@ -81,6 +85,8 @@ class Script:
         self._late: dict[int, dict[int, float]] = defaultdict(dict)
         self._end_s = 0.0
         self._latency_s = LATENCY_S
+        captor = self._swarm.captor
+        self._wording = None if captor is None else Wording(self._swarm.local, captor.captured, captor.made)
 
     def document(self, name: str) -> Document:
         """The scenario."""
@@ -89,6 +95,8 @@ class Script:
             self._latency_s = LATENCY_S if next_s - at_s > SOON_S else MOMENT_S
             self._play(move, at_s)
         self._let_nothing_end_before_the_end()
+        if self._wording is not None:
+            self._wording.word()
         bounds = self._swarm.bounds
         lateness = {
             agent_id: in_text(sorted(late.items()), "+") for agent_id, late in sorted(self._late.items()) if late
@@ -99,6 +107,7 @@ class Script:
             "duration_s": float(round(self._end_s) + SETTLES_S),
             "network": {"delay": LATENCY_S},
             "settings": {**EVENT_FILLS_BLOCK, **bounds.settings},
+            **({"security": {"captured": bounds.captured}} if bounds.captured else {}),
             **({"stagger": dict(bounds.stagger)} if bounds.stagger else {}),
             **({"quirks": dict(bounds.quirks)} if bounds.quirks else {}),
             **({"timeline": self._timeline} if self._timeline else {}),
@@ -162,6 +171,8 @@ class Script:
             for action in move.actions
             if action.what == "timer"
         ]
+        if any(action.what == "lie" for action in move.actions):
+            earliest += HEARD_AFTER_S
         other_s = round(max([at_s, earliest, *ends]), 3)
         air: list[_Flight] = []
         acted_s = other_s if not ends else max(ends)
@@ -188,7 +199,14 @@ class Script:
     def _other(self, agent: _Agent, action: Action, now: float) -> Step:
         if action.what == "complete":
             self._events.append({"at_s": now, "agent": agent.agent_id})
-            return self._swarm.local.complete(agent.local, action.number)
+            step = self._swarm.local.complete(agent.local, action.number)
+            if self._wording is not None:
+                self._wording.completed(agent.agent_id, action.number, now)
+            return step
+        if action.what == "lie" and self._wording is not None:
+            lie = self._wording.lie(agent.agent_id, action.number)
+            self._timeline.append({"at_s": round(now - HEARD_AFTER_S, 6), "lie": lie})
+            return self._swarm.local.lie(agent.local, action.number)
         agent.timers = {}
         if action.what == "reboot":
             self._timeline.append({"at_s": now, "reboot": [agent.agent_id], "down_s": MOMENT_S, "disk": "kept"})
@@ -199,6 +217,8 @@ class Script:
     def _done(self, agent: _Agent, step: Step, now: float) -> list[_Flight]:
         """The agent has done this: its timers, and what it sends."""
         agent.local = step.local
+        if self._wording is not None and step.local != DEAD:
+            self._wording.sees(step.local)
         running = self._swarm.local.known[step.local].running if step.local != DEAD else ()
         agent.timers = {timer: run for timer, run in agent.timers.items() if timer in running}
         started = dict(step.started)

@@ -10,16 +10,21 @@ from itertools import combinations, permutations, product
 from typing import NamedTuple
 
 from harness.prove.bounds import FAULTS, Bounds
+from harness.prove.captor import Captor
 from harness.prove.instant import Action, Agents, Instants, Wave
 from harness.prove.local import DEAD, Flaw, LocalStates, Started
 from harness.prove.order import Order, Places
 from harness.prove.zones import NOTHING_RUNS, Zones
 
 State = tuple[int, ...]
-"""Blocks completed, faults left (a bit for each), zone, then the agents."""
+"""Blocks completed, what may yet befall (a bit for each fault and the capture, and how many lies), zone, the agents."""
 MOST_KNOWN = 200_000
 """So many instants are remembered; then they are worked out again."""
-ALL_FAULTS = (1 << len(FAULTS)) - 1
+ONCE = (*FAULTS, "captured")
+"""What may befall an agent once, by the bit that says that it still may."""
+ALL_LEFT = -1
+LIES = 1 << len(ONCE)
+"""One more lie that may be told."""
 BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 """Where they stand in it."""
 
@@ -45,11 +50,12 @@ class _Outcome(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """What may come of agents, whatever the zone: the timers that end, blocks completed, faults left, and outcomes."""
+    """What may come of agents, whatever the zone: the timers that end, blocks completed, what is left, and outcomes."""
 
     ended: tuple[int, ...]
     completed: int
     left: int
+    lies: int
     outcomes: tuple[_Outcome, ...]
 
 
@@ -65,7 +71,10 @@ class Swarm:
         self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], _Instant] = {}
         self._as_they_are = tuple(range(bounds.agents))
         own = [1] * bounds.agents if bounds.alike else range(1, bounds.agents + 1)
-        faults = sum(1 << FAULTS.index(name) for name in bounds.faults if name != "duplicate")
+        faults = sum(1 << ONCE.index(name) for name in bounds.faults if name != "duplicate")
+        self.captor = None if bounds.captured is None else Captor(bounds, self.local)
+        if bounds.captured is not None:
+            faults += (1 << ONCE.index("captured")) + bounds.lies * LIES
         self.initial: State = (0, faults, NOTHING_RUNS, *(self.local.initial[agent_id] for agent_id in own))
 
     # What an instant begins with
@@ -119,6 +128,16 @@ class Swarm:
         for bit, fault in enumerate(FAULTS):
             if state[LEFT] >> bit & 1:
                 yield from ((Action(place, fault),) for place in alive)
+        if self.captor is not None:
+            yield from self._of_the_captor(self.captor, state)
+
+    def _of_the_captor(self, captor: Captor, state: State) -> Iterator[tuple[Action, ...]]:
+        """It takes the vehicle, and then one agent after the other hears what it says."""
+        assert self.bounds.captured is not None, "it has somebody's keys"
+        if state[LEFT] >> ONCE.index("captured") & 1:
+            yield (Action(self.bounds.captured - 1, "captured"),)
+        elif state[LEFT] >= LIES:
+            yield from ((lie,) for lie in captor.lies(state[AGENTS:]))
 
     def coincidences(self, state: State, actions: Sequence[Action]) -> int:
         """How many moments have to be the same by chance for this to happen in one instant, and before all else."""
@@ -161,7 +180,7 @@ class Swarm:
             instant = self._known[key] = self._instant(*key, tell=False)
         if self._can_be(state, instant):
             for agents, zone, _ in self._ordered(state, instant):
-                yield (state[BLOCKS] + instant.completed, state[LEFT] & instant.left, zone, *agents)
+                yield (state[BLOCKS] + instant.completed, _left(state, instant), zone, *agents)
 
     def moves(self, state: State, actions: tuple[Action, ...], lossy: bool) -> Iterator[Move]:
         """The same, with how each comes about."""
@@ -169,7 +188,7 @@ class Swarm:
         if self._can_be(state, instant):
             ordered = self._ordered(state, instant)
             for outcome, (agents, zone, places) in zip(instant.outcomes, ordered, strict=True):
-                after = (state[BLOCKS] + instant.completed, state[LEFT] & instant.left, zone, *agents)
+                after = (state[BLOCKS] + instant.completed, _left(state, instant), zone, *agents)
                 yield Move(actions, after, places, outcome.wave, outcome.started)
 
     def _can_be(self, state: State, instant: _Instant) -> bool:
@@ -192,14 +211,15 @@ class Swarm:
 
     def _instant(self, locals_: tuple[int, ...], actions: tuple[Action, ...], lossy: bool, *, tell: bool) -> _Instant:
         at = {timer: index + 1 for index, timer in enumerate(self._running(locals_))}
-        left = ALL_FAULTS
+        left = ALL_LEFT
         for action in actions:
-            if action.what in FAULTS:
-                left &= ~(1 << FAULTS.index(action.what))
+            if action.what in ONCE:
+                left &= ~(1 << ONCE.index(action.what))
         return _Instant(
             tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer")),
             sum(action.what == "complete" for action in actions),
             left,
+            sum(action.what == "lie" for action in actions),
             tuple(
                 _Outcome(there.locals, self._running_after(at, there), there.started if tell else (), wave)
                 for there, wave in self._instants.outcomes(locals_, actions, lossy, tell=tell).items()
@@ -242,9 +262,24 @@ class Swarm:
         known = self.local.known
         return next((flaw for local in state[AGENTS:] if local != DEAD and (flaw := known[local].flaw)), None)
 
+    def violated(self, state: State) -> Iterator[str]:
+        """Characteristics that a captor has violated though no agent has done anything wrong.
+
+        Somebody believed what the vehicle never sent, or holds a block in its name that it never completed.
+        """
+        if state[LEFT] // LIES < self.bounds.lies:
+            yield "1"
+        if any(local != DEAD and self.local.known[local].deceived for local in state[AGENTS:]):
+            yield "4"
+
     def is_idle(self, state: State) -> bool:
         return all(local == DEAD or self.local.known[local].idle for local in state[AGENTS:])
 
     def chains(self, state: State) -> set[tuple[int, ...]]:
         """The chains that there are."""
         return {self.local.known[local].chain for local in state[AGENTS:] if local != DEAD}
+
+
+def _left(state: State, instant: _Instant) -> int:
+    """What may still befall."""
+    return (state[LEFT] & instant.left) - instant.lies * LIES

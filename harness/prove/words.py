@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from harness.prove.example import Example
-from harness.prove.prove import CLAIMS, PLAYED, Proof
+from harness.prove.prove import PLAYED, Proof
 
 WHY = {
     "flaw": "it ends where the first flaw is",
@@ -23,9 +23,11 @@ def in_words(proof: Proof) -> Iterator[str]:
         f"  {figures.states:,} states{left}, {figures.transitions:,} transitions, {figures.local_states:,} "
         f"local states, {figures.zones:,} zones, {instants}, in {figures.seconds:.1f} s"
     )
-    for kind, claim in CLAIMS.items():
-        if kind != "steps" or proof.bounds.steps:
-            yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
+    for kind, claim in proof.claims.items():
+        yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
+        if (shown := proof.shown.get(kind)) is not None:
+            yield f"    the nearest, {shown.instants} instants: {shown.replay}"
+            yield from _played(shown)
     if proof.flaw is not None:
         yield f"    {proof.flaw.sentence}"
     yield from _of_the_whole(proof)
@@ -55,6 +57,8 @@ def _name(kind: str) -> str:
 
 
 def _mark(proof: Proof, kind: str) -> str:
+    if kind in proof.shown:
+        return "✘ violated,"
     if proof.flaw is not None and proof.flaw.kind == kind:
         return "✘ not shown," if proof.bounds.network == "any" and proof.example is None else "✘ violated,"
     return "✔ holds," if proof.complete else "- not decided,"

@@ -8,6 +8,7 @@ timeline:
   - {at_s: 500, forge: {message: Commit Block, sender: 2}}
   - {at_s: 600, forge: {message: Block Add Response, sender: 3, approve: false, for_s: 60}}
   - {at_s: 700, flood: {for_s: 10, per_s: 50, message: Chain Contain Query}}
+  - {at_s: 800, lie: {message: Commit Block, sender: 3, receiver: 1, block: made 790.5, chain: ["2.1", "1.1"]}}
 
 `message` and `sender` that are left out mean any. The rogue hears everything that agents send, and everybody hears the
 rogue, whatever keeps agents apart. It adds to what is on the air and can take nothing away: an original that it delays,
@@ -21,8 +22,8 @@ from pydantic import Field, model_validator
 from harness.scenario.fates import MessageName
 from harness.scenario.model import Model, Seconds, VehicleId
 
-InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood"]
-INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood")
+InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie"]
+INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie")
 """Keys of a timeline entry."""
 
 MAX_FLOOD = 100_000
@@ -147,7 +148,65 @@ class Flood(_Lasting):
         return f"{super().in_words()}, {self.per_s:g} a second"
 
 
-Injection = Replay | Duplicate | DelayedCopy | Corrupt | Forge | Flood
+BlockName = Annotated[str, Field(pattern=r"^(\d{1,5}\.\d{1,6}|made \d{1,9}(\.\d{1,6})?)$")]
+
+
+class Lie(Model):
+    """One message in `sender`'s name, of just this content, which `receiver` alone hears; everybody if it is left out.
+
+    `block` is the block that it is about: "2.1" is the first that agent 2 has proposed, "made 12.5" one that the rogue
+    makes in the sender's name, with that timestamp in mission seconds. `chain` are the blocks of the chain that it is
+    about, the oldest first, or `nobody's`; that of a Commit Block is what its block goes on top of. A Next in Sequence
+    Response without `block` says "Is Top Of Chain".
+    """
+
+    NEEDS: ClassVar[dict[str, tuple[str, ...]]] = {
+        "Block Add Request": ("block", "chain"),
+        "Block Add Response": ("block", "approve"),
+        "Commit Block": ("block", "chain"),
+        "Chain Contain Query": ("chain",),
+        "Chain Contain Response": ("chain", "approve"),
+        "Chain Hash Successor Query": ("chain",),
+        "Next in Sequence Response": ("chain", "timestamp_s"),
+        "Request for Block": ("block",),
+        "Block Response": ("block",),
+    }
+    MAY_HAVE: ClassVar[dict[str, tuple[str, ...]]] = {
+        "Block Add Response": ("chain",),
+        "Next in Sequence Response": ("block",),
+    }
+
+    message: MessageName
+    sender: VehicleId
+    receiver: VehicleId | None = None
+    block: BlockName | None = None
+    chain: Annotated[list[BlockName], Field(max_length=1000)] | Literal["nobody's"] | None = None
+    approve: bool | None = None
+    timestamp_s: Seconds | None = None
+
+    @property
+    def lasts_s(self) -> float:
+        return 0.0
+
+    @model_validator(mode="after")
+    def _says_all_of_it(self) -> "Lie":
+        needs, may = self.NEEDS[self.message], self.MAY_HAVE.get(self.message, ())
+        given = {key for key in ("block", "chain", "approve", "timestamp_s") if getattr(self, key) is not None}
+        if not {*needs} <= given <= {*needs, *may}:
+            allowed = f", and may have {' and '.join(f'`{key}`' for key in may)}" if may else ""
+            raise ValueError(f"a {self.message} says {' and '.join(f'`{key}`' for key in needs)}{allowed}")
+        return self
+
+    def in_words(self) -> str:
+        whom = "" if self.receiver is None else f" to {self.receiver} alone"
+        about = "" if self.block is None else f" about block {self.block}"
+        chain = self.chain if isinstance(self.chain, str) else " ".join(self.chain or ()) or "inception"
+        on = "" if self.chain is None else f", chain {chain}"
+        says = "" if self.approve is None else f", saying {'yes' if self.approve else 'no'}"
+        return f"{self.message} from {self.sender}{whom}{about}{on}{says}"
+
+
+Injection = Replay | Duplicate | DelayedCopy | Corrupt | Forge | Flood | Lie
 MODELS: dict[str, type[Injection]] = {
     "replay": Replay,
     "duplicate": Duplicate,
@@ -155,4 +214,5 @@ MODELS: dict[str, type[Injection]] = {
     "corrupt": Corrupt,
     "forge": Forge,
     "flood": Flood,
+    "lie": Lie,
 }

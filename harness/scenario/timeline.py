@@ -14,6 +14,7 @@ from harness.scenario.injection import (
     Forge,
     Injection,
     InjectionName,
+    Lie,
     Replay,
 )
 from harness.scenario.model import Instant, Seconds
@@ -30,7 +31,7 @@ class _Entry(Disturbance):
     stands until `heal` or another one. With `for_s` such a change passes: after so many mission seconds what it has
     changed is as it would be without it.
 
-    What happens to agents, from `crash` to `resume`: `harness.scenario.faults`. Injections, from `replay` to `flood`:
+    What happens to agents, from `crash` to `resume`: `harness.scenario.faults`. Injections, from `replay` to `lie`:
     `harness.scenario.injection`.
     """
 
@@ -43,6 +44,7 @@ class _Entry(Disturbance):
     corrupt: Corrupt | None = None
     forge: Forge | None = None
     flood: Flood | None = None
+    lie: Lie | None = None
 
     @field_validator("delay", "duplicate", "corrupt", mode="before")
     @classmethod

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from harness.archive.directory import ROGUE_CONTROL, ROGUE_FILE
 from harness.play.rogue.journal import Journal
 from harness.play.rogue.rogue import Rogue
-from harness.scenario.injection import MODELS
+from harness.scenario.injection import MODELS, Lie
 from netem.frames import udp_broadcast
 from ucp.clock import MissionClock
 from ucp.control import CommandError, ControlServer
@@ -117,6 +117,8 @@ class RogueNode:
             injection = MODELS[request["what"]].model_validate(request["injection"])
         except (KeyError, ValidationError) as error:
             raise CommandError(f"no injection: {error}") from None
+        if isinstance(injection, Lie):
+            raise CommandError("a `lie` needs virtual time: use --backend sim")
         self._rogue.begin(request["number"], injection, self._clock.now())
         self._send()
         return {}

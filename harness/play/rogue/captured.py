@@ -27,15 +27,20 @@ class CapturedKeys:
         self._ear = self._session(bundle.agent_id, 0)
         self._mouths: dict[int, Session] = {}
         """By the sender in whose name it speaks."""
+        self._signatures: dict[bytes, bytes] = {}
+        """The makers', of all blocks that were on the air."""
 
     def opened(self, datagram: bytes, now: float) -> tuple[Message, Request] | None:
         """What a datagram says, and how an answer would name it; None if it is nothing new that can be opened."""
         self._ear.epochs.look_at(now)
         try:
             clear = read_clear(datagram)
-            message = self._ear.open(datagram, clear).said.message
+            opened = self._ear.open(datagram, clear)
         except (MalformedDatagramError, KeyError):  # of a sender of another mission
             return None
+        message = opened.said.message
+        if type(message) in CARRY_A_BLOCK:
+            self._signatures[message.block.block_hash] = opened.block_signature  # type: ignore[union-attr]
         return message, Request(clear.sender, clear.boot, clear.sequence)
 
     def sealed(
@@ -48,8 +53,9 @@ class CapturedKeys:
         mouth.epochs.look_at(now)
         signature = None
         if type(message) in CARRY_A_BLOCK:
-            data = message.block.block_data()  # type: ignore[union-attr]
-            signature = sign_block(mouth.private_key, mouth.mission, data)
+            block = message.block  # type: ignore[union-attr]
+            heard = self._signatures.get(block.block_hash)
+            signature = heard or sign_block(mouth.private_key, mouth.mission, block.block_data())
         return mouth.seal(sequence, message, request, signature, 0)
 
     def _session(self, sender: int, now_us: int) -> Session:

@@ -16,9 +16,10 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 from harness.play.rogue import crafted
+from harness.play.rogue.lies import Overheard, UnheardError
 from harness.play.rogue.line import line_of
 from harness.play.rogue.sequences import forged_sequence
-from harness.scenario.injection import Corrupt, DelayedCopy, Duplicate, Flood, Forge, Injection, Replay
+from harness.scenario.injection import Corrupt, DelayedCopy, Duplicate, Flood, Forge, Injection, Lie, Replay
 from ucp.block import HASH_BYTES, next_chain_hash
 from ucp.clock import MICROSECONDS
 from ucp.messages import (
@@ -33,7 +34,7 @@ from ucp.messages import (
     NextInSequenceResponse,
     decode,
 )
-from ucp.secure.envelope import NAMES, read_clear
+from ucp.secure.envelope import NAMES, REQUEST_OF, read_clear
 from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
@@ -48,6 +49,10 @@ FLOODED_AT_ONCE = 64
 """Messages of a flood between two looks at anything else."""
 
 
+QUESTIONS = {NAMES[answer]: NAMES[question] for answer, question in REQUEST_OF.items()}
+"""Type of an answer -> type of the question, by their names."""
+
+
 @dataclass(frozen=True, slots=True)
 class RogueDatagram:
     """One datagram of the rogue: `what` it is, of the injection with this number, under the address of `source`."""
@@ -58,6 +63,8 @@ class RogueDatagram:
     datagram: bytes
     plain: bytes | None = None
     """What it says in plain, if it is sealed and the rogue made it."""
+    receiver: int | None = None
+    """Who alone hears it; None: everybody."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         said = self.plain or self.datagram
@@ -86,10 +93,18 @@ class _Window:
 
 
 class Rogue:
-    """`epoch_us` is mission second 0 on the agents' clocks, in microseconds; `captured` are a vehicle's keys."""
+    """`epoch_us` is mission second 0 on the agents' clocks, in microseconds; `captured` are a vehicle's keys.
+
+    It tells lies about chains if it knows `initial_data`, that of the mission.
+    """
 
     def __init__(
-        self, roster: Sequence[int], seed: int, epoch_us: int = 0, captured: "CapturedKeys | None" = None
+        self,
+        roster: Sequence[int],
+        seed: int,
+        epoch_us: int = 0,
+        captured: "CapturedKeys | None" = None,
+        initial_data: bytes = b"",
     ) -> None:
         self.sent: Counter[int] = Counter()
         """How many datagrams each injection that has begun has made."""
@@ -97,11 +112,14 @@ class Rogue:
         self._rng = Random(f"{seed}/rogue")
         self._epoch_us = epoch_us
         self._captured = captured
-        self._secured = False
-        """Whether the mission is, by what is on the air."""
+        self._secured = captured is not None
+        """Whether the mission is, by what is on the air, or as it has its keys."""
         self._heard: deque[tuple[int, str, bytes]] = deque(maxlen=REMEMBERED)
         self._top_chain_hash: bytes | None = None
         self._votes_name_chain = False
+        self._overheard = Overheard(initial_data, epoch_us)
+        self._asked: dict[tuple[int, str], Request] = {}
+        """By sender and type of a question, sealed ones: how an answer to the last names it."""
         self._windows: list[_Window] = []
         self._waiting: list[tuple[float, int, RogueDatagram]] = []
         self._outbox: list[RogueDatagram] = []
@@ -114,6 +132,10 @@ class Rogue:
         except MalformedDatagramError:
             return
         self._heard.append((sender, name, datagram))
+        if message is not None:
+            self._overheard.hears(sender, message)
+        if request is not None:
+            self._asked[sender, name] = request
         if isinstance(message, BlockAddRequest | CommitBlock):
             self._top_chain_hash = message.chain_hash
         elif isinstance(message, BlockAddResponse):
@@ -143,6 +165,8 @@ class Rogue:
             self._replay(number, injection)
         elif isinstance(injection, Forge) and injection.for_s is None:
             self._forge_commit(number, injection, now)
+        elif isinstance(injection, Lie):
+            self._lie(number, injection, now)
         else:
             self._windows.append(_Window(number, injection, now + injection.lasts_s, now))
             self.handle_timer(now)
@@ -173,7 +197,7 @@ class Rogue:
             answer = None if heard.message is None else self._answer(injection, heard.message)
             if sender != injection.sender and answer is not None:
                 self._forge(window.number, "forge", injection.sender, answer, now, heard.request)
-        elif not injection.matches(heard.name, sender):
+        elif isinstance(injection, Lie) or not injection.matches(heard.name, sender):
             return
         elif isinstance(injection, Duplicate):
             for _ in range(injection.copies):
@@ -210,6 +234,15 @@ class Rogue:
         for sender, data in reversed(last):
             self._send(RogueDatagram(number, "replay", sender, data))
 
+    def _lie(self, number: int, lie: Lie, now: float) -> None:
+        try:
+            message = self._overheard.message(lie)
+        except UnheardError:
+            return  # that nothing was sent is told in the end
+        question = QUESTIONS.get(lie.message, "")
+        request = self._asked.get((lie.receiver or 0, question))
+        self._forge(number, "lie", lie.sender, message, now, request, lie.receiver)
+
     def _forge_commit(self, number: int, forge: Forge, now: float) -> None:
         if self._secured and self._top_chain_hash is None:
             self._top_chain_hash = bytes(HASH_BYTES)  # what the chain ends in is sealed: it can but guess
@@ -233,16 +266,23 @@ class Rogue:
             window.next_at = window.until - flood.for_s + self.sent[window.number] / flood.per_s
 
     def _forge(
-        self, number: int, what: str, sender: int, message: Any, now: float, request: "Request | None" = None
+        self,
+        number: int,
+        what: str,
+        sender: int,
+        message: Any,
+        now: float,
+        request: "Request | None" = None,
+        receiver: int | None = None,
     ) -> None:
         sequence = forged_sequence(number, self.sent[number])
         plain = crafted.datagram(sender, sequence, message)
         if not (self._secured and self._captured):
-            self._send(RogueDatagram(number, what, sender, plain))
+            self._send(RogueDatagram(number, what, sender, plain, receiver=receiver))
             return
         said = decode(plain).message
         sealed = self._captured.sealed(sender, sequence, said, request, now, self._timestamp_us(now))
-        self._send(RogueDatagram(number, what, sender, sealed, plain))
+        self._send(RogueDatagram(number, what, sender, sealed, plain, receiver))
 
     def _send(self, injected: RogueDatagram) -> None:
         self.sent[injected.injection] += 1

@@ -131,7 +131,8 @@ class Clockwork:
         from harness.play.simulation.rogue import VirtualRogue  # scapy takes long to import
 
         captured = self._keys.captured if self._keys else None
-        return VirtualRogue(self.roster, self.seed, self._air, len(self.roster), self._recorder.injected, captured)
+        number, write = len(self.roster), self._recorder.injected
+        return VirtualRogue(self.roster, self.seed, self._air, number, write, captured, self._initial_data)
 
     def _late_rogue(self) -> "VirtualRogue":
         """One that has been on the air all along, and begins to send now."""

@@ -30,8 +30,9 @@ class VirtualRogue:
         number: int,
         write: Callable[[dict[str, Any]], None],
         captured: "CapturedKeys | None" = None,
+        initial_data: bytes = b"",
     ) -> None:
-        self._rogue = Rogue(roster, seed, captured=captured)
+        self._rogue = Rogue(roster, seed, captured=captured, initial_data=initial_data)
         self._roster = roster
         self._air = air
         self._number = number
@@ -65,7 +66,11 @@ class VirtualRogue:
 
     def _send(self, now: float) -> None:
         for injected in self._rogue.to_send():
-            hearing = [number for number, agent in enumerate(self._roster) if agent != injected.source]
+            hearing = [
+                number
+                for number, agent in enumerate(self._roster)
+                if agent != injected.source and injected.receiver in (None, agent)
+            ]
             self._air.inject(now + MOMENT_S, StrayDatagram(injected.source, injected.datagram), hearing)
             self._journal.add(injected, now)
         soonest = self._rogue.next_timer()

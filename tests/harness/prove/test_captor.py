@@ -1,0 +1,211 @@
+"""Somebody with a vehicle's keys: what is looked at is all that can be said, and playing shows what comes of it."""
+
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from harness.prove import Bounds, BoundsError, in_words, prove
+from harness.prove.alone import collect
+from harness.prove.explore import Graph, explore
+from harness.prove.letters import NOBODYS, Asked, Material, letters
+from harness.prove.local import DEAD
+from harness.prove.script import Script
+from harness.prove.shape import Held, shape_of
+from harness.prove.snapshot import NOW_S, put_back, take
+from harness.prove.swarm import AGENTS, LEFT, LIES, ONCE, Swarm
+from harness.run.simulate import simulate
+from harness.scenario.load import parse
+from tests.harness.command import harness, sentences
+from ucp.agent import Agent
+from ucp.block import Block, next_chain_hash
+from ucp.messages import (
+    BlockAddRequest,
+    BlockAddResponse,
+    BlockResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    ChainHashSuccessorQuery,
+    CommitBlock,
+    Message,
+    NextInSequenceResponse,
+    RequestForBlock,
+)
+from ucp.secure.agent import SecuredAgent
+from ucp.secure.signatures import BlockSignatures
+
+CAPTURED = 3
+
+
+@cache
+def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> Graph:
+    swarm = Swarm(Bounds(agents, blocks, "lossy", captured=agents, lies=lies))
+    graph = explore(swarm, most_bytes=8e9, most_s=60)
+    assert graph.ended == "complete"
+    return graph
+
+
+def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
+    """Each agent in each state in which somebody may lie to it, and of what that can speak."""
+    local, captor = graph.swarm.local, graph.swarm.captor
+    assert captor is not None
+    pairs = {
+        (state[AGENTS + place], place, material)
+        for state in graph.states
+        if state[LEFT] >= LIES and not state[LEFT] >> ONCE.index("captured") & 1
+        for place, material in captor.material(state[AGENTS:])
+    }
+    for number, place, material in sorted(pairs, key=lambda pair: pair[:2]):
+        agent = Agent(place + 1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
+        put_back(agent, local.known[number].snapshot)
+        yield agent, material
+
+
+def random_message(lots: Random, agent: Agent, material: Material) -> Message:
+    """Whatever can be said by who knows of these blocks, and can make others."""
+    made = Block(CAPTURED, lots.randrange(3_000_000), lots.randbytes(20))
+    blocks = [*material.blocks, made]
+    hashes = [*material.named, made.block_hash, lots.randbytes(32)]
+    chain = agent.state.chain
+    tops = [chain.inception.chain_hash, *(chain_hash for _, chain_hash in chain.with_chain_hashes())]
+    tops += [waits.contains for waits in material.others if waits.contains is not None]
+    tops += [waits.successor for waits in material.others if waits.successor is not None]
+    tops += [waits.vote[1] for waits in material.others if waits.vote is not None]
+    tops += [next_chain_hash(top, lots.choice(hashes)) for top in tops] + [lots.randbytes(32), NOBODYS]
+    block, block_hash, chain_hash = lots.choice(blocks), lots.choice(hashes), lots.choice(tops)
+    yes = lots.random() < 0.5
+    return lots.choice(
+        [
+            BlockAddRequest(block_hash, chain_hash),
+            BlockAddResponse(block_hash, yes, lots.choice([None, chain_hash])),
+            CommitBlock(block, lots.choice([chain_hash, next_chain_hash(chain.top_chain_hash, block.block_hash)])),
+            ChainContainQuery(chain_hash),
+            ChainContainResponse(chain_hash, yes),
+            ChainHashSuccessorQuery(chain_hash),
+            NextInSequenceResponse(chain_hash, lots.choice([None, block_hash]), lots.randrange(3_000_000)),
+            RequestForBlock(block_hash),
+            BlockResponse(block),
+        ]
+    )
+
+
+def outcome(agent: Agent, message: Message, others: frozenset[Asked]) -> Any:
+    """What the agent becomes, whatever new blocks are called, and what it says that anybody waits for; it goes back."""
+    before = take(agent)
+    agent.receive_message(CAPTURED, 0, message, NOW_S)
+    state = agent.state
+    shape = shape_of(state, held := Held(state))
+    counted = sorted(state.voters), sorted(state.reconcile_responders), sorted(state.vote_count.items())
+    said = [sent for _, sent in agent.messages_to_send() if matters(sent, others)]
+    put_back(agent, before)
+    return held.number(shape), counted, said
+
+
+def matters(message: Message, others: frozenset[Asked]) -> bool:
+    match message:
+        case BlockAddResponse():
+            return any(waits.vote is not None and waits.vote[0] == message.block_hash for waits in others)
+        case ChainContainResponse():
+            return any(waits.contains == message.chain_hash for waits in others)
+        case NextInSequenceResponse():
+            return any(waits.successor == message.chain_hash for waits in others)
+        case BlockResponse():
+            return any(waits.block == message.block.block_hash for waits in others)
+    return True
+
+
+def test_whatever_is_said_comes_to_what_one_of_the_letters_comes_to() -> None:
+    lots, changed = Random(20), 0
+    for agent, material in lied_to(explored()):
+        nothing = outcome(agent, ChainContainQuery(NOBODYS), material.others)
+        known = [nothing, *(outcome(agent, said, material.others) for said in letters(agent.state, CAPTURED, material))]
+        for _ in range(300):
+            message = random_message(lots, agent, material)
+            came = outcome(agent, message, material.others)
+            changed += came != nothing
+            assert came in known, message
+    assert changed > 500
+
+
+def test_every_letter_is_let_in_and_nothing_else() -> None:
+    local = explored().swarm.local
+    dropped = set().union(*(agent.dropped for agent in local._agents.values()))
+    assert dropped == {"not signed by its sender", "block not signed by its maker"}
+    assert {reason for agent in local._revoked.values() for reason in agent.dropped} == {"revoked sender"}
+    assert any(agent.received for agent in local._agents.values())
+
+
+@pytest.mark.parametrize(
+    ("kind", "owner", "rule", "broken"),
+    [
+        ("revoked", SecuredAgent, "_why_not_opened", lambda self, clear: None),
+        ("name", BlockSignatures, "is_genuine", lambda self, block, signature: True),
+    ],
+)
+def test_a_gate_with_a_rule_left_out_is_found(
+    monkeypatch: pytest.MonkeyPatch, kind: str, owner: type, rule: str, broken: Any
+) -> None:
+    monkeypatch.setattr(owner, rule, broken)
+    graph = explore(Swarm(Bounds(2, 1, "lossy", captured=2)), most_bytes=8e9, most_s=60)
+    assert graph.flaw is not None
+    assert graph.flaw.kind == kind
+
+
+def test_what_was_looked_at_is_what_is_played() -> None:
+    graph, lots = explored(2, 1, 2), Random(20)
+    lied = [number for number, state in enumerate(graph.states) if state[LEFT] // LIES == 0 and number]
+    for number in lots.sample(lied, 12):
+        document = Script(graph, graph.path(number)).document("a lie")
+        lies = sum("lie" in entry for entry in document.get("timeline", ()))
+        traces = simulate(parse(document), 1, tracing=True).evidence.traces
+        forged = [run for trace in traces.values() for run in trace.runs if run.trigger.get("seq", 0) >= 1 << 31]
+        assert len(forged) == lies
+        for place, local in enumerate(graph.states[number][AGENTS:]):
+            if local != DEAD:
+                state = graph.swarm.local.state(local)
+                there = (len(state.chain), len(state.blocks_to_be_committed), len(state.reconcile_stack), state.idle)
+                seen = [
+                    (run.state.chain, run.state.deque, run.state.stack, run.state.idle)
+                    for run in traces[place + 1].runs
+                ]
+                assert there in [(0, 0, 0, True), *seen]
+
+
+def test_a_captor_violates_1_and_4_and_nothing_else(tmp_path: Path) -> None:
+    proof = prove(Bounds(3, 1, "lossy", captured=CAPTURED), out=tmp_path / "captured.yaml")
+    assert proof.exit_status == 1
+    assert proof.flaw is None
+    assert {key: {*example.judged} for key, example in proof.shown.items() if example} == {
+        "1": {"1", "4"},
+        "4": {"1", "4"},
+    }
+    bad = [line.split(",")[1].split(":")[0].strip() for line in in_words(proof) if line.startswith(("✘", "-"))]
+    assert bad == ["characteristic 1", "characteristic 4"]
+    assert proof.to_json()["lies"] == 1
+
+
+def test_who_says_nothing_violates_nothing(tmp_path: Path) -> None:
+    assert prove(Bounds(3, 1, "lossy", captured=1, lies=0), out=tmp_path / "silent.yaml").exit_status == 0
+
+
+def test_any_number_of_lies_in_any_network_comes_to_nothing_worse(tmp_path: Path) -> None:
+    collected = collect(Bounds(3, 1, "any", captured=CAPTURED), most_bytes=8e9, most_s=60)
+    assert (collected.ended, collected.flaw, collected.shown) == ("complete", None, {"1", "4"})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"captured": 4}, {"captured": 1, "lies": 99}, {"captured": 1, "faults": ("death",)}, {"captured": 1, "agents": 1}],
+)
+def test_impossible_bounds_are_one_sentence(wrong: dict[str, Any]) -> None:
+    with pytest.raises(BoundsError):
+        Bounds(**{"agents": 3, **wrong})
+
+
+def test_lies_are_for_who_is_captured(tmp_path: Path) -> None:
+    refused = harness("prove", "--lies", 2, cwd=tmp_path)
+    assert refused.returncode == 2
+    assert len(sentences(refused.stderr)) == 1
