@@ -63,7 +63,7 @@ def consolidate_command(
     record = consolidate(came_home(paths), depot_of(depot_key))
     reconciliation = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
     reconciled = reconciliation.line if reconciliation else None
-    print_lines(in_words(record, reconciled))
+    print_lines(in_words(record, reconciled, opened=depot_key is not None))
     print_lines(_written(record, reconciled, out, kml_file, geojson_file, csv_file))
     if html_file is not None:
         from harness.depot.page import draw

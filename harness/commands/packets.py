@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from harness.commands.bundle import BundleOption, opener_of
 from harness.commands.terminal import complain, print_lines
-from harness.errors import WRONG_REQUEST, MachineError
+from harness.errors import WRONG_REQUEST
 from harness.packets import text
 from harness.packets.document import document
 from harness.packets.exchanges import Exchanges
@@ -20,9 +21,6 @@ from harness.packets.selection import Selection
 from harness.packets.story import in_order, story
 from harness.packets.text import Paint, Wording
 from harness.packets.transmissions import join
-
-if TYPE_CHECKING:
-    from ucp.secure.opening import Opener
 
 
 def packets_command(
@@ -43,38 +41,18 @@ def packets_command(
     between: Annotated[
         tuple[float, float] | None, typer.Option(metavar="S1 S2", help="Only what was sent in these mission seconds.")
     ] = None,
-    bundle: Annotated[
-        Path | None,
-        typer.Option(help="Opens what a secured mission sealed: any vehicle's, of `ucp-harness keys bundle`."),
-    ] = None,
+    bundle: BundleOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="The same as JSON on standard output.")] = False,
 ) -> None:
     """Print each datagram, who received it and who lost it, and what was answered to it, from a run's captures."""
     selection = Selection(sender, receiver, message, between)
-    captures = read_captures(capture_files(paths), _opener(bundle))
+    captures = read_captures(capture_files(paths), opener_of(bundle))
     if captures.used:
         print_lines(_told(captures, selection, follow, lost, as_json, runs_of(paths)))
     for sentence in (*captures.problems, *captures.errors):
         complain(sentence)
     if captures.errors:
         raise typer.Exit(WRONG_REQUEST)
-
-
-def _opener(bundle: Path | None) -> "Opener | None":
-    """What opens that vehicle's mission; None without a bundle. Raises KeysError, MachineError."""
-    if bundle is None:
-        return None
-    try:
-        from harness.keyring import KeysError
-        from ucp.secure.bundle import load_bundle
-        from ucp.secure.keyfile import KeyFileError
-        from ucp.secure.opening import Opener
-    except ModuleNotFoundError:
-        raise MachineError("--bundle takes a further package: `pip install ucp-harness[secure]`") from None
-    try:
-        return Opener(load_bundle(bundle))
-    except KeyFileError as error:
-        raise KeysError(f"--bundle: {error}") from None
 
 
 def _told(

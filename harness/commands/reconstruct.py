@@ -6,6 +6,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from harness.commands.bundle import BundleOption, opener_of
+from harness.commands.depot_key import DepotKey, depot_of
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, RunDirectoryError
 from harness.field.homecoming import sort_out
@@ -17,16 +19,19 @@ def reconstruct_command(
         list[Path], typer.Argument(metavar="DIR...", help="What came home: directories and files; run directories too.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The scenario; must be new.")],
+    bundle: BundleOption = None,
+    depot_key: DepotKey = None,
     as_json: Annotated[bool, typer.Option("--json", help="What came of it, as JSON on standard output.")] = False,
 ) -> None:
     """Make a scenario that flies what came home again, in virtual time: exit status 1, and where, if it cannot."""
     if out.exists():
         raise RunDirectoryError(f"{out} exists: choose another --out, nothing is overwritten")
     with Console(stderr=True).status("reading what came home") as status:
-        homecoming = sort_out(paths)
+        opener, depot = opener_of(bundle), depot_of(depot_key)
+        homecoming = sort_out(paths, opener)
         flight = homecoming.largest()
         name = f"{paths[0].resolve().name} flown again"[:200]
-        reconstruction = reconstruct(flight, name, status.update)
+        reconstruction = reconstruct(flight, name, status.update, opener=opener, depot=depot)
     left_out = [*homecoming.sentences()]
     write(reconstruction, out, paths, left_out)
     for sentence in left_out:

@@ -11,8 +11,11 @@ FORKS_TOLD = 5
 NAMES_TOLD = 8
 
 
-def in_words(record: Consolidation, reconciled: Reconciled | None = None) -> Iterator[str]:
-    """What came home, where chains part, what one vehicle alone has, what was lost, and what a reconcile made of it."""
+def in_words(record: Consolidation, reconciled: Reconciled | None = None, *, opened: bool = False) -> Iterator[str]:
+    """What came home, where chains part, what one vehicle alone has, what was lost, and what a reconcile made of it.
+
+    `opened`: the depot's key was there.
+    """
     header = record.header
     home = sorted(record.home.latest)
     of_all = (
@@ -32,7 +35,12 @@ def in_words(record: Consolidation, reconciled: Reconciled | None = None) -> Ite
             f"the longest {header.longest_chain}"
         )
     if sealed := sum(block.line.sealed for block in record.blocks):
-        yield f"{_blocks(sealed)} sealed to the depot: --depot-key, with the key of this mission's, opens what it can"
+        closed = _blocks(sealed)
+        yield (
+            f"{closed} not opened by this key: not sealed by the agent that it names, or damaged"
+            if opened
+            else f"{closed} sealed to the depot: --depot-key, with the key of this mission's, opens what it can"
+        )
     yield from map(fork_in_words, record.forks[:FORKS_TOLD])
     if len(record.forks) > FORKS_TOLD:
         yield f"and they part at {len(record.forks) - FORKS_TOLD} more places"

@@ -25,6 +25,8 @@ class Names:
         self._blocks: dict[bytes, str] = {}
         self._top_of: dict[bytes, bytes | None] = {}
         self._spoken_of: set[bytes] = set()
+        self._sealed = False
+        """Whether of some messages nobody here knows which block they are about."""
         self._from_start: set[int] = set()
         self._proposed: dict[int, int] = {}
         for run in runs:
@@ -56,9 +58,8 @@ class Names:
             return hashes[0]
         if hashes:
             raise CaptureError(f"--follow {wanted} fits {len(hashes)} blocks: give more digits of the hash")
-        raise CaptureError(
-            f"--follow {wanted}: no message is about that block; give a name or a hash that is printed here"
-        )
+        way_out = "--bundle shows what is sealed" if self._sealed else "give a name or a hash that is printed here"
+        raise CaptureError(f"--follow {wanted}: no message is known to be about that block; {way_out}")
 
     def _learn_from_exports(self, run: Path) -> None:
         try:
@@ -74,6 +75,7 @@ class Names:
 
     def _learn(self, transmission: Transmission, known: bool) -> None:
         summary = transmission.summary
+        self._sealed |= summary.is_sealed
         if summary.block_hash is not None:
             self._spoken_of.add(summary.block_hash)
         if transmission.origin == "forged":

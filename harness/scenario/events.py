@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from harness.scenario.model import Data, Instant, Model, Seconds, VehicleId
-from ucp.events import MAX_MEAN_S
+from ucp.events import MAX_MEAN_S, LoggableEvent
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
 Bytes = bytes
@@ -19,7 +19,8 @@ class ScriptedEvent(Model):
     """At `at_s` mission seconds `agent` logs one event with `bytes` bytes of data, all zero.
 
     Or the event of a flight, word for word: with this `data`, in base64, this `event_id`, and the `timestamp_us` that
-    the vehicle's clock showed; without it the event has the time of the agent's clock.
+    the vehicle's clock showed; without it the event has the time of the agent's clock. If it filled a block that was
+    sealed, `sealed` is what that sealed to, in base64: without the vehicle's keys nobody can do it again.
     """
 
     at_s: Instant
@@ -28,10 +29,23 @@ class ScriptedEvent(Model):
     event_id: Annotated[int, Field(ge=1, le=254, strict=True)] = 1
     data: Annotated[Data, Field(max_length=MAX_DATA_CHARACTERS)] | None = None
     timestamp_us: Annotated[int, Field(ge=0, lt=2**64, strict=True)] | None = None
+    sealed: Annotated[Data, Field(max_length=MAX_DATA_CHARACTERS)] | None = None
 
     @property
     def event_data(self) -> Bytes:
         return Bytes(self.bytes) if self.data is None else base64.b64decode(self.data)
+
+    @property
+    def logged(self) -> LoggableEvent:
+        """Of a flight, word for word. It has a timestamp."""
+        assert self.timestamp_us is not None, "it is of a flight"
+        return LoggableEvent(self.timestamp_us, self.event_id, self.event_data)
+
+    @model_validator(mode="after")
+    def _sealed_is_of_a_flight(self) -> "ScriptedEvent":
+        if self.sealed is not None and self.timestamp_us is None:
+            raise ValueError("`sealed` is of an event of a flight, and that has a `timestamp_us`")
+        return self
 
 
 class Events(Model):

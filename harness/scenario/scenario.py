@@ -324,6 +324,9 @@ class Scenario(Model):
             if (size := len(event.event_data)) > largest:
                 why = f"by `settings.max_event_bytes` an event has at most {largest} bytes of data, not {size}"
                 raise ValueError(f"events.script.{index}: {why}")
+            if event.sealed is not None and self.settings.max_block_bytes > MAX_EVENT_DATA_BYTES - SEAL_BYTES:
+                why = f"takes `settings.max_block_bytes` of at most {MAX_EVENT_DATA_BYTES - SEAL_BYTES}"
+                raise ValueError(f"events.script.{index}.sealed {why}")
         return self
 
     @model_validator(mode="after")

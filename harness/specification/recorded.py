@@ -18,7 +18,7 @@ from harness.archive.vocabulary import (
 )
 from harness.checker.steps.follower import COUNTING, Tells
 from harness.checker.steps.header import CheckedHeader
-from harness.checker.steps.inputs import decoded, event_of, stored_blocks
+from harness.checker.steps.inputs import decoded, event_of, sealed_of, stored_blocks
 from ucp.agent import HANDLERS, ON_TIMER, why_not_handled
 from ucp.block import LATEST_US, Block, InceptionBlock, next_chain_hash
 from ucp.messages import (
@@ -32,6 +32,7 @@ from ucp.messages import (
     NextInSequenceResponse,
     RequestForBlock,
 )
+from ucp.sealed import SEAL_BYTES, sealed_to
 from ucp.trace import HandlerRun, Sent
 
 INCEPTION = 1
@@ -196,10 +197,16 @@ class _Writer:
         event = event_of(run.input)
         self._current += event.encode()
         timestamp_us = min(max(event.timestamp_us, self._newest_us + 1), LATEST_US)
-        block = Block(self._header.agent_id, timestamp_us, self._current)
+        block = Block(self._header.agent_id, timestamp_us, self._sealed(run) or self._current)
         if any(operation == "complete" for operation, _ in run.changes):
             self._current, self._newest_us = b"", timestamp_us
         return (LOGGED, event.encoded_bytes, *_block(block))
+
+    def _sealed(self, run: HandlerRun) -> bytes | None:
+        """What it says that its events were sealed to, in a mission that seals, if it is as long as that is."""
+        sealed = sealed_of(run.sealed)
+        seals = sealed is not None and sealed_to(self._header.initial_data) is not None
+        return sealed if seals and len(sealed or b"") == len(self._current) + SEAL_BYTES else None
 
     def _booted(self, run: HandlerRun) -> Item:
         """What it was found to hold: all changes before the reconcile stack is emptied."""

@@ -359,7 +359,7 @@ def test_an_agent_that_was_not_captured_from_its_start_on_has_no_ordinals(tmp_pa
     digits = BLOCK.block_hash.hex()[:8]
     assert names.block(BLOCK.block_hash) == digits
     assert names.chain(CHAIN) == f"{CHAIN.hex()[:8]} ({digits})"
-    with pytest.raises(CaptureError, match=r"--follow 1\.1: no message is about that block"):
+    with pytest.raises(CaptureError, match=r"--follow 1\.1: no message is known to be about that block"):
         names.find("1.1")
 
 

@@ -185,7 +185,7 @@ def test_a_file_that_is_no_capture_is_told_and_the_others_are_read(run_dir: Path
         (["run", "--to", "9"], "--to 9: there is no capture of that vehicle; captures are of 1, 2, 3"),
         (
             ["run", "--follow", "7.1"],
-            "--follow 7.1: no message is about that block; give a name or a hash that is printed here",
+            "--follow 7.1: no message is known to be about that block; give a name or a hash that is printed here",
         ),
     ],
 )

@@ -2,12 +2,13 @@
 
 import base64
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from harness.archive.traces import Header
 from harness.checker.waiting import SLACK_WALL_S
 from ucp.block import MAX_AGENT_ID
+from ucp.core import Seal
 from ucp.settings import Settings
 
 EARLY_WALL_S = 0.001
@@ -35,6 +36,8 @@ class CheckedHeader:
     early_s: float
     late_s: float
     secured: bool = False
+    seal: Seal | None = field(default=None, repr=False, compare=False)
+    """How the agent sealed its event data, as far as that is on record, if it did."""
 
     def local(self, mission_s: float) -> float:
         """What the agent's clock shows at `mission_s`."""

@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from harness.field.homecoming.homecoming import LeftOut
 from harness.packets.capture import Capture, Datagram
+
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
 
 ENOUGH_FRAMES = 5000
 
@@ -21,10 +25,13 @@ class Glance:
     """The file that it is, or was made from."""
 
 
-def glance(path: Path, left_out: list[LeftOut]) -> Glance | None:
-    """None if there is no UCP datagram at its beginning. Raises CaptureError if it cannot be read."""
+def glance(path: Path, left_out: list[LeftOut], opener: "Opener | None" = None) -> Glance | None:
+    """None if there is no UCP datagram at its beginning; `opener` opens what is sealed.
+
+    Raises CaptureError if it cannot be read.
+    """
     capture, datagrams = Capture(0, path), dict[bytes, Datagram]()
-    capture.read(datagrams, ENOUGH_FRAMES)
+    capture.read(datagrams, ENOUGH_FRAMES, opener=opener)
     left_out += [LeftOut(path, problem.removeprefix(f"{path}: ")) for problem in capture.problems]
     if not datagrams:
         what = "no frame" if not capture.frames else f"none of its first {capture.frames} frames is of UCP"

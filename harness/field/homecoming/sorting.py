@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from harness.archive.exports import MAX_EXPORT_BYTES, Export, export_of, not_json
 from harness.archive.opened import Opened
@@ -19,6 +19,9 @@ from harness.packets.pcap import MAGICS
 from ucp.events import LoggableEvent
 from ucp.export import SCHEMA as EXPORT_SCHEMA
 
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
+
 MAX_DOCUMENTS = 1000
 """Exports in one file."""
 ALIKE_TOLD = 3
@@ -29,13 +32,14 @@ _BLANK = " \t\r\n\0\ufeff"
 
 
 @gc_paused()
-def sort_out(paths: Iterable[Path]) -> Homecoming:
+def sort_out(paths: Iterable[Path], opener: "Opener | None" = None) -> Homecoming:
     """What is in files and directories, of whatever name and in whatever state: sorted by flight.
 
-    Raises FieldError if a path does not exist. What cannot be used is told in `left_out`, and nothing else is raised.
+    `opener` opens what is sealed in captures of a secured mission. Raises FieldError if a path does not exist. What
+    cannot be used is told in `left_out`, and nothing else is raised.
     """
     left_out: list[LeftOut] = []
-    sorter = Sorter(left_out)
+    sorter = Sorter(left_out, opener)
     for path in files_of(paths, left_out):
         sorter.take(path)
     return sorter.sorted_out()
@@ -44,7 +48,8 @@ def sort_out(paths: Iterable[Path]) -> Homecoming:
 class Sorter:
     """Takes files one after another, and what adapters make of others'."""
 
-    def __init__(self, left_out: list[LeftOut]) -> None:
+    def __init__(self, left_out: list[LeftOut], opener: "Opener | None" = None) -> None:
+        self._opener = opener
         self.lives: list[Life] = []
         self.exports: list[tuple[Path, Export]] = []
         self.captures: list[Glance] = []
@@ -65,7 +70,7 @@ class Sorter:
             if begins.startswith(_BAGS):
                 self._drop(path, "a ROS bag, or what a recorder packed: `ucp-harness import` reads it")
             elif begins[:4] in MAGICS:
-                seen = glance(path, self._left_out)
+                seen = glance(path, self._left_out, self._opener)
                 self.captures += [seen] if seen else []
             elif lives := read_lives(path, self._left_out):
                 self.lives += lives

@@ -194,7 +194,7 @@ class _Attempt:
         self.choices: list[int] = []
         """For each timer how many other orders there are."""
         self._header = header
-        self._agent = Agent(header.agent_id, header.roster, header.initial_data, header.settings)
+        self._agent = _agent(header)
         self.stood_still: Still | None = None
         """When it cannot have been at work, for it sent nothing and had something to send."""
         self._stills = stills
@@ -214,7 +214,7 @@ class _Attempt:
 
     def left_on_disk(self) -> StoredState:
         """What it held at the end."""
-        agent = Agent(self._header.agent_id, self._header.roster, self._header.initial_data, self._header.settings)
+        agent = _agent(self._header)
         for given in self.inputs:
             _feed(agent, given.at_s, given.what, self._stored)
         return StoredState.of(agent.state)
@@ -344,3 +344,7 @@ def _feed(agent: Agent, now: float, what: What, stored: StoredState | None) -> N
         case Booted():
             assert stored is not None, "it boots from something"
             agent.boot(stored, now)
+
+
+def _agent(header: CheckedHeader) -> Agent:
+    return Agent(header.agent_id, header.roster, header.initial_data, header.settings, seal=header.seal)

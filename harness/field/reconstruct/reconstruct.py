@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from harness.archive.exports import Export
 from harness.checker.judgement import agents
@@ -19,6 +19,10 @@ from harness.run.simulate import InMemory, Simulated, simulate_in_memory
 from harness.scenario.load import parse
 from harness.scenario.write import Document
 from ucp.clock import MICROSECONDS
+
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
+    from ucp.secure.sealing import Depot
 
 SEED = 1
 """Of the reconstruction, in which nothing is left to chance."""
@@ -105,12 +109,21 @@ class Reconstruction:
         }
 
 
-def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -> Reconstruction:
-    """Fly it again. `tell` is told what is being done. Raises FieldError if there is nothing to fly it by."""
+def reconstruct(
+    flight: Flight,
+    name: str,
+    tell: Tell = lambda sentence: None,
+    *,
+    opener: "Opener | None" = None,
+    depot: "Depot | None" = None,
+) -> Reconstruction:
+    """Fly it again. `tell` is told what is being done. Raises FieldError if there is nothing to fly it by.
+
+    Of a secured mission `opener` opens captures, and `depot` blocks.
+    """
     tell("reading what each agent was told")
     remarks: list[str] = []
-    elsewhere = Elsewhere(flight)
-    remarks += elsewhere.problems
+    elsewhere = Elsewhere(flight, opener, depot)
     mission, headers = told(flight, elsewhere, name, remarks)
     alone = Alone(flight, elsewhere)
     rehearsals, why = alone.rehearsals, alone.why
@@ -120,6 +133,9 @@ def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -
             alone.rehearse(header)
         else:
             why[agent_id] = "was set otherwise than the others, and a scenario has one set of settings"
+    remarks += dict.fromkeys(elsewhere.problems)
+    if any(header.secured for header in headers.values()):
+        remarks.append("it was secured, and is flown again without keys: what was dropped for them is not on the air")
     remarks += alone.remarks
     if not any(rehearsal.played for rehearsal in rehearsals.values()):
         first = next((f"agent {agent_id} {words}; " for agent_id, words in why.items()), "")
@@ -129,7 +145,7 @@ def reconstruct(flight: Flight, name: str, tell: Tell = lambda sentence: None) -
     lost = {agent_id for agent_id in rehearsals if flight.exports and agent_id not in flight.exports}
     if lost:
         remarks.append(f"no export of {agents(lost)}: taken to have been lost with the end of the trace")
-    document = scenario_of(mission, table, rehearsals, lost)
+    document = scenario_of(mission, table, rehearsals, lost, elsewhere.sealed)
     tell("flying it again")
     simulated = simulate_in_memory(InMemory(tracing=True), parse(document), SEED)
     difference = first_difference(table, rehearsals, simulated)
@@ -163,7 +179,9 @@ def _compare_chains(
 
 
 def _export_differs(home: Export, rehearsal: Rehearsal, flight: Flight) -> str:
-    trace = flight.traces[home.agent_id]
+    trace = flight.traces.get(home.agent_id)
+    if trace is None:
+        return f"has another chain in its export, of {len(home.chain)} blocks, than what reached it leads to"
     last_s = trace.runs[-1].t if trace.runs else 0.0
     return (
         f"is played up to the end of its trace at t={last_s:g} s, with {len(rehearsal.chain)} blocks in its chain: "

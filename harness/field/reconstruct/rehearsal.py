@@ -131,6 +131,7 @@ class _Life:
             header.initial_data,
             header.settings,
             handlers=wrong_handlers(rehearsal.quirks, Random(0)),
+            seal=header.seal,
         )
         self._rehearsal = rehearsal
         self._hears_all = bool(rehearsal.quirks)

@@ -18,16 +18,19 @@ from ucp.quirks import Quirks
 from ucp.settings import Settings
 
 MOMENT_S = APART_S / 2
+Sealed = Mapping[int, Mapping[bytes, bytes]]
+"""By agent, and by the event that filled the block."""
 LONG_S = 0.5
 """A timer that is so late was not only waiting for its turn: its agent stood still."""
 
 
 def scenario_of(
-    mission: Mission, table: Timetable, rehearsals: Mapping[int, Rehearsal], lost: Collection[int]
+    mission: Mission, table: Timetable, rehearsals: Mapping[int, Rehearsal], lost: Collection[int], sealed: Sealed
 ) -> Document:
     """The scenario, as a document. An agent of the roster that was not rehearsed has no part in it.
 
-    Those that were `lost` are switched off with the last thing on record; so is who had more to do then.
+    Those that were `lost` are switched off with the last thing on record; so is who had more to do then. `sealed` is
+    what agents sealed.
     """
     lives = {agent: _lives(table.lives(agent), len(rehearsal.pending)) for agent, rehearsal in rehearsals.items()}
     strays = _Strays()
@@ -44,7 +47,7 @@ def scenario_of(
         "settings": _settings(mission.settings),
         "quirks": _quirks({agent: rehearsal.quirks for agent, rehearsal in rehearsals.items()}),
         "timeline": _at_instants_of_their_own(entries),
-        "events": {"source": "scripted", "script": _events(table)},
+        "events": {"source": "scripted", "script": _events(table, sealed)},
         "fates": fates,
         "datagrams": strays.documents(),
         "lateness": {agent: in_text(sorted(late.items()), "+") for agent, late in table.lateness.items() if late},
@@ -93,7 +96,7 @@ def _quirks(by_agent: Mapping[int, Quirks]) -> Document:
     return {name: {"agents": wrong} for name, wrong in agents.items()}
 
 
-def _events(table: Timetable) -> list[Document]:
+def _events(table: Timetable, sealed: Sealed) -> list[Document]:
     events: list[Document] = []
     for agent, happenings in table.happenings.items():
         for happening in happenings:
@@ -101,7 +104,9 @@ def _events(table: Timetable) -> list[Document]:
                 event = logged.event
                 data = {"data": _base64(event.data)} if event.data.strip(b"\0") else {"bytes": len(event.data)}
                 own = {"event_id": event.event_id, "timestamp_us": event.timestamp_us}
-                events.append({"at_s": happening.at_s, "agent": agent, **own, **data})
+                blocks = sealed.get(agent, {}).get(event.encode())
+                seal = {} if blocks is None else {"sealed": _base64(blocks)}
+                events.append({"at_s": happening.at_s, "agent": agent, **own, **data, **seal})
     return sorted(events, key=lambda event: (event["at_s"], event["agent"]))
 
 

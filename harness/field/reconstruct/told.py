@@ -3,7 +3,7 @@
 import base64
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from harness.archive.traces import Header
@@ -42,7 +42,7 @@ def told(
         if header.initial_data is None and initial_data is not None:
             header = header.model_copy(update={"initial_data": initial_data})
         try:
-            headers[agent_id] = checked(header)
+            headers[agent_id] = elsewhere.with_seal(checked(header))
         except ImpossibleHeaderError as error:
             remarks.append(f"agent {agent_id}: {error}")
     roster = {*flight.roster, *flight.agents, *(member for header in headers.values() for member in header.roster)}
@@ -50,7 +50,7 @@ def told(
     common = Counter(header.settings for header in headers.values()).most_common(1)
     untraced = sorted({*elsewhere.captured} & {*flight.exports} - {*headers})
     if untraced and initial_data is not None:
-        whole = partial(_assumed, roster=roster, initial_data=initial_data)
+        whole = partial(_assumed, elsewhere, roster=roster, initial_data=initial_data)
         captured = {agent_id: elsewhere.captured[agent_id] for agent_id in untraced}
         settings = common[0][0] if common else likely(elsewhere, captured, whole)
         headers |= {agent_id: whole(agent_id, settings) for agent_id in untraced}
@@ -58,7 +58,7 @@ def told(
         remarks.append(f"settings of {agents(untraced)} are not on record, and assumed to be {whose}")
     settings = Counter(header.settings for header in headers.values()).most_common(1)[0][0] if headers else Settings()
     if not headers:
-        raise FieldError(NOTHING)
+        raise FieldError("; ".join([*elsewhere.problems[:1], NOTHING]))
     of_all = Counter(header.initial_data for header in headers.values()).most_common(1)[0][0]
     data = of_all if initial_data is None else base64.b64decode(initial_data)
     return Mission(name, tuple(sorted(roster)), data, settings), headers
@@ -77,7 +77,8 @@ def _initial_data(flight: Flight) -> str | None:
     return next((export.inception.block_data for export in flight.exports.values()), None)
 
 
-def _assumed(agent_id: int, settings: Settings, *, roster: Iterable[int], initial_data: str) -> CheckedHeader:
+def _assumed(
+    elsewhere: Elsewhere, agent_id: int, settings: Settings, *, roster: Iterable[int], initial_data: str
+) -> CheckedHeader:
     header = Header(agent_id=agent_id, roster=sorted(roster), settings={}, clock={}, initial_data=initial_data)
-    made = checked(header)
-    return CheckedHeader(**{**vars(made), "settings": settings})
+    return elsewhere.with_seal(replace(checked(header), settings=settings))

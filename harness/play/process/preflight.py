@@ -33,6 +33,7 @@ def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
         *(["clocks"] if scenario.clocks else []),
         *(["timeline.lie"] if any(entry.lie for entry in scenario.timeline) else []),
         *(["events.script.timestamp_us"] if any(event.timestamp_us for event in scenario.events.script) else []),
+        *(["events.script.sealed"] if any(event.sealed for event in scenario.events.script) else []),
     ]
     if keys:
         named = ", ".join(f"`{key}`" for key in keys)

@@ -7,6 +7,7 @@ mission; `backend.py` does.
 import base64
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, Any, cast
 
@@ -20,6 +21,7 @@ from harness.play.simulation.late_timers import LateTimers
 from harness.play.simulation.lives import BlockNames, Incarnation, Secured
 from harness.play.simulation.recorder import Recorder
 from harness.play.simulation.recurrence import Recurrence
+from harness.play.simulation.seals import seals_of
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import Medium
@@ -362,7 +364,11 @@ class Clockwork:
 
     def _own_agent(self, agent_id: int, seed: int, life: int) -> OwnAgent:
         quirks = self.scenario.quirks_of(agent_id)
-        make = OwnAgent if self._keys is None else self._keys.agent(agent_id, life, self._now)
+        make: Callable[..., OwnAgent] = OwnAgent
+        if self._keys is not None:
+            make = self._keys.agent(agent_id, life, self._now)
+        elif (seal := seals_of(self.scenario.events.script, agent_id)) is not None:
+            make = partial(OwnAgent, seal=seal)
         return make(
             agent_id,
             self.roster,
