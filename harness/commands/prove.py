@@ -46,7 +46,7 @@ def prove_command(
         typer.Option(metavar="ID", help="Somebody has this agent's keys, and says anything with them."),
     ] = None,
     lies: Annotated[
-        int | None, typer.Option(help="How much of that is heard, by one agent each; any number with --network any.")
+        int | None, typer.Option(help="How many messages that are, each heard by any; any number with --network any.")
     ] = None,
     whole: Annotated[
         bool, typer.Option("--whole", help="Take no two states for one, though they behave alike.")

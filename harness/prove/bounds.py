@@ -32,7 +32,7 @@ class Bounds:
     moment by chance, but those only whose distance is fixed, as one began by the other. `reduced`: states that behave
     alike are one. `steps`: each step of the agents is held against that of right ones, too. `stagger`: agents' timers
     differ, as a scenario's `stagger` says. `captured`: somebody has this agent's keys, and after a moment of his choice
-    speaks in its name; `lies` such messages are heard, or any number in the network "any".
+    speaks in its name: `lies` messages, each heard by any of the agents, or any number in the network "any".
     """
 
     agents: int = 2

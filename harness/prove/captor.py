@@ -1,10 +1,11 @@
-"""Somebody has a vehicle's keys, and speaks in its name: what it can say in each global state, heard by one agent each.
+"""Somebody has a vehicle's keys, and speaks in its name: what it can say in each global state, and who hears it.
 
 It hears all that is on the air, so it knows of every block that anybody has committed, and the hash of every block
 that was proposed. Blocks in the vehicle's own name it makes: of whatever age, which is all that tells them apart.
 """
 
 from collections.abc import Iterable, Iterator
+from itertools import combinations
 from typing import NamedTuple
 
 from harness.play.rogue.lies import made_block
@@ -56,11 +57,23 @@ class Captor:
         self._looks: dict[int, _Look] = {}
         self._letters: dict[tuple[int, Material], tuple[int, ...]] = {}
 
-    def lies(self, locals_: tuple[int, ...]) -> Iterator[Action]:
-        """All that one of the agents can hear of it, and that makes any difference."""
-        for place, material in self.material(locals_):
-            for message in self._to(locals_[place], material):
-                yield Action(place, "lie", message)
+    def lies(self, locals_: tuple[int, ...]) -> Iterator[tuple[Action, ...]]:
+        """All that it can say and that makes any difference, each heard by any of those to whom it does."""
+        messages = dict.fromkeys(
+            message for place, material in self.material(locals_) for message in self._to(locals_[place], material)
+        )
+        for message in messages:
+            differ = [
+                Action(place, "lie", message) for place, local in enumerate(locals_) if self._differs(local, message)
+            ]
+            for count in range(1, len(differ) + 1):
+                yield from combinations(differ, count)
+
+    def _differs(self, local: int, message: int) -> bool:
+        if local == DEAD:
+            return False
+        step = self._local.lie(local, message)
+        return step.local != local or bool(step.sent or step.started)
 
     def material(self, locals_: tuple[int, ...]) -> Iterator[tuple[int, Material]]:
         """For the agent at each place that of which it can speak to it."""

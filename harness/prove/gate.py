@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from harness.errors import MachineError
+from harness.play.rogue.lies import made_block
 from ucp.agent import Agent
-from ucp.block import Block
 from ucp.messages import CARRY_A_BLOCK, Message
 
 if TYPE_CHECKING:
@@ -78,8 +78,7 @@ class Gate:
         if another is not None:
             yield self.sealed(message, now, sender=another)
         if type(message) in CARRY_A_BLOCK:
-            block = message.block  # type: ignore[union-attr]
-            others = Block(receiver, block.timestamp_us, block.event_data)
+            others = made_block(receiver, message.block.timestamp_us)  # type: ignore[union-attr]
             yield self.sealed(replace(message, block=others), now)  # type: ignore[arg-type]
 
     def _key(self, agent_id: int) -> Any:

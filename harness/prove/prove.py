@@ -201,7 +201,7 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Pr
         round(found.seconds, 3),
         round(time.process_time() - began_s, 3),
     )
-    proof = Proof(bounds, figures, found.ended, found.flaw, way=found.way, shown=dict.fromkeys(found.shown))
+    proof = Proof(bounds, figures, found.ended, found.flaw, way=found.way, shown=dict.fromkeys(sorted(found.shown)))
     if found.flaw is not None:
         limits = replace(limits, most_s=min(RUN_LOOKED_FOR_S, limits.most_s - found.seconds))
         swarm = Swarm(_with_instants(bounds))

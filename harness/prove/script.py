@@ -185,7 +185,9 @@ class Script:
                     self._late[agent.agent_id][number] = now - nominal_s
                 step = self._swarm.local.end_timer(agent.local, action.number)
             else:
-                now, other_s = other_s, round(other_s + MOMENT_S, 3)
+                now = other_s
+                if action.what != "lie":  # all hear it at once
+                    other_s = round(other_s + MOMENT_S, 3)
                 step = self._other(agent, action, now)
             acted_s = max(acted_s, now)
             air += self._done(agent, step, now)
@@ -204,8 +206,7 @@ class Script:
                 self._wording.completed(agent.agent_id, action.number, now)
             return step
         if action.what == "lie" and self._wording is not None:
-            lie = self._wording.lie(agent.agent_id, action.number)
-            self._timeline.append({"at_s": round(now - HEARD_AFTER_S, 6), "lie": lie})
+            self._timeline += self._wording.lie(agent.agent_id, action.number, round(now - HEARD_AFTER_S, 6))
             return self._swarm.local.lie(agent.local, action.number)
         agent.timers = {}
         if action.what == "reboot":

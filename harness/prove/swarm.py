@@ -132,12 +132,12 @@ class Swarm:
             yield from self._of_the_captor(self.captor, state)
 
     def _of_the_captor(self, captor: Captor, state: State) -> Iterator[tuple[Action, ...]]:
-        """It takes the vehicle, and then one agent after the other hears what it says."""
+        """It takes the vehicle, and then says one thing after the other, which any of the agents hear."""
         assert self.bounds.captured is not None, "it has somebody's keys"
         if state[LEFT] >> ONCE.index("captured") & 1:
             yield (Action(self.bounds.captured - 1, "captured"),)
         elif state[LEFT] >= LIES:
-            yield from ((lie,) for lie in captor.lies(state[AGENTS:]))
+            yield from captor.lies(state[AGENTS:])
 
     def coincidences(self, state: State, actions: Sequence[Action]) -> int:
         """How many moments have to be the same by chance for this to happen in one instant, and before all else."""
@@ -146,7 +146,7 @@ class Swarm:
         at = {timer: index + 1 for index, timer in enumerate(self._running(state[AGENTS:]))}
         ended = tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer"))
         if not ended:
-            return len(actions) - 1
+            return len({(action.what, action.number) for action in actions}) - 1
         if self.zones.after(state[ZONE], ended, ()) is None:
             return len(actions)  # they never end at once
         return self.zones.coincidences(state[ZONE], ended) + len(actions) - len(ended)
@@ -219,7 +219,7 @@ class Swarm:
             tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer")),
             sum(action.what == "complete" for action in actions),
             left,
-            sum(action.what == "lie" for action in actions),
+            int(any(action.what == "lie" for action in actions)),
             tuple(
                 _Outcome(there.locals, self._running_after(at, there), there.started if tell else (), wave)
                 for there, wave in self._instants.outcomes(locals_, actions, lossy, tell=tell).items()

@@ -42,16 +42,23 @@ class Wording:
         for block, chain_hash in chain.with_chain_hashes():
             below = self._chains[chain_hash] = (*below, block.block_hash)
 
-    def lie(self, receiver: int, number: int) -> Document:
-        """The captor has said this to the receiver alone: an entry, which is filled in when it is worded."""
-        entry: Document = {"sender": self._captured, "receiver": receiver}
-        self._lies.append((entry, self._local.messages[number]))
-        return entry
+    def lie(self, receiver: int, number: int, at_s: float) -> list[Document]:
+        """The captor says this, and the receiver hears it: an entry, which is filled in when it is worded.
+
+        None if it is what another has just heard.
+        """
+        message = self._local.messages[number]
+        if self._lies and (self._lies[-1][0]["at_s"], self._lies[-1][1]) == (at_s, message):
+            self._lies[-1][0]["lie"]["receivers"].append(receiver)
+            return []
+        entry: Document = {"at_s": at_s, "lie": {"sender": self._captured, "receivers": [receiver]}}
+        self._lies.append((entry, message))
+        return [entry]
 
     def word(self) -> None:
         """The whole way is known: fill in all entries."""
         for entry, message in self._lies:
-            entry |= self._said(message)
+            entry["lie"] |= self._said(message)
 
     def _said(self, message: Message) -> Document:
         said: Document = {"message": message.NAME}

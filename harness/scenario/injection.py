@@ -8,7 +8,7 @@ timeline:
   - {at_s: 500, forge: {message: Commit Block, sender: 2}}
   - {at_s: 600, forge: {message: Block Add Response, sender: 3, approve: false, for_s: 60}}
   - {at_s: 700, flood: {for_s: 10, per_s: 50, message: Chain Contain Query}}
-  - {at_s: 800, lie: {message: Commit Block, sender: 3, receiver: 1, block: made 790.5, chain: ["2.1", "1.1"]}}
+  - {at_s: 800, lie: {message: Commit Block, sender: 3, receivers: [1, 2], block: made 790.5, chain: ["2.1", "1.1"]}}
 
 `message` and `sender` that are left out mean any. The rogue hears everything that agents send, and everybody hears the
 rogue, whatever keeps agents apart. It adds to what is on the air and can take nothing away: an original that it delays,
@@ -152,7 +152,7 @@ BlockName = Annotated[str, Field(pattern=r"^(\d{1,5}\.\d{1,6}|made \d{1,9}(\.\d{
 
 
 class Lie(Model):
-    """One message in `sender`'s name, of just this content, which `receiver` alone hears; everybody if it is left out.
+    """One message in `sender`'s name, of just this content, which `receivers` hear; everybody if they are left out.
 
     `block` is the block that it is about: "2.1" is the first that agent 2 has proposed, "made 12.5" one that the rogue
     makes in the sender's name, with that timestamp in mission seconds. `chain` are the blocks of the chain that it is
@@ -178,7 +178,7 @@ class Lie(Model):
 
     message: MessageName
     sender: VehicleId
-    receiver: VehicleId | None = None
+    receivers: Annotated[list[VehicleId], Field(min_length=1)] | None = None
     block: BlockName | None = None
     chain: Annotated[list[BlockName], Field(max_length=1000)] | Literal["nobody's"] | None = None
     approve: bool | None = None
@@ -198,7 +198,7 @@ class Lie(Model):
         return self
 
     def in_words(self) -> str:
-        whom = "" if self.receiver is None else f" to {self.receiver} alone"
+        whom = "" if self.receivers is None else f" to {' and '.join(map(str, self.receivers))} alone"
         about = "" if self.block is None else f" about block {self.block}"
         chain = self.chain if isinstance(self.chain, str) else " ".join(self.chain or ()) or "inception"
         on = "" if self.chain is None else f", chain {chain}"

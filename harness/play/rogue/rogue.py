@@ -63,7 +63,7 @@ class RogueDatagram:
     datagram: bytes
     plain: bytes | None = None
     """What it says in plain, if it is sealed and the rogue made it."""
-    receiver: int | None = None
+    receivers: Sequence[int] | None = None
     """Who alone hears it; None: everybody."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
@@ -240,8 +240,9 @@ class Rogue:
         except UnheardError:
             return  # that nothing was sent is told in the end
         question = QUESTIONS.get(lie.message, "")
-        request = self._asked.get((lie.receiver or 0, question))
-        self._forge(number, "lie", lie.sender, message, now, request, lie.receiver)
+        asking = self._roster if lie.receivers is None else lie.receivers
+        request = next((self._asked[agent, question] for agent in asking if (agent, question) in self._asked), None)
+        self._forge(number, "lie", lie.sender, message, now, request, lie.receivers)
 
     def _forge_commit(self, number: int, forge: Forge, now: float) -> None:
         if self._secured and self._top_chain_hash is None:
@@ -273,16 +274,16 @@ class Rogue:
         message: Any,
         now: float,
         request: "Request | None" = None,
-        receiver: int | None = None,
+        receivers: Sequence[int] | None = None,
     ) -> None:
         sequence = forged_sequence(number, self.sent[number])
         plain = crafted.datagram(sender, sequence, message)
         if not (self._secured and self._captured):
-            self._send(RogueDatagram(number, what, sender, plain, receiver=receiver))
+            self._send(RogueDatagram(number, what, sender, plain, receivers=receivers))
             return
         said = decode(plain).message
         sealed = self._captured.sealed(sender, sequence, said, request, now, self._timestamp_us(now))
-        self._send(RogueDatagram(number, what, sender, sealed, plain, receiver))
+        self._send(RogueDatagram(number, what, sender, sealed, plain, receivers))
 
     def _send(self, injected: RogueDatagram) -> None:
         self.sent[injected.injection] += 1

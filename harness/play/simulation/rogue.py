@@ -69,7 +69,7 @@ class VirtualRogue:
             hearing = [
                 number
                 for number, agent in enumerate(self._roster)
-                if agent != injected.source and injected.receiver in (None, agent)
+                if agent != injected.source and (injected.receivers is None or agent in injected.receivers)
             ]
             self._air.inject(now + MOMENT_S, StrayDatagram(injected.source, injected.datagram), hearing)
             self._journal.add(injected, now)
