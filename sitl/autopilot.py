@@ -230,11 +230,11 @@ class Autopilot:
                 self._go_on_to(self.place(item.frame, item.x, item.y, item.z), self.current_item)
 
     def _save(self, failsafe: Failsafe) -> None:
-        """Do what ArduPilot does by itself: a copter without a position lands, others fly on or hold."""
+        """Do what ArduPilot does by itself: a copter without a position lands, a rover holds."""
         can_land = self.vehicle_type == "copter"
         if failsafe == "ekf":
             self.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF variance")
-            if self.armed and self.vehicle_type != "plane":
+            if self.armed:
                 mode = "LAND" if can_land else "HOLD"
                 self.say(mavlink.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {mode} Mode")
                 self._switch_to(mode)
@@ -242,8 +242,10 @@ class Autopilot:
         level = failsafe.removeprefix("battery ")
         used = f"{self.volts:.2f}V used {self.used_mah:.0f} mAh"
         self.say(mavlink.MAV_SEVERITY_WARNING, f"Battery 1 is {level} {used}")
-        if self.armed and self.mode != "LAND":
-            self._switch_to("LAND" if can_land and (level == "critical" or not self.ready) else "RTL")
+        self.say(mavlink.MAV_SEVERITY_WARNING, "Battery Failsafe")
+        action = self.failsafes.action(failsafe)
+        if self.armed and action and self.mode != "LAND":
+            self._switch_to("LAND" if can_land and not self.ready else action)
 
     def _switch_to(self, mode: str) -> None:
         if mode != self.mode:

@@ -15,7 +15,6 @@ ACCEL_MS2 = 2.5  # WPNAV_ACCEL
 VERTICAL_ACCEL_MS2 = 1.0  # WPNAV_ACCEL_Z
 LAND_SLOWLY_M = 10.0  # LAND_ALT_LOW
 LANDING_MS = 0.5  # LAND_SPEED
-TURNING_S = 1.2  # before it leaves a place: measured, 1 s in GUIDED and 2 s in AUTO, where it smooths (WPNAV_JERK)
 SPIN_UP_S = 3.0  # from arming to the first movement, measured
 
 
@@ -23,9 +22,11 @@ SPIN_UP_S = 3.0  # from arming to the first movement, measured
 class Copter:
     """The `MotionModel` of a copter: it stops at every place, and goes straight from one to the next.
 
-    `settling_s` goes by before it comes down; what is given is measured, in AUTO.
+    `turning_s` goes by before it leaves a place, and `settling_s` before it comes down; what is given is measured, in
+    AUTO, where it smooths its way (WPNAV_JERK).
     """
 
+    turning_s: float = 3.0
     settling_s: float = 3.0
 
     cruise_ms = CRUISE_MS
@@ -47,7 +48,7 @@ class Copter:
             limits.append((abs(climb_m), CLIMB_MS if climb_m > 0 else DESCENT_MS, VERTICAL_ACCEL_MS2))
         speed = min(limit * length_m / part_m for part_m, limit, _ in limits)
         accel = min(limit * length_m / part_m for part_m, _, limit in limits)
-        return [Rest(start, TURNING_S), Line(start, place, speed, accel)]
+        return [Rest(start, self.turning_s), Line(start, place, speed, accel)]
 
     def loiter(
         self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None

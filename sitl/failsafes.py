@@ -1,7 +1,7 @@
 """What the embedded vehicle's surroundings and parts are, and when its failsafes act: no flight, no clock, no MAVLink.
 
-Parameters as in ArduPilot's simulation, as far as a vehicle of closed formulas can have them: it has a GPS, a battery
-and, a copter, motors, and a plane feels wind; it has no compass. What it lacks it does not know as a parameter.
+Parameters as in ArduPilot and its simulation, as far as a vehicle of closed formulas can have them: it has a GPS, a
+battery and, a copter, motors, and a plane feels wind; it has no compass. What it lacks it does not know as a parameter.
 """
 
 from __future__ import annotations
@@ -12,14 +12,25 @@ from typing import Literal
 from sitl.vehicle import VehicleType
 
 BATTERY_FULL_V, BATTERY_USED_V = 16.8, 3.6  # full, and what of that a battery loses until it is empty
-BATTERY_LOW_V, BATTERY_CRITICAL_V = 10.5, 10.0  # BATT_LOW_VOLT; BATT_CRT_VOLT as an operator would set it
-BATTERY_LOW_S = 10.0  # BATT_LOW_TIMER
-NO_GPS_S = 5.0  # an EKF does without that long, about
+NO_GPS_S = 8.0  # an EKF does without that long, as measured with 4.7
 
 SLOWEST_MS = 3.0  # over the ground, however strong the wind
 
 GPS, VOLTS, THRUST, MOTOR = "SIM_GPS1_ENABLE", "SIM_BATT_VOLTAGE", "SIM_ENGINE_MUL", "SIM_ENGINE_FAIL"
 WIND, WIND_FROM = "SIM_WIND_SPD", "SIM_WIND_DIR"
+
+LOW_AT, CRITICAL_AT, LOW_FOR = "BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_TIMER"
+WHEN_LOW, WHEN_CRITICAL = "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"
+BATTERY = {LOW_AT: 0.0, CRITICAL_AT: 0.0, LOW_FOR: 10.0, WHEN_LOW: 0.0, WHEN_CRITICAL: 0.0}
+"""ArduPilot's defaults: a battery is never low, and a copter's is, but nothing is done about it."""
+COPTER_LOW_V = 10.5
+
+ACTIONS: dict[VehicleType, dict[float, str]] = {
+    "copter": {1: "LAND", 2: "RTL", 3: "RTL", 4: "LAND"},
+    "plane": {1: "RTL", 2: "RTL"},
+    "rover": {1: "RTL", 2: "HOLD", 3: "RTL", 4: "HOLD"},
+}
+"""The modes that BATT_FS_..._ACT asks for, where no smarter way home is known; others ask for none."""
 
 Failsafe = Literal["ekf", "battery low", "battery critical"]
 
@@ -28,9 +39,11 @@ class Failsafes:
     """Of one vehicle; times are its own seconds."""
 
     def __init__(self, vehicle_type: VehicleType) -> None:
-        self.parameters = {GPS: 1.0, VOLTS: BATTERY_FULL_V}
+        self.parameters = {GPS: 1.0, VOLTS: BATTERY_FULL_V, **BATTERY}
+        self._actions = ACTIONS[vehicle_type]
+        self._needs_gps = vehicle_type != "plane"  # which knows its airspeed, and reckons from that where it is
         if vehicle_type == "copter":
-            self.parameters |= {THRUST: 1.0, MOTOR: 0.0}
+            self.parameters |= {THRUST: 1.0, MOTOR: 0.0, LOW_AT: COPTER_LOW_V}
         if vehicle_type == "plane":
             self.parameters |= {WIND: 0.0, WIND_FROM: 180.0}
         self.acting: list[Failsafe] = []
@@ -56,13 +69,18 @@ class Failsafes:
         """What a battery has of which so much is used, 0 to 1."""
         return max(0.0, self.parameters[VOLTS] - BATTERY_USED_V * used)
 
+    def action(self, failsafe: Failsafe) -> str | None:
+        """The mode that a battery's failsafe asks for, if any."""
+        return self._actions.get(self.parameters[WHEN_LOW if failsafe == "battery low" else WHEN_CRITICAL])
+
     def look(self, now_s: float, used: float) -> Failsafe | None:
         """What acts now, if anything does; ask again until nothing does."""
         volts = self.volts(used)
+        low_for_s = self.parameters[LOW_FOR]
         causes: dict[Failsafe, tuple[bool, float]] = {
-            "ekf": (not self.has_gps, NO_GPS_S),
-            "battery critical": (volts <= BATTERY_CRITICAL_V, BATTERY_LOW_S),
-            "battery low": (volts <= BATTERY_LOW_V, BATTERY_LOW_S),
+            "ekf": (self._needs_gps and not self.has_gps, NO_GPS_S),
+            "battery critical": (volts <= self.parameters[CRITICAL_AT], low_for_s),
+            "battery low": (volts <= self.parameters[LOW_AT], low_for_s),
         }
         for failsafe, (is_there, after_s) in causes.items():
             if not is_there:

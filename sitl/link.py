@@ -26,6 +26,7 @@ TELEMETRY_INTERVAL_S = 0.25  # simulated
 MIN_TELEMETRY_INTERVAL_S = 0.1  # of our time, per message: what a link costs must not grow with the speedup
 PATIENCE_INTERVALS = 4  # who asks too often postpones what he asks for
 MIN_RATE_SPAN_S = 1.0
+HEIGHTS_DIFFER_M = 10.0
 
 TELEMETRY = (
     mavlink.MAVLINK_MSG_ID_SYS_STATUS,
@@ -91,6 +92,7 @@ class Link(asyncio.Protocol):
         self._first_time: tuple[float, float] | None = None  # wall, simulated
         self._last_time: tuple[float, float] | None = None
         self._estimate_is_good = False
+        self._knows_its_height: bool | None = None  # above its home: whether it did when its estimate got good
 
     async def start(self) -> None:
         """Begin to read, to log and to send heartbeats."""
@@ -275,11 +277,16 @@ class Link(asyncio.Protocol):
         self._on_time(message)
         if not self._estimate_is_good or (message.lat == 0 and message.lon == 0):
             return  # ArduPlane 4.7 says after its boot that it is near 0 N, 0 E, and a rover that its altitude is 0
+        height_m, says_m = message.alt / 1e3 - self.home.alt_m, message.relative_alt / 1e3
+        if self._knows_its_height is None:  # a rover of 4.7 has set its home, and is 584 m above it ever after
+            self._knows_its_height = abs(says_m - height_m) < HEIGHTS_DIFFER_M
+        if self._knows_its_height:  # what it says above the sea stands still once a copter of 4.7 has lost its GPS
+            height_m = says_m
         self.state.position = Position(
             message.lat / 1e7,
             message.lon / 1e7,
-            message.alt / 1e3,
-            message.alt / 1e3 - self.home.alt_m,
+            self.home.alt_m + height_m,
+            height_m,
             message.vx / 100,
             message.vy / 100,
             -message.vz / 100,
@@ -290,7 +297,7 @@ class Link(asyncio.Protocol):
         now = (self.heard_at, message.time_boot_ms / 1e3)
         if self._last_time is None or now[1] < self._last_time[1] - 1.0:  # first heard, or rebooted
             self._first_time = now
-            self._estimate_is_good = False
+            self._estimate_is_good, self._knows_its_height = False, None
         self._last_time = now
         self.state.time_s = now[1]
 

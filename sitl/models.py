@@ -46,7 +46,7 @@ MODELS: dict[VehicleType, MotionModel] = {"copter": Copter(), "plane": Plane(), 
 """As they fly missions, in AUTO."""
 
 AT_ONCE: dict[VehicleType, MotionModel] = {
-    "copter": Copter(settling_s=0.0),
+    "copter": Copter(turning_s=1.2, settling_s=0.0),
     "plane": Plane(),
     "rover": Rover(start_s=0.0),
 }

@@ -16,11 +16,11 @@ from sitl.kinematics import NEAR_M, Arc, Climbing, Line, Motion, Point, Rest, Se
 
 CRUISE_MS = 22.0  # AIRSPEED_CRUISE
 OVER_GROUND = (
-    1.06  # metres over the ground for each that its airspeed sensor counts, measured: the air is thin up there
+    1.064  # metres over the ground for each that its airspeed sensor counts, measured: the air is thin up there
 )
 CLIMB_MS = 5.0  # TECS_CLMB_MAX
-LOITER_RADIUS_M = 96.0  # clockwise, at CRUISE_MS; measured, of WP_LOITER_RAD 80, which grows in thin air
-LOITER_RADIUS_M_PER_MS = 1.25  # measured: so much smaller for each metre per second less
+LOITER_RADIUS_M = 96.4  # clockwise, at CRUISE_MS; measured, of WP_LOITER_RAD 80, which grows in thin air
+LOITER_RADIUS_M_PER_MS = 0.95  # measured: so much smaller for each metre per second less
 ROLL_S = 1.4  # measured: before it turns to a circle
 SWING_M = 120.0  # measured: how far before a place it begins to swing out for its circle
 JOIN_RAD = 1.1  # measured: how far to the left of straight ahead it leaves a place that it is to circle
@@ -71,19 +71,21 @@ class Plane:
     def loiter(
         self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
     ) -> Sequence[Segment]:
-        """Clockwise round the place, for so many seconds from when it has come to the circle.
+        """Clockwise round the place, for so many seconds from when it begins to swing out for the circle.
 
         From inside it crosses the circle straight; from outside it flies towards the place, and passes it on its left.
         """
         path, radius_m = _Path(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS), loiter_radius_m(speed_ms)
         if math.dist(start.point[:2], place[:2]) < radius_m:
-            path.straight_to(_on_circle(place, radius_m, start.yaw_rad - JOIN_RAD))
+            joins_rad = start.yaw_rad - JOIN_RAD
         else:
             if not start.yaw_rate_rads:
                 path.straight(ROLL_S * path.speed_ms)
             path.fly_by(place, SWING_M)
-            path.straight_to(_on_circle(place, radius_m, path.bearing_rad(place) - math.pi / 2))
-        path.arc(place[:2], seconds * path.speed_ms / radius_m)
+            joins_rad = path.bearing_rad(place) - math.pi / 2
+        path.straight_to(_on_circle(place, radius_m, joins_rad))
+        swing_s = path.segments[-1].duration_s
+        path.arc(place[:2], max(0.0, seconds - swing_s) * path.speed_ms / radius_m)
         if after is not None and math.isfinite(seconds):
             path.arc(place[:2], _until_heading_for(after, place, end_of(path.segments)))
         return path.segments

@@ -56,7 +56,11 @@ def _state(vehicle: Autopilot) -> int:
 def _health(vehicle: Autopilot) -> int:
     """The sensors that are well, and what depends on them."""
     low = any(failsafe.startswith("battery") for failsafe in vehicle.failsafes.acting)
-    unwell = (0 if vehicle.ready else NOT_YET) | (mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if low else 0)
+    unwell = mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if low else 0
+    if not vehicle.ready:
+        unwell |= NOT_YET
+    if vehicle.has_booted and vehicle.vehicle_type != "rover":  # without GPS they reckon on
+        unwell &= ~mavlink.MAV_SYS_STATUS_AHRS
     return int((SENSORS | NOT_ILL) & ~unwell)
 
 

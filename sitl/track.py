@@ -78,7 +78,7 @@ def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mot
     begins = landing_begins(waypoints, vehicle_type)
     led, staying = leg_by_leg(waypoints[:begins], vehicle_type, start)
     if begins is None or len(led) < begins:
-        return [*led, staying]
+        return led if len(led) == len(waypoints) and waypoints[-1].kind == "land" else [*led, staying]
     return [*led, *_mission(waypoints[begins:], vehicle_type, end_of(led))]
 
 

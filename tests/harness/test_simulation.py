@@ -215,7 +215,7 @@ BURSTS = {
         ("loss_15.yaml", 2, "a8cce796a772945e"),
         ("missed_commit.yaml", 1, "10472e41ff7f2740"),
         ("partition_heal.yaml", 1, "988c978a053cea73"),
-        ("split_rejoin.yaml", 1, "ce082f5ec744d039"),
+        ("split_rejoin.yaml", 1, "314fd04da1a47bb4"),
         ("attrition.yaml", 1, "2dcf131485a492fe"),
         ("bursts", 1, "c096a7b164a7bf65"),
     ],

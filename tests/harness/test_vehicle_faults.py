@@ -71,7 +71,8 @@ def test_virtual_time_refuses_it(tmp_path: Path) -> None:
 
 @pytest.mark.lab
 def test_a_run_in_which_vehicles_are_in_trouble_goes_on_and_says_what_they_cannot(tmp_path: Path) -> None:
-    written = write_scenario(tmp_path, **{**scenario(TROUBLE), "duration_s": 80, "speedup": 20})
+    goes_home = {"parameters": {"BATT_FS_LOW_ACT": 2}}
+    written = write_scenario(tmp_path, **{**scenario(TROUBLE, each={2: goes_home}), "duration_s": 80, "speedup": 20})
     out = tmp_path / "run"
     done = harness("run", written, "--out", out)
     assert done.returncode == 2, done.stderr

@@ -52,11 +52,12 @@ def mode_of(vehicle: Autopilot) -> str:
     return vehicle.mode
 
 
-def test_without_gps_a_copter_lands_and_says_so_and_its_position_does_not_count() -> None:
+def test_without_gps_a_copter_lands_and_says_so() -> None:
     vehicle, texts = airborne()
     vehicle.failsafes.parameters["SIM_GPS1_ENABLE"] = 0.0
-    assert not sys_status(vehicle).onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_AHRS
+    assert not sys_status(vehicle).onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_SENSOR_GPS
     vehicle.advance(61.0)
+    vehicle.advance(68.0)
     assert mode_of(vehicle) == "GUIDED"
     vehicle.advance(70.0)
     assert texts == ["EKF variance", "EKF Failsafe: changed to LAND Mode"]
@@ -66,26 +67,38 @@ def test_without_gps_a_copter_lands_and_says_so_and_its_position_does_not_count(
     assert vehicle.arm() == mavlink.MAV_RESULT_FAILED
     vehicle.failsafes.parameters["SIM_GPS1_ENABLE"] = 1.0
     vehicle.advance(301.0)
-    assert sys_status(vehicle).onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_AHRS
+    assert sys_status(vehicle).onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_SENSOR_GPS
     assert heartbeat(vehicle).system_status == mavlink.MAV_STATE_STANDBY
 
 
-@pytest.mark.parametrize(("vehicle_type", "mode"), [("plane", "TAKEOFF"), ("rover", "HOLD")])
-def test_without_gps_a_plane_flies_on_and_a_rover_stops(vehicle_type: VehicleType, mode: str) -> None:
+@pytest.mark.parametrize(
+    ("vehicle_type", "mode", "said"), [("plane", "TAKEOFF", []), ("rover", "HOLD", ["EKF variance"])]
+)
+def test_without_gps_a_plane_flies_on_and_a_rover_stops_whose_position_does_not_count(
+    vehicle_type: VehicleType, mode: str, said: list[str]
+) -> None:
     vehicle, texts = airborne(vehicle_type)
     vehicle.failsafes.parameters["SIM_GPS1_ENABLE"] = 0.0
     vehicle.advance(61.0)
     vehicle.advance(70.0)
-    assert texts[0] == "EKF variance"
-    assert vehicle.mode == mode
+    assert (vehicle.mode, texts[:1]) == (mode, said)
+    counts = bool(sys_status(vehicle).onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_AHRS)
+    assert counts is (vehicle_type == "plane")
 
 
 @pytest.mark.parametrize(
-    ("volts", "mode", "said"), [(10.4, "RTL", "Battery 1 is low 1"), (9.5, "LAND", "Battery 1 is critical 9")]
+    ("volts", "given", "mode", "said"),
+    [
+        (10.4, {}, "GUIDED", "Battery 1 is low 1"),
+        (10.4, {"BATT_FS_LOW_ACT": 2.0}, "RTL", "Battery 1 is low 1"),
+        (9.5, {"BATT_CRT_VOLT": 10.0, "BATT_FS_CRT_ACT": 1.0}, "LAND", "Battery 1 is critical 9"),
+    ],
 )
-def test_a_low_battery_brings_it_home_and_a_critical_one_down(volts: float, mode: str, said: str) -> None:
+def test_a_low_battery_does_what_its_parameters_say(
+    volts: float, given: dict[str, float], mode: str, said: str
+) -> None:
     vehicle, texts = airborne()
-    vehicle.failsafes.parameters["SIM_BATT_VOLTAGE"] = volts
+    vehicle.failsafes.parameters |= {"SIM_BATT_VOLTAGE": volts, **given}
     vehicle.advance(61.0)
     vehicle.advance(69.0)
     assert (vehicle.mode, texts) == ("GUIDED", [])

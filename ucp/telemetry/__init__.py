@@ -30,10 +30,10 @@ changes.
 Failsafes are read from what is meant for machines. While one acts (radio, battery, ground station, EKF, terrain, dead
 reckoning), ArduPilot's HEARTBEAT says MAV_STATE_CRITICAL; a plane that has crashed says MAV_STATE_EMERGENCY. Which one
 it is, SYS_STATUS tells of some, by a bit of MAV_SYS_STATUS_SENSOR that is enabled and unhealthy: RC receiver, battery,
-geofence (a breach is not critical) and AHRS, the estimate of attitude and position. These bits are "what failed". They
-count while the vehicle is armed or critical: before a flight the estimate is not healthy yet. Every change is an event,
-and so is the end. A ground station failsafe has no bit: log `text` too, where ArduPilot says which it is and what it
-does about it.
+compass, GPS, geofence (neither a breach nor a lost compass is critical) and AHRS, the estimate of
+attitude and position. These bits are "what failed". They count while the vehicle is armed or critical: before a flight
+the estimate is not healthy yet. Every change is an event, and so is the end. A ground station failsafe has no bit: log
+`text` too, where ArduPilot says which it is and what it does about it.
 
 Battery levels are every 10 %, and every 5 % from 20 % down. A level reached is an event, and so is a battery that was
 charged or changed. A vehicle that does not know its percentage has no levels; its battery failsafe is event 7.

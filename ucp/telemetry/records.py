@@ -26,7 +26,10 @@ UNKNOWN_HEADING = UNKNOWN_VOLTAGE = 0xFFFF
 CRITICAL_STATES = frozenset({5, 6, 8})
 """MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY, MAV_STATE_FLIGHT_TERMINATION."""
 
-SENSORS = {1 << 16: "RC receiver", 1 << 20: "geofence", 1 << 21: "AHRS", 1 << 25: "battery"}
+SENSORS = {
+    **{1 << 2: "compass", 1 << 5: "GPS"},
+    **{1 << 16: "RC receiver", 1 << 20: "geofence", 1 << 21: "AHRS", 1 << 25: "battery"},
+}
 """The bits of MAV_SYS_STATUS_SENSOR that a failsafe event can hold, and what they are called."""
 
 MODE_CHANGE_DATA = struct.Struct(">IBII")
