@@ -1,6 +1,7 @@
 """A run whose vehicles are seen, and one of them commanded, at a ground station."""
 
 import json
+import os
 import threading
 import time
 from pathlib import Path
@@ -18,20 +19,23 @@ DEADLINE_S = 60.0
 class GroundStation(threading.Thread):
     """Sees who is there, and sends vehicle 2 home once it flies; on a free port."""
 
-    def __init__(self) -> None:
+    def __init__(self, deadline_s: float = DEADLINE_S) -> None:
         super().__init__(daemon=True)
+        self._deadline_s = deadline_s
         self._link = mavutil.mavlink_connection("udpin:127.0.0.1:0", dialect="ardupilotmega")
         self.port = self._link.port.getsockname()[1]
         self.seen: set[int] = set()
         self.over = threading.Event()
 
     def run(self) -> None:
-        commanded, deadline = False, time.monotonic() + DEADLINE_S
+        commanded, deadline = False, time.monotonic() + self._deadline_s
         while not self.over.is_set() and time.monotonic() < deadline:
             message = self._link.recv_match(type=["HEARTBEAT", "GLOBAL_POSITION_INT"], blocking=True, timeout=0.2)
             if message is None:
                 continue
-            self.seen.add(message.get_srcSystem())
+            if message.get_srcSystem() not in self.seen:  # an ArduPilot says where it is to who asks
+                self.seen.add(message.get_srcSystem())
+                self._link.mav.request_data_stream_send(message.get_srcSystem(), 1, mavlink.MAV_DATA_STREAM_ALL, 4, 1)
             flies = message.get_type() == "GLOBAL_POSITION_INT" and message.relative_alt > 19_000
             if flies and message.get_srcSystem() == 2 and not commanded:
                 commanded = True
@@ -58,6 +62,36 @@ def test_an_operator_sees_all_vehicles_and_flies_the_one_that_is_commanded(tmp_p
     flown = {vehicle: (it["mode"], it["armed"]) for vehicle, it in record["vehicles"].items()}
     assert flown["2"] == (MODES["copter"]["RTL"], False)
     assert flown["1"] == flown["3"] == (MODES["copter"]["GUIDED"], True)
+
+
+@pytest.mark.ardupilot
+@pytest.mark.parametrize(
+    "backend",
+    [
+        pytest.param(("process",), marks=pytest.mark.lab),
+        pytest.param(("docker", "--image-from-host"), marks=pytest.mark.docker),
+    ],
+)
+def test_an_operator_flies_a_real_copter_under_a_debugger(backend: tuple[str, ...], tmp_path: Path) -> None:
+    """Two minutes, of which a copter needs 46 s to get ready."""
+    if "ARDUPILOT_SITL" not in os.environ:
+        pytest.skip("no ArduPilot: set ARDUPILOT_SITL to the directory that holds an arducopter")
+    ground = GroundStation(deadline_s=200)
+    ground.start()
+    vehicles = {"kind": "ardupilot", "each": {1: {"debugger": "gdb"}}}
+    scenario = write_scenario(tmp_path, agents=2, vehicles=vehicles, duration_s=60, speedup=1)
+    out = tmp_path / "run"
+    gcs = ("--gcs", f"127.0.0.1:{ground.port}")
+    done = harness("run", scenario, "--out", out, *gcs, "--backend", *backend, deadline_s=300)
+    ground.over.set()
+    ground.join()
+    assert done.returncode == 0, done.stdout + done.stderr
+    record = json.loads((out / "run.json").read_text())
+    assert ground.seen >= {1, 2}
+    (command,) = record["ground_station"]["commands"]
+    assert (command["vehicles"], command["command"]) == ([2], "MAV_CMD_DO_SET_MODE")
+    assert record["vehicles"]["2"]["mode"] == MODES["copter"]["RTL"]
+    assert min(vehicle["real_time_factor"] for vehicle in record["vehicles"].values()) > 0.95
 
 
 @pytest.mark.whoever
