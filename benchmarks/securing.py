@@ -1,7 +1,11 @@
-"""What security costs: `python -m benchmarks.securing [--rounds 200] [--missions 20]`.
+"""What security costs: `python -m benchmarks.securing [--rounds 200] [--missions 20] [--matrix SEEDS] [--speedup 20]`.
 
 Bytes and processor time of each message's datagram, plain and secured, sent and received; then whole missions in
 virtual time: a sweep, and runs with traces, each beside the plain one of the same seed.
+
+`--matrix SEEDS`: the thesis's matrix with so many seeds instead, as `ucp-harness matrix` plays it on one core, and
+beside it the floor: each datagram is signed, or signed and verified once, and nothing else is done. `--speedup 20`:
+five agents as processes instead (root), and whether they keep the clock; exit status 1 if not.
 """
 
 import argparse
@@ -10,7 +14,17 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import count
+from pathlib import Path
+from resource import RUSAGE_CHILDREN, getrusage
+from tempfile import TemporaryDirectory
 
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from benchmarks.played_by import LOSS as LOSS_OF_MATRIX
+from benchmarks.played_by import scenario as scenario_of_matrix
+from harness.matrix.play import simulated
+from harness.play.progress import Silent
+from harness.run.run import run
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from ucp.block import Block
@@ -103,19 +117,76 @@ def per_mission(missions: int) -> None:
         )
 
 
+def matrix(seeds: int) -> None:
+    """Processor time of the same cells and seeds in turn, plain and secured, and what no secured one can do without."""
+    plain_s = secured_s = 0.0
+    datagrams = 0
+    for loss in LOSS_OF_MATRIX:
+        cell = scenario_of_matrix(5, loss, final_reconcile=False, settle_s=7200.0)
+        keyed = cell.secured()
+        for seed in range(1, seeds + 1):
+            began = time.process_time()
+            simulated(cell, seed)
+            between = time.process_time()
+            simulated(keyed, seed)
+            secured_s += time.process_time() - between
+            plain_s += between - began
+        datagrams += sum(agent["messages_sent"] for agent in simulate(keyed, 1).played.agents.values())
+    runs = len(LOSS_OF_MATRIX) * seeds
+    plain_ms, secured_ms, each = plain_s / runs * 1e3, secured_s / runs * 1e3, datagrams / len(LOSS_OF_MATRIX)
+    key = Ed25519PrivateKey.generate()
+    data = bytes(180)
+    signature, public = key.sign(data), key.public_key()
+    sign_us = microseconds(1000, partial(key.sign, data))
+    verify_us = microseconds(1000, partial(public.verify, signature, data))
+    say("matrix", "plain ms", "secured ms", "ratio")
+    say(f"{runs} runs", f"{plain_ms:.1f}", f"{secured_ms:.1f}", f"{secured_ms / plain_ms:.2f}")
+    say("floor", "datagrams", "sign us", "verify us", "signed", "and verified")
+    ratios = (1 + each * us / 1e3 / plain_ms for us in (sign_us, sign_us + verify_us))
+    say("of a run", f"{each:.0f}", f"{sign_us:.0f}", f"{verify_us:.0f}", *(f"{ratio:.2f}" for ratio in ratios))
+
+
+def as_processes(speedup: float) -> bool:
+    """Whether five agents keep the clock, plain and secured, by the vote timers in their own traces."""
+    plain = Scenario.model_validate(
+        {"name": "clock", "network": {"loss": 0.15}, "vehicles": {"kind": "none"}, "speedup": speedup}
+    )
+    kept = True
+    say("as processes", "late s", "of s", "processor s", "bad")
+    for name, request in (("plain", plain), ("secured", plain.secured())):
+        with TemporaryDirectory() as directory:
+            began = getrusage(RUSAGE_CHILDREN)
+            finished = run(request, 1, Path(directory) / "run", Silent(), "process")
+            ended = getrusage(RUSAGE_CHILDREN)
+        spent = ended.ru_utime + ended.ru_stime - began.ru_utime - began.ru_stime
+        late = finished.timer_lag
+        told = (f"{late.late_s:.2f}", f"{late.asked_s:g}") if late else ("?", "?")
+        say(name, *told, f"{spent:.1f}", ", ".join(finished.result.bad) or "nothing")
+        kept = kept and late is not None and late.tolerable and not finished.result.bad
+    return kept
+
+
 def say(first: str, *cells: str) -> None:
     sys.stdout.write(f"{first:28}" + "".join(f"{cell:>12}" for cell in cells) + "\n")
     sys.stdout.flush()
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=1000)
     parser.add_argument("--missions", type=int, default=20)
+    parser.add_argument("--matrix", type=int, metavar="SEEDS")
+    parser.add_argument("--speedup", type=float)
     arguments = parser.parse_args()
-    per_datagram(arguments.rounds)
-    per_mission(arguments.missions)
+    if arguments.matrix is not None:
+        matrix(arguments.matrix)
+    elif arguments.speedup is not None:
+        return 0 if as_processes(arguments.speedup) else 1
+    else:
+        per_datagram(arguments.rounds)
+        per_mission(arguments.missions)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
