@@ -85,6 +85,8 @@ def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
     within = f"that began after {since:g} s, when {when}"
     if there_s[1] < math.inf:
         within += f", and ended by {there_s[1]:g} s, when the first was switched off"
+    if _somebody_stood_still(evidence, since, math.inf):
+        within += ", and during which nobody stood still"
     sentence = f"agent {agent_id} completed no reconcile {within}, "
     return sentence + (
         f"and none came of the vote at {proposed[-1]:g} s" if proposed else "and proposed no block since"
@@ -100,7 +102,7 @@ def without(evidence: Evidence) -> str:
 def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
     """Those of `differing` that completed a reconcile since full connectivity and the others' last change.
 
-    One during which nobody was missing whose export is judged, and nobody else was there.
+    One during which nobody was missing or stood still whose export is judged, and nobody else was there.
     """
     since = evidence.connected_since_s
     if since is None:
@@ -111,10 +113,21 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
     for agent_id in differing & set(evidence.traces):
         others_changed_at = max((t for peer, t in last_change.items() if peer != agent_id), default=0.0)
         for life in evidence.traces[agent_id].lives():
-            began = False
+            began_s: float | None = None
             for _, run in life:
                 if run.handler == "reconcile_begin" and run.branch == "begun":
-                    began = run.t >= max(since, others_changed_at, from_s)
-                elif began and run.t <= until_s and run.handler == "reconcile_finalize" and not run.state.reconciling:
+                    began_s = run.t if run.t >= max(since, others_changed_at, from_s) else None
+                elif (
+                    began_s is not None
+                    and run.t <= until_s
+                    and run.handler == "reconcile_finalize"
+                    and not run.state.reconciling
+                    and not _somebody_stood_still(evidence, began_s, run.t)
+                ):
                     had.add(agent_id)
     return had
+
+
+def _somebody_stood_still(evidence: Evidence, from_s: float, until_s: float) -> bool:
+    """Whether one of those who are judged neither heard nor answered for a while: who asks then asks not all."""
+    return any(evidence.was_paused(agent_id, from_s, until_s) for agent_id in evidence.present)

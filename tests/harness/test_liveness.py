@@ -161,6 +161,26 @@ def test_an_agent_that_stands_still_to_the_end_is_not_judged() -> None:
     assert (liveness(run).verdict, liveness(run).reason) == ("not applicable", "agent 3 stood still to the end")
 
 
+def test_who_asks_one_that_stands_still_had_no_chance_to_agree() -> None:
+    """Agent 3 has a block that nobody else has, and is paused to the end: the final reconcile asks it in vain."""
+    run = simulate(
+        scenario(
+            agents=3,
+            duration_s=60,
+            settings={"max_block_bytes": 267},
+            events={"source": "scripted", "script": [{"at_s": 1, "agent": 3}, {"at_s": 40, "agent": 1}]},
+            fates=[{"message": "Commit Block", "sender": 3, "count": 1, "drop": True}],
+            timeline=[{"at_s": 30, "pause": [3]}],
+            final_reconcile=True,
+        ),
+        seed=1,
+        tracing=True,
+    )
+    assert run.result.figures["reconciles"]
+    assert run.result.bad == ()
+    assert "and during which nobody stood still" in run.result.characteristics["5"].reason
+
+
 def test_time_until_uniform_is_known_of_every_run_that_ends_with_one_chain() -> None:
     """Traced or not, and it is when the chains were last changed."""
     for seed in range(5):
