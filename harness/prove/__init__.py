@@ -10,6 +10,7 @@ alone.py      network any: each agent by itself, against all that could ever be 
 order.py      of all orders of the agents one that stands for all
 swarm.py      global states, and all that may happen next
 expansion.py  what may follow one state
+collecting.py Python's collector rests meanwhile
 crew.py       other processes that look at states, too
 explore.py    all of them, breadth first
 attractor.py  from which states a goal is come to, whichever timer is the next to end

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
+from harness.prove.collecting import cycles_left_alone
 from harness.prove.crew import Crew
 from harness.prove.expansion import Expansion, expanded
 from harness.prove.local import Flaw
@@ -77,6 +78,7 @@ class Graph:
         return path[::-1]
 
 
+@cycles_left_alone()
 def explore(
     swarm: Swarm,
     *,

@@ -75,12 +75,14 @@ class Instants:
         self._outcomes: dict[tuple[int, Heard, bool, bool], list[_Outcome]] = {}
         self._choices_of: dict[tuple[int, int, Started, tuple[tuple[int, int], ...], bool, bool], list[_Choice]] = {}
         self._places = range(bounds.agents)
+        self._names = [
+            [other + 2 if bounds.alike and other < place else other + 1 for other in self._places]
+            for place in self._places
+        ]
 
     def name_of(self, other: int, place: int) -> int:
         """What the agent at `place` calls the one at `other`."""
-        if not self._bounds.alike:
-            return other + 1
-        return other + 2 if other < place else other + 1
+        return self._names[place][other]
 
     def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
         """Whether it makes a difference to the agent at `place` in which order it hears what it heard of the wave."""
@@ -156,11 +158,8 @@ class Instants:
         """Whether nothing of what is said makes any difference to the agent at `place`, so that no order of it does."""
         if local == DEAD:
             return True
-        lets_be = self._local.lets_be
-        for sender, message in said:
-            if sender != place and not lets_be(local, self.name_of(sender, place), message):
-                return False
-        return True
+        lets_be, names = self._local.lets_be, self._names[place]
+        return all(sender == place or lets_be(local, names[sender], message) for sender, message in said)
 
     def _choices(
         self, place: int, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, answered: bool
@@ -193,8 +192,11 @@ class Instants:
             return ()
         if step.local == DEAD:
             return ()
+        started = step.started or before
+        if before and step.started:
+            started = tuple(sorted({**dict(before), **dict(step.started)}.items()))
         running = self._local.known[step.local].running
-        return tuple(sorted(item for item in {**dict(before), **dict(step.started)}.items() if item[0] in running))
+        return tuple([item for item in started if item[0] in running])
 
     def _outcomes_of(self, local: int, heard: Heard, lossy: bool, answered: bool) -> list[_Outcome]:
         """What can become of an agent that hears these, each with an order in which it does: positions in `heard`."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from harness.prove.attractor import Attractor, Check
+from harness.prove.collecting import cycles_left_alone
 from harness.prove.crew import Crew
 from harness.prove.cycles import cycles
 from harness.prove.explore import Graph
@@ -33,6 +34,7 @@ class Liveness:
     """Whether all that follows more votes was looked at."""
 
 
+@cycles_left_alone()
 def look(graph: Graph, check: Check = lambda: None, crew: Crew | None = None) -> Liveness:
     """Of a graph that is complete; a crew, if there is one, lets those vote who are at rest with several chains."""
     at_rest = dict(_at_rest(graph, check))

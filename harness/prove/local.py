@@ -110,6 +110,7 @@ class LocalStates:
 
     def __init__(self, bounds: Bounds) -> None:
         self.bounds = bounds
+        self._alike = bounds.alike
         self.known: list[Known] = []
         self.flawed: set[int] = set()
         """Those that must never be."""
@@ -193,7 +194,7 @@ class LocalStates:
         Where it makes no difference who is who, what an agent does is the same but for these names (docs/proof.md).
         """
         known = self.known[local]
-        if not self.bounds.alike or known.agent_id != FIRST or known.flaw is not None:
+        if not self._alike or known.agent_id != FIRST or known.flaw is not None:
             return None
         tallies = [known.snapshot[name] for name in NAMES_OF_OTHERS]
         in_order = sorted(
@@ -208,7 +209,7 @@ class LocalStates:
         Or if they have other names to the agent, as it has heard of somebody before.
         """
         known = self.known[local]
-        if not self.bounds.alike or known.agent_id != FIRST or known.names_others or known.flaw is not None:
+        if not self._alike or known.agent_id != FIRST or known.names_others or known.flaw is not None:
             return None
         in_order = tuple(dict.fromkeys((*senders, *self._others)))
         return None if in_order == self._others else _back(in_order)
@@ -219,7 +220,7 @@ class LocalStates:
 
     def lets_be(self, local: int, sender: int, message: int) -> bool:
         """Whether it makes no difference at all that the agent hears this."""
-        if self.bounds.alike and not self.known[local].names_others:
+        if self._alike and not self.known[local].names_others:
             sender = FIRST_OTHER  # it is one to the agent who says it
         key = local, sender, message
         lets_be = self._lets_be.get(key)

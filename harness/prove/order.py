@@ -24,6 +24,7 @@ class Order:
     """Puts agents in order. `name_of` is what the agent at a place calls the one at another."""
 
     def __init__(self, local: LocalStates, zones: Zones, name_of: Callable[[int, int], int]) -> None:
+        self._as_they_are = tuple(range(local.bounds.agents))
         self._local = local
         self._zones = zones
         self._name_of = name_of
@@ -45,35 +46,35 @@ class Order:
         places = orders[0]
         if len(orders) > 1:
             places = min(orders, key=lambda places: self._looks(locals_, zone, timers, places))
-        agents = tuple(self._renamed(locals_[old], new, places) for new, old in enumerate(places))
+        if places == self._as_they_are:
+            return locals_, zone, places
+        agents = tuple([self._renamed(locals_[old], new, places) for new, old in enumerate(places)])
         if zone:
-            zone = self._zones.permuted(zone, tuple(timer for place in places for timer in timers[place]))
+            zone = self._zones.permuted(zone, tuple([timer for place in places for timer in timers[place]]))
         return agents, zone, places
 
-    def _timers(self, locals_: Sequence[int]) -> list[tuple[int, ...]]:
+    def _timers(self, locals_: Sequence[int]) -> list[range]:
         """For each place which of the zone's timers are its agent's."""
-        timers, count = [], 0
+        timers, first = [], 1
         for local in locals_:
-            running = 0 if local == DEAD else len(self._local.known[local].running)
-            timers.append(tuple(range(count + 1, count + running + 1)))
-            count += running
+            end = first if local == DEAD else first + len(self._local.known[local].running)
+            timers.append(range(first, end))
+            first = end
         return timers
 
-    def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[tuple[int, ...]]) -> Iterator[Places]:
+    def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
         """All orders of the agents by what can be said of each; those of whom the same can be said in any."""
-
-        bounds = self._zones.bounds(zone)
+        known = self._local.known
+        bounds = self._zones.bounds(zone) if zone else [()]
         looks: list[tuple[Any, ...]] = [
-            (DEAD,)
-            if local == DEAD
-            else (self._local.known[local].anonymous, *(bounds[timer] for timer in timers[place] if zone))
-            for place, local in enumerate(locals_)
+            (DEAD,) if local == DEAD else (known[local].anonymous, *bounds[own.start : own.stop])
+            for local, own in zip(locals_, timers, strict=True)
         ]
         if len(set(looks)) == len(looks):
             yield tuple(sorted(range(len(locals_)), key=looks.__getitem__))
             return
         named: list[list[set[int]]] = []
-        if any(local != DEAD and self._local.known[local].names_others for local in locals_):
+        if any(local != DEAD and known[local].names_others for local in locals_):
             named = [self._named(local, place) for place, local in enumerate(locals_)]
             looks = [
                 (
@@ -95,7 +96,7 @@ class Order:
             yield tuple(place for group in chosen for place in group)
 
     def _change_places_freely(
-        self, group: Sequence[int], timers: Sequence[tuple[int, ...]], named: Sequence[Sequence[set[int]]]
+        self, group: Sequence[int], timers: Sequence[range], named: Sequence[Sequence[set[int]]]
     ) -> bool:
         """Whether agents that look alike are one as the other: without timers, and in nobody's tally or in the same."""
         if timers[group[0]]:
@@ -117,9 +118,7 @@ class Order:
         """Whom the agent at `place` calls so."""
         return name - 2 if name - 2 < place else name - 1
 
-    def _looks(
-        self, locals_: tuple[int, ...], zone: int, timers: Sequence[tuple[int, ...]], places: Places
-    ) -> tuple[Any, ...]:
+    def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
         """What tells this order from others."""
         new_place = {old: new for new, old in enumerate(places)}
         named = [
