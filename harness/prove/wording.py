@@ -87,7 +87,10 @@ class Wording:
 
     def _name(self, block_hash: bytes) -> str:
         name = self._names.get(block_hash)
-        return f"{MADE}{self._second(self._made[block_hash].timestamp_us):.6f}" if name is None else name
+        if name is not None:
+            return name
+        second = f"{self._second(self._made[block_hash].timestamp_us):.6f}"
+        return MADE + second.rstrip("0").rstrip(".")
 
     def _second(self, timestamp_us: int) -> float:
         """A time between those at which blocks were completed, as it is on this way; later than all is later still."""

@@ -1,6 +1,7 @@
 """The rows: who, what they do, and the scenario in which they do it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from harness.scenario import Scenario
@@ -13,7 +14,8 @@ LOST_S, REVOKED_S, ATTACK_S = 100, 200, 300
 class Row:
     """`attack` are entries of the timeline without their times; with `captured` whoever attacks has vehicle 3's keys.
 
-    `revoked`: they are revoked before it begins. `quirks` are those of vehicle 3, which then is a traitor.
+    `revoked`: they are revoked before it begins. `quirks` are those of vehicle 3, which then is a traitor. `own` are
+    keys of the scenario that are as nowhere else.
     """
 
     who: str
@@ -22,6 +24,7 @@ class Row:
     captured: bool = False
     revoked: bool = False
     quirks: tuple[str, ...] = ()
+    own: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def scenario(self) -> Scenario:
@@ -42,6 +45,7 @@ class Row:
                 "quirks": {name: {"value": True, "agents": [CAPTURED]} for name in self.quirks},
                 "timeline": timeline,
                 "final_reconcile": True,
+                **self.own,
             }
         )
 
@@ -67,6 +71,31 @@ _AGAIN = (
     {"replay": {"count": 500}},
 )
 
+_ALL_IN_STEP: dict[str, Any] = {
+    "settings": {"max_block_bytes": 267},
+    "events": {"source": "scripted", "script": [{"at_s": 2 + agent, "agent": agent} for agent in (1, 2, 4, 5)]},
+    "timeline": [
+        {"at_s": 1, "kill": [CAPTURED]},
+        *(
+            {
+                "at_s": 1 + agent / 10,
+                "lie": {
+                    "message": "Commit Block",
+                    "sender": CAPTURED,
+                    "receivers": [agent],
+                    "block": f"made {1 + agent / 10}",
+                    "chain": [],
+                },
+            }
+            for agent in (1, 2, 4, 5)
+        ),
+        {"at_s": 12.5, "lie": {"message": "Chain Hash Successor Query", "sender": CAPTURED, "chain": "nobody's"}},
+        {"at_s": 100, "revoke": [CAPTURED], "heard_by": [1, 2]},
+    ],
+    "final_reconcile": False,
+}
+"""Blocks fill while all have a block to vote on; the livelock that it ends in was found by `prove --captured`."""
+
 ROWS = (
     Row("outsider", "forges a commit and votes, and floods", (_commit(2), _answers(2, "Block Add Response"), _FLOOD)),
     Row("replayer", "sends all that it hears again: at once, later, and with a bit flipped", _AGAIN),
@@ -74,6 +103,12 @@ ROWS = (
     Row("captor of vehicle 3", "commits a block in vehicle 3's name", (_commit(CAPTURED),), captured=True),
     Row("captor of vehicle 3", "answers all questions with lies", _LIES, captured=True),
     Row("captor of vehicle 3", "floods, in any name", (_FLOOD,), captured=True),
+    Row(
+        "captor of vehicle 3, revoked afterwards",
+        "commits another block to each, and has all reconcile at once while they vote; no final reconcile",
+        captured=True,
+        own=_ALL_IN_STEP,
+    ),
     Row(
         "captor of vehicle 3, revoked",
         "does all of that",

@@ -1,6 +1,7 @@
 """Somebody with a vehicle's keys: what is looked at is all that can be said, and playing shows what comes of it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -10,8 +11,9 @@ import pytest
 
 from harness.prove import Bounds, BoundsError, in_words, prove
 from harness.prove.alone import collect
+from harness.prove.captor import Captor
 from harness.prove.explore import Graph, explore
-from harness.prove.letters import NOBODYS, Asked, Material, letters
+from harness.prove.letters import NOBODYS, Asked, Material, asked, letters
 from harness.prove.local import DEAD
 from harness.prove.script import Script
 from harness.prove.shape import Held, shape_of
@@ -20,8 +22,11 @@ from harness.prove.swarm import AGENTS, LEFT, LIES, ONCE, Swarm
 from harness.run.simulate import simulate
 from harness.scenario.load import parse
 from tests.harness.command import harness, sentences
+from tests.harness.prove.test_explore import all_seen, deliver, seen_of
 from ucp.agent import Agent
 from ucp.block import Block, next_chain_hash
+from ucp.clock import MICROSECONDS
+from ucp.events import LoggableEvent
 from ucp.messages import (
     BlockAddRequest,
     BlockAddResponse,
@@ -36,6 +41,7 @@ from ucp.messages import (
 )
 from ucp.secure.agent import SecuredAgent
 from ucp.secure.signatures import BlockSignatures
+from ucp.settings import Settings
 
 CAPTURED = 3
 
@@ -49,13 +55,13 @@ def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> Graph:
 
 
 def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
-    """Each agent in each state in which somebody may lie to it, and of what that can speak."""
-    local, captor = graph.swarm.local, graph.swarm.captor
-    assert captor is not None
+    """Each agent in each state in which somebody could lie to it once more, and of what that can speak."""
+    bounds, local = graph.swarm.bounds, graph.swarm.local
+    captor = Captor(replace(bounds, lies=bounds.lies + 1), local)
     pairs = {
         (state[AGENTS + place], place, material)
         for state in graph.states
-        if state[LEFT] >= LIES and not state[LEFT] >> ONCE.index("captured") & 1
+        if not state[LEFT] >> ONCE.index("captured") & 1
         for place, material in captor.material(state[AGENTS:])
     }
     for number, place, material in sorted(pairs, key=lambda pair: pair[:2]):
@@ -66,7 +72,7 @@ def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
 
 def random_message(lots: Random, agent: Agent, material: Material) -> Message:
     """Whatever can be said by who knows of these blocks, and can make others."""
-    made = Block(CAPTURED, lots.randrange(3_000_000), lots.randbytes(20))
+    made = Block(CAPTURED, lots.randrange(2_000_000), lots.randbytes(20))
     blocks = [*material.blocks, made]
     hashes = [*material.named, made.block_hash, lots.randbytes(32)]
     chain = agent.state.chain
@@ -122,12 +128,73 @@ def test_whatever_is_said_comes_to_what_one_of_the_letters_comes_to() -> None:
     for agent, material in lied_to(explored()):
         nothing = outcome(agent, ChainContainQuery(NOBODYS), material.others)
         known = [nothing, *(outcome(agent, said, material.others) for said in letters(agent.state, CAPTURED, material))]
-        for _ in range(300):
+        for _ in range(80):
             message = random_message(lots, agent, material)
             came = outcome(agent, message, material.others)
             changed += came != nothing
             assert came in known, message
     assert changed > 500
+
+
+def test_reduced_is_all_that_there_is() -> None:
+    reduced, whole = (
+        explored(2, 2),
+        explore(Swarm(Bounds(2, 2, "lossy", captured=2, reduced=False)), most_bytes=8e9, most_s=60),
+    )
+    assert len(reduced.states) < len(whole.states)
+    assert all_seen(reduced) == all_seen(whole)
+
+
+def test_whatever_a_captor_does_by_chance_is_among_it() -> None:
+    seen = all_seen(explored())
+    for seed in range(200):
+        for there in by_chance(Random(seed)):
+            assert there in seen
+
+
+def by_chance(lots: Random) -> Iterator[Any]:
+    """Three agents complete one block, and lose what they lose; the third is captured, and one lie is told."""
+    agents = [Agent(number, (1, 2, 3), b"proof", Settings(max_block_bytes=267)) for number in (1, 2, 3)]
+    times = {lots.uniform(0, 30): what for what in ("completes", "captured", "lies")}
+    while True:
+        soonest = min(
+            ((at, agent.agent_id) for agent in agents if (at := agent.next_timer()) is not None), default=None
+        )
+        now = min(times, default=None)
+        if now is not None and (soonest is None or now <= soonest[0]):
+            what = times.pop(now)
+            if what == "completes":
+                lots.choice(agents).add_event(LoggableEvent(MICROSECONDS, 1, bytes(256)), now)
+            elif what == "captured":
+                agents = agents[:2]
+            elif len(agents) == 2:
+                lie(agents, now, lots)
+        elif soonest is not None and soonest[0] < 200:
+            now, acts = soonest
+            agents[acts - 1].handle_timer(now)
+        else:
+            return
+        deliver(agents, 0.3, now, lots)
+        yield seen_of(agents)
+
+
+def lie(agents: list[Agent], now: float, lots: Random) -> None:
+    """Some of the agents hear it."""
+    captor = Swarm(Bounds(3, 1, captured=CAPTURED)).captor
+    assert captor is not None
+    held = [frozenset((*agent.state.chain, *agent.state.reconcile_stack)) for agent in agents]
+    named = [block.block_hash for agent in agents for block in agent.state.blocks_to_be_committed]
+    blocks = frozenset(captor.made.values()).union(*held)
+    material = Material(
+        blocks,
+        frozenset({*named, *(block.block_hash for block in blocks)}),
+        frozenset(map(asked, [agent.state for agent in agents])),
+        (),
+    )
+    message = random_message(lots, lots.choice(agents), material)
+    for agent in agents:
+        if lots.random() < 0.7:
+            agent.receive_message(CAPTURED, 0, message, now)
 
 
 def test_every_letter_is_let_in_and_nothing_else() -> None:
