@@ -25,7 +25,7 @@ BRANCHES: tuple[Branch, ...] = tuple(
 """All that there are in the contract."""
 
 MOST = 2_000_000
-"""More local states, or pairs, than so many are not told apart: they would take all memory."""
+"""So many local states, or pairs, are kept: more would take all memory."""
 KEPT = 20_000
 """So much that agents held is kept, with what was worked out of it."""
 
@@ -48,7 +48,7 @@ class Reached:
             if len(mine) < MOST:
                 mine |= its
             elif not its <= mine:
-                self.untold = f"more than {MOST:,} are not told apart"
+                self.untold = f"of local states and pairs only the first {MOST:,} are looked at"
         self.branches.update(other.branches)
         self.steps += other.steps
         self.untold = self.untold or other.untold

@@ -5,7 +5,7 @@ anything was, so that it is the same however many processes play.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from random import Random
@@ -14,8 +14,10 @@ from typing import NamedTuple
 from pydantic import ValidationError
 
 from harness.coverage import Reached
+from harness.coverage.reached import MOST
 from harness.errors import ScenarioError, UnsupportedError
 from harness.explore.document import Document, with_key
+from harness.explore.guided.beyond import Beyond
 from harness.explore.guided.change import Limits, changed
 from harness.explore.guided.identity import Identity
 from harness.explore.guided.trial import Apart, Tried, tried, with_liveness_phase
@@ -84,6 +86,9 @@ class Hunt:
     limits: Limits
     lots: Random
     reached: Reached = field(default_factory=Reached)
+    states_beyond: Beyond = field(default_factory=Beyond)
+    pairs_beyond: Beyond = field(default_factory=Beyond)
+    """What was reached when `reached` was full."""
     kept: list[Kept] = field(default_factory=list)
     runs: int = 0
     found: dict[Identity, Candidate] = field(default_factory=dict)
@@ -144,11 +149,11 @@ class Hunt:
             self._apart.add(news.apart)
             document = with_key(candidate.document, "final_reconcile", True)
             self._to_reconcile.append(candidate._replace(document=document))
-        before = len(self.reached.states), len(self.reached.pairs)
+        gave = _taken_down(news.reached.states, self.reached.states, self.states_beyond)
+        pairs = _taken_down(news.reached.pairs, self.reached.pairs, self.pairs_beyond)
         branches = any(branch not in self.reached.branches for branch in news.reached.branches)
         self.reached.add(news.reached)
-        gave = len(self.reached.states) - before[0]
-        if not (gave or branches or len(self.reached.pairs) > before[1]):
+        if not (gave or branches or pairs):
             return False
         self.kept.append(Kept(candidate, gave, news.reached.steps))
         if len(self.kept) > MOST_KEPT:
@@ -156,6 +161,16 @@ class Hunt:
             self.kept.remove(least)
             self._dropped.append(least.candidate)
         return True
+
+    @property
+    def local_states(self) -> int:
+        """How many were reached."""
+        return len(self.reached.states) + self.states_beyond.count
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs of one and an input were reached."""
+        return len(self.reached.pairs) + self.pairs_beyond.count
 
     def _next(self, worth: Sequence[float]) -> Candidate:
         lots, kept = self.lots, self._pick(worth)
@@ -169,3 +184,12 @@ class Hunt:
         if self.lots.random() < 0.5:
             return self.lots.choice(self.kept[-NEWEST:])
         return self.lots.choices(self.kept, cum_weights=worth)[0]
+
+
+def _taken_down(numbers: Iterable[int], told_apart: Collection[int], beyond: Beyond) -> int:
+    """How many of them are new; they go beyond, if there is no more room."""
+    new = [number for number in numbers if number not in told_apart and number not in beyond]
+    if len(told_apart) >= MOST:
+        for number in new:
+            beyond.add(number)
+    return len(new)

@@ -102,7 +102,7 @@ class Night:
 
     def grow(self) -> None:
         """Take down what is known by now; of a long night every second, fourth, eighth run."""
-        self.growth.append((self.hunt.runs, len(self.hunt.reached.states)))
+        self.growth.append((self.hunt.runs, self.hunt.local_states))
         if len(self.growth) > 2 * SAMPLES:
             del self.growth[1::2]
 
@@ -123,8 +123,8 @@ class Night:
             "processor_s": round(self.processor_s, 1),
             "runs": self.hunt.runs,
             "kept": len(self.hunt.kept),
-            "local_states": len(reached.states),
-            "pairs": len(reached.pairs),
+            "local_states": self.hunt.local_states,
+            "pairs": self.hunt.pairs,
             "coverage": coverage_to_json(reached, self.there),
             "growth": [list(sample) for sample in self.growth],
             "findings": [told.to_json() for told in self.told],
@@ -218,13 +218,13 @@ class _Nightwatch:
             return sum(outcome is True for _, outcome in outcomes), len(seeds)
 
     def _hunt(self, begun: list[Candidate]) -> None:
-        """From what is kept; what of that gives nothing any more is dropped."""
+        """From what is kept; what of that gives nothing any more is dropped, if there was time to play all of it."""
         hunt, before = self._night.hunt, self._corpus.runs()
         kept = set(map(id, self._taken(hunt.begin([*begun, *before], self._jobs))))
         if not hunt.kept:
             reason = hunt.failed[0][1] if hunt.failed else "no run of the scenario can be changed and played"
             raise HarnessError(f"there is nothing to begin with: {reason}")
-        for candidate in before:
+        for candidate in () if self._over else before:
             if id(candidate) not in kept:
                 self._corpus.drop(candidate)
         while not self._over:
@@ -247,7 +247,7 @@ class _Nightwatch:
                 yield candidate
             for identity in hunt.found.keys() - self._known.keys() - self._new.keys():
                 self._take_down(identity, hunt.found[identity])
-            self._watcher.on_progress(hunt.runs, len(hunt.reached.states), len(hunt.found))
+            self._watcher.on_progress(hunt.runs, hunt.local_states, len(hunt.found))
             if self._over:
                 return
 

@@ -96,6 +96,31 @@ def test_a_hunt_is_the_same_however_many_play_it() -> None:
     assert [kept.candidate for kept in alone.kept] == [kept.candidate for kept in shared.kept]
 
 
+def test_a_hunt_goes_on_to_learn_when_it_can_keep_no_more_local_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hunted() -> Hunt:
+        limits, begun = beginnings(ordinary(), range(2))
+        hunt = Hunt(limits, Random(1))
+        for _ in (*hunt.begin([Candidate(*each) for each in begun], 1), *hunt.round(1)):
+            pass
+        return hunt
+
+    roomy = hunted()
+    for module in ("harness.coverage.reached", "harness.explore.guided.hunt"):
+        monkeypatch.setattr(f"{module}.MOST", 100)
+    narrow = hunted()
+    assert len(narrow.reached.states) < len(roomy.reached.states)
+    assert (narrow.local_states, narrow.pairs) == (roomy.local_states, roomy.pairs)
+    assert [kept.candidate for kept in narrow.kept] == [kept.candidate for kept in roomy.kept]
+
+
+def test_a_night_too_short_to_play_what_is_kept_loses_none_of_it(tmp_path: Path) -> None:
+    night(tmp_path / "corpus")
+    kept = {*(tmp_path / "corpus/runs").iterdir()}
+    short = night(tmp_path / "corpus", runs=5)
+    assert short.hunt.runs < len(kept)
+    assert {*(tmp_path / "corpus/runs").iterdir()} >= kept
+
+
 def test_an_agent_alone_that_others_refuse_for_ever_is_shown_by_a_short_document() -> None:
     """What a hunt found: of five with four chains at rest one has a block, and nobody takes it."""
     script = [(1.0, 3), (42.944, 2), (48.087, 1), (82.944, 4)]
