@@ -18,11 +18,14 @@ import pytest
 import requests
 import yaml
 
+from harness.keyring.home import Home
 from harness.play.containers import engine, images, ownership, preflight
 from harness.play.containers.container import STDERR, STDOUT, Output
 from harness.play.containers.images import Image
 from harness.scenario import Scenario
 from tests.harness.command import harness, sentences, write_scenario
+from tests.harness.secure.secrets import left_in, told
+from tests.harness.secure.secrets import secrets as secrets_of
 
 
 def listening(path: Path) -> socket.socket:
@@ -61,7 +64,8 @@ def test_an_engine_that_this_user_may_not_use(tmp_path: Path) -> None:
     server = listening(path)
     path.chmod(0o600)
     code = f"""
-import os; from harness.play.containers import engine; os.environ["DOCKER_HOST"] = "unix://{path}"; os.setuid(65534)
+import os; from harness.keyring.home import Home
+from harness.play.containers import engine; os.environ["DOCKER_HOST"] = "unix://{path}"; os.setuid(65534)
 try: engine.Engine.connect()
 except engine.DockerError as error: print(error)
 """
@@ -246,6 +250,30 @@ def test_a_compose_file_has_everybody_at_their_addresses(tmp_path: Path) -> None
     again = harness("run", tmp_path / "scenario.yaml", "--emit-compose", tmp_path / "compose.yaml")
     assert again.returncode == 2
     assert "is there already" in sentences(again.stderr)[0]
+
+
+def test_a_compose_file_shows_each_agent_its_own_bundle_and_holds_no_secret(tmp_path: Path) -> None:
+    home = Home.new(tmp_path / "home", [1, 2], seals=True, epoch_s=600.0)
+    home.write_bundles(tmp_path / "bundles")
+    keys = {"agents": 2, "vehicles": {"kind": "none"}}
+    document = emitted(tmp_path, **keys, security={"keys": str(tmp_path / "bundles"), "seal": True})
+    assert document["secrets"]["2.bundle.json"] == {"file": str(tmp_path / "bundles/2.bundle.json")}
+    assert [document["services"][f"agent-{agent}"]["secrets"] for agent in (1, 2)] == [
+        ["1.bundle.json"],
+        ["2.bundle.json"],
+    ]
+    assert "secrets" not in document["services"]["start"]
+    mission = json.loads((tmp_path / "compose/agents/2.mission.json").read_text())
+    assert mission["security"] == {"bundle": "/run/secrets/2.bundle.json"}
+    assert mission["features"] == ["secured", "sealed"]
+    left = [("compose.yaml", (tmp_path / "compose.yaml").read_bytes()), *left_in(tmp_path / "compose")]
+    assert told(secrets_of(home, 2), left) == []
+    for directory in ("fresh", str(home.directory)):
+        asked = write_scenario(tmp_path, **keys, security={"keys": directory})
+        refused = harness("run", asked, "--emit-compose", tmp_path / "other.yaml")
+        assert refused.returncode == 2
+        assert "ucp-harness keys bundle" in refused.stderr
+        assert not (tmp_path / "other.yaml").exists()
 
 
 def test_in_a_compose_file_an_image_of_ones_own_runs_ones_own_command(tmp_path: Path) -> None:

@@ -11,11 +11,13 @@ from typing import Any
 
 import yaml
 
+from harness.archive.directory import PUBLIC_KEYS_FILE
 from harness.errors import RunDirectoryError, ScenarioError
 from harness.play.containers import images, ownership
 from harness.play.containers.backend import Containers
 from harness.play.containers.images import Image
 from harness.play.containers.preflight import refuse_debuggers_that_are_not_in_the_image
+from harness.play.keys import FRESH, FRESH_BYTES, MissionKeys, keys_of
 from harness.play.process.mission_file import mission_file
 from harness.scenario import Scenario
 from netem import addresses
@@ -24,6 +26,8 @@ from ucp.files import write_json_atomically
 
 INSIDE = "/ucp"
 """Where the directory beside the compose file is in every container."""
+SECRETS = "/run/secrets"
+"""Where compose puts the files that only some containers see."""
 
 TOP = """\
 # {name}: {count} agents{vehicles}, to start by hand and look inside:
@@ -33,16 +37,17 @@ TOP = """\
 # The network is Docker's, and perfect: no loss, no partition, no timeline{grounded}.
 # Mission time runs {speedup:g} times as fast as the clock, from the moment at which the service `start` has found all
 # agents ready. The agents' files are in {directory}/agents; when they have been stopped,
-# ucp-harness check {directory}/agents/*.chain.json judges the chains.
+# ucp-harness check {directory}/agents/*.chain.json judges the chains.{secured}
 """
+SECURED = """
+# Each agent reads its own bundle where it lies, and cannot write there: what epochs leave behind is not erased."""
 
 
 def write_compose(
     scenario: Scenario, seed: int, kinds: dict[int, VehicleKind], system_ids: dict[int, int], file: Path
 ) -> Path:
     """Write `file` and the directory beside it, which is returned. Raises RunDirectoryError if one is there already."""
-    if scenario.security:
-        raise ScenarioError("`security` needs keys, which no compose file hands out: leave it out, or --emit-compose")
+    keys = _keys(scenario)
     if scenario.gcs:
         raise ScenarioError("`gcs` needs a run, which no compose file is: leave it out, or --emit-compose")
     refuse_debuggers_that_are_not_in_the_image(scenario)
@@ -52,8 +57,8 @@ def write_compose(
             raise RunDirectoryError(f"{path} is there already: choose another name, nothing is overwritten")
     try:
         (beside / "agents").mkdir(parents=True)
-        services = _services(scenario, seed, kinds, system_ids, beside)
-        document = {"services": services, "networks": {"air": _network()}}
+        services = _services(scenario, seed, kinds, system_ids, beside, keys)
+        document = {"services": services, "networks": {"air": _network()}, **_secrets(scenario, keys)}
         top = TOP.format(
             name=scenario.name.replace("\n", " "),
             count=len(scenario.roster),
@@ -62,11 +67,37 @@ def write_compose(
             file=file.name,
             directory=beside.name,
             speedup=scenario.speedup,
+            secured=SECURED if keys else "",
         )
         file.write_text(top + yaml.safe_dump(document, sort_keys=False, width=120), encoding="utf-8")
     except OSError as error:
         raise RunDirectoryError(f"{error.filename or file} cannot be written: {error.strerror}") from None
     return beside
+
+
+def _keys(scenario: Scenario) -> MissionKeys | None:
+    """Those of the bundles that the user handed out, which stay where they are; None of a mission that has none."""
+    if scenario.security is None:
+        return None
+    bundles = [Path(scenario.security.keys) / _bundle(vehicle) for vehicle in scenario.roster]
+    if scenario.security.keys == FRESH or not all(bundle.exists() for bundle in bundles):
+        raise ScenarioError(
+            "`security.keys`: a compose file hands out the files of a directory of bundles, and holds no keys itself: "
+            "write them with `ucp-harness keys bundle HOME --out bundles`, and say {keys: bundles}"
+        )
+    return keys_of(scenario, bytes(FRESH_BYTES))
+
+
+def _secrets(scenario: Scenario, keys: MissionKeys | None) -> dict[str, Any]:
+    """Each vehicle's bundle, which compose shows to its agent alone, and to nobody for writing."""
+    if keys is None or scenario.security is None:
+        return {}
+    directory = Path(scenario.security.keys).absolute()
+    return {"secrets": {_bundle(vehicle): {"file": str(directory / _bundle(vehicle))} for vehicle in keys.bundles}}
+
+
+def _bundle(vehicle: int) -> str:
+    return f"{vehicle}.bundle.json"
 
 
 def _network() -> dict[str, Any]:
@@ -75,12 +106,21 @@ def _network() -> dict[str, Any]:
 
 
 def _services(
-    scenario: Scenario, seed: int, kinds: dict[int, VehicleKind], system_ids: dict[int, int], beside: Path
+    scenario: Scenario,
+    seed: int,
+    kinds: dict[int, VehicleKind],
+    system_ids: dict[int, int],
+    beside: Path,
+    keys: MissionKeys | None,
 ) -> dict[str, Any]:
     ours, build = _our_image(scenario, beside)
     asked = scenario.docker.image
     in_named = set(images.agents_in_named(scenario))
     services: dict[str, Any] = {}
+    initial_data = f"{scenario.name}, seed {seed}, by hand".encode()
+    if keys is not None:
+        initial_data = keys.sealed_to_depot(initial_data)
+        write_json_atomically(beside / "agents" / PUBLIC_KEYS_FILE, keys.public.to_json())
     for number, vehicle in enumerate(scenario.roster):
         mission = f"{vehicle}.mission.json"
         write_json_atomically(
@@ -89,10 +129,11 @@ def _services(
                 vehicle,
                 scenario,
                 seed,
-                f"{scenario.name}, seed {seed}, by hand".encode(),
+                initial_data,
                 address=addresses.address(vehicle),
                 broadcast=addresses.BROADCAST,
                 with_vehicle=bool(kinds),
+                bundle=f"{SECRETS}/{_bundle(vehicle)}" if keys else None,
             ),
         )
         network: dict[str, Any] = {"networks": {"air": {"ipv4_address": addresses.address(vehicle)}}}
@@ -109,6 +150,7 @@ def _services(
         image = Image(str(asked), "python3", foreign=True) if vehicle in in_named else ours
         services[f"agent-{vehicle}"] = _service(scenario, image, argv, "agents", beside) | network
         services[f"agent-{vehicle}"] |= {} if vehicle in in_named else build
+        services[f"agent-{vehicle}"] |= {"secrets": [_bundle(vehicle)]} if keys else {}
     waits = {"network_mode": "none", "depends_on": [f"agent-{vehicle}" for vehicle in scenario.roster]}
     (beside / "start.py").write_bytes(Path(__file__).with_name("start.py").read_bytes())
     argv = [sys.executable, f"{INSIDE}/start.py", f"{INSIDE}/agents"]

@@ -8,13 +8,15 @@ from_host   an empty image, with this machine's programs, interpreter and packag
 import hashlib
 import importlib.util
 import io
+import json
 import os
 import shutil
 import sys
 import tarfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import docker.errors
@@ -106,11 +108,16 @@ def project(engine: Engine, say: Callable[[str], object]) -> Image:
 
 def project_name() -> str:
     """Of other packages, or another Dockerfile, it is another image."""
-    return f"{PROJECT_IMAGE}:{version('ucp-harness')}-{hashlib.sha256(_tar(context())).hexdigest()[:12]}"
+    made_of = _tar(context()) + json.dumps(build_arguments()).encode("ascii")
+    return f"{PROJECT_IMAGE}:{version('ucp-harness')}-{hashlib.sha256(made_of).hexdigest()[:12]}"
 
 
 def build_arguments() -> dict[str, str]:
-    return {"PYMAVLINK": version("pymavlink")}
+    """Versions of the packages in it: those that are here."""
+    arguments = {"PYMAVLINK": version("pymavlink")}
+    with suppress(PackageNotFoundError):  # without it there are no missions with keys
+        arguments["CRYPTOGRAPHY"] = version("cryptography")
+    return arguments
 
 
 def _build(engine: Engine, name: str, say: Callable[[str], object]) -> None:
