@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -17,6 +17,7 @@ from harness.conformance.states import VARIANTS, explore
 from harness.conformance.vectors import Vectors
 from harness.play.progress import Silent
 from harness.run.run import run
+from harness.run.simulate import simulate
 from tests.harness.command import harness, write_scenario
 from tests.harness.virtual import scenario
 from tests.machine import do_without
@@ -34,10 +35,10 @@ HARD_RUN: dict[str, Any] = {
 }
 
 
-def compiled(program: Path, *options: str) -> Path:
+def compiled(program: Path, *options: str, libraries: Sequence[str] = ()) -> Path:
     if shutil.which("cc") is None:
         do_without("cc", "no C compiler (Debian packages `gcc` and `libc6-dev`)")
-    subprocess.run(["cc", *WARNINGS, *options, "-o", program, SOURCE, "-lm"], check=True)
+    subprocess.run(["cc", *WARNINGS, *options, "-o", program, SOURCE, "-lm", *libraries], check=True)
     return program
 
 
@@ -55,6 +56,18 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
         do_without("cc", "no sanitizers (Debian package `libgcc-12-dev`)")
     options = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover")
     return compiled(folder / "ucp_agent", *options)
+
+
+@pytest.fixture(scope="session")
+def secured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with keys, and it ends as soon as it does what C does not define, or leaks."""
+    folder = tmp_path_factory.mktemp("secured")
+    probe = ["cc", "-fsanitize=address,undefined", "-x", "c", "-o", folder / "probe", "-", "-lcrypto"]
+    code = b"#include <openssl/evp.h>\nint main(void){return EVP_chacha20_poly1305() == 0;}"
+    if shutil.which("cc") and subprocess.run(probe, input=code, capture_output=True, check=False).returncode != 0:
+        do_without("cc", "no OpenSSL 3 to compile with (Debian package `libssl-dev`), or no sanitizers")
+    options = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover", "-DSECURED")
+    return compiled(folder / "ucp_agent", *options, libraries=("-lcrypto",))
 
 
 @pytest.fixture(scope="module")
@@ -189,6 +202,70 @@ def test_a_mission_in_virtual_time_with_ours_among_them(agent: Path, tmp_path: P
     assert_nothing_to_find(tmp_path / "run")
     record = json.loads((tmp_path / "run" / "run.json").read_text(encoding="utf-8"))
     assert record["agents"]["1"]["version"] == "ucp_agent.c, 1"
+
+
+def test_without_keys_it_says_that_it_lacks_them(agent: Path) -> None:
+    with Player([str(agent)]) as player:
+        for keys in ({"features": ["secured"], "security": {"bundle": "7.json"}}, {"security": {"bundle": "7.json"}}):
+            answer = player.give({"t": 0, "mission": mission(**keys)})
+            assert answer["unsupported"] and "secured" in answer["error"]
+
+
+def test_with_keys_it_drops_what_is_to_be_dropped(secured: Path) -> None:
+    vectors = json.loads((VECTORS / "secured.json").read_text(encoding="ascii"))
+    drops = vectors["drops"]
+    told = mission(roster=drops["roster"], features=["secured"], security={"bundle": "7.bundle.json"})
+    with Player([str(secured)]) as player:
+        begun = player.give({"t": drops["now"], "mission": told, "boot": vectors["boot"], "bundle": {"schema": "x"}})
+        assert "bundle" in begun["error"]
+        begun = {"t": drops["now"], "mission": told, "boot": vectors["boot"], "bundle": vectors["bundles"]["7"]}
+        assert "error" not in player.give(begun)
+        for case in drops["datagrams"]:
+            (line,) = player.give({"t": drops["now"], "datagram": case["datagram"]})["trace"]
+            assert line.get("dropped") == case["dropped"], case["what"]
+
+
+SECURED_RUN: dict[str, Any] = {
+    **HARD_RUN,
+    "duration_s": 250,
+    "timeline": [
+        *HARD_RUN["timeline"],
+        {"at_s": 130, "reboot": [3], "down_s": 5, "disk": "kept"},
+        {"at_s": 160, "forge": {"message": "Commit Block", "sender": 4}},
+        {"at_s": 170, "kill": [4]},
+        {"at_s": 180, "revoke": [4], "heard_by": [1]},
+        {"at_s": 200, "replay": {"count": 100}},
+    ],
+}
+
+
+def test_with_keys_it_is_ours_to_the_byte(secured: Path) -> None:
+    """Sealed and signed, rebooted, told of a revocation, and replayed to."""
+    ours = scenario(agents=4, security={"seal": True}, **SECURED_RUN)
+    mixed = ours.model_copy(update={"agent_command": {1: [str(secured)], 3: [str(secured)]}})
+    played, among_ours = simulate(mixed, 1, tracing=True), simulate(ours, 1, tracing=True, deliver_all=True)
+    exports = [run.evidence.exports for run in (played, among_ours)]
+    assert {agent: export.model_dump() for agent, export in exports[0].items()} == {
+        agent: export.model_dump() for agent, export in exports[1].items()
+    }
+    assert {agent: told["dropped"] for agent, told in played.played.agents.items()} == {
+        agent: told["dropped"] for agent, told in among_ours.played.agents.items()
+    }
+    assert not played.result.bad
+
+
+@pytest.mark.lab
+@pytest.mark.whoever
+def test_with_keys_over_udp_with_ours_among_them(secured: Path, tmp_path: Path) -> None:
+    commands = {1: [str(secured)], 3: [str(secured)]}
+    keys = {"agents": 4, "agent_command": commands, "security": {"seal": True, "captured": 4}}
+    path = write_scenario(tmp_path, vehicles={"kind": "none"}, speedup=20, **keys, **SECURED_RUN)
+    environment = {**os.environ, "ASAN_OPTIONS": "exitcode=99"}
+    done = harness("run", path, "--seed", 1, "--out", tmp_path / "run", env=environment)
+    assert done.returncode in (0, 1), done.stdout + done.stderr
+    record = json.loads((tmp_path / "run" / "run.json").read_text(encoding="utf-8"))
+    assert (record["steps"]["verdict"], record["records"]["verdict"]) == ("as specified", "agree"), record
+    assert "revoked sender" in {reason for agent in record["agents"].values() for reason in agent["dropped"]}
 
 
 @pytest.mark.lab

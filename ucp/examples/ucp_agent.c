@@ -2,12 +2,14 @@
  * An agent of the Uniform Chain Protocol (UCP) in one file of C11, written from ucp/CONTRACT.md alone.
  *
  *     cc -O2 -Wall -Wextra -Werror -o ucp_agent ucp_agent.c -lm
+ *     cc -O2 -DSECURED -o ucp_agent ucp_agent.c -lm -lcrypto      the same with keys: ucp_secured.c, on OpenSSL
  *     ucp_agent MISSION_FILE      one agent, over UDP
  *     ucp_agent --virtual         agents in virtual time, inputs and outputs as lines
  *
  * The 20 algorithms stand in order in section 6. Above them is what they need (bytes, hashes, JSON, the mission,
  * blocks, messages), below what drives them (inputs, trace, export, store, control socket, virtual time).
- * It has every feature but `telemetry` and `quirks`, for which it ends with status 127.
+ * It has every feature but `telemetry` and `quirks`, for which it ends with status 127, and so it does for `secured`
+ * and `sealed` if it was compiled without keys.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -23,6 +25,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/random.h>
 #include <sys/socket.h>
 #include <sys/signalfd.h>
 #include <sys/stat.h>
@@ -32,7 +35,7 @@
 
 enum {
     STATUS_WRONG = 2, STATUS_LACKS = 127,               /* exit statuses, beside 0 and 1 */
-    MAX_MISSION = 4 << 20, MAX_REQUEST = 65536, MAX_VIRTUAL = 64 << 20, MAX_DEPTH = 512,
+    MAX_MISSION = 4 << 20, MAX_BUNDLE = 8 << 20, MAX_REQUEST = 65536, MAX_VIRTUAL = 64 << 20, MAX_DEPTH = 512,
     HEADER = 14, MAX_DATAGRAM = 1472, BLOCK_HEADER = 12, EVENT_HEADER = 11, MAX_EVENT_DATA = 1024,
     MAX_CLIENTS = 64, AGENT_IDS = 65536, ROOT = 1
 };
@@ -479,6 +482,7 @@ typedef struct {
     Settings settings;
     uint64_t seed, epoch_us;
     char *store;                                        /* NULL: keep nothing */
+    char *bundle;                                       /* the file with its keys; NULL: the mission is not secured */
 } Mission;
 
 typedef struct { int status; char text[160]; } Fault;   /* what is wrong, in one sentence of ASCII without quotes */
@@ -498,7 +502,11 @@ __attribute__((format(printf, 3, 4))) static bool fail(Fault *fault, int status,
 /* Features come before all values: one that is lacking may be the reason why a value is not known. */
 static bool mission_features(Json *j, uint32_t root, Fault *fault) {
     static const char *const has[] = {"store", "vote_names_chain", "changed_before_tally", "asks_after_commit",
-                                      "top_needs_majority", "phase1_tie=pop", "phase2_tie=block"};
+                                      "top_needs_majority", "phase1_tie=pop", "phase2_tie=block",
+#ifdef SECURED
+                                      "secured", "sealed",
+#endif
+    };
     uint32_t list = member(j, root, "features"), quirks = member(j, root, "quirks");
     if (list != 0 && kind(j, list) != '[') return fail(fault, STATUS_WRONG, "features is no list of strings.");
     for (uint32_t i = list + 1; list != 0 && i < j->node[list].end; i = j->node[i].end) {
@@ -513,6 +521,11 @@ static bool mission_features(Json *j, uint32_t root, Fault *fault) {
                         name);
         }
     }
+#ifndef SECURED
+    uint32_t security = member(j, root, "security");
+    if (security != 0 && kind(j, security) != 'n')
+        return fail(fault, STATUS_LACKS, "This agent does not have the feature 'secured'.");
+#endif
     if (says(j, member(j, member(j, root, "events"), "source"), "mavlink"))
         return fail(fault, STATUS_LACKS, "This agent does not have the feature 'telemetry'.");
     if (quirks != 0 && kind(j, quirks) != '{') return fail(fault, STATUS_WRONG, "quirks is no object.");
@@ -578,6 +591,21 @@ static bool mission_address(Json *j, uint32_t network, const char *key, struct i
     return inet_pton(AF_INET, text, address) == 1;
 }
 
+/* A path; NULL where there is none. */
+static bool mission_path(Json *j, uint32_t at, const char *what, char **path, Fault *fault) {
+    size_t n;
+    free(*path);
+    *path = NULL;
+    if (at == 0 || kind(j, at) == 'n') return true;
+    const char *text = kind(j, at) == '"' ? json_text(j, at, &n) : NULL;
+    if (text == NULL || n == 0 || memchr(text, '\0', n) != NULL)
+        return fail(fault, STATUS_WRONG, "%s is neither null nor a path.", what);
+    *path = grow(NULL, n + 1);
+    memcpy(*path, text, n);
+    (*path)[n] = '\0';
+    return true;
+}
+
 static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault) {
     uint64_t value;
     uint32_t at;
@@ -628,19 +656,11 @@ static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault) {
     m->epoch_us = 0;
     if (m->has_epoch && !json_uint(j, at, 0, INT64_MAX, &m->epoch_us))
         return fail(fault, STATUS_WRONG, "epoch_us is neither null nor a time.");
-    at = member(j, root, "store");
-    free(m->store);
-    m->store = NULL;
-    if (at != 0 && kind(j, at) != 'n') {
-        size_t n;
-        const char *path = kind(j, at) == '"' ? json_text(j, at, &n) : NULL;
-        if (path == NULL || n == 0 || memchr(path, '\0', n) != NULL)
-            return fail(fault, STATUS_WRONG, "store is neither null nor a path.");
-        m->store = grow(NULL, n + 1);
-        memcpy(m->store, path, n);
-        m->store[n] = '\0';
-    }
-    return true;
+    at = member(j, root, "security");
+    if (at != 0 && kind(j, at) != 'n' && kind(j, member(j, at, "bundle")) != '"')
+        return fail(fault, STATUS_WRONG, "security is neither null nor an object with a bundle.");
+    return mission_path(j, member(j, root, "store"), "store", &m->store, fault)
+        && mission_path(j, member(j, at, "bundle"), "bundle", &m->bundle, fault);
 }
 
 /* ================================================================================================================
@@ -744,24 +764,32 @@ enum timer { VOTING, PHASE_ONE, PHASE_TWO, PHASE_THREE, FINALIZE_GAP, TIMERS, NO
 static const struct { const char *name; int algorithm; } TIMER[TIMERS] = {
     {"voting", 5}, {"phase one", 11}, {"phase two", 15}, {"phase three", 19}, {"finalize gap", 20}};
 
-enum change { COMPLETE, CHAIN_PUSH, CHAIN_POP, DEQUE_PUSH, DEQUE_POP, STACK_PUSH, STACK_TAKE, CHANGES };
+enum change { COMPLETE, CHAIN_PUSH, CHAIN_POP, DEQUE_PUSH, DEQUE_POP, STACK_PUSH, STACK_TAKE, CHANGES,
+              SIGNED = CHANGES, LIVED, REVOKED };           /* those of keys are in the store alone */
 static const char *const CHANGE[CHANGES] = {"complete", "chain+", "chain-", "deque+", "deque-", "stack+", "stack-"};
 
 enum drop {
     GOOD = -1, TRUNCATED, OVERSIZED, WRONG_MAGIC, WRONG_VERSION, IMPOSSIBLE_SENDER, WRONG_LENGTH, UNKNOWN_TYPE,
-    BAD_VOTE, IMPOSSIBLE_AGENT, OWN_SENDER, STRANGER, STRANGERS_BLOCK, DROPS
+    BAD_VOTE, IMPOSSIBLE_AGENT, OWN_SENDER, STRANGER, STRANGERS_BLOCK,
+    NOT_SECURED, REVOKED_SENDER, NOT_THE_AUTHORITY, KNOWN_ALREADY, EPOCH_OUT_OF_RANGE, OLD_BOOT, REPLAYED,     /* with keys */
+    NOT_AUTHENTIC, NOT_THE_SENDER, ANSWERS_NO_REQUEST, NOT_THE_MAKER, DROPS
 };
 static const char *const DROP[DROPS] = {
     "truncated", "oversized", "wrong magic", "wrong version", "impossible sender", "wrong length", "unknown type",
-    "bad vote", "impossible agent", "own sender", "sender not on the roster", "block not of the roster"};
+    "bad vote", "impossible agent", "own sender", "sender not on the roster", "block not of the roster",
+    "not secured", "revoked sender", "not signed by the authority", "known already", "epoch out of range", "old boot",
+    "replayed", "not authentic", "not signed by its sender", "answers no request", "block not signed by its maker"};
 
 typedef struct { uint64_t yes, no; } Count;
 typedef struct { bool is_top; Hash block; uint64_t count, timestamp; } Candidate;   /* is_top: Is Top Of Chain */
 
 enum trigger { BY_MESSAGE, BY_TIMER, BY_EVENT, BY_LOCAL, BY_OPERATOR, BY_BOOT };
 
+typedef struct Keys Keys;
+
 typedef struct {
     Mission m;
+    Keys *keys;                                         /* NULL: the mission is not secured */
     Set roster;
     Hash bh0, ch0;
 
@@ -807,6 +835,7 @@ typedef struct {
     unsigned started_timers;                            /* a bit for each */
     Buf body;                                           /* of the message that it is about to send */
     Buf changes, sent;                                  /* JSON */
+    Buf sealed;                                         /* event data that it sealed */
 } Agent;
 
 static size_t completed_len(const Agent *a) { return a->completed.len / 32; }
@@ -979,6 +1008,31 @@ static enum drop read_datagram(const Agent *a, const uint8_t *d, size_t n, Input
     return GOOD;
 }
 
+/* --- Keys: without them none of these is called, for `keys` is NULL. ---------------------------------------------- */
+
+#ifdef SECURED
+#include "ucp_secured.c"
+#else
+typedef struct { int type; uint32_t sender; } Opened;
+enum { BOOT = 16, REVOCATION = 10 };
+#define keys_free(a) ((void)(a))
+#define keys_read(a, j, bundle, boot, fault) ((void)(a), (void)(j), (void)(bundle), (void)(boot), false)
+#define keys_open(a, now, d, n, plain, opened) ((void)(now), (void)(opened), TRUNCATED)
+#define keys_allow(a, now, opened, in, drop) (drop)
+#define keys_keep(a, opened, in) ((void)(opened))
+#define keys_seal(a, heard) ((void)(heard))
+#define keys_revoke(a, now, body, n) ((void)(body), (void)(n), TRUNCATED)
+#define keys_signature(a, data, n) ((const uint8_t *)NULL)
+#define keys_seals(a) false
+#define keys_seal_events(a, timestamp, out) ((void)(out), (size_t)0)
+#define keys_replay(a, what, at, n) ((size_t)0)
+#define keys_boot(a) ((void)(a))
+#define keys_moved(a) false
+#define put_keys_store(b, a) ((void)(b))
+#define put_lived(b, keys) ((void)(b))
+#define put_bundle(b, j, bundle, keys) ((void)(b))
+#endif
+
 /* ================================================================================================================
  * 6  The 20 algorithms. Each returns the branch that it took.
  * ============================================================================================================= */
@@ -1001,8 +1055,14 @@ static const char *build_data_block(Agent *a) {
     uint8_t data[BLOCK_HEADER + MAX_EVENT_DATA];
     write_be(data, a->m.agent_id, 4);
     write_be(data + 4, timestamp, 8);
-    memcpy(data + BLOCK_HEADER, a->current, a->current_len);
-    complete(a, block_new(data, BLOCK_HEADER + a->current_len));
+    size_t size = a->current_len;
+    if (a->keys != NULL && keys_seals(a)) {
+        size = keys_seal_events(a, timestamp, data + BLOCK_HEADER);
+        put(&a->sealed, data + BLOCK_HEADER, size);
+    } else {
+        memcpy(data + BLOCK_HEADER, a->current, size);
+    }
+    complete(a, block_new(data, BLOCK_HEADER + size));
     a->current_len = 0;
     trigger(a, PROCESS_NEXT_DEQUE_BLOCK);
     return "full";
@@ -1395,6 +1455,11 @@ static void put_run(Agent *a, int algorithm, enum trigger by, uint64_t which, co
     for (int i = 0; i < TIMERS; i++)                    /* a handler starts one at most */
         if (a->started_timers & 1u << i)
             put_format(b, ",\"started\":{\"%s\":%.17g}", TIMER[i].name, a->timer[i].duration);
+    if (a->sealed.len > 0) {
+        put_text(b, ",\"sealed\":\"");
+        put_base64(b, a->sealed.data, a->sealed.len);
+        put_byte(b, '"');
+    }
     put_format(b, ",\"state\":{\"chain\":%zu,\"deque\":%zu,\"stack\":%zu,\"reconciling\":%s,\"idle\":%s,\"top\":\"",
                a->chain.len, a->deque.len, a->stack.len, truth(a->reconciling), truth(is_idle(a)));
     put_hex(b, a->top.b, 32);
@@ -1411,7 +1476,7 @@ static void run_handler(Agent *a, int algorithm, enum trigger by, uint64_t which
     a->handled++;
     if (a->tracing)
         put_run(a, algorithm, by, which, branch);
-    a->changes.len = a->sent.len = 0;
+    a->changes.len = a->sent.len = a->sealed.len = 0;
 }
 
 /* The handler of an input, then those of local events, first in first out. */
@@ -1431,20 +1496,76 @@ static void begin_input(Agent *a, double now) {
         snprintf(a->t, sizeof a->t, "%.6f", now);
 }
 
-static void take_datagram(Agent *a, double now, const uint8_t *datagram, size_t n) {
-    Input in;
-    begin_input(a, now);
-    enum drop drop = read_datagram(a, datagram, n, &in);
-    if (drop == GOOD) {
-        run_all(a, MESSAGES[in.type].algorithm, BY_MESSAGE, 0, &in);
-        return;
-    }
+static void drop_datagram(Agent *a, enum drop drop, const uint8_t *datagram, size_t n) {
     a->dropped[drop]++;
     if (a->tracing) {
         put_format(&a->lines, "{\"t\":%s,\"dropped\":\"%s\",\"datagram\":\"", a->t, DROP[drop]);
         put_base64(&a->lines, datagram, n);
         put_text(&a->lines, "\"}\n");
     }
+}
+
+/* A revocation that was new is a command, from whoever it came; 0: from the control socket. */
+static void note_revocation(Agent *a, const uint8_t *body, size_t n, uint32_t from) {
+    if (!a->tracing) return;
+    put_format(&a->lines, "{\"t\":%s,\"command\":\"revoke\",\"request\":{\"command\":\"revoke\",\"revocation\":\"",
+               a->t);
+    put_base64(&a->lines, body, n);
+    put_text(&a->lines, "\"");
+    if (from != 0)
+        put_format(&a->lines, ",\"from\":%u", from);
+    put_text(&a->lines, "}}\n");
+}
+
+/* The same with keys: what is authentic is read as if it had come in plain. */
+static void take_sealed(Agent *a, double now, const uint8_t *datagram, size_t n) {
+    Input in = {0};
+    Opened opened = {0};
+    Buf plain = {0};
+    enum drop drop = keys_open(a, now, datagram, n, &plain, &opened);
+    if (drop == GOOD && opened.type == REVOCATION) {
+        note_revocation(a, datagram + 36, n - 36, opened.sender);
+    } else {
+        if (drop == GOOD)
+            drop = keys_allow(a, now, &opened, &in, read_datagram(a, plain.data, plain.len, &in));
+        if (drop == GOOD) {
+            run_all(a, MESSAGES[in.type].algorithm, BY_MESSAGE, 0, &in);
+            keys_keep(a, &opened, &in);
+        } else {
+            drop_datagram(a, drop, datagram, n);
+        }
+    }
+    keys_seal(a, &opened);
+    free(plain.data);
+}
+
+static void take_datagram(Agent *a, double now, const uint8_t *datagram, size_t n) {
+    Input in;
+    begin_input(a, now);
+    if (a->keys != NULL) {
+        take_sealed(a, now, datagram, n);
+        return;
+    }
+    enum drop drop = read_datagram(a, datagram, n, &in);
+    if (drop == GOOD)
+        run_all(a, MESSAGES[in.type].algorithm, BY_MESSAGE, 0, &in);
+    else
+        drop_datagram(a, drop, datagram, n);
+}
+
+static void seal_all(Agent *a) {                        /* what an input that is no datagram has it send */
+    if (a->keys != NULL)
+        keys_seal(a, NULL);
+}
+
+/* The command; NULL, or why not. One that is known already is no error. */
+static const char *take_revocation(Agent *a, double now, const uint8_t *body, size_t n) {
+    begin_input(a, now);
+    enum drop drop = keys_revoke(a, now, body, n);
+    if (drop == GOOD)
+        note_revocation(a, body, n, 0);
+    seal_all(a);
+    return drop == GOOD || drop == KNOWN_ALREADY ? NULL : "The authority does not say so.";
 }
 
 static bool event_fits(const Agent *a, size_t n) { return EVENT_HEADER + n <= a->m.settings.max_event_bytes; }
@@ -1460,6 +1581,7 @@ static void take_event(Agent *a, double now, uint8_t event_id, uint64_t timestam
         memcpy(event + EVENT_HEADER, data, n);
     Input in = {.raw = event, .raw_len = EVENT_HEADER + n, .timestamp = timestamp};
     run_all(a, 1, BY_EVENT, event_id, &in);
+    seal_all(a);
 }
 
 /* The timer whose turn it is: of those that have come the earliest, those started during this very input last. */
@@ -1481,6 +1603,7 @@ static void take_timers(Agent *a, double now) {
         a->timer[i].runs = false;
         run_all(a, TIMER[i].algorithm, BY_TIMER, (uint64_t)i, NULL);
     }
+    seal_all(a);
 }
 
 static double next_deadline(const Agent *a) {           /* infinity if no timer runs */
@@ -1494,6 +1617,7 @@ static double next_deadline(const Agent *a) {           /* infinity if no timer 
 static void take_reconcile(Agent *a, double now) {
     begin_input(a, now);
     run_all(a, RECONCILE_BEGIN, BY_OPERATOR, 0, NULL);
+    seal_all(a);
 }
 
 /* A command that runs no handler leaves a line of its own. */
@@ -1525,6 +1649,7 @@ static void agent_new(Agent *a) {
     a->out.len = a->lines.len = a->journal.len = a->changes.len = a->sent.len = 0;
     set_clear(&a->voters);
     set_clear(&a->responders);
+    keys_free(a);
 }
 
 /* An agent that found a store goes on as if nobody had answered its reconcile: Algorithm 20. */
@@ -1533,6 +1658,8 @@ static void boot(Agent *a, double now) {
     const List *lists[] = {&a->chain, &a->deque, &a->stack};
     const enum change changes[] = {CHAIN_PUSH, DEQUE_PUSH, STACK_PUSH};
     begin_input(a, now);
+    if (a->keys != NULL)
+        keys_boot(a);
     a->reconciling = true;
     for (size_t i = 0; i < completed_len(a); i++)
         put_change(&a->changes, COMPLETE, a->completed.data + 32 * i);
@@ -1549,6 +1676,7 @@ static void boot(Agent *a, double now) {
         }
     Input in = {.raw = found.data, .raw_len = found.len};
     run_all(a, RECONCILE_FINALIZE, BY_BOOT, a->chain.len, &in);
+    seal_all(a);
     free(found.data);
 }
 
@@ -1578,7 +1706,8 @@ static void put_header(Buf *b, const Agent *a) {
                s->asks_after_commit ? "\"asks_after_commit\":true," : "",
                s->top_needs_majority ? "\"top_needs_majority\":true," : "", s->phase1_tie_pop ? "pop" : "phase2",
                s->phase2_tie_block ? "block" : "oldest");
-    put_format(b, ",\"clock\":{\"epoch_us\":%" PRIu64 ",\"speedup\":%.17g}}\n", a->m.epoch_us, a->m.speedup);
+    put_format(b, ",\"clock\":{\"epoch_us\":%" PRIu64 ",\"speedup\":%.17g}%s}\n", a->m.epoch_us, a->m.speedup,
+               a->keys != NULL ? ",\"secured\":true" : "");
 }
 
 static void put_status(Buf *b, const Agent *a, double now, const char *trace_problem) {
@@ -1603,7 +1732,7 @@ static void put_status(Buf *b, const Agent *a, double now, const char *trace_pro
     put_byte(b, '}');
 }
 
-static void put_blocks(Buf *b, const char *name, const List *list, bool in_chain) {
+static void put_blocks(Buf *b, Agent *a, const char *name, const List *list, bool in_chain) {
     put_format(b, ",\"%s\":[", name);
     for (size_t i = 0; i < list->len; i++) {
         const Block *block = list->at[i];
@@ -1612,6 +1741,11 @@ static void put_blocks(Buf *b, const char *name, const List *list, bool in_chain
         put_base64(b, block->data + BLOCK_HEADER, block->size - (size_t)BLOCK_HEADER);
         put_text(b, "\",\"block_hash\":\"");
         put_hex(b, block->hash.b, 32);
+        const uint8_t *signature = a->keys != NULL ? keys_signature(a, block->data, block->size) : NULL;
+        if (signature != NULL) {
+            put_text(b, "\",\"signature\":\"");
+            put_base64(b, signature, 64);
+        }
         put_text(b, in_chain ? "\",\"chain_hash\":\"" : "\",\"chain_hash\":null}");
         if (in_chain) {
             put_hex(b, block->chain.b, 32);
@@ -1631,7 +1765,7 @@ static void put_hashes(Buf *b, const Agent *a) {        /* of `completed` */
     put_byte(b, ']');
 }
 
-static void put_export(Buf *b, const Agent *a, uint64_t exported_at) {
+static void put_export(Buf *b, Agent *a, uint64_t exported_at) {
     put_format(b, "{\"schema\":\"ucp-chain-export/1\",\"agent_id\":%u,\"exported_at_us\":%" PRIu64
                ",\"inception\":{\"block_data\":\"", a->m.agent_id, exported_at);
     put_base64(b, a->m.initial_data.data, a->m.initial_data.len);
@@ -1640,9 +1774,9 @@ static void put_export(Buf *b, const Agent *a, uint64_t exported_at) {
     put_text(b, "\",\"chain_hash\":\"");
     put_hex(b, a->ch0.b, 32);
     put_text(b, "\"}");
-    put_blocks(b, "chain", &a->chain, true);
-    put_blocks(b, "blocks_to_be_committed", &a->deque, false);
-    put_blocks(b, "reconcile_stack", &a->stack, false);
+    put_blocks(b, a, "chain", &a->chain, true);
+    put_blocks(b, a, "blocks_to_be_committed", &a->deque, false);
+    put_blocks(b, a, "reconcile_stack", &a->stack, false);
     put_text(b, ",\"current_block\":{\"event_data\":\"");
     put_base64(b, a->current, a->current_len);
     put_format(b, "\"},\"reconcile_in_progress\":%s,\"idle\":%s", truth(a->reconciling),
@@ -1661,7 +1795,8 @@ static void put_error(Buf *b, bool unsupported, const char *error) {
  * ============================================================================================================= */
 
 /* record    length u32 || changes (length bytes) || the first 8 bytes of H(changes)
-   change    what u8, then: complete, stack-: block hash; chain+, deque+, stack+: length u16 || BD; others: nothing */
+   change    what u8, then: complete, stack-: block hash; chain+, deque+, stack+: length u16 || BD; others: nothing
+             with keys also: its maker's signature of a block; when a life began; a revocation */
 
 static void put_store_header(Buf *b, const Agent *a) {
     put(b, "UCP store of ucp_agent.c, 1\n", 28);
@@ -1673,6 +1808,12 @@ static bool store_replay(Agent *a, const uint8_t *at, const uint8_t *end) {
     while (at < end) {
         enum change what = (enum change)*at++;
         Block *block = NULL;
+        if (what >= CHANGES && a->keys != NULL) {
+            size_t n = keys_replay(a, what, at, (size_t)(end - at));
+            if (n == 0) return false;
+            at += n;
+            continue;
+        }
         if (what == CHAIN_PUSH || what == DEQUE_PUSH || what == STACK_PUSH) {
             if (end - at < 2 || end - at - 2 < (ptrdiff_t)read_be(at, 2) || !block_well_formed(at + 2, read_be(at, 2)))
                 return false;
@@ -1743,10 +1884,10 @@ static bool read_file(const char *path, size_t limit, Buf *b) {   /* at most a b
 }
 
 /* The file is there whole, or it is as it was before. */
-static bool replace_file(const char *path, const Buf *content) {
+static bool replace_file(const char *path, const Buf *content, mode_t mode) {
     char new[4096];
     if ((size_t)snprintf(new, sizeof new, "%s.new", path) >= sizeof new) return errno = ENAMETOOLONG, false;
-    int fd = open(new, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666);
+    int fd = open(new, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, mode);
     if (fd < 0) return false;
     bool good = write_all(fd, content->data, content->len) && fsync(fd) == 0;
     int error = errno;
@@ -1776,6 +1917,8 @@ typedef struct {
     int clients;
     Json json;
     Buf bytes;
+    Json bundle;                                        /* its keys as they were read, over `keys` */
+    Buf keys;
 } Station;
 
 static double seconds(clockid_t clock) {
@@ -1846,7 +1989,7 @@ static bool store_open(Station *s) {                    /* reads what is there, 
         fprintf(stderr, "The store cannot be read: %s.\n", strerror(errno));
         good = false;
     } else if (file.len == 0) {                         /* none, or an empty one */
-        good = replace_file(a->m.store, &header);
+        good = replace_file(a->m.store, &header, 0666);
         if (good)
             sync_folder(a->m.store);
         else
@@ -1891,11 +2034,40 @@ static void store_write(Station *s) {
     a->keeping = false;
 }
 
+/* --- Keys -------------------------------------------------------------------------------------------------------- */
+
+static bool bundle_read(Station *s, Fault *fault) {
+    Agent *a = s->a;
+    struct stat about;
+    struct timespec time;
+    uint8_t life[BOOT];
+    clock_gettime(CLOCK_REALTIME, &time);
+    write_be(life, (uint64_t)time.tv_sec * 1000000 + (uint64_t)time.tv_nsec / 1000, 8);
+    if (getrandom(life + 8, 8, 0) != 8) return fail(fault, STATUS_WRONG, "No random numbers can be had.");
+    if (stat(a->m.bundle, &about) != 0 || !read_file(a->m.bundle, MAX_BUNDLE, &s->keys))
+        return fail(fault, STATUS_WRONG, "The bundle cannot be read: %s.", strerror(errno));
+    if ((about.st_mode & 077) != 0) return fail(fault, STATUS_WRONG, "Others can read the bundle: chmod 600 it.");
+    put_byte(&s->keys, '\0');
+    if (s->keys.len - 1 > MAX_BUNDLE || !json_parse(&s->bundle, (char *)s->keys.data, s->keys.len - 1))
+        return fail(fault, STATUS_WRONG, "The bundle is too large, or no JSON.");
+    return keys_read(a, &s->bundle, ROOT, life, fault);
+}
+
+static void bundle_write(Station *s) {                  /* without the secrets of epochs that are over */
+    Buf anew = {0};
+    put_bundle(&anew, &s->bundle, ROOT, s->a->keys);
+    if (!replace_file(s->a->m.bundle, &anew, 0600))
+        fprintf(stderr, "The group's last secret is still on disk: %s.\n", strerror(errno));
+    free(anew.data);
+}
+
 /* --- What follows an input: store, trace, messages, in this order. ----------------------------------------------- */
 
 static void settle(Station *s) {
     Agent *a = s->a;
     struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons(a->m.port), .sin_addr = a->m.broadcast};
+    if (a->keys != NULL && keys_moved(a))
+        bundle_write(s);
     store_write(s);
     trace_write(s);
     for (size_t at = 0; at < a->out.len;) {
@@ -1929,6 +2101,8 @@ static void begin_mission(Station *s, uint64_t epoch_us) {
     put_header(&a->lines, a);
     if (a->boots)
         boot(a, a->now);
+    if (a->keys != NULL && a->keeping)
+        put_lived(&a->journal, a->keys);
     settle(s);
     s->random = a->m.seed;
     s->next_second = a->m.random_events ? a->now + draw_part(s) : INFINITY;
@@ -1975,7 +2149,7 @@ static bool export_chain(Station *s) {
     s->bytes.len = 0;
     put_export(&s->bytes, a, a->started ? timestamp_at(a, mission_now(s)) : 0);
     put_byte(&s->bytes, '\n');
-    if (replace_file(s->export_name, &s->bytes)) return true;
+    if (replace_file(s->export_name, &s->bytes, 0666)) return true;
     fprintf(stderr, "The chain export cannot be written: %s.\n", strerror(errno));
     return false;
 }
@@ -2010,6 +2184,12 @@ static void answer(Station *s, uint32_t request, Buf *b) {
         error = a->started ? NULL : "The mission has not begun.";
         if (error == NULL)
             take_reconcile(a, mission_now(s));
+    } else if (a->keys != NULL && says(j, command, "revoke")) {
+        Buf body = {0};
+        error = !a->started ? "The mission has not begun."
+              : !json_bytes(j, member(j, request, "revocation"), &body) ? "This is no revocation."
+              : take_revocation(a, mission_now(s), body.data, body.len);
+        free(body.data);
     } else if (stop || export) {
         a->no_events = a->no_events || stop;
         error = export && !export_chain(s) ? "The export could not be written." : NULL;
@@ -2168,6 +2348,10 @@ static int play_over_udp(Agent *a, const char *mission_file) {
         return fault.status;
     }
     agent_new(a);
+    if (a->m.bundle != NULL && !bundle_read(s, &fault)) {
+        fprintf(stderr, "%s\n", fault.text);
+        return fault.status;
+    }
     snprintf(s->export_name, sizeof s->export_name, "%u.chain.json", a->m.agent_id);
     snprintf(s->control_name, sizeof s->control_name, "%u.control", a->m.agent_id);
     snprintf(trace_name, sizeof trace_name, "%u.trace.jsonl", a->m.agent_id);
@@ -2185,9 +2369,10 @@ static int play_over_udp(Agent *a, const char *mission_file) {
     unlink(s->control_name);
     while (s->clients > 0)
         client_close(s, 0);
-    free(s->bytes.data);
-    free(s->json.node);
-    free(s->json.scratch.data);
+    void *const all[] = {s->bytes.data, s->json.node, s->json.scratch.data, s->keys.data, s->bundle.node,
+                         s->bundle.scratch.data};
+    for (size_t i = 0; i < sizeof all / sizeof *all; i++)
+        free(all[i]);
     return exported ? 0 : 1;
 }
 
@@ -2203,7 +2388,7 @@ static bool virtual_error(Virtual *v, const char *error, bool unsupported) {
 }
 
 /* The store's value is the file that would be left, in base64, with all that is there in place of how it came. */
-static void put_store(Buf *b, const Agent *a) {
+static void put_store(Buf *b, Agent *a) {
     const List *lists[] = {&a->chain, &a->deque, &a->stack};
     const enum change changes[] = {CHAIN_PUSH, DEQUE_PUSH, STACK_PUSH};
     Buf file = {0};
@@ -2215,6 +2400,8 @@ static void put_store(Buf *b, const Agent *a) {
     for (int k = 0; k < 3; k++)
         for (size_t i = 0; i < lists[k]->len; i++)
             put_journal(&file, changes[k], lists[k]->at[i]);
+    if (a->keys != NULL)
+        put_keys_store(&file, a);
     put_byte(b, '"');
     put_base64(b, file.data, file.len);
     put_byte(b, '"');
@@ -2231,6 +2418,22 @@ static bool virtual_store(Virtual *v, uint32_t value) { /* into an agent that is
     return v->a->boots;
 }
 
+/* The driver takes the part of disk and chance: it gives the bundle, and says which life this is. */
+static bool virtual_keys(Virtual *v, Fault *fault) {
+    Json *j = &v->json;
+    uint8_t life[BOOT];
+    size_t n;
+    uint32_t boot = member(j, ROOT, "boot");
+    const char *text = kind(j, boot) == '"' ? json_text(j, boot, &n) : NULL;
+    if (text == NULL || n != 2 * BOOT) return fail(fault, STATUS_WRONG, "A secured mission takes a bundle and a boot.");
+    for (size_t i = 0; i < BOOT; i++) {
+        int high = hex_digit(text[2 * i]), low = hex_digit(text[2 * i + 1]);
+        if (high < 0 || low < 0) return fail(fault, STATUS_WRONG, "boot is not hexadecimal.");
+        life[i] = (uint8_t)(high << 4 | low);
+    }
+    return keys_read(v->a, j, member(j, ROOT, "bundle"), life, fault);
+}
+
 static bool virtual_mission(Virtual *v, double t, uint32_t mission) {
     Agent *a = v->a;
     Json *j = &v->json;
@@ -2242,6 +2445,8 @@ static bool virtual_mission(Virtual *v, double t, uint32_t mission) {
         || (trace != 0 && kind(j, trace) != 't' && kind(j, trace) != 'f'))
         return virtual_error(v, "This is no mission in virtual time.", false);
     agent_new(a);
+    if (a->m.bundle != NULL && !virtual_keys(v, &fault))
+        return virtual_error(v, fault.text, fault.status == STATUS_LACKS);
     if (store != 0 && kind(j, store) != 'n' && !virtual_store(v, store))
         return virtual_error(v, "The store is none of this agent and this mission.", false);
     a->started = true;
@@ -2272,6 +2477,15 @@ static void virtual_command(Virtual *v, double t, uint32_t command, Buf *b) {
     } else if (says(j, command, "reconcile")) {
         take_reconcile(a, t);
         put_text(b, "{\"ok\":true}");
+    } else if (a->keys != NULL && says(j, command, "revoke")) {
+        Buf body = {0};
+        const char *error = !json_bytes(j, member(j, ROOT, "revocation"), &body) ? "This is no revocation."
+                          : take_revocation(a, t, body.data, body.len);
+        free(body.data);
+        if (error != NULL)
+            put_error(b, false, error);
+        else
+            put_text(b, "{\"ok\":true}");
     } else {
         put_error(b, true, "This agent does not have the command.");
     }
@@ -2395,7 +2609,8 @@ static void agent_free(Agent *a) {
     list_clear(&a->stack);
     void *const all[] = {a->chain.at, a->deque.at, a->stack.at, a->completed.data, a->candidates, a->out.data,
                          a->lines.data, a->journal.data, a->body.data, a->changes.data, a->sent.data, a->m.roster,
-                         a->m.initial_data.data, a->m.store};
+                         a->m.initial_data.data, a->m.store, a->m.bundle, a->sealed.data};
+    keys_free(a);
     for (size_t i = 0; i < sizeof all / sizeof *all; i++)
         free(all[i]);
 }
