@@ -5,9 +5,10 @@ datagrams.py  malformed and hostile ones, floods
 blocks.py     how events become blocks; what one vote leaves for the next
 program.py    start, end, wrong missions, the control socket
 disk.py       a full disk, kill and reboot
+secured.py    missions with keys
 """
 
-from harness.conformance.cases import blocks, datagrams, disk, program
+from harness.conformance.cases import blocks, datagrams, disk, program, secured
 from harness.conformance.cases.bench import ALL, Bench, ByHand
 
-__all__ = ["ALL", "Bench", "ByHand", "blocks", "datagrams", "disk", "program"]
+__all__ = ["ALL", "Bench", "ByHand", "blocks", "datagrams", "disk", "program", "secured"]
