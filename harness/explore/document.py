@@ -190,7 +190,8 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
     if "partition" in entry or "network" in entry:
         entry = _disturbance(entry, kept)
         return entry if "partition" in entry or "network" in entry else None
-    if not {sender for name in INJECTIONS if (sender := at(entry, f"{name}.sender")) is not None} <= {*kept}:
+    named = {sender for name in INJECTIONS if (sender := at(entry, f"{name}.sender")) is not None}
+    if not named.union(at(entry, "lie.receivers") or ()) <= {*kept}:
         return None
     faults = [kind.what for kind in ASKED_FOR]
     entry = _of(entry, faults, kept)

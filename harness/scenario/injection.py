@@ -20,7 +20,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from harness.scenario.fates import MessageName
-from harness.scenario.model import Model, Seconds, VehicleId
+from harness.scenario.model import Instant, Model, Seconds, VehicleId
 
 InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie"]
 INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie")
@@ -182,7 +182,7 @@ class Lie(Model):
     block: BlockName | None = None
     chain: Annotated[list[BlockName], Field(max_length=1000)] | Literal["nobody's"] | None = None
     approve: bool | None = None
-    timestamp_s: Seconds | None = None
+    timestamp_s: Instant | None = None
 
     @property
     def lasts_s(self) -> float:

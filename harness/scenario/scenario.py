@@ -280,6 +280,8 @@ class Scenario(Model):
             if entry.injection is not None:
                 name, injection = entry.injection
                 yield from ((f"timeline.{index}.{name}.sender", agent) for agent in (injection.sender,) if agent)
+            if entry.lie is not None:
+                yield from ((f"timeline.{index}.lie.receivers", agent) for agent in entry.lie.receivers or ())
 
     @model_validator(mode="after")
     def _plans_can_be_flown(self) -> "Scenario":

@@ -258,6 +258,12 @@ def test_dead_and_paused_agents_hear_the_rogue_as_they_hear_anybody(tmp_path: Pa
         ),
         ({"forge": {"message": "Commit Block", "sender": 1, "approve": True}}, "a Commit Block says neither"),
         ({"flood": {"for_s": 100, "per_s": 5000}}, "500000 messages are too many: a flood has 100000 at most"),
+        ({"lie": {"message": "Commit Block", "sender": 1, "block": "1.1"}}, "a Commit Block says `block` and `chain`"),
+        ({"lie": {"message": "Request for Block", "sender": 1, "block": 2.1}}, "`timeline.0.lie.block` is 2.1"),
+        (
+            {"lie": {"message": "Chain Contain Query", "sender": 1, "chain": [], "receivers": [9]}},
+            "timeline.0.lie.receivers names vehicle 9, which does not exist",
+        ),
     ],
 )
 def test_a_mistake_is_told_in_one_sentence(entry: dict[str, Any], sentence: str) -> None:

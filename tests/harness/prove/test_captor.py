@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from harness.errors import ScenarioError
+from harness.play.process.preflight import refuse_what_needs_virtual_time
 from harness.prove import Bounds, BoundsError, in_words, prove
 from harness.prove.alone import collect
 from harness.prove.captor import Captor
@@ -270,6 +272,24 @@ def test_any_number_of_lies_in_any_network_comes_to_nothing_worse(tmp_path: Path
 def test_impossible_bounds_are_one_sentence(wrong: dict[str, Any]) -> None:
     with pytest.raises(BoundsError):
         Bounds(**{"agents": 3, **wrong})
+
+
+def test_a_lie_is_heard_by_whom_it_is_told_also_without_keys() -> None:
+    lie = {"message": "Commit Block", "sender": 3, "receivers": [1], "block": "made 4.5", "chain": []}
+    unheard = {"message": "Commit Block", "sender": 3, "block": "2.7", "chain": []}
+    document = {
+        "name": "a lie",
+        "agents": 3,
+        "duration_s": 60,
+        "events": {"source": "scripted"},
+        "timeline": [{"at_s": 5, "lie": lie}, {"at_s": 6, "lie": unheard}],
+    }
+    played = simulate(parse(document), 1, tracing=True)
+    assert [run.branch for run in played.evidence.traces[1].runs] == ["committed"]
+    assert not played.evidence.traces[2].runs
+    assert len(played.played.unmatched_fates) == 1
+    with pytest.raises(ScenarioError, match=r"timeline\.lie"):
+        refuse_what_needs_virtual_time(parse(document))
 
 
 def test_lies_are_for_who_is_captured(tmp_path: Path) -> None:
