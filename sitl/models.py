@@ -8,7 +8,7 @@ from typing import Protocol
 from sitl.copter import Copter
 from sitl.kinematics import Motion, Point, Segment
 from sitl.plane import Plane
-from sitl.rover import Rover
+from sitl.rover import TURN_RATE_RADS, Rover
 from sitl.vehicle import VehicleType
 
 
@@ -48,6 +48,6 @@ MODELS: dict[VehicleType, MotionModel] = {"copter": Copter(), "plane": Plane(), 
 AT_ONCE: dict[VehicleType, MotionModel] = {
     "copter": Copter(turning_s=1.2, settling_s=0.0),
     "plane": Plane(),
-    "rover": Rover(start_s=0.0),
+    "rover": Rover(start_s=0.0, corner_rads=TURN_RATE_RADS),
 }
 """As they do what they are told outside of a mission: in GUIDED, and when they are to land."""

@@ -27,11 +27,10 @@ JOIN_RAD = 1.1  # measured: how far to the left of straight ahead it leaves a pl
 REACHED_M = 40.0  # measured: 20 to 28, and 52 before it turns round
 TURN_RADIUS_M = 55.0  # measured
 WIDE_TURN_RADIUS_M, WIDE_TURN_RAD = 110.0, 1.0  # measured: small turns are flown less tightly
-RATHER_RIGHT_M, STILL_RIGHT_M = (
-    20.0,
-    80.0,
-)  # measured: where it is about as far, it turns to the right, if it does already
-LINE_AHEAD_M = 150.0  # how far ahead, on the line between two places, it aims at to come back to it
+RATHER_LEFT_M = 60.0  # measured: who is to circle a place to the right swings out to the left before
+STILL_RIGHT_M = 80.0  # measured: who turns to the right goes on to, unless the other way is so much shorter
+SWAY_M = 2.0  # measured: it comes to that line from outside its turn, sways over it, and turns round to where it was
+LINE_AHEAD_M = 147.0  # how far ahead, on the line between two places, it aims at to come back to it
 HEADING_RAD = math.radians(10.0)  # as near as it heads for the next place when it leaves a circle
 LOW_M = 10.0  # low enough to land from a circle of LOITER_RADIUS_M
 
@@ -39,7 +38,8 @@ SPOOL_UP_S = 0.7  # the take-off, measured
 RUNWAY_ACCEL_MS2 = 8.0
 RUNWAY_M = CRUISE_MS**2 / (2 * RUNWAY_ACCEL_MS2)  # from standing to flying
 TAKE_OFF_CLIMB_MS, TAKE_OFF_MS = 10.0, 26.5
-LEVEL_M = 25.0  # in its mode TAKEOFF it turns once it is so high,
+LEVEL_OFF_M = 30.0  # straight on, before it turns
+LEVEL_M = 30.0  # in its mode TAKEOFF it turns once it is so high (three times TKOFF_LVL_ALT),
 AHEAD_M = 200.0  # TKOFF_DIST: to circle a place so far ahead of where it stood
 
 LANDING_MS = 17.5  # the landing, measured
@@ -54,6 +54,7 @@ class Plane:
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
         run, path = _lift_off(start, altitude_m, altitude_m)
+        path.straight(LEVEL_OFF_M)
         return [*run, *path.segments]
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
@@ -81,7 +82,7 @@ class Plane:
         else:
             if not start.yaw_rate_rads:
                 path.straight(ROLL_S * path.speed_ms)
-            path.fly_by(place, SWING_M)
+            path.fly_by(place, SWING_M, 0.0 if start.yaw_rate_rads else RATHER_LEFT_M)
             joins_rad = path.bearing_rad(place) - math.pi / 2
         path.straight_to(_on_circle(place, radius_m, joins_rad))
         swing_s = path.segments[-1].duration_s
@@ -112,9 +113,8 @@ def _until_heading_for(there: Point, centre: Point, here: Motion) -> float:
     away_m, radius_m = math.dist(centre[:2], there[:2]), math.dist(centre[:2], here.point[:2])
     if away_m < 1.05 * radius_m:
         return 0.0
-    bearing_rad = math.atan2(there.east_m - centre.east_m, there.north_m - centre.north_m)
-    leaves_rad = bearing_rad - math.acos(radius_m / away_m) - HEADING_RAD
-    turn_rad = (leaves_rad - math.atan2(here.east_m - centre.east_m, here.north_m - centre.north_m)) % math.tau
+    leaves_rad = _bearing_rad(centre, there) - math.acos(radius_m / away_m) - HEADING_RAD
+    turn_rad = (leaves_rad - _bearing_rad(centre, here.point)) % math.tau
     return 0.0 if turn_rad > math.tau - 2 * HEADING_RAD else turn_rad
 
 
@@ -145,18 +145,21 @@ class _Path:
     def arc(self, centre: tuple[float, float], turn_rad: float) -> None:
         self._add(Arc(self._end, centre, turn_rad, self.speed_ms))
 
-    def fly_by(self, place: Point, reached_m: float) -> None:
-        """Turn towards `place`, whichever way is shorter, and go straight until it is `reached_m` away."""
+    def fly_by(self, place: Point, reached_m: float, rather_left_m: float = 0.0) -> None:
+        """Turn towards `place`, whichever way is shorter, and go straight until it is `reached_m` away.
+
+        To the right if that is shorter by more than `rather_left_m`.
+        """
         here = self._end
         if math.dist(here.point[:2], place[:2]) <= max(reached_m, NEAR_M):
             self.straight(0.0)
             return
-        turn = _turn_towards(here, place, WIDE_TURN_RADIUS_M)
+        turn = _turn_towards(here, place, WIDE_TURN_RADIUS_M, rather_left_m)
         if turn is None or abs(turn.turn_rad) > WIDE_TURN_RAD:
-            turn = _turn_towards(here, place, TURN_RADIUS_M)
+            turn = _turn_towards(here, place, TURN_RADIUS_M, rather_left_m)
         if turn is None:  # neither way: it is beside and too close, so first get away from it
             self.straight(2 * TURN_RADIUS_M)
-            self.fly_by(place, reached_m)
+            self.fly_by(place, reached_m, rather_left_m)
             return
         if abs(turn.turn_rad) > NEAR_M:
             self.arc(turn.centre, turn.turn_rad)
@@ -164,7 +167,7 @@ class _Path:
 
     def bearing_rad(self, place: Point) -> float:
         """Of a place as seen from the end of the path."""
-        return math.atan2(place.east_m - self._end.east_m, place.north_m - self._end.north_m)
+        return _bearing_rad(self._end.point, place)
 
     def _add(self, level: Segment) -> None:
         self.segments.append(Climbing(level, self._up_m, self._rate_ms))
@@ -185,9 +188,13 @@ def _back_and_on(
 ) -> Sequence[Segment]:
     """Back to the line that leads to `place` from `before`, and on it until it is `reached_m` away."""
     aim = None if before is None else _back_on_line(start.point, before, place)
-    if aim is None:
+    if before is None or aim is None:
         return _fly_by(start, place, speed_ms, rate_ms, reached_m)
-    back = _fly_by(start, aim, max(speed_ms, CRUISE_MS * OVER_GROUND), rate_ms, REACHED_M)
+    line_rad = _bearing_rad(before, place)
+    turn_rad = (line_rad - start.yaw_rad + math.pi) % math.tau - math.pi
+    sways_m = math.copysign(SWAY_M, turn_rad) if abs(turn_rad) < math.pi / 2 else 0.0
+    swayed = _beside(Motion(*aim, yaw_rad=line_rad), sways_m)
+    back = _fly_by(start, Point(*swayed, aim.up_m), max(speed_ms, CRUISE_MS * OVER_GROUND), rate_ms, REACHED_M)
     return [*back, *_fly_by(end_of(back), place, speed_ms, rate_ms, reached_m)]
 
 
@@ -205,7 +212,7 @@ class _Turn(NamedTuple):
     ahead_m: float
 
 
-def _turn_towards(start: Motion, place: Point, radius_m: float) -> _Turn | None:
+def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: float) -> _Turn | None:
     """The turn that makes the shorter way; None: the place is inside both circles."""
     ways = []
     for side in (1, -1):  # to the right, to the left
@@ -221,8 +228,12 @@ def _turn_towards(start: Motion, place: Point, radius_m: float) -> _Turn | None:
             turn_rad = 0.0
         ways.append(_Turn(centre, side * turn_rad, math.sqrt(away_m**2 - radius_m**2)))
     lengths_m = {way: abs(way.turn_rad) * radius_m + way.ahead_m for way in ways}
-    right_m = STILL_RIGHT_M if start.yaw_rate_rads > 0 else RATHER_RIGHT_M
-    return min(ways, key=lambda way: lengths_m[way] + (0.0 if way.turn_rad >= 0 else right_m), default=None)
+    still_right_m = STILL_RIGHT_M if start.yaw_rate_rads > 0 else 0.0
+    return min(
+        ways,
+        key=lambda way: lengths_m[way] + (rather_left_m if way.turn_rad >= 0 else still_right_m),
+        default=None,
+    )
 
 
 def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
@@ -236,6 +247,10 @@ def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
         return None
     part = along_m / length_m
     return Point(before.north_m + part * north, before.east_m + part * east, place.up_m)
+
+
+def _bearing_rad(here: Point, there: Point) -> float:
+    return math.atan2(there.east_m - here.east_m, there.north_m - here.north_m)
 
 
 def _on_circle(place: Point, radius_m: float, bearing_rad: float) -> Point:

@@ -1,14 +1,14 @@
-"""Flies a square with a real ArduCopter, at speedup 4, and ends it: for test_real_flight.py, and to record a track.
+"""Flies a short plan with a real ArduPilot, at speedup 8, and ends it: for test_real_flight.py.
 
-    python -m tests.sitl.real_flight DIRECTORY mission|guided [TRACK.json NOTE]
+    python -m tests.sitl.real_flight DIRECTORY copter|plane|rover mission|guided
 
-Run it in a network namespace of its own: ArduPilot listens on every address and may send multicast.
+prints at which second of the vehicle's clock it was told to fly. Run it in a network namespace of its own: ArduPilot
+listens on every address and may send multicast.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import subprocess
 import sys
@@ -19,60 +19,53 @@ from pymavlink import mavutil
 from sitl.ardupilot import ArduPilot
 from sitl.pilot import Pilot
 from sitl.plan import By, GoTo, Land, Plan, TakeOff
+from sitl.vehicle import VehicleType
 from tests.sitl.flying import DEADLINE_S, HOME, connect
 
-SPEEDUP = 4.0
-SQUARE = Plan(
-    (TakeOff(20), *(GoTo(*corner, speed_ms=5) for corner in ((100, 0), (100, 100), (0, 100), (0, 0))), Land())
-)
+SPEEDUP = 8.0
+PLANS: dict[VehicleType, Plan] = {
+    "copter": Plan((TakeOff(10), GoTo(60, 30, speed_ms=8), Land())),
+    "plane": Plan((TakeOff(40), GoTo(-300, -100), Land())),
+    "rover": Plan((GoTo(40, 20), GoTo(0, 0))),
+}
 
 
-def fly(directory: Path, by: By) -> Path:
-    """The telemetry log of a flight, in `directory`."""
-    tlog = directory / "3.tlog"
-    launch = ArduPilot.find(None, os.environ).launch(3, HOME, SPEEDUP, directory)
+def fly(directory: Path, vehicle_type: VehicleType, by: By) -> float:
+    """When it was told to; `directory` has the telemetry log then."""
+    launch = ArduPilot.find(None, os.environ, vehicle_type).launch(3, HOME, SPEEDUP, directory)
 
-    async def flight() -> None:
-        pilot = Pilot(3, connect(launch.pilot_port), tlog, SPEEDUP, HOME)
+    async def flight() -> float:
+        pilot = Pilot(3, connect(launch.pilot_port), directory / "3.tlog", SPEEDUP, HOME, vehicle_type)
         await pilot.start()
         try:
-            await pilot.fly(pilot.flight(SQUARE, by))
+            plan = pilot.flight(PLANS[vehicle_type], by)
+            await pilot.get_ready(plan)
+            assert pilot.state.time_s is not None
+            began_s = pilot.state.time_s
+            await pilot.fly(plan)
         finally:
             await pilot.close()
+        return began_s
 
     with (directory / "log").open("w") as log:
         vehicle = subprocess.Popen(
             launch.argv, cwd=directory, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
         )
     try:
-        asyncio.run(flight())
+        return asyncio.run(flight())
     finally:
         vehicle.terminate()
         vehicle.wait(DEADLINE_S)
-    return tlog
 
 
-def track_of(tlog: Path) -> list[list[float]]:
-    """One [time, north, east, up] a simulated second: seconds since boot, metres from home."""
-    points: list[list[float]] = []
-    log = mavutil.mavlink_connection(str(tlog))
+def track_of(tlog: Path, began_s: float) -> list[tuple[float, tuple[float, float, float]]]:
+    """Seconds since then, and metres from home."""
+    log, points = mavutil.mavlink_connection(str(tlog)), []
     while (message := log.recv_match(type="GLOBAL_POSITION_INT")) is not None:
-        time_s = message.time_boot_ms / 1e3
-        if message.lat and (not points or time_s - points[-1][0] >= 1.0):
-            north_m, east_m, _ = HOME.metres_to(message.lat / 1e7, message.lon / 1e7, 0.0)
-            points.append([round(value, 2) for value in (time_s, north_m, east_m, message.relative_alt / 1e3)])
+        if (second := message.time_boot_ms / 1e3 - began_s) >= 0:
+            points.append((second, HOME.metres_to(message.lat / 1e7, message.lon / 1e7, message.alt / 1e3)))
     return points
 
 
-def main(directory: str, by: By, track: str | None = None, note: str = "") -> None:
-    points = track_of(fly(Path(directory), by))
-    if track is not None:
-        rows = ",\n".join(json.dumps(point) for point in points)
-        Path(track).write_text(
-            f'{{"note": {json.dumps(note)},\n"columns": ["time_s", "north_m", "east_m", "up_m"],\n'
-            f'"points": [\n{rows}\n]}}\n'
-        )
-
-
 if __name__ == "__main__":
-    main(*sys.argv[1:])  # type: ignore[arg-type]
+    sys.stdout.write(f"{fly(Path(sys.argv[1]), sys.argv[2], sys.argv[3])}\n")  # type: ignore[arg-type]

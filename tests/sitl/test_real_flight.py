@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -7,23 +8,44 @@ from pathlib import Path
 
 import pytest
 
-from tests.sitl.real_flight import track_of
+from sitl.airframes import BINARIES
+from sitl.plan import By
+from sitl.track import track
+from sitl.vehicle import VEHICLE_TYPES, VehicleType
+from tests.sitl.flying import HOME
+from tests.sitl.real_flight import PLANS, track_of
+
+WAYS: list[By] = ["mission", "guided"]
+LATE_S, APART_M = 5.0, 6.0  # copters and rovers: so late, and then so near
+PLANE_APART_M, PLANE_BESIDE_M = 80.0, 40.0  # planes: at the same second, and from their path over the ground
 
 
 @pytest.mark.ardupilot
-@pytest.mark.parametrize("by", ["mission", "guided"])
-def test_a_real_copter_flies_its_plan(by: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", WAYS)
+@pytest.mark.parametrize("vehicle_type", VEHICLE_TYPES)
+def test_a_real_vehicle_flies_its_plan_as_it_is_computed(vehicle_type: VehicleType, by: By, tmp_path: Path) -> None:
     """In a network namespace of its own: ArduPilot listens on every address and may send multicast."""
-    if "ARDUPILOT_SITL" not in os.environ:
-        pytest.skip("no ArduPilot: set ARDUPILOT_SITL to the directory that holds an arducopter")
+    program, directory = BINARIES[vehicle_type], os.environ.get("ARDUPILOT_SITL")
+    if directory is None:
+        pytest.skip(f"no ArduPilot: set ARDUPILOT_SITL to the directory that holds an {program}")
+    if not (Path(directory) / program).exists():
+        pytest.skip(f"no {program} in {directory}, which ARDUPILOT_SITL names")
     network = "ip link set lo up multicast on && ip route add 224.0.0.0/4 dev lo && exec"
     inside = ["unshare", "--user", "--map-root-user", "--net", "sh", "-c", f'{network} "$@"', "sh"]
-    flight = [sys.executable, "-m", "tests.sitl.real_flight", str(tmp_path), by]
+    flight = [sys.executable, "-m", "tests.sitl.real_flight", str(tmp_path), vehicle_type, by]
     flown = subprocess.run([*inside, *flight], capture_output=True, text=True, timeout=300, check=False)
     if flown.returncode != 0 and "unshare" in flown.stderr:
         pytest.skip(f"no network namespace to be had here: {flown.stderr.strip()}")
     assert flown.returncode == 0, flown.stderr
-    track = track_of(tmp_path / "3.tlog")
-    assert max(north_m for _, north_m, _, _ in track) == pytest.approx(100, abs=5)
-    assert max(up_m for *_, up_m in track) == pytest.approx(20, abs=2)
-    assert track[-1][3] < 2
+    computed = track(vehicle_type, PLANS[vehicle_type], heading_deg=HOME.heading_deg, by=by)
+    places = track_of(tmp_path / "3.tlog", float(flown.stdout))
+    path = [computed.at(quarter / 4)[:2] for quarter in range(4 * round(places[-1][0]))]
+    late = [tenth / 10 for tenth in range(round(-10 * LATE_S), round(10 * LATE_S) + 1)]
+    for second, place in places:
+        when = f"{second:.1f} s after it was told to fly"
+        if vehicle_type == "plane":
+            assert math.dist(place, computed.at(second)) < PLANE_APART_M, when
+            assert min(math.dist(place[:2], near) for near in path) < PLANE_BESIDE_M, when
+        else:
+            assert min(math.dist(place, computed.at(second + late_s)) for late_s in late) < APART_M, when
+    assert places[-1][1][2] < 2

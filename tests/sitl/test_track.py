@@ -17,10 +17,12 @@ from sitl.track import Track, track
 from sitl.vehicle import VehicleType
 from tests.sitl.cockpit import Cockpit
 from tests.sitl.flying import HOME
-from tests.sitl.real_flight import SQUARE
 from tests.sitl.recorded import flight
 
 TRACKS = Path(__file__).parent / "tracks"
+SQUARE = Plan(
+    (TakeOff(20), *(GoTo(*corner, speed_ms=5) for corner in ((100, 0), (100, 100), (0, 100), (0, 0))), Land())
+)
 ROUND_TRIP = Plan((TakeOff(30), GoTo(300, -100, altitude_m=60), Loiter(45), GoTo(0, 200, speed_ms=12), GoTo(0, 0)))
 DRIVE = Plan((GoTo(100, 0, speed_ms=3), Loiter(45), GoTo(0, 200), GoTo(0, 0)))
 
