@@ -8,7 +8,8 @@ hands them out in their order and takes in what follows them in that order: so a
 import time
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 from harness.errors import HarnessError
@@ -188,6 +189,10 @@ class _Other:
         self._numbers: list[int] = []
         """Of each state that it has told of, here."""
 
+    @property
+    def connection(self) -> Connection:
+        return self._worker.connection
+
     def give(self, states: Sequence[State]) -> None:
         self._worker.connection.send(self._line.told(states))
 
@@ -287,25 +292,30 @@ class Crew:
         if not self._others:
             self._others = [_Other(self._swarm) for _ in range(self._size)]
         idle = deque(self._others)
-        busy: deque[tuple[_Other, int]] = deque()
+        busy: dict[int, _Other] = {}
+        answers: dict[int, tuple[_Other, Following | Needed]] = {}
+        due: deque[int] = deque()
         given = first
-
-        def give_some() -> None:
-            nonlocal given
-            size = min(CHUNK, max(1, (len(states) - given) // (2 * len(self._others))))
-            other = idle.popleft()
-            give(other, states[given : given + size])
-            busy.append((other, given))
-            given += size
-
         while True:
             while idle and given < len(states):
-                give_some()
-            if not busy:
+                size = min(CHUNK, max(1, (len(states) - given) // (2 * len(self._others))))
+                other = busy[given] = idle.popleft()
+                give(other, states[given : given + size])
+                due.append(given)
+                given += size
+            if not due:
                 return
-            other, number = busy.popleft()
-            answer = other.receive()
-            idle.append(other)
-            if given < len(states):  # it need not wait until this is taken in
-                give_some()
-            yield other, number, answer
+            for number in _answered(busy, wait_for_one=due[0] not in answers):
+                other = busy.pop(number)
+                answers[number] = other, other.receive()
+                idle.append(other)
+            if due[0] in answers and not (idle and given < len(states)):  # nobody waits until this is taken in
+                number = due.popleft()
+                other, answer = answers.pop(number)
+                yield other, number, answer
+
+
+def _answered(busy: Mapping[int, _Other], *, wait_for_one: bool) -> list[int]:
+    """Those of the questions, by the number of their first state, that are answered."""
+    ready = wait([other.connection for other in busy.values()], timeout=None if wait_for_one else 0)
+    return [number for number, other in busy.items() if other.connection in ready]

@@ -68,10 +68,11 @@ _Outcome = tuple[Step, tuple[int, ...]]
 class Instants:
     """What instants make of agents."""
 
-    def __init__(self, local: LocalStates, bounds: Bounds) -> None:
+    def __init__(self, local: LocalStates, bounds: Bounds, *, every_order: bool = False) -> None:
         self._local = local
         self._bounds = bounds
         self._twice = "duplicate" in bounds.faults
+        self._any_order_of_counting = bounds.reduced and not self._twice and not every_order
         self._outcomes: dict[tuple[int, Heard, bool, bool], list[_Outcome]] = {}
         self._choices_of: dict[tuple[int, int, Started, tuple[tuple[int, int], ...], bool, bool], list[_Choice]] = {}
         self._places = range(bounds.agents)
@@ -239,7 +240,7 @@ class Instants:
         for position, (sender, message) in enumerate(heard):
             if lets_be(local, sender, message):
                 others.append(position)
-            elif self._bounds.reduced and not self._twice and only_counts(local, sender, message):
+            elif self._any_order_of_counting and only_counts(local, sender, message):
                 matter.append(position)
             else:
                 return None

@@ -60,13 +60,16 @@ class _Instant(NamedTuple):
 
 
 class Swarm:
-    """All global states of `bounds` are made here."""
+    """All global states of `bounds` are made here.
 
-    def __init__(self, bounds: Bounds) -> None:
+    `every_order`: answers are heard in every order, though they are only counted, for the local states in between.
+    """
+
+    def __init__(self, bounds: Bounds, *, every_order: bool = False) -> None:
         self.bounds = bounds
         self.local = LocalStates(bounds)
         self.zones = Zones()
-        self._instants = Instants(self.local, bounds)
+        self._instants = Instants(self.local, bounds, every_order=every_order)
         self._order = Order(self.local, self.zones, self.name_of) if bounds.alike else None
         self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], _Instant] = {}
         self._as_they_are = tuple(range(bounds.agents))

@@ -67,6 +67,15 @@ def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, fa
     assert all_seen(reduced) == all_seen(whole)
 
 
+@pytest.mark.parametrize("network", ["lossless", "lossy"])
+def test_in_which_order_answers_are_counted_makes_no_difference(network: Any) -> None:
+    in_one, in_every = Swarm(Bounds(3, 2, network)), Swarm(Bounds(3, 2, network), every_order=True)
+    one, every = (explore(swarm, most_bytes=8e9, most_s=60) for swarm in (in_one, in_every))
+    assert in_one.local.steps < in_every.local.steps
+    assert (len(one.states), one.transitions) == (len(every.states), every.transitions)
+    assert all_seen(one) == all_seen(every)
+
+
 def test_on_two_cores_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.prove.crew.WORTH_A_CREW", 10)
     bounds = Bounds(3, 2, "lossy", ("reboot",))
