@@ -116,11 +116,18 @@ class Corpus:
     # Runs
 
     def runs(self) -> list[Candidate]:
-        """Those that are kept, in the order of their names."""
+        """Those that are kept, each once, in the order of their names."""
         paths = sorted((self.directory / "runs").iterdir())
         if len(paths) > 2 * MOST_KEPT:
             self.left_out.append(f"{len(paths) - 2 * MOST_KEPT} of {len(paths)} files in {self.directory / 'runs'}")
-        return [candidate for path in paths[: 2 * MOST_KEPT] if (candidate := self._run(path)) is not None]
+        by_name: dict[str, Candidate] = {}
+        for path in paths[: 2 * MOST_KEPT]:
+            if (candidate := self._run(path)) is not None:
+                name = _name_of(candidate)
+                by_name[name] = candidate
+                if path.name != name:  # as others, or older versions, name it
+                    self._rename(path, name)
+        return list(by_name.values())
 
     def _run(self, path: Path) -> Candidate | None:
         name = _NAME.fullmatch(path.name)
@@ -200,6 +207,12 @@ class Corpus:
             self.left_out.append(f"{path.name} is left out: {str(error)[:200]}")
             return None
 
+    def _rename(self, path: Path, name: str) -> None:
+        def rename(path: Path) -> None:
+            path.replace(path.with_name(name))
+
+        self._tell(rename, path)
+
     def _read(self, path: Path) -> bytes:
         status = path.stat(follow_symlinks=False)
         if not stat.S_ISREG(status.st_mode) or status.st_size > 64 * MOST_BYTES:
@@ -273,5 +286,5 @@ def _is_part(value: Any, whole: Any) -> bool:
 
 
 def _name_of(candidate: Candidate) -> str:
-    text = json.dumps(candidate.document, sort_keys=True)
+    text = json.dumps(with_liveness_phase(candidate.document), sort_keys=True)  # as it is read again
     return f"{sha256(text.encode()).hexdigest()[:12]}-seed-{candidate.seed}.yaml"

@@ -118,7 +118,17 @@ def test_a_night_too_short_to_play_what_is_kept_loses_none_of_it(tmp_path: Path)
     kept = {*(tmp_path / "corpus/runs").iterdir()}
     short = night(tmp_path / "corpus", runs=5)
     assert short.hunt.runs < len(kept)
-    assert {*(tmp_path / "corpus/runs").iterdir()} >= kept
+    assert {*(tmp_path / "corpus/runs").iterdir()} == kept, "each once"
+
+
+def test_what_is_kept_is_there_once_from_night_to_night(tmp_path: Path) -> None:
+    first = night(tmp_path / "corpus")
+    (one, *_) = (tmp_path / "corpus/runs").iterdir()
+    one.rename(one.with_name(f"{'0' * 12}-{one.name.partition('-')[2]}"))
+    again = night(tmp_path / "corpus", runs=first.hunt.runs)
+    files = {path.name for path in (tmp_path / "corpus/runs").iterdir()}
+    assert one.name in files
+    assert len(files) <= len(again.hunt.kept)
 
 
 def test_an_agent_alone_that_others_refuse_for_ever_is_shown_by_a_short_document() -> None:
