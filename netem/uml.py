@@ -7,8 +7,9 @@ directory where it was, and writes with the caller's rights; it needs none beyon
 with TMPDIR in it, is the guest's own. It has one processor, and a system call costs about twenty of the host's.
 
 What the command prints comes out here as it comes. Its terminal is a console of the guest, where Ctrl-C and SIGTERM
-are typed as Ctrl-C, and nothing else is. On another console the guest says an empty line every few seconds, and at
-last the command's exit status: without that last word there is an error, never a status.
+are typed as Ctrl-C, and nothing else is; a further one is for shells (`netem.uml_shell`). On another console the guest
+says an empty line every few seconds, and at last the command's exit status: without that last word there is an error,
+never a status.
 
 Its programs keep their floating point and vector registers also on processors that it does not know
 (`netem.uml_registers`).
@@ -48,6 +49,8 @@ SILENCE_LIMIT_S = 90.0
 """A guest from which nothing comes for so long hangs: it boots within a few seconds, and then beats."""
 
 POLL_S = 0.05
+SHELLS_KEYS, SHELLS_SCREEN = "keys", "screen"
+"""Files of a guest's folder: what is typed at the console of shells (`netem.uml_shell`), and what is shown there."""
 INTERRUPTED = 128 + signal.SIGINT
 CTRL_C = b"\x03"
 
@@ -56,7 +59,7 @@ _GUARD = """
 exec "$@"
 """
 
-_INIT = """#!/bin/sh
+_INIT = r"""#!/bin/sh
 export PATH={path}
 mount -t proc proc /proc
 mount -t sysfs sysfs /sys
@@ -77,6 +80,13 @@ carriers=
 carry() {{ mkfifo "/run/$1"; cat "/run/$1" >"/dev/$1" & carriers="$carriers $!"; }}
 {carried}
 set +e
+# What `netem.uml_shell` asks for, each with a terminal of its own; it is asked for until it has begun.
+mkdir -p /dev/pts && mount -t devpts devpts /dev/pts
+while stty -echo && read -r asked; do
+  mv "{folder}/$asked" "{folder}/$asked.begun" || continue
+  script -qefc "sh {folder}/$asked.begun" /dev/null
+  printf '\000%s %s\n' "$asked" "$?"
+done 0<>/dev/tty5 1>&0 2>/dev/null &
 setsid --ctty --wait sh {command} </dev/tty1 >{stdout} 2>{stderr}
 status=$?
 for carrier in $carriers; do wait "$carrier"; done
@@ -168,6 +178,7 @@ def _init(command: Path) -> str:
         size=f"rows {rows} columns {columns}",
         carried="\n".join(f"carry {Path(path).name}" for path in (stdout, stderr) if path.startswith("/run")),
         command=shlex.quote(str(command)),
+        folder=command.parent,
         stdout=stdout,
         stderr=stderr,
     )
@@ -186,15 +197,17 @@ class _Guest:
         typed, self._keyboard = os.pipe()
         caller, self._lifeline = os.pipe()
         with contextlib.ExitStack() as stack:
-            kernel_log, terminal, stdout, stderr, word = (
+            kernel_log, terminal, stdout, stderr, word, screen = (
                 stack.enter_context((folder / name).open("ab")).fileno()
-                for name in ("kernel", "stdout", "stdout", "stderr", "word")
+                for name in ("kernel", "stdout", "stdout", "stderr", "word", SHELLS_SCREEN)
             )
+            os.mkfifo(folder / SHELLS_KEYS, 0o600)
+            keys = stack.enter_context((folder / SHELLS_KEYS).open("r+b", buffering=0)).fileno()
             options = [
                 f"mem={MEMORY}", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw",
                 f'init="{folder / "init"}"', f"uml_dir={folder}", "con=null", "con0=null,fd:1",
                 f"con1=fd:{typed},fd:{terminal}", f"con2=null,fd:{stdout}", f"con3=null,fd:{stderr}",
-                f"con4=null,fd:{word}", "quiet", "selinux=0", "panic=-1",
+                f"con4=null,fd:{word}", f"con5=fd:{keys},fd:{screen}", "quiet", "selinux=0", "panic=-1",
             ]  # fmt: skip
             self._process = subprocess.Popen(
                 ["sh", "-c", _GUARD, "sh", str(kernel), *options],
@@ -203,7 +216,7 @@ class _Guest:
                 stderr=kernel_log,
                 cwd=folder,
                 env={**os.environ, **preload, "UML_CALLER": str(caller), "UML_FOLDER": str(folder)},
-                pass_fds=(typed, terminal, stdout, stderr, word, caller),
+                pass_fds=(typed, terminal, stdout, stderr, word, keys, screen, caller),
                 start_new_session=True,
             )
         os.close(typed)

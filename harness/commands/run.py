@@ -17,7 +17,7 @@ from harness.backend_names import BackendName
 from harness.commands.terminal import complain, show_programs, show_result, show_rogue, show_survival
 from harness.commands.watch import PORT, show_address
 from harness.errors import HarnessError, ScenarioError
-from harness.machine.kernel import Kernel, run_inside
+from harness.machine.kernel import OUT, Kernel, run_inside
 from harness.play import progress
 from harness.play.backends import BACKENDS
 from harness.play.interventions import Interventions
@@ -99,8 +99,9 @@ def run_command(
             raise HarnessError(why)
         if request.gcs:
             raise ScenarioError("no ground station reaches into User Mode Linux: leave out --kernel uml, or --gcs")
-        options = {"--seed": chosen_seed, "--out": directory, "--speedup": speedup, "--vehicles": vehicles}
+        options = {"--seed": chosen_seed, "--speedup": speedup, "--vehicles": vehicles}
         given = [f"{option}={value}" for option, value in options.items() if value is not None]
+        given += [f"{OUT}{directory.resolve()}"]
         given += ["--capture"] if capture else []
         given += ["--secured"] if secured else []
         console.print("Booting User Mode Linux.", style="dim")

@@ -9,6 +9,7 @@ import typer
 
 from harness.commands.terminal import complain
 from harness.errors import MachineError, RunDirectoryError
+from harness.machine.kernel import enter, runs_inside
 from harness.machine.running import running, way_into
 
 
@@ -20,18 +21,22 @@ def shell_command(
     ] = None,
 ) -> None:
     """Open a shell in the network of a vehicle whose run goes on (ping, tcpdump, ip); without one, list what runs."""
-    runs = running()
+    runs, inside = running(), runs_inside()
     if run is None:
         for path, vehicles in runs.items():
             typer.echo(f"{path}: vehicles {_listed(vehicles)}")
-        if not runs:
+        for path in inside:
+            typer.echo(f"{path}: in User Mode Linux")
+        if not (runs or inside):
             complain("no run goes on that can be seen from here")
         return
     directory = run.resolve()
+    if directory in inside:
+        asked = ["shell", str(directory), *([] if vehicle is None else [str(vehicle)])]
+        raise typer.Exit(enter(inside[directory], [*asked, *(["--", *command] if command else [])]))
     if directory not in runs:
         raise RunDirectoryError(
-            f"nobody of {run} is to be seen here: its run is over, has not begun, or goes on in User Mode Linux, where "
-            f"no shell reaches; {_what_runs(list(runs))}"
+            f"nobody of {run} is to be seen here: its run is over, or has not begun; {_what_runs([*runs, *inside])}"
         )
     vehicles = runs[directory]
     if vehicle is None:

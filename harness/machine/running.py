@@ -1,7 +1,8 @@
 """Which runs go on at this machine, and who lives where in them: from the processes' own working directories.
 
-A run needs no register for that: an agent works in RUN/agents/ID, a vehicle in RUN/vehicles/ID, and either is in the
-network namespace of its vehicle, as a process as in a container.
+A run needs no register for that: a vehicle works in RUN/vehicles/ID, an agent in RUN/agents and in a later life in
+RUN/agents/ID-LIFE, with ID.mission.json as its last argument; and either is in the network namespace of its vehicle, as
+a process as in a container.
 """
 
 import contextlib
@@ -11,8 +12,8 @@ from pathlib import Path
 
 from harness.archive.exports import RUN_FILE
 
-_PLACE = re.compile(r"(?P<run>.+)/(?:agents|vehicles)/(?P<vehicle>[1-9][0-9]{0,4})(?:-[0-9]+)?")
-"""A later life has a directory of its own: RUN/agents/7-2."""
+_PLACE = re.compile(r"(?P<run>.+)/(?:agents|vehicles/(?P<vehicle>[1-9][0-9]{0,4})(?:-[0-9]+)?|agents/[1-9][0-9-]*)")
+_MISSION = re.compile(rb"(?:.*/)?([1-9][0-9]{0,4})\.mission\.json")
 
 
 def running(proc: Path = Path("/proc")) -> dict[Path, dict[int, int]]:
@@ -24,8 +25,17 @@ def running(proc: Path = Path("/proc")) -> dict[Path, dict[int, int]]:
         with contextlib.suppress(OSError):  # gone meanwhile, or another user's
             place = _PLACE.fullmatch(str((entry / "cwd").readlink()))
             if place and Path(place["run"], RUN_FILE).is_file() and _is_elsewhere(entry, proc):
-                runs[Path(place["run"])].setdefault(int(place["vehicle"]), int(entry.name))
+                vehicle = place["vehicle"] or _of_its_mission(entry)
+                if vehicle is not None:
+                    runs[Path(place["run"])].setdefault(int(vehicle), int(entry.name))
     return {run: dict(sorted(vehicles.items())) for run, vehicles in sorted(runs.items())}
+
+
+def _of_its_mission(entry: Path) -> bytes | None:
+    """Whose mission file an agent was started with; None if with none."""
+    *_, last = (entry / "cmdline").read_bytes().removesuffix(b"\0").split(b"\0")
+    named = _MISSION.fullmatch(last)
+    return named[1] if named else None
 
 
 def _is_elsewhere(entry: Path, proc: Path) -> bool:

@@ -49,10 +49,14 @@ def test_an_interrupted_run_is_exported_and_judged(tmp_path: Path, number: signa
 
 
 @pytest.mark.uml
-def test_a_killed_harness_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_shell_reaches_inside_and_a_killed_harness_leaves_nothing_behind(tmp_path: Path) -> None:
     with _Started(tmp_path) as started:
         started.wait_for_mission()
         assert started.left()
+        run = tmp_path / "run"
+        assert f"{run}: in User Mode Linux\n" in harness("shell").stdout
+        inside = harness("shell", run, 2, "--", "sh", "-c", "ip -brief address; exit 7", deadline_s=DEADLINE_S)
+        assert (inside.returncode, "10.77.0.2/14" in inside.stdout) == (7, True), inside
         started.process.kill()
         started.process.wait()
         started.wait_until_nothing_is_left()

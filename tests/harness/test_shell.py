@@ -14,10 +14,10 @@ DEADLINE_S = 60.0
 
 
 @contextmanager
-def going_on(tmp_path: Path) -> Iterator[Path]:
+def going_on(tmp_path: Path, kind: str) -> Iterator[Path]:
     """A run whose agents all live, until the end of the block."""
     out = tmp_path / "run"
-    scenario = write_scenario(tmp_path, duration_s=100_000)
+    scenario = write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": kind})
     with subprocess.Popen(
         [*COMMAND, "run", str(scenario), "--out", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as process:
@@ -32,8 +32,9 @@ def going_on(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.lab
-def test_a_command_is_run_in_the_network_of_a_vehicle(tmp_path: Path) -> None:
-    with going_on(tmp_path) as out:
+@pytest.mark.parametrize("kind", ["embedded", "none"])
+def test_a_command_is_run_in_the_network_of_a_vehicle(kind: str, tmp_path: Path) -> None:
+    with going_on(tmp_path, kind) as out:
         assert f"{out}: vehicles 1, 2, 3\n" in harness("shell").stdout
         inside = harness("shell", out, 2, "--", "ip", "-brief", "address")
         assert "10.77.0.2/14" in inside.stdout
@@ -52,4 +53,4 @@ def test_a_command_is_run_in_the_network_of_a_vehicle(tmp_path: Path) -> None:
 def test_a_run_that_does_not_go_on_is_one_sentence(tmp_path: Path) -> None:
     done = harness("shell", tmp_path)
     assert done.returncode == 2
-    assert f"nobody of {tmp_path} is to be seen here: its run is over, has not begun, or" in sentences(done.stderr)[0]
+    assert f"nobody of {tmp_path} is to be seen here: its run is over, or has not begun;" in sentences(done.stderr)[0]
