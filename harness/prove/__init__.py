@@ -6,6 +6,9 @@ local.py      local states by number; each step computed once, by the real agent
 reference.py  whether a step is that of a right agent
 zones.py      how long timers have yet to run, compared with each other
 instant.py    what an instant makes of the agents: who hears what in which order, and loses what
+letters.py    all that a captor can say to an agent, up to what the agent can tell apart
+captor.py     what somebody who has a vehicle's keys can say in each state
+gate.py       the real gate that it has to come through
 alone.py      network any: each agent by itself, against all that could ever be sent
 order.py      of all orders of the agents one that stands for all
 swarm.py      global states, and all that may happen next
@@ -20,6 +23,7 @@ liveness.py   whether there is always a way to rest with one chain, and whether 
 livelock.py   the forms of going round, each with a scenario and what it takes to get there
 times.py      mission seconds for a way through the graph
 script.py     a way through the graph as a scenario that the simulation plays
+wording.py    what a captor says as an entry of that scenario's timeline
 example.py    a scenario, played and written
 prove.py      all of that together
 words.py      what came out, for people

@@ -166,6 +166,8 @@ def _config(bounds: Bounds) -> str:
         raise BoundsError("the specification has no faults: leave --faults out")
     if bounds.apart:
         raise BoundsError("the specification lets things happen at once by chance: it has no --timers apart")
+    if bounds.captured is not None:
+        raise BoundsError("the specification has nobody who lies: leave --captured out")
     if bounds.stagger:
         raise BoundsError("the specification has one duration for all agents: leave --stagger out")
     unknown = [name for name in bounds.quirks if name not in AS_PRINTED]
