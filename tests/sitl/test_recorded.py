@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.link import Link
 from sitl.vehicle import Home
@@ -46,6 +47,30 @@ def test_a_vehicle_is_nowhere_until_its_estimate_is_good_and_then_where_it_is(na
                 assert abs(north_m) < FIELD_M and abs(east_m) < FIELD_M
 
 
+@pytest.mark.parametrize(
+    ("says", "height_m"),
+    [
+        ([(604_080, 20_000), (600_900, 5_000), (600_900, 3)], 0.003),
+        ([(584_090, 583_900), (585_090, 584_900)], 1.09),
+    ],
+)
+def test_a_height_is_what_it_says_above_its_home_unless_its_home_was_never_right(
+    says: list[tuple[int, int]], height_m: float, link: Link
+) -> None:
+    """A copter that has lost its GPS says one altitude for ever; a rover set its home before it knew its altitude."""
+    vehicle, ahrs = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAV_SYS_STATUS_AHRS
+    well = mavlink.MAVLink_sys_status_message(ahrs, ahrs, ahrs, *[0] * 10)
+    place = round(HOME.lat_deg * 1e7), round(HOME.lon_deg * 1e7)
+    for second, (alt_mm, relative_mm) in enumerate(says):
+        link.data_received(mavlink.MAVLink_system_time_message(0, second * 1000).pack(vehicle) + well.pack(vehicle))
+        where = mavlink.MAVLink_global_position_int_message(second * 1000, *place, alt_mm, relative_mm, 0, 0, 0, 0)
+        link.data_received(where.pack(vehicle))
+    position = link.state.position
+    assert position is not None
+    assert position.relative_alt_m == pytest.approx(height_m, abs=0.01)
+    assert position.alt_m == pytest.approx(HOME.alt_m + height_m, abs=0.01)
+
+
 def logged(name: Name, position_interval_s: float = 1.0) -> list[tuple[int, bytes]]:
     source = TelemetryEvents(position_interval_s, random.Random(1), EVENT_KINDS)
     events = []
@@ -63,6 +88,18 @@ def test_positions_are_logged_from_then_on_with_heights_above_home(name: Name) -
         height_m = position.alt_mm / 1e3 - HOME.alt_m
         assert position.relative_alt_mm / 1e3 == pytest.approx(height_m, abs=3)
     assert abs(positions[0].relative_alt_mm) < 1_000
+
+
+def test_an_agent_that_comes_when_a_rover_is_armed_knows_its_height_all_the_same() -> None:
+    source = TelemetryEvents(1.0, random.Random(1), ["position"])
+    came, heights_mm = False, []
+    for frame, message in messages("rover-mission"):
+        came = came or bool(getattr(message, "base_mode", 0) & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        if came:
+            events = source.receive(frame, getattr(message, "time_boot_ms", 0) / 1e3)
+            heights_mm += [Position.unpack(data).relative_alt_mm for _, data in events]
+    assert heights_mm
+    assert all(abs(height_mm) < 1_000 for height_mm in heights_mm)
 
 
 REACHED: dict[Name, list[int]] = {

@@ -88,6 +88,15 @@ def test_a_breached_fence_is_a_failsafe_although_it_is_not_critical() -> None:
     assert said(source("failsafe"), heartbeat(ACTIVE), status(FENCE)) == ["[0.0 s] failsafe, active: geofence"]
 
 
+@pytest.mark.parametrize(
+    ("bit", "name"), [(mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG, "compass"), (mavlink.MAV_SYS_STATUS_SENSOR_GPS, "GPS")]
+)
+def test_a_sensor_that_is_lost_in_flight_is_named_though_nothing_is_critical(bit: int, name: str) -> None:
+    """ArduPilot 4.7 says nothing else of a lost compass, nor a plane of a lost GPS."""
+    lost = mavlink.MAVLink_sys_status_message(ALL | bit, ALL | bit, ALL, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
+    assert said(source("failsafe"), heartbeat(ACTIVE), lost) == [f"[0.0 s] failsafe, active: {name}"]
+
+
 def test_what_is_unhealthy_on_the_ground_or_not_enabled_has_not_failed() -> None:
     events = source("failsafe")
     assert said(events, heartbeat(STANDBY, armed=False), status(ALL)) == []

@@ -20,6 +20,7 @@ _MOST_NAGGED = 100
 _BOOTED_MS = 1_000  # a clock that goes back as much as this has begun anew
 _HOME_OFF_MM = 10_000  # a vehicle that stands so far above its home has set it before it knew its altitude
 _HOME_MOVED_MM = 1_000
+_NEVER_FLIES = frozenset({10, 11})  # MAV_TYPE_GROUND_ROVER, MAV_TYPE_SURFACE_BOAT
 
 
 class TelemetryEvents:
@@ -48,7 +49,7 @@ class TelemetryEvents:
         self._position_due: float | None = None
         self._vehicle_ms = 0
         self._mode = records.UNKNOWN_MODE
-        self._armed = False
+        self._armed = self._never_flies = False
         self._state = 0  # MAV_STATE_UNINIT
         self._failsafe = (0, 0)  # MAV_STATE if critical, what failed: as last logged
         self._text = ""
@@ -121,6 +122,7 @@ class TelemetryEvents:
                 (records.ARMED if armed else records.DISARMED, records.ARMING_DATA.pack(self._vehicle_ms, mode))
             )
         self._mode, self._armed, self._state = mode, armed, message.system_status
+        self._never_flies = message.type in _NEVER_FLIES
         self._failsafes(events)
 
     def _failsafes(self, events: list[tuple[int, bytes]]) -> None:
@@ -183,7 +185,7 @@ class TelemetryEvents:
         if not self._means_its_position() or (message.lat == 0 and message.lon == 0):  # no fix yet
             return
         if self._ground is None and self._mode != records.UNKNOWN_MODE:
-            self._ground = _Ground(message, stands=not self._armed)
+            self._ground = _Ground(message, stands=self._never_flies or not self._armed)
         if self._position_due is None:
             self._position_due = now + self._draw()
         if now < self._position_due:
@@ -226,7 +228,7 @@ class _Ground:
     """
 
     def __init__(self, message: Any, stands: bool) -> None:
-        """`stands`: it is on the ground, at its home, as it has not been armed."""
+        """`stands`: it is on the ground, as high as its home, as it has not been armed or cannot fly."""
         self._home_mm = message.alt - message.relative_alt
         self._error_mm = message.relative_alt if stands and abs(message.relative_alt) > _HOME_OFF_MM else 0
 
