@@ -1,5 +1,6 @@
 """A run whose vehicles are seen, and one of them commanded, at a ground station."""
 
+import asyncio
 import json
 import os
 import threading
@@ -10,7 +11,10 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from harness.play.simulation import on_station
+from harness.scenario import Scenario
 from sitl.modes import MODES
+from sitl.track import track
 from tests.harness.command import harness, write_scenario
 
 DEADLINE_S = 60.0
@@ -110,6 +114,26 @@ def test_tracks_in_virtual_time_are_seen_and_refuse_commands(tmp_path: Path) -> 
     (command,) = record["ground_station"]["commands"]
     assert (command["vehicles"], command["command"]) == ([2], "MAV_CMD_DO_SET_MODE")
     assert "Its commands were refused: tracks are computed" in (out / "report.html").read_text()
+
+
+def test_vehicles_whose_time_stands_still_are_heard_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(on_station, "SHOW_S", 0.0)
+    monkeypatch.setattr(on_station, "SILENT_S", 0.0)
+    link = mavutil.mavlink_connection("udpin:127.0.0.1:0", dialect="ardupilotmega")
+    asked = Scenario.model_validate({"name": "held", "agents": 2, "gcs": f"127.0.0.1:{link.port.getsockname()[1]}"})
+
+    async def stand_still() -> None:
+        standing = {vehicle: track("copter", None) for vehicle in (1, 2)}
+        shown = await on_station.TracksOnStation.open(asked, standing, lambda: 0.0)
+        for _ in range(5):
+            shown.show(0.0, lost=set())
+            await asyncio.sleep(0.01)
+        shown.close()
+
+    asyncio.run(stand_still())
+    heard = [link.recv_match(type="HEARTBEAT", blocking=True, timeout=DEADLINE_S) for _ in range(6)]
+    assert {message.get_srcSystem() for message in heard} == {1, 2}
+    link.close()
 
 
 @pytest.mark.parametrize(

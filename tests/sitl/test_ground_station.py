@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 import sitl.ground_station
-from sitl.address import Address
+from sitl.address import Address, connected
 from sitl.frames import FrameSplitter
 from sitl.ground_station import GroundStation
 from sitl.operator import MOST_COMMANDS, CommandLog
@@ -236,3 +236,13 @@ def test_what_is_no_address_is_one_sentence(text: str) -> None:
 def test_a_host_that_nobody_knows_is_one_sentence() -> None:
     with pytest.raises(VehicleError, match=r"the ground station at nobody\.invalid:14550 cannot be sent anything"):
         asyncio.run(GroundStation.open(Address("nobody.invalid", 14550), lambda: 0.0, lambda vehicles: None))
+
+
+def test_of_a_name_that_is_both_the_address_of_ipv4_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    ways = [
+        (socket.AF_INET6, socket.SOCK_DGRAM, 17, "", ("::1", 14550, 0, 0)),
+        (socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.1", 14550)),
+    ]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: ways)
+    with connected(Address("localhost", 14550)) as sock:
+        assert sock.getpeername() == ("127.0.0.1", 14550)
