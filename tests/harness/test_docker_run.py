@@ -10,9 +10,11 @@ from typing import Any
 
 import pytest
 
+from harness.keyring.home import Home
 from harness.play.containers import ownership
 from tests.harness.command import Running, harness, processes, sentences, write_scenario
 from tests.harness.docker import Way, containers, stranger
+from tests.harness.secure.secrets import left_in, secrets, told
 
 pytestmark = pytest.mark.docker
 
@@ -74,6 +76,32 @@ def test_faults_of_agents_and_vehicles(tmp_path: Path) -> None:
     assert (run / "vehicles/2-2/telemetry.tlog").stat().st_size > 0
     assert "went on from a store" in (run / "agents/3-2/3.log").read_text()
     assert containers(run) == []
+
+
+def test_captured_keys_do_in_containers_what_they_do_elsewhere_and_no_secret_is_left(tmp_path: Path) -> None:
+    """Sealed, forged in two names, replayed, revoked: what each agent dropped, and the one block that got in."""
+    home = Home.new(tmp_path / "home", [1, 2, 3], seals=True, epoch_s=30.0)
+    timeline = [
+        {"at_s": 40, "forge": {"message": "Commit Block", "sender": 2}},
+        {"at_s": 45, "forge": {"message": "Commit Block", "sender": 3}},
+        {"at_s": 50, "duplicate": {"for_s": 10}},
+        {"at_s": 70, "kill": [3]},
+        {"at_s": 72, "revoke": [3], "heard_by": [1]},
+        {"at_s": 80, "forge": {"message": "Commit Block", "sender": 3}},
+    ]
+    security = {"keys": str(home.directory), "seal": True, "captured": 3}
+    done = on_docker(
+        tmp_path, agents=3, duration_s=100, speedup=10, security=security, timeline=timeline, events={"mean_s": 8},
+        **NO_VEHICLES,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stdout + done.stderr
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert [record["characteristics"][key]["verdict"] for key in "134"] == ["violated", "holds", "violated"]
+    dropped = {reason for agent in record["agents"].values() for reason in agent["dropped"]}
+    assert dropped >= {"not signed by its sender", "replayed", "revoked sender"}
+    left = [("its output", (done.stdout + done.stderr).encode()), *left_in(tmp_path / "run")]
+    assert told(secrets(home, 14), left) == []
+    assert containers(tmp_path / "run") == []
 
 
 def test_after_sigkill_clean_removes_what_is_ours_and_no_more(tmp_path: Path) -> None:

@@ -421,6 +421,36 @@ def late_timers() -> Story:
     return story
 
 
+def secured() -> Story:
+    """With keys, and events sealed: what is heard twice is dropped, and whoever is revoked; then it reboots."""
+    from ucp.vectors.secured_story import SecuredStory  # needs the extra `secure`
+
+    story = SecuredStory()
+    first = others_block(A, 1, at_s=1)
+    chain = story.chain()
+    story.hear(A, BlockAddRequest(first.block_hash, chain.top_chain_hash))
+    story.hear_again()
+    chain.append(first)
+    story.hear(A, CommitBlock(first, chain.top_chain_hash))
+    story.complete_a_block()
+    story.vote((A, True), (B, True))
+    story.wait()
+    story.hear(B, ChainHashSuccessorQuery(chain.top_chain_hash))
+    story.revoke(C)
+    story.hear(C, ChainContainQuery(chain.top_chain_hash))
+    story.hear(A, ChainContainQuery(chain.top_chain_hash))
+    story.hear_datagram(b"UC\1 in plain")
+    story.command("status")
+    story.command("export")
+    story.complete_a_block()
+    story.reboot(down_s=900.0)
+    story.hear(C, ChainContainQuery(chain.top_chain_hash))
+    story.hear(B, RequestForBlock(first.block_hash))
+    story.wait()
+    story.command("export")
+    return story
+
+
 MISSIONS: dict[str, Callable[[], Story]] = {
     mission.__name__: mission
     for mission in (
@@ -443,6 +473,7 @@ MISSIONS: dict[str, Callable[[], Story]] = {
         offered_what_it_holds,
         reboot,
         late_timers,
+        secured,
     )
 }
 """Transcript -> mission."""

@@ -38,6 +38,8 @@ class Story:
     have sequence numbers of their own, which mean nothing to the protocol.
     """
 
+    initial_data = INITIAL_DATA
+
     def __init__(self, *, roster: tuple[int, ...] = ROSTER, epoch_us: int = 0, at_s: float = 0.0, **settings: Any):
         self.exchanges: list[dict[str, Any]] = []
         self.now = at_s
@@ -59,7 +61,7 @@ class Story:
             "features": [],
             "agent_id": AGENT_ID,
             "roster": list(self._roster),
-            "initial_data": in_base64(INITIAL_DATA),
+            "initial_data": in_base64(self.initial_data),
             "network": {"address": "10.77.0.7", "broadcast": "10.79.255.255", "port": 14600},
             "events": {"source": "none"},
             "settings": settings,
@@ -68,9 +70,18 @@ class Story:
             "speedup": 1,
             "epoch_us": self._epoch_us,
             "store": None,
+            **self._of_mission(),
         }
         mission["features"] = needed(mission)
-        self._exchange({"mission": mission, "trace": True, **store})
+        self._exchange({"mission": mission, "trace": True, **self._of_life(), **store})
+
+    def _of_mission(self) -> dict[str, Any]:
+        """Further keys of the mission."""
+        return {}
+
+    def _of_life(self) -> dict[str, Any]:
+        """Further keys of the line with which a life begins."""
+        return {}
 
     def log(self, data_bytes: int = 256, *, after_s: float = 1.0, event_id: int = 5) -> None:
         """The vehicle logs an event, whose data is so long."""
@@ -87,7 +98,15 @@ class Story:
     def hear(self, sender: int, message: Message, *, after_s: float = 0.125) -> None:
         """Another agent's message arrives."""
         self._sequence += 1
-        self.hear_datagram(encode(sender, self._sequence, message), after_s=after_s)
+        self.hear_datagram(self._encoded(sender, self._sequence, message), after_s=after_s)
+
+    def _encoded(self, sender: int, sequence: int, message: Message) -> bytes:
+        """As it is on the air."""
+        return encode(sender, sequence, message)
+
+    def _message(self, datagram: bytes) -> Message | None:
+        """What the agent said; None if it is no message."""
+        return decode(datagram).message
 
     def hear_datagram(self, datagram: bytes, *, after_s: float = 0.125) -> None:
         """Whatever the radio delivers."""
@@ -142,7 +161,8 @@ class Story:
     @property
     def sent(self) -> list[Message]:
         """What it broadcast last."""
-        return [decode(base64.b64decode(datagram)).message for datagram in self.output["sent"]]
+        said = (self._message(base64.b64decode(datagram)) for datagram in self.output["sent"])
+        return [message for message in said if message is not None]
 
     # Answers of others to what it asked last
 
@@ -167,7 +187,7 @@ class Story:
         """What it sent last of this type."""
         for exchange in reversed(self.exchanges):
             for datagram in reversed(exchange["output"]["sent"]):
-                message = decode(base64.b64decode(datagram)).message
+                message = self._message(base64.b64decode(datagram))
                 if isinstance(message, question):
                     return message
         raise AssertionError(f"it has sent no {question.__name__}")

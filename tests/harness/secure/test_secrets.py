@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,26 @@ def test_what_a_run_of_processes_that_fails_leaves_has_no_secret(home: Home, tmp
     assert status == 1, left[0]
     assert any(b"bundle" in content for name, content in left if name.endswith("2.log"))
     assert told(secrets(home, EPOCHS), left) == []
+
+
+@pytest.mark.parametrize("tells", ["error", "version"])
+def test_an_agent_in_virtual_time_that_tells_all_tells_no_secret(home: Home, tmp_path: Path, tells: str) -> None:
+    """It refuses its mission with all that it was given; or it says so of itself when it is asked."""
+    says = {
+        "error": "{'error': 'no: ' + str(given.get('bundle'))[-460:]}",
+        "version": "{'sent': [], 'timer': None, 'trace': [], 'answer': str(given)}",
+    }[tells]
+    agent = tmp_path / "agent.py"
+    agent.write_text(
+        f"import json, sys\nfor line in sys.stdin:\n given = json.loads(line)\n print(json.dumps({says}), flush=True)\n"
+    )
+    asked = scenario(tmp_path, home, agent_command={"2": [sys.executable, str(agent)]}, capture=False, timeline=[])
+    status, left = run(asked, "--backend", "sim")
+    assert status == 1, left[0]
+    if tells == "error":
+        assert b"(a secret)" in left[0][1]
+    shown = {name: secret[:8] for name, secret in secrets(home, EPOCHS).items()}
+    assert told(shown, left) == []
 
 
 @pytest.mark.lab
