@@ -77,7 +77,7 @@ def test_what_a_run_of_processes_that_fails_leaves_has_no_secret(home: Home, tmp
 def test_an_agent_in_virtual_time_that_tells_all_tells_no_secret(home: Home, tmp_path: Path, tells: str) -> None:
     """It refuses its mission with all that it was given; or it says so of itself when it is asked."""
     says = {
-        "error": "{'error': 'no: ' + str(given.get('bundle'))[-460:]}",
+        "error": "{'error': 'no: ' + str(given.get('bundle'))[-190:]}",
         "version": "{'sent': [], 'timer': None, 'trace': [], 'answer': str(given)}",
     }[tells]
     agent = tmp_path / "agent.py"
