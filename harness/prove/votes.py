@@ -17,8 +17,8 @@ MOST_LOOKED_AT = 50_000
 """States that follow the votes of one state, with wrong agents without end; with more it is not decided."""
 MOST_KNOWN = 200_000
 """Of so many states it is remembered how many votes they need."""
-LONGEST = 80
-"""So many instants, at most, has a way that is tried before all are looked at."""
+LONGEST = 150
+"""So many instants, at most, has a way that is tried, with those of all its votes, before all are looked at."""
 
 
 class UndecidedError(Exception):
@@ -45,9 +45,12 @@ class Votes:
         most = self._swarm.bounds.agents
         return next((votes for votes in range(1, most + 1) if self._leads_by_a_vote(fork, votes)), None)
 
-    def _leads_by_a_vote(self, fork: State, votes: int) -> bool:
-        """Whether a vote of somebody's leads to one chain, if then there may be all but one of `votes` more."""
-        return any(self._leads(after, votes - 1) for after in self._after_a_vote(fork))
+    def _leads_by_a_vote(self, fork: State, votes: int, instants: int = 0) -> bool:
+        """Whether a vote of somebody's leads to one chain, if then there may be all but one of `votes` more.
+
+        So many `instants` are on the way to it: Python bears only so many.
+        """
+        return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 
     def _after_a_vote(self, fork: State) -> Iterator[State]:
         """What may follow when one of the agents that make a difference votes; those first whose chain fewest have."""
@@ -59,17 +62,17 @@ class Votes:
         for place in sorted(alike.values(), key=lambda place: chains[known[locals_[place]].chain]):
             yield from self._swarm.after(fork, (Action(place, "complete", fork[BLOCKS] + 1),), lossy=False)
 
-    def _leads(self, state: State, votes: int) -> bool:
+    def _leads(self, state: State, votes: int, instants: int) -> bool:
         """Whether some way, whichever timer is the next to end, leads from here to rest with one chain."""
-        if not self._some_way(state, votes, set()) and self._too_few.get(state, -1) < votes:
-            self._look_at_all(state, votes)
+        if not self._some_way(state, votes, set(), instants) and self._too_few.get(state, -1) < votes:
+            self._look_at_all(state, votes, instants)
         return self._is_enough(state, votes)
 
     def _is_enough(self, state: State, votes: int) -> bool:
         enough = self._enough.get(state)
         return enough is not None and enough <= votes
 
-    def _some_way(self, state: State, votes: int, tried: set[State], instants: int = 0) -> bool:
+    def _some_way(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
         """Whether a way is found that comes to no state twice. If not there may be one nevertheless."""
         if self._is_enough(state, votes):
             return True
@@ -78,7 +81,7 @@ class Votes:
         tried.add(state)
         self._count()
         if self._swarm.is_idle(state):
-            leads = self._at_rest_leads(state, votes)
+            leads = self._at_rest_leads(state, votes, instants)
         else:
             leads = self._timers_lead(state, votes, tried, instants)
         if leads:
@@ -99,8 +102,8 @@ class Votes:
                 break
         return leads
 
-    def _at_rest_leads(self, state: State, votes: int) -> bool:
-        return len(self._swarm.chains(state)) <= 1 or (votes > 0 and self._leads_by_a_vote(state, votes))
+    def _at_rest_leads(self, state: State, votes: int, instants: int) -> bool:
+        return len(self._swarm.chains(state)) <= 1 or (votes > 0 and self._leads_by_a_vote(state, votes, instants))
 
     def _by_timer(self, state: State) -> Iterator[Iterator[State]]:
         """For each timer that may be the next to end what may follow if it does."""
@@ -114,7 +117,7 @@ class Votes:
                     for after in self._swarm.after(state, actions, lossy=False)
                 )
 
-    def _look_at_all(self, state: State, votes: int) -> None:
+    def _look_at_all(self, state: State, votes: int, instants: int) -> None:
         """Of all that may follow it is known then whether so many votes are enough."""
         states, numbers = [state], {state: 0}
 
@@ -130,7 +133,9 @@ class Votes:
             by_timer.append(quiet(self._swarm, at, number_of).by_timer)
         attractor = Attractor(by_timer, self._swarm.bounds.timers_any, self._check)
         attractor.add(
-            number for number, at in enumerate(states) if self._swarm.is_idle(at) and self._at_rest_leads(at, votes)
+            number
+            for number, at in enumerate(states)
+            if self._swarm.is_idle(at) and self._at_rest_leads(at, votes, instants)
         )
         for number, at in enumerate(states):
             if number in attractor:
