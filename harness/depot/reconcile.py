@@ -55,9 +55,9 @@ def reconcile(record: Consolidation, say: Callable[[str], None] = lambda words: 
     rounds = without_waiting(_put_together(swarm, [agent_id for agent_id, held in stored.items() if held.deque]))
     swarm.end()
     at_us = max(export.exported_at_us for export in home.exports.values()) + round(swarm.now() * MICROSECONDS)
-    maker = ExportMaker()
+    maker, signatures = ExportMaker(), _signatures(home)
     exports = {
-        life.agent.agent_id: maker.export(life.state, at_us).model_copy(
+        life.agent.agent_id: maker.export(life.state, at_us, signatures).model_copy(
             update={"current_block": home.exports[life.agent.agent_id].current_block}
         )
         for life in swarm.living()
@@ -104,6 +104,16 @@ def _scenario(record: Consolidation) -> Scenario:
         "vehicles": {"kind": "none"},
     }
     return parse(asked)
+
+
+def _signatures(home: CameHome) -> dict[bytes, bytes]:
+    """Those of the blocks' makers that came home, by block hash; each is as good as it was."""
+    return {
+        bytes.fromhex(block.block_hash): base64.b64decode(block.signature)
+        for brought in home.brought
+        for block in brought.export.blocks()
+        if block.signature is not None
+    }
 
 
 def _stored(home: CameHome) -> dict[int, StoredState]:

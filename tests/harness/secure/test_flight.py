@@ -99,6 +99,14 @@ def test_a_command_says_what_is_true_and_no_secret(
     assert told(secrets(home, 12), left) == []
 
 
+def test_what_is_reconciled_at_home_keeps_the_makers_signatures(flown: Path, tmp_path: Path) -> None:
+    done = harness("consolidate", flown, "--out", tmp_path / "record.jsonl", "--reconcile")
+    assert done.returncode == 0, done.stderr
+    shutil.copy(flown / "public.json", tmp_path / "record.reconciled")
+    judged = json.loads(harness("check", tmp_path / "record.reconciled", "--json").stdout)
+    assert judged["characteristics"]["4"]["verdict"] == "holds", judged["characteristics"]["4"]
+
+
 def brought_home(flown: Path, directory: Path) -> Path:
     """Exports and captures, and no trace."""
     directory.mkdir()
