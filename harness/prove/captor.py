@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from itertools import combinations
 from typing import NamedTuple
 
-from harness.play.rogue.lies import made_block
+from harness.play.rogue.lies import NOBODYS, made_block
 from harness.prove.bounds import Bounds
 from harness.prove.instant import Action
 from harness.prove.letters import Asked, Material, asked, letters
@@ -112,7 +112,7 @@ class Heard:
         assert bounds.captured is not None, "a vehicle is captured"
         self._captured = bounds.captured
         self._blocks = {made_block(self._captured, ordinal * MICROSECONDS) for ordinal in ordinals}
-        self._named = {block.block_hash for block in self._blocks}
+        self._named = {NOBODYS, *(block.block_hash for block in self._blocks)}
         self._proposals: dict[int, set[Asked]] = {}
         self._times_us = Ages(bounds.blocks, 0).said
 

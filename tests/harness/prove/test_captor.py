@@ -11,12 +11,13 @@ import pytest
 
 from harness.errors import ScenarioError
 from harness.play.process.preflight import refuse_what_needs_virtual_time
+from harness.play.rogue.lies import made_block
 from harness.prove import Bounds, BoundsError, in_words, prove
 from harness.prove.alone import collect
 from harness.prove.captor import Captor
 from harness.prove.explore import Graph, explore
 from harness.prove.letters import NOBODYS, Asked, Material, asked, letters
-from harness.prove.local import DEAD
+from harness.prove.local import DEAD, LocalStates
 from harness.prove.script import Script
 from harness.prove.shape import Held, shape_of
 from harness.prove.snapshot import NOW_S, put_back, take
@@ -296,3 +297,42 @@ def test_lies_are_for_who_is_captured(tmp_path: Path) -> None:
     refused = harness("prove", "--lies", 2, cwd=tmp_path)
     assert refused.returncode == 2
     assert len(sentences(refused.stderr)) == 1
+
+
+def test_whatever_a_captor_does_by_chance_in_any_network_is_among_it() -> None:
+    """One block of its own, any number of lies; messages of the others come late, twice, or never."""
+    seen = set()
+
+    def keep(local: LocalStates) -> None:
+        for known in local.known:
+            agent = Agent(known.agent_id, (1, 2, 3), b"proof", local.settings)
+            put_back(agent, known.snapshot)
+            seen.add(seen_of([agent]))
+
+    assert collect(Bounds(3, 1, "any", captured=CAPTURED), most_bytes=8e9, most_s=60, keep=keep).ended == "complete"
+    for seed in range(150):
+        for there in lied_to_at_any_time(Random(seed)):
+            assert there in seen
+
+
+def lied_to_at_any_time(lots: Random) -> Iterator[Any]:
+    agents = [Agent(number, (1, 2, 3), b"proof", Settings(max_block_bytes=267)) for number in (1, 2)]
+    own, now, air = made_block(CAPTURED, MICROSECONDS), 0.0, []
+    for _ in range(60):
+        now += lots.choice([0.01, 2.5, 5.0, 10.0]) * lots.random()
+        for agent in agents:
+            agent.handle_timer(now)
+            air += [(agent, said) for _, said in agent.messages_to_send()]
+        if air and lots.random() < 0.5:
+            sender, message = lots.choice(air)
+            receiver = agents[sender is agents[0]]
+            receiver.receive_message(sender.agent_id, 0, message, now)
+        agent, other = lots.sample(agents, 2)
+        material = Material(
+            frozenset((own,)), frozenset((own.block_hash, NOBODYS)), frozenset((asked(other.state),)), (1,)
+        )
+        chosen = [*letters(agent.state, CAPTURED, material), random_message(lots, agent, material)]
+        lie = lots.choice(chosen)
+        if getattr(lie, "block", own) == own:
+            agent.receive_message(CAPTURED, 0, lie, now)
+        yield from (seen_of([each]) for each in agents)
