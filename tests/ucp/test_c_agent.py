@@ -26,6 +26,9 @@ from ucp.vectors.replay import Player, play
 
 SOURCE = Path(ucp.__path__[0]) / "examples" / "ucp_agent.c"
 VECTORS = INDEX.parent.parent
+ABOUT: dict[str, dict[str, Any]] = json.loads(INDEX.read_text(encoding="ascii"))
+TRANSCRIPTS = {*ABOUT}
+SECURED = {name for name, about in ABOUT.items() if "secured" in about["features"]}
 WARNINGS = ["-std=c11", "-Wall", "-Wextra", "-Werror"]
 HARD_RUN: dict[str, Any] = {
     "network": {"loss": 0.15},
@@ -96,9 +99,17 @@ def vectors(name: str) -> Any:
     return json.loads((VECTORS / f"{name}.json").read_text(encoding="ascii"))
 
 
-@pytest.mark.parametrize("name", json.loads(INDEX.read_text(encoding="ascii")))
+@pytest.mark.parametrize("name", sorted(TRANSCRIPTS - SECURED))
 def test_a_transcript(name: str, player: Player) -> None:
     assert play(player, INDEX.with_name(f"{name}.jsonl")) is None
+
+
+@pytest.mark.parametrize("name", sorted(SECURED))
+def test_a_transcript_with_keys(name: str, player: Player, secured: Path) -> None:
+    lacks = play(player, INDEX.with_name(f"{name}.jsonl"))
+    assert lacks is not None and lacks.startswith("not supported")
+    with Player([str(secured)]) as playing:
+        assert play(playing, INDEX.with_name(f"{name}.jsonl")) is None
 
 
 def test_generated_vectors(agent: Path) -> None:
