@@ -7,14 +7,18 @@ from harness.prove.attractor import Check
 from harness.prove.explore import Graph
 
 
-def cycles(graph: Graph, check: Check) -> list[list[int]]:
+def cycles(graph: Graph, check: Check = lambda: None) -> list[list[int]]:
     """A shortest way round in each part of the graph from whose states all others of it are reached; nearest first."""
     parts = [part for part in _parts(graph, check) if len(part) > 1 or part[0] in _after(graph, part[0])]
     return [_round(graph, min(part), set(part)) for part in sorted(parts, key=min)]
 
 
 def _after(graph: Graph, number: int) -> set[int]:
-    return {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
+    """What may follow; only of what was looked at, if that is not all."""
+    following = {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
+    if graph.ended == "complete":
+        return following
+    return {state for state in following if state < len(graph.quiet)}
 
 
 def _round(graph: Graph, start: int, part: set[int]) -> list[int]:

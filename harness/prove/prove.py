@@ -12,6 +12,7 @@ from harness.prove import livelock, liveness
 from harness.prove.alone import collect
 from harness.prove.bounds import Bounds, BoundsError
 from harness.prove.crew import Crew
+from harness.prove.cycles import cycles
 from harness.prove.example import Example, keep, play
 from harness.prove.explore import Graph, explore
 from harness.prove.livelock import Livelock
@@ -102,7 +103,7 @@ class Proof:
     reluctant: Example | None = None
     """The nearest state for which one more vote is not enough, if more votes are."""
     livelocks: list[Livelock] = field(default_factory=list)
-    """The first of each form, those that were played."""
+    """The first of each form, those that were played; also of what was looked at where that is not all."""
     way: list[str] = field(default_factory=list)
     shown: dict[str, Example | None] = field(default_factory=dict)
     """By characteristic of `OF_CAPTORS`: the nearest of what a captor does; None in the network `any`."""
@@ -122,7 +123,7 @@ class Proof:
     @property
     def exit_status(self) -> int:
         live = self.liveness
-        if self.flaw or self.shown or (live is not None and (live.cycles or live.lost is not None)):
+        if self.flaw or self.shown or self.livelocks or (live is not None and (live.cycles or live.lost is not None)):
             return VIOLATED
         if "interrupted" in (self.ended, self.whole_ended):
             return INTERRUPTED
@@ -154,7 +155,7 @@ class Proof:
             "fork": None if self.fork is None else self.fork.to_json(),
             "reluctant": None if self.reluctant is None else self.reluctant.to_json(),
             "without_a_way_to_one_chain": None if live is None else live.astray,
-            "livelocks": None if live is None else len(live.cycles),
+            "livelocks": sum(each.ways for each in self.livelocks) or None if live is None else len(live.cycles),
             "livelock_forms": [each.to_json() for each in self.livelocks],
             "example": None if self.example is None else self.example.to_json(),
         }
@@ -256,13 +257,14 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
 def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
     """Write what was found as scenarios: the first to `path`."""
     live = proof.liveness
+    ways_round = live.cycles if live is not None else cycles(graph) if proof.ended in ("memory", "time") else []
     for key, number in graph.shown.items():
         beside = path.with_stem(f"{path.stem}_characteristic_{key}")
         proof.shown[key] = _example(graph, number, SHOWN[key], beside, f"{name} characteristic {key}")
     if proof.flaw is not None and graph.flawed is not None:
         proof.example = _example(graph, graph.flawed, proof.flaw.sentence, path, name)
-    elif live is not None and live.cycles:
-        proof.livelocks = list(livelock.show(graph, live.cycles, path, name))
+    elif ways_round:
+        proof.livelocks = list(livelock.show(graph, ways_round, path, name))
         proof.example = proof.livelocks[0].example
     elif live is not None and live.lost is not None:
         proof.example = _example(graph, live.lost, "no way was found from here to rest with one chain", path, name)

@@ -73,7 +73,10 @@ def _of_the_whole(proof: Proof) -> Iterator[str]:
         if proof.whole_ended != "complete":
             yield f"  of the whole graph: {WHY[proof.whole_ended]}"
         yield "- not decided, one chain: from every state some way without losses leads to rest with one chain"
-        yield "- not decided, livelock: the swarm cannot go round for ever"
+        if proof.livelocks:
+            yield "✘ violated, livelock: what was looked at has ways to go round for ever, though nothing is lost"
+        else:
+            yield "- not decided, livelock: the swarm cannot go round for ever"
         return
     votes = len(live.astray) - 1
     after = (

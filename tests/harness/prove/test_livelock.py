@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from harness.prove import Bounds, in_words, prove
+from harness.prove import Bounds, Progress, in_words, prove
 from harness.prove.explore import explore
+from harness.prove.progress import Budget
 from harness.prove.swarm import Swarm
 from harness.prove.votes import Votes
 from harness.prove.zones import NOTHING_RUNS, Zones
@@ -24,6 +25,19 @@ def test_each_form_becomes_a_scenario_that_goes_round(tmp_path: Path, blocks: in
     assert livelock.cycle.agents == [1, 2]
     assert {"vote_timer_expiration", "reconcile_finalize"} <= {step.handler for step in livelock.cycle.steps}
     assert any("two moments have to be the same by chance" in line for line in in_words(proof))
+
+
+def test_a_way_round_is_found_also_if_not_everything_is_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(progress: Progress) -> None:
+        if progress.looked_at >= 500:
+            monkeypatch.setattr(Budget, "ended", lambda *_: "time")
+
+    proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "round.yaml", watch=stop)
+    assert (proof.ended, proof.liveness, proof.exit_status) == ("time", None, 1)
+    assert proof.livelocks
+    assert [line[0] for line in in_words(proof) if "one chain:" in line or "livelock:" in line] == ["-", "✘"]
 
 
 def test_blocks_may_come_when_they_like_but_for_one(tmp_path: Path) -> None:
