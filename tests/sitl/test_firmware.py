@@ -85,9 +85,13 @@ def environ(tmp_path: Path) -> dict[str, str]:
 
 
 def install_copter(
-    server: FirmwareServer, environ: dict[str, str], version: str = "stable", watcher: Onlooker | None = None
+    server: FirmwareServer,
+    environ: dict[str, str],
+    version: str = "stable",
+    watcher: Onlooker | None = None,
+    stall_s: float = 10.0,
 ) -> Outcome:
-    return install("copter", version, environ, watcher or Onlooker(), server.url, stall_s=0.2)
+    return install("copter", version, environ, watcher or Onlooker(), server.url, stall_s=stall_s)
 
 
 def the_binary(environ: dict[str, str]) -> bytes:
@@ -299,7 +303,7 @@ def test_what_can_be_no_mirror_is_refused(base: str, environ: dict[str, str]) ->
 def test_a_server_that_falls_silent_is_given_up_and_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, silent_after=HALF)
     with pytest.raises(DownloadError, match=r"127\.0\.0\.1:\d+ sent nothing for 0\.2 s"):
-        install_copter(server, environ)
+        install_copter(server, environ, stall_s=0.2)
     server.change(BINARY_PATH, silent_after=None)
     install_copter(server, environ)
     assert server.ranges_of("arducopter")[1] is not None
