@@ -2,6 +2,8 @@
 
 bounds.py     within which everything is looked at
 snapshot.py   an agent's whole state: copied, put back, as a key
+flaws.py      what must never be at one agent
+parts.py      the parts of states, each once
 local.py      local states by number; each step computed once, by the real agent
 reference.py  whether a step is that of a right agent
 zones.py      how long timers have yet to run, compared with each other

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 
 from harness.prove.bounds import Bounds
 from harness.prove.captor import Heard
+from harness.prove.flaws import Flaw
 from harness.prove.letters import Material
-from harness.prove.local import DEAD, Flaw, LocalStates, Step
+from harness.prove.local import DEAD, LocalStates, Step
 from harness.prove.progress import Ended, Progress, memory_bytes
 from harness.prove.zones import NOTHING_RUNS, Zones
 

@@ -11,7 +11,7 @@ from functools import partial
 from harness.prove.collecting import cycles_left_alone
 from harness.prove.crew import Crew
 from harness.prove.expansion import Expansion, expanded
-from harness.prove.local import Flaw
+from harness.prove.flaws import Flaw
 from harness.prove.progress import LOOK_EVERY, Budget, Ended, Progress
 from harness.prove.swarm import State, Swarm
 

@@ -5,20 +5,20 @@ given the input, and its state is taken: no line of the protocol is written here
 looked at once, when it gets its number.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from hashlib import blake2b
 from random import Random
 from typing import Any, NamedTuple
 
 from harness.prove.bounds import Bounds
+from harness.prove.flaws import FLAWS_OF_STEPS, Flaw, flaw_of, is_deceived
 from harness.prove.gate import Gate
+from harness.prove.parts import NAMES_OF_OTHERS, Parts
 from harness.prove.reference import Give, Reference
-from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, dead, keyed, put_back, take
+from harness.prove.snapshot import NOW_S, RUNNING_S, Snapshot, dead, put_back, take
 from ucp.agent import HANDLERS, Agent
-from ucp.block import Block, next_chain_hash
+from ucp.block import Block
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.handler import EventHandler
@@ -52,19 +52,6 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Flaw:
-    """Something that must never be: of which characteristic ("2", "3", "4"), or "hang", "crash" or "steps"; a sentence.
-
-    Or of a captor: what is heard in another's "name", or of a vehicle that is "revoked", and a block in the name of an
-    "honest" one. `handler` is that of a wrong step.
-    """
-
-    kind: str
-    sentence: str
-    handler: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Known:
     """A local state. `waits` says whether the agent reconciles, `chain` is the number of its chain.
 
@@ -89,10 +76,6 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 
 
 Content = tuple[int, Snapshot, "Flaw | None"]
-FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
-"""Kinds that the state after a step does not show."""
-NAMES_OF_OTHERS = ("voters", "reconcile_responders")
-"""Parts of the state that are sets of other agents."""
 TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))
 """Parts of the state in which answers are counted, and nothing else is done with them until a timer ends."""
 
@@ -138,13 +121,7 @@ class LocalStates:
         self.durations_us = [round(duration * MICROSECONDS) for duration in durations]
         """By timer."""
         self._numbers: dict[tuple[Any, ...], int] = {}
-        self._parts: dict[tuple[str, Any], Any] = {}
-        """All parts of states, each once: so states are equal if their parts are the same."""
-        self._part_numbers: dict[int, int] = {}
-        """By `id`."""
-        self._digests: dict[int, bytes] = {}
-        """Of each part, by its `id`: the same on any machine."""
-        self._hashes: dict[int, bytes] = {}
+        self._parts = Parts()
         self.completed: list[tuple[bytes, int, int]] = []
         """Hashes of completed blocks, as they were: of whom, by the agent's number here, and the how manieth it is."""
         self._blocks: dict[bytes, int] = {}
@@ -371,7 +348,7 @@ class LocalStates:
         if self.bounds.reduced:
             if hears and any(self.timers[timer] == "voting" for timer, _ in started):
                 raise ReductionError("an agent begins a vote because of a message: try again with --whole")
-            self._check_that_nothing_is_lost(before.snapshot, agent.state)
+            _check_that_nothing_is_lost(before.snapshot, agent.state)
         return Step(self._intern(agent, after, before, flaw, keep=not boots), sent, started)
 
     def _has_completed(self, agent: Agent, completed: int, ordinal: int) -> None:
@@ -436,11 +413,11 @@ class LocalStates:
     def _with(self, local: int, parts: Snapshot) -> int:
         """The same agent but for who is in its tallies."""
         known = self.known[local]
-        snapshot = known.snapshot | {name: self._part(name, value) for name, value in parts.items()}
-        key = self._key(known.agent_id, known.flaw, snapshot)
+        snapshot = known.snapshot | {name: self._parts.part(name, value) for name, value in parts.items()}
+        key = self._parts.key(known.agent_id, known.flaw, snapshot)
         number = self._numbers.setdefault(key, len(self.known))
         if number == len(self.known):
-            anonymous = self._anonymous(known.agent_id, known.flaw, snapshot)
+            anonymous = self._parts.anonymous(known.agent_id, known.flaw, snapshot)
             names_others = any(snapshot[name] for name in NAMES_OF_OTHERS)
             self.known.append(replace(known, snapshot=snapshot, anonymous=anonymous, names_others=names_others))
         return number
@@ -460,16 +437,17 @@ class LocalStates:
         """
         like = {} if before is None else before.snapshot
         snapshot = {
-            name: value if like.get(name, self) is value else self._part(name, value) for name, value in taken.items()
+            name: value if like.get(name, self) is value else self._parts.part(name, value)
+            for name, value in taken.items()
         }
         if keep:
             self._loaded[agent.agent_id] = snapshot
         if self.bounds.reduced:
             forgotten = WHAT_ONLY_CHECKS_READ | dead(agent.state)
             snapshot = snapshot | {
-                name: self._part(name, value) for name, value in forgotten.items() if snapshot[name] != value
+                name: self._parts.part(name, value) for name, value in forgotten.items() if snapshot[name] != value
             }
-        key = self._key(agent.agent_id, flaw, snapshot)
+        key = self._parts.key(agent.agent_id, flaw, snapshot)
         number = self._numbers.setdefault(key, len(self.known))
         if number == len(self.known):
             state = agent.state
@@ -483,11 +461,11 @@ class LocalStates:
                     tuple(index for index, timer in enumerate(state.timers) if timer.deadline is not None),
                     state.idle,
                     state.reconcile_in_progress,
-                    tuple(self._name(block.block_hash) for block in state.chain),
-                    flaw or self._flaw(state),
-                    self._anonymous(agent.agent_id, flaw, snapshot),
+                    tuple(self._parts.name(block.block_hash) for block in state.chain),
+                    flaw or flaw_of(state, self._blocks, self.bounds.captured),
+                    self._parts.anonymous(agent.agent_id, flaw, snapshot),
                     any(snapshot[name] for name in NAMES_OF_OTHERS),
-                    self._is_deceived(state),
+                    is_deceived(state, self._blocks, self.bounds.captured),
                 )
             )
             if self.known[number].flaw is not None:
@@ -508,72 +486,13 @@ class LocalStates:
         put_back(agent, snapshot)
         return self._intern(agent, take(agent), None, flaw)
 
-    def _part(self, name: str, value: Any) -> Any:
-        """The one part that stands for all that are equal."""
-        key = name, keyed(value, self._name)
-        part = self._parts.setdefault(key, value)
-        if part is value:
-            self._part_numbers.setdefault(id(part), len(self._part_numbers))
-            self._digests[id(part)] = blake2b(repr(key[1]).encode(), digest_size=8).digest()
-        return part
 
-    def _key(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> tuple[Any, ...]:
-        numbers = self._part_numbers
-        return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
-
-    def _anonymous(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> int:
-        parts = [
-            len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()
-        ]
-        return int.from_bytes(blake2b(repr((agent_id, flaw, parts)).encode(), digest_size=8).digest())
-
-    def _name(self, digest: bytes) -> int:
-        """A number for a hash, the same on any machine."""
-        name = int.from_bytes(digest[:8])
-        assert self._hashes.setdefault(name, digest) == digest, "no two hashes that there are begin alike"
-        return name
-
-    # What is looked at
-
-    def _flaw(self, state: AgentState) -> Flaw | None:
-        aside = [block.block_hash for block in (*state.blocks_to_be_committed, *state.reconcile_stack)]
-        chain = [block.block_hash for block in state.chain]
-        if state.idle and (aside or not {*state.completed} <= {*chain}):
-            return Flaw("2", "an idle agent holds a completed block that is not in its chain")
-        if any(count > 1 for count in Counter([*chain, *aside]).values()):
-            return Flaw("3", "an agent holds a block twice")
-        makers = self._makers(state)
-        if any(self._blocks.get(made) != maker != self.bounds.captured for made, maker in makers.items()):
-            kind = "4" if self.bounds.captured is None else "honest"
-            return Flaw(kind, "an agent holds a block that the agent that it names never completed")
-        chain_hash = state.chain.inception.chain_hash
-        for block, said in state.chain.with_chain_hashes():
-            chain_hash = next_chain_hash(chain_hash, block.block_hash)
-            if said != chain_hash:
-                return Flaw("4", "a chain hash is not that of the blocks below it")
-        if state.reconcile_in_progress and all(timer.deadline is None for timer in state.reconcile_timers):
-            return Flaw("hang", "an agent reconciles, and no timer of the reconcile runs: it answers nobody for ever")
-        return None
-
-    def _makers(self, state: AgentState) -> dict[bytes, int]:
-        """Who made the blocks that an agent holds, as these say."""
-        held = (*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack)
-        return {block.block_hash: block.agent_id for block in held}
-
-    def _is_deceived(self, state: AgentState) -> bool:
-        if self.bounds.captured is None:
-            return False
-        return any(
-            maker == self.bounds.captured and block_hash not in self._blocks
-            for block_hash, maker in self._makers(state).items()
-        )
-
-    def _check_that_nothing_is_lost(self, before: Snapshot, state: AgentState) -> None:
-        """Blocks stay: without that the completed ones could not be forgotten (characteristic 2)."""
-        held = {block.block_hash for name in ("blocks_to_be_committed", "reconcile_stack") for block in before[name]}
-        held.update(before["chain"].parts["_block_of_hash"])
-        if not all(state.holds(block_hash) for block_hash in held):
-            raise ReductionError("a block that an agent held is gone: try again with --whole")
+def _check_that_nothing_is_lost(before: Snapshot, state: AgentState) -> None:
+    """Blocks stay: without that the completed ones could not be forgotten (characteristic 2)."""
+    held = {block.block_hash for name in ("blocks_to_be_committed", "reconcile_stack") for block in before[name]}
+    held.update(before["chain"].parts["_block_of_hash"])
+    if not all(state.holds(block_hash) for block_hash in held):
+        raise ReductionError("a block that an agent held is gone: try again with --whole")
 
 
 def _back(names: Names) -> Names:

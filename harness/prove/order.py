@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby, islice, permutations, product
 from typing import Any
 
-from harness.prove.local import DEAD, NAMES_OF_OTHERS, LocalStates
+from harness.prove.local import DEAD, LocalStates
+from harness.prove.parts import NAMES_OF_OTHERS
 from harness.prove.zones import Zones
 
 Places = tuple[int, ...]

@@ -15,9 +15,10 @@ from harness.prove.crew import Crew
 from harness.prove.cycles import cycles
 from harness.prove.example import Example, keep, play
 from harness.prove.explore import Graph, explore
+from harness.prove.flaws import Flaw
 from harness.prove.livelock import Livelock
 from harness.prove.liveness import Liveness
-from harness.prove.local import Flaw, ReductionError
+from harness.prove.local import ReductionError
 from harness.prove.progress import Budget, Ended, Figures, GivenUpError, Progress
 from harness.prove.script import Script
 from harness.prove.swarm import AGENTS, ZONE, Swarm

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 from harness.prove.bounds import FAULTS, Bounds
 from harness.prove.captor import Captor
+from harness.prove.flaws import Flaw
 from harness.prove.instant import Action, Agents, Instants, Wave
-from harness.prove.local import DEAD, Flaw, LocalStates, Started
+from harness.prove.local import DEAD, LocalStates, Started
 from harness.prove.order import Order, Places
 from harness.prove.zones import NOTHING_RUNS, Zones
 

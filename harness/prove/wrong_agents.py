@@ -13,7 +13,7 @@ from harness.prove import liveness
 from harness.prove.alone import collect
 from harness.prove.bounds import Bounds
 from harness.prove.explore import explore
-from harness.prove.local import Flaw
+from harness.prove.flaws import Flaw
 from harness.prove.progress import Ended
 from harness.prove.swarm import Swarm
 from ucp.agent import HANDLERS

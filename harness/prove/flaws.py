@@ -1,0 +1,62 @@
+"""What must never be, as far as it can be seen at one agent."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from ucp.block import next_chain_hash
+from ucp.state import AgentState
+
+
+@dataclass(frozen=True, slots=True)
+class Flaw:
+    """Something that must never be: of which characteristic ("2", "3", "4"), or "hang", "crash" or "steps"; a sentence.
+
+    Or of a captor: what is heard in another's "name", or of a vehicle that is "revoked", and a block in the name of an
+    "honest" one. `handler` is that of a wrong step.
+    """
+
+    kind: str
+    sentence: str
+    handler: str | None = None
+
+
+FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
+"""Kinds that the state after a step does not show."""
+
+
+def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> Flaw | None:
+    """What is wrong with an agent's state, if anything; `completed` are all blocks by hash, and who completed each.
+
+    Blocks in the name of the agent that is `captured` need not have been completed.
+    """
+    aside = [block.block_hash for block in (*state.blocks_to_be_committed, *state.reconcile_stack)]
+    chain = [block.block_hash for block in state.chain]
+    if state.idle and (aside or not {*state.completed} <= {*chain}):
+        return Flaw("2", "an idle agent holds a completed block that is not in its chain")
+    if any(count > 1 for count in Counter([*chain, *aside]).values()):
+        return Flaw("3", "an agent holds a block twice")
+    if any(completed.get(made) != maker != captured for made, maker in _makers(state).items()):
+        kind = "4" if captured is None else "honest"
+        return Flaw(kind, "an agent holds a block that the agent that it names never completed")
+    chain_hash = state.chain.inception.chain_hash
+    for block, said in state.chain.with_chain_hashes():
+        chain_hash = next_chain_hash(chain_hash, block.block_hash)
+        if said != chain_hash:
+            return Flaw("4", "a chain hash is not that of the blocks below it")
+    if state.reconcile_in_progress and all(timer.deadline is None for timer in state.reconcile_timers):
+        return Flaw("hang", "an agent reconciles, and no timer of the reconcile runs: it answers nobody for ever")
+    return None
+
+
+def is_deceived(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> bool:
+    """Whether the agent holds a block in the name of the one that is `captured` which that never completed."""
+    if captured is None:
+        return False
+    return any(maker == captured and made not in completed for made, maker in _makers(state).items())
+
+
+def _makers(state: AgentState) -> dict[bytes, int]:
+    """Who made the blocks that an agent holds, as these say; by hash."""
+    held = (*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack)
+    return {block.block_hash: block.agent_id for block in held}
