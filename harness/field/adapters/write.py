@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from harness.archive.directory import claim
+from harness.archive.directory import PUBLIC_KEYS_FILE, claim
 from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
 from harness.archive.exports import Export
 from harness.archive.opened import Opened
@@ -77,6 +77,10 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
         (directory / CAPTURES).mkdir()
     for agent_id, capture in flight.captures.items():
         agents[agent_id].capture = _copied(capture, directory, str(agent_id))
+    if flight.public_keys is not None:
+        from ucp.secure.bundle import write_public
+
+        write_public(directory / PUBLIC_KEYS_FILE, flight.public_keys)
     return ImportedFlight(
         directory=name,
         initial_data=next((trace.header.initial_data for trace in flight.traces.values()), None)

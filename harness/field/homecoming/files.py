@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from harness.archive.directory import PUBLIC_KEYS_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE
 from harness.errors import FieldError
 from harness.field.homecoming.homecoming import LeftOut
@@ -16,7 +15,7 @@ MAX_FILES = 10_000
 MAX_DEPTH = 16
 _BY_THE_HARNESS = {
     *(RUN_FILE, BEFORE_FINAL_RECONCILE, "vehicles", "network.jsonl", "tracks.jsonl", "rogue.jsonl"),
-    *(PUBLIC_KEYS_FILE, "report.html", "report.md", "junit.xml", "chains.svg"),
+    *("report.html", "report.md", "junit.xml", "chains.svg"),
 }
 """What the harness itself writes into a run directory: no agent left it."""
 _NO_RECORD = re.compile(r"(\d+|capture|lab|rogue)\.(log|mission\.json|control|store)")
@@ -72,7 +71,7 @@ def _walk(
                 left_out.append(LeftOut(path, f"it is more than {MAX_DEPTH} directories deep"))
                 return
             of_run = of_run or (path / RUN_FILE).is_file()
-            not_here = _BY_THE_HARNESS if of_run else {_IMPORT_FILE, PUBLIC_KEYS_FILE}
+            not_here = _BY_THE_HARNESS if of_run else {_IMPORT_FILE}
             for inner in sorted(path.iterdir(), key=_files_first):
                 if inner.name not in not_here and not (of_run and _NO_RECORD.fullmatch(inner.name)):
                     yield from _walk(inner, left_out, depth=depth + 1, of_run=of_run)

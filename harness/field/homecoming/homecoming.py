@@ -3,11 +3,15 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
 from harness.errors import FieldError
 from ucp.events import LoggableEvent
+
+if TYPE_CHECKING:
+    from ucp.secure.bundle import PublicKeys
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,8 @@ class Flight:
     """Events that an agent was given, as somebody beside it took them down: its own trace has them anyway."""
     sources: dict[int, list[Path]] = field(default_factory=dict)
     """The files that the trace of an agent was read from."""
+    public_keys: "PublicKeys | None" = None
+    """Of a secured mission, if they came along."""
 
     @property
     def agents(self) -> list[int]:

@@ -12,6 +12,7 @@ from harness.field.homecoming.files import files_of
 from harness.field.homecoming.flights import put_together
 from harness.field.homecoming.glance import Glance, glance
 from harness.field.homecoming.homecoming import Homecoming, LeftOut, Remark
+from harness.field.homecoming.keys import PUBLIC_SCHEMA, give_keys, read_public_keys
 from harness.field.homecoming.lives import Life, read_lives
 from harness.field.homecoming.logged import read_logged
 from harness.gc_pause import gc_paused
@@ -20,6 +21,7 @@ from ucp.events import LoggableEvent
 from ucp.export import SCHEMA as EXPORT_SCHEMA
 
 if TYPE_CHECKING:
+    from ucp.secure.bundle import PublicKeys
     from ucp.secure.opening import Opener
 
 MAX_DOCUMENTS = 1000
@@ -54,12 +56,14 @@ class Sorter:
         self.exports: list[tuple[Path, Export]] = []
         self.captures: list[Glance] = []
         self.logged: list[tuple[Path, int, LoggableEvent]] = []
+        self._public_keys: list[tuple[Path, PublicKeys]] = []
         self._left_out = left_out
 
     def sorted_out(self) -> Homecoming:
         """What all of that makes."""
         remarks: list[Remark] = []
         flights = put_together(self.lives, self.exports, self.captures, self.logged, self._left_out, remarks)
+        give_keys(flights, self._public_keys, self._left_out)
         return Homecoming(flights, [*_summed_up(self._left_out)], remarks)
 
     def take(self, path: Path) -> None:
@@ -95,6 +99,10 @@ class Sorter:
             text = ""
         if not text.startswith(("{", "[")):
             self._drop(path, _what_else(data))
+            return
+        if PUBLIC_SCHEMA in text:
+            if (keys := read_public_keys(path, self._left_out)) is not None:
+                self._public_keys.append((path, keys))
             return
         self.take_exports(path, text)
 

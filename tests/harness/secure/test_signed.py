@@ -110,3 +110,17 @@ def test_a_sealed_run_has_no_event_in_its_blocks(run: Path) -> None:
     assert "sealed to the depot" in done.stdout
     export = json.loads((run / "agents/1.chain.json").read_text())
     assert max(len(base64.b64decode(block["event_data"])) for block in export["chain"]) <= 1024
+
+
+def test_an_import_takes_the_public_keys_of_its_flight_along(home: Path, tmp_path: Path) -> None:
+    others = {**json.loads((home / "public.json").read_text()), "mission": "00" * 16}
+    (home / "others.json").write_text(json.dumps(others))
+    (home / "broken.json").write_text(json.dumps({**others, "mission": "no"}))
+    done = harness("import", home, "--out", tmp_path / "brought in")
+    assert done.returncode == 0, done.stderr
+    assert "others.json: public keys that no block here is signed with" in done.stderr
+    assert "broken.json: public keys, but `mission` must be" in done.stderr
+    assert "left out" not in done.stdout
+    judgement = genuine(tmp_path / "brought in")
+    assert judgement["verdict"] == "holds", judgement
+    assert "was signed by the agent that it names" in judgement["reason"]
