@@ -19,7 +19,7 @@ from harness.prove.local import DEAD
 from harness.prove.progress import memory_bytes
 from harness.prove.swarm import AGENTS, ZONE, State, Swarm
 from harness.prove.votes import UndecidedError, Votes
-from harness.run.sweep import Failed, Worker
+from harness.run.sweep import Failed, Worker, signals_held
 
 WORTH_A_CREW = 500
 """So many states that have not been looked at are shared among the cores."""
@@ -290,7 +290,8 @@ class Crew:
     ) -> Iterator[tuple[_Other, int, Following | Needed]]:
         """Each with whose it is and the first state that it is of; in order, also of states added meanwhile."""
         if not self._others:
-            self._others = [_Other(self._swarm) for _ in range(self._size)]
+            with signals_held():  # what a fork calls lets no Ctrl-C out
+                self._others = [_Other(self._swarm) for _ in range(self._size)]
         idle = deque(self._others)
         busy: dict[int, _Other] = {}
         answers: dict[int, tuple[_Other, Following | Needed]] = {}

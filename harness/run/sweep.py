@@ -151,14 +151,14 @@ class _Pool(Generic[T, R]):
                 due += 1
 
     def stop(self) -> None:
-        with _signals_held():
+        with signals_held():
             for worker in [*self._idle, *(worker for _, worker in self._busy.values())]:
                 worker.stop()
             self._idle.clear()
             self._busy.clear()
 
     def _begin(self, number: int, task: T) -> None:
-        with _signals_held():  # no worker is ever unknown to us
+        with signals_held():  # no worker is ever unknown to us
             worker = self._idle.pop() if self._idle else Worker(self._work)
             self._busy[worker.connection] = number, worker
         with contextlib.suppress(BrokenPipeError):  # killed while it waited: told when its connection is read
@@ -168,10 +168,10 @@ class _Pool(Generic[T, R]):
         try:
             outcome = connection.recv()
         except (EOFError, OSError):
-            with _signals_held():
+            with signals_held():
                 number, worker = self._busy.pop(connection)
                 return number, Failed(_death(worker.stop()))
-        with _signals_held():
+        with signals_held():
             number, worker = self._busy.pop(connection)
             self._idle.append(worker)
         return number, outcome
@@ -186,7 +186,7 @@ def _death(exit_code: int) -> str:
 
 
 @contextlib.contextmanager
-def _signals_held() -> Iterator[None]:
+def signals_held() -> Iterator[None]:
     """What must not be interrupted half-way. A process that is forked here begins with the signals held."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:

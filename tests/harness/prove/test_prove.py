@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+import os
 import signal
 import subprocess
 import time
@@ -156,6 +157,18 @@ def test_nobody_goes_on_who_was_interrupted(monkeypatch: pytest.MonkeyPatch) -> 
     assert graph.ended == "interrupted"
     assert graph.looked_at == LOOK_EVERY
     assert not multiprocessing.active_children()
+
+
+def test_ctrl_c_while_a_crew_begins_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is called at a fork swallows all exceptions."""
+    interruptions = [signal.SIGINT]
+    os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
+    monkeypatch.setattr("harness.prove.crew.WORTH_A_CREW", 10)
+    swarm = Swarm(Bounds(2, 3, "lossy"))
+    with Crew(swarm, 2) as crew:
+        graph = explore(swarm, most_bytes=8e9, most_s=60, crew=crew)
+    assert not interruptions
+    assert graph.ended == "interrupted"
 
 
 def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
