@@ -165,8 +165,12 @@ def test_ctrl_c_while_a_crew_begins_is_not_lost(monkeypatch: pytest.MonkeyPatch)
     os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
     monkeypatch.setattr("harness.prove.crew.WORTH_A_CREW", 10)
     swarm = Swarm(Bounds(2, 3, "lossy"))
-    with Crew(swarm, 2) as crew:
-        graph = explore(swarm, most_bytes=8e9, most_s=60, crew=crew)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's job in the background ignores
+    try:
+        with Crew(swarm, 2) as crew:
+            graph = explore(swarm, most_bytes=8e9, most_s=60, crew=crew)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert not interruptions
     assert graph.ended == "interrupted"
 
