@@ -84,6 +84,7 @@ class Beside:
             from netem.lab import in_words  # which takes its time to import
 
             end = in_words(self._process.wait())
+            self._complaining.join(ENDING_S)  # it may not have come to the last words yet
             self.problem = f"the page's server ended by itself with {end} ({self._last_words}), and the run went on"
         return bool(self._readers)
 
