@@ -15,7 +15,8 @@ from harness.prove import Bounds, BoundsError, Limits, Progress
 from harness.run.sweep import cores, terminated_is_interrupted
 
 GIGABYTE = 1e9
-TIMERS = ("duration", "apart", "any")
+TIMERS = ("duration", "any")
+CLOCKS = ("agreed", "any")
 
 
 def prove_command(
@@ -29,8 +30,16 @@ def prove_command(
     ] = "",
     timers: Annotated[
         str,
-        typer.Option(help="When timers end: by duration; apart: nothing at once by chance; any: in whatever order."),
+        typer.Option(help="When timers end: by duration; any: in whatever order."),
     ] = "duration",
+    coincidences: Annotated[
+        int | None,
+        typer.Option(help="How many moments, at most, are the same by chance; without it any number."),
+    ] = None,
+    clocks: Annotated[
+        str,
+        typer.Option(help="Which of two blocks is the older: agreed, the one completed first; any: either, each time."),
+    ] = "agreed",
     settings: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="A setting of all agents; may be repeated.")
     ] = None,
@@ -73,6 +82,8 @@ def prove_command(
     """
     if timers not in TIMERS:
         raise BoundsError(f"--timers must be one of {', '.join(TIMERS)}, not {timers!r}")
+    if clocks not in CLOCKS:
+        raise BoundsError(f"--clocks must be one of {', '.join(CLOCKS)}, not {clocks!r}")
     quirks = _pairs("--quirk", quirk)
     if lies is not None and (captured is None or network == "any"):
         raise BoundsError("--lies is for --captured, and not for --network any, where any number is heard")
@@ -82,7 +93,7 @@ def prove_command(
         network,  # type: ignore[arg-type]  # it is checked
         tuple(name for name in faults.split(",") if name),
         timers == "any",
-        timers == "apart",
+        coincidences,
         _pairs("--settings", settings),
         quirks,
         reduced=not whole and not quirks,
@@ -90,6 +101,7 @@ def prove_command(
         stagger=_pairs("--stagger", stagger),  # type: ignore[arg-type]  # it is checked
         captured=captured,
         lies=1 if lies is None else lies,
+        clocks_any=clocks == "any",
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:

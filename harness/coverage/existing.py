@@ -28,7 +28,7 @@ def existing(bounds: Bounds, *, most_bytes: float = 4e9, most_s: float = float("
         collected = collect(bounds, most_bytes=most_bytes, most_s=most_s, keep=lambda local: _add(there, local))
         there.ended = collected.ended
     else:
-        swarm = Swarm(bounds, every_order=True)
+        swarm = Swarm(bounds, every_count=True)
         there.ended = explore(swarm, most_bytes=most_bytes, most_s=most_s).ended
         _add(there, swarm.local)
     return there

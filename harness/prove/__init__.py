@@ -4,6 +4,7 @@ bounds.py     within which everything is looked at
 snapshot.py   an agent's whole state: copied, put back, as a key
 flaws.py      what must never be at one agent
 parts.py      the parts of states, each once
+blocks.py     which blocks a state is about, and the same state about others
 local.py      local states by number; each step computed once, by the real agent
 reference.py  whether a step is that of a right agent
 zones.py      how long timers have yet to run, compared with each other
@@ -24,6 +25,7 @@ votes.py      how many more votes it takes until there is one chain
 liveness.py   whether there is always a way to rest with one chain, and whether one goes round for ever
 livelock.py   the forms of going round, each with a scenario and what it takes to get there
 times.py      mission seconds for a way through the graph
+ages.py       which block has to be older than which on it
 script.py     a way through the graph as a scenario that the simulation plays
 wording.py    what a captor says as an entry of that scenario's timeline
 example.py    a scenario, played and written

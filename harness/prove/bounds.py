@@ -16,6 +16,7 @@ FAULTS = ("reboot", "death", "duplicate")
 MAX_AGENTS = 9
 MAX_BLOCKS = 9
 MAX_LIES = 9
+MAX_COINCIDENCES = 9
 EVENT_FILLS_BLOCK = {"max_block_bytes": 267}
 """An event completes a block."""
 
@@ -28,11 +29,12 @@ class BoundsError(HarnessError):
 class Bounds:
     """`agents` that complete `blocks` blocks in all; each of `faults` but "duplicate" happens once at most.
 
-    `timers_any`: a timer may end whenever it runs, however long it should. `apart`: no two things happen at the same
-    moment by chance, but those only whose distance is fixed, as one began by the other. `reduced`: states that behave
-    alike are one. `steps`: each step of the agents is held against that of right ones, too. `stagger`: agents' timers
-    differ, as a scenario's `stagger` says. `captured`: somebody has this agent's keys, and after a moment of his choice
-    speaks in its name: `lies` messages, each heard by any of the agents, or any number in the network "any".
+    `timers_any`: a timer may end whenever it runs, however long it should. `coincidences`: so many moments, at most,
+    are the same by chance, beside those whose distance is fixed, as one began by the other. `reduced`: states that
+    behave alike are one. `steps`: each step of the agents is held against that of right ones, too. `stagger`: agents'
+    timers differ, as a scenario's `stagger` says. `captured`: somebody has this agent's keys, and after a moment of his
+    choice speaks in its name: `lies` messages, each heard by any of the agents, or any number in the network "any".
+    `clocks_any`: of two blocks any may be the older, whoever completed them when: each time that it is asked.
     """
 
     agents: int = 2
@@ -40,7 +42,7 @@ class Bounds:
     network: Network = "lossy"
     faults: tuple[str, ...] = ()
     timers_any: bool = False
-    apart: bool = False
+    coincidences: int | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     quirks: Mapping[str, bool | float] = field(default_factory=dict)
     reduced: bool = True
@@ -48,6 +50,7 @@ class Bounds:
     stagger: Stagger = field(default_factory=dict)
     captured: int | None = None
     lies: int = 1
+    clocks_any: bool = False
 
     def __post_init__(self) -> None:
         for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):
@@ -59,6 +62,7 @@ class Bounds:
             if fault not in FAULTS:
                 raise BoundsError(f"--faults must be some of {', '.join(FAULTS)}, not {fault!r}")
         self._check_captured()
+        self._check_time()
         if self.stagger and self.network == "any":
             raise BoundsError("--stagger is not for --network any, where each agent is looked at by itself")
         for name, step_s in self.stagger.items():
@@ -86,10 +90,24 @@ class Bounds:
         if self.quirks or "death" in self.faults:
             raise BoundsError("--captured is for right agents that stay: leave out --quirk and the fault death")
 
+    def _check_time(self) -> None:
+        if self.coincidences is not None and not 0 <= self.coincidences <= MAX_COINCIDENCES:
+            raise BoundsError(f"--coincidences must be 0..{MAX_COINCIDENCES}, not {self.coincidences}")
+        for option, given in (("--coincidences", self.coincidences is not None), ("--clocks any", self.clocks_any)):
+            if given and (self.timers_any or self.network == "any"):
+                raise BoundsError(f"{option} is not for --timers any, nor for --network any")
+        if self.clocks_any and (self.quirks or self.captured is not None):
+            raise BoundsError("--clocks any is for right agents: leave out --quirk and --captured")
+
     @property
     def alike(self) -> bool:
         """Whether it makes no difference who is who."""
         return self.reduced and not self.stagger and self.captured is None
+
+    @property
+    def blocks_alike(self) -> bool:
+        """Whether it makes no difference which block is which."""
+        return self.alike and self.clocks_any
 
     @property
     def settles(self) -> bool:
@@ -109,7 +127,10 @@ class Bounds:
             lies = "as many lies as it likes" if self.network == "any" else f"{self.lies} lie{'s' * (self.lies != 1)}"
             parts.append(f"agent {self.captured} captured, {lies}")
         parts += [f"faults {', '.join(self.faults)}"] if self.faults else []
-        parts += ["timers in any order"] if self.timers_any else ["nothing at once by chance"] if self.apart else []
+        parts += ["timers in any order"] if self.timers_any else []
+        if self.coincidences is not None:
+            parts += [f"{self.coincidences or 'no'} coincidence{'s' * (self.coincidences != 1)}"]
+        parts += ["any block the older"] if self.clocks_any else []
         parts += [f"{name} {value}" for name, value in self.settings.items()]
         parts += [f"stagger {name} {step_s}" for name, step_s in self.stagger.items()]
         parts += [f"quirk {name}" for name in self.quirks]

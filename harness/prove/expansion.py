@@ -47,7 +47,7 @@ def quiet(swarm: Swarm, state: State, number_of: NumberOf, known: _Following | N
         for actions in swarm.ending(state)
     }
     by_timer = []
-    for action, tied in swarm.tied(state).items():
+    for action, tied in swarm.alternatives(state):
         if (action,) in after:
             choices = [after[actions] for actions in after if tied.issuperset(actions)]
             by_timer.append(tuple(dict.fromkeys(chain.from_iterable(choices))))

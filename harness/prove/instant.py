@@ -31,12 +31,14 @@ MOST_SEEN = 500
 class Action(NamedTuple):
     """What an agent does of its own: "timer" and its number, "complete" and the block's ordinal, or a fault.
 
-    Or what befalls it: it is "captured", or hears a "lie", a message with this number.
+    Or what befalls it: it is "captured", or hears a "lie", a message with this number. A timer that may end in several
+    ways, as any block may be the older, ends in this `way`.
     """
 
     place: int
     what: str
     number: int = 0
+    way: int = 0
 
 
 class Agents(NamedTuple):
@@ -116,7 +118,7 @@ class Instants:
                 if not said or not flawed.isdisjoint(there.locals):
                     silent.setdefault(there, way)
                     continue
-                for heard, answers, orders in self._hear(there, said, lossy, rounds, tell=tell):
+                for heard, answers, orders in self._hear(there, said, lossy, rounds):
                     if (heard, answers) not in after:
                         after[heard, answers] = Wave(way, said, orders) if tell else None
             waiting = after
@@ -129,7 +131,7 @@ class Instants:
 
     def _act(self, local: int, action: Action) -> Step:
         if action.what == "timer":
-            return self._local.end_timer(local, action.number)
+            return self._local.end_timer(local, action.number, action.way)
         if action.what == "complete":
             return self._local.complete(local, action.number)
         if action.what == "reboot":
@@ -139,15 +141,10 @@ class Instants:
         return Step(DEAD, (), ())
 
     def _hear(
-        self, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, rounds: int, *, tell: bool
+        self, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, rounds: int
     ) -> Iterator[tuple[Agents, tuple[tuple[int, int], ...], tuple[tuple[int, ...], ...]]]:
         answered = rounds >= ANSWERED
-        choices = [
-            [(self._settled(local, answered), there.started[place], (), ())]
-            if not tell and self._lets_be(local, place, said)
-            else self._choices(place, there, said, lossy, answered)
-            for place, local in enumerate(there.locals)
-        ]
+        choices = [self._choices(place, there, said, lossy, answered) for place in self._places]
         for chosen in product(*choices):
             locals_, started, answers, orders = zip(*chosen, strict=True)
             yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders

@@ -14,7 +14,7 @@ from harness.archive.record import Cycle
 from harness.prove.example import Example, keep, play
 from harness.prove.explore import Graph
 from harness.prove.local import DEAD
-from harness.prove.script import Completion, Script
+from harness.prove.script import NO_CLOCKS, Completion, Script
 from harness.prove.swarm import AGENTS
 
 MOST_FORMS = 12
@@ -31,9 +31,10 @@ _Form = tuple[object, ...]
 class Livelock:
     """`ways` parts of the graph go round in this form. `completions` are when blocks may be completed to come there.
 
-    `coincidences`: so many moments have to be the same by chance on the way, to within the time that a message takes;
-    None if timers end in any order, which leaves that open.
+    `coincidences`: so many moments have to be the same by chance on this way, to within the time that a message takes;
+    another may need fewer; None if timers end in any order, which leaves that open.
     `cycle` is what the simulation was found to go round in when it played the example; None if it went another way.
+    `contradictory`: ties go as no clocks make them go.
     """
 
     ways: int
@@ -41,11 +42,13 @@ class Livelock:
     completions: tuple[Completion, ...]
     example: Example
     cycle: Cycle | None
+    contradictory: bool = False
 
     def to_json(self) -> dict[str, Any]:
         return {
             "ways": self.ways,
             "coincidences": self.coincidences,
+            "contradictory": self.contradictory,
             "completions": [completion._asdict() for completion in self.completions],
             "cycle": None if self.cycle is None else self.cycle.model_dump(mode="json"),
             "example": self.example.to_json(),
@@ -53,12 +56,16 @@ class Livelock:
 
     def in_words(self) -> str:
         """What it takes to get there."""
+        if self.contradictory:
+            return NO_CLOCKS
         if self.coincidences is None:
             return "if timers can end like that, and one of them may wait for ever"
+        if not self.coincidences and self.cycle is None:
+            return "without a coincidence, if what is sent at the same moment crosses in the same way in every round"
         if not self.coincidences:
-            return "it takes no coincidence"
-        moments = "two moments have" if self.coincidences == 1 else f"{self.coincidences} times two moments have"
-        return f"it takes that {moments} to be the same by chance, to within the time that a message takes"
+            return "which takes no coincidence"
+        moments = "two moments are" if self.coincidences == 1 else f"{self.coincidences} times two moments are"
+        return f"on this way there {moments} the same by chance, to within the time that a message takes"
 
 
 def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
@@ -91,7 +98,7 @@ def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> It
 
 
 def _shown(graph: Graph, alike: Sequence[list[int]], path: Path, name: str) -> Livelock:
-    """With as few coincidences as there are, and blocks as free as can be: the first that the simulation goes too."""
+    """With as few coincidences as the nearest have, and blocks as free as can be: one that the simulation goes, too."""
     bounds = graph.swarm.bounds
     tried: list[tuple[int, int, int, list[int], list[int], Script]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MOST_PLAYED]:
@@ -102,15 +109,18 @@ def _shown(graph: Graph, alike: Sequence[list[int]], path: Path, name: str) -> L
     first = None
     for coincidences, _, _, begin, cycle, script in sorted(tried, key=lambda each: each[:3]):
         played = play(script.document(name))
-        first = first or (coincidences, begin, cycle, played)
+        went = coincidences, begin, cycle, played, script.contradictory
         if "liveness" in played.judged:
-            first = coincidences, begin, cycle, played
+            first = went
             break
+        if first is None or (first[-1] and not script.contradictory):
+            first = went
     assert first is not None, "there is a way round"
-    coincidences, begin, cycle, played = first
+    coincidences, begin, cycle, played, contradictory = first
     several = Script(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
     completions = () if bounds.timers_any else tuple(several.completions())
     sentence = f"The swarm can go round in circles for ever: {len(begin) - 1} instants after the beginning."
-    example = keep(played, path, bounds, len(begin) - 1 + len(cycle), [sentence])
+    said = [sentence, *([f"It does {NO_CLOCKS}."] if contradictory else [])]
+    example = keep(played, path, bounds, len(begin) - 1 + len(cycle), said)
     known = None if bounds.timers_any else coincidences
-    return Livelock(len(alike), known, completions, example, played.cycle)
+    return Livelock(len(alike), known, completions, example, played.cycle, contradictory)

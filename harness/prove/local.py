@@ -11,6 +11,7 @@ from functools import partial
 from random import Random
 from typing import Any, NamedTuple
 
+from harness.prove.blocks import Blocks, Ordinals
 from harness.prove.bounds import Bounds
 from harness.prove.flaws import FLAWS_OF_STEPS, Flaw, flaw_of, is_deceived
 from harness.prove.gate import Gate
@@ -24,6 +25,7 @@ from ucp.events import LoggableEvent
 from ucp.handler import EventHandler
 from ucp.messages import CARRY_A_BLOCK, Message
 from ucp.quirks import wrong_handlers
+from ucp.reconcile import most_named
 from ucp.state import AgentState
 from ucp.store import StoredState
 
@@ -51,6 +53,13 @@ class Step(NamedTuple):
     started: Started
 
 
+class End(NamedTuple):
+    """What may come of it when a timer ends, and which of the candidates of phase 2 is the oldest then."""
+
+    step: Step
+    oldest: bytes | None
+
+
 @dataclass(frozen=True, slots=True)
 class Known:
     """A local state. `waits` says whether the agent reconciles, `chain` is the number of its chain.
@@ -75,7 +84,7 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 """Parts of the state that no handler needs where nothing is ever lost, as they are at the beginning."""
 
 
-Content = tuple[int, Snapshot, "Flaw | None"]
+Content = tuple[int, Snapshot, "Flaw | None", Ordinals]
 TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))
 """Parts of the state in which answers are counted, and nothing else is done with them until a timer ends."""
 
@@ -91,8 +100,9 @@ class LocalStates:
     says why that is sound.
     """
 
-    def __init__(self, bounds: Bounds) -> None:
+    def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
         self.bounds = bounds
+        self._every_count = every_count
         self._alike = bounds.alike
         self.known: list[Known] = []
         self.flawed: set[int] = set()
@@ -126,11 +136,14 @@ class LocalStates:
         """Hashes of completed blocks, as they were: of whom, by the agent's number here, and the how manieth it is."""
         self._blocks: dict[bytes, int] = {}
         """The same by hash: who made them."""
-        self._ordinals: dict[bytes, frozenset[int]] = {}
-        """Hashes of blocks and chains: which blocks they are of."""
+        self._named = Blocks(self._agents[1].state.chain.inception, self._made)
+        self._about: dict[int, Ordinals] = {}
+        self._patterns: dict[int, int] = {}
+        self._of_pattern: dict[tuple[int, Ordinals], int] = {}
         self.messages: list[Message] = []
         self._message_numbers: dict[Message, int] = {}
         self._steps: dict[tuple[int, int, int], Step] = {}
+        self._ends: dict[tuple[int, int], list[End]] = {}
         self._lets_be: dict[tuple[int, int, int], bool] = {}
         self._counts: dict[tuple[int, int, int], bool] = {}
         self._settled: dict[int, int] = {}
@@ -221,15 +234,89 @@ class LocalStates:
             )
         return counts
 
-    def end_timer(self, local: int, timer: int) -> Step:
-        """A timer of the agent ends."""
-        key = local, -1, timer
-        step = self._steps.get(key)
-        if step is None:
-            step = self._steps[key] = self._computed(
-                local, lambda agent: agent.end_timer(agent.state.timers[timer], NOW_S)
-            )
-        return step
+    def end_timer(self, local: int, timer: int, way: int = 0) -> Step:
+        """A timer of the agent ends, in one of the `ends` that this may have."""
+        return self.ends(local, timer)[way].step
+
+    def ends(self, local: int, timer: int) -> list[End]:
+        """All that may come of it when this timer ends: more than one only if the agent asks which block is older, and
+        any may be."""
+        key = local, timer
+        ends = self._ends.get(key)
+        if ends is None:
+            oldest: list[bytes | None] = [None]
+            if self.bounds.clocks_any and self.timers[timer] == "phase two":
+                candidates = self.known[local].snapshot["reconcile_response_dictionary"]
+                oldest = sorted(candidates, key=lambda candidate: candidates[candidate][1]) or oldest
+            steps: dict[Step, bytes | None] = {}
+            for candidate in oldest:
+                steps.setdefault(self._computed(local, partial(_end, timer, candidate)), candidate)
+            ends = self._ends[key] = [End(step, candidate) for step, candidate in steps.items()]
+        return ends
+
+    def older(self, local: int, timer: int, way: int) -> tuple[int, frozenset[int]]:
+        """Which block has to be older than which for a timer to end in this way: 0 is the inception block's number.
+
+        It is older than none where nothing is asked of it.
+        """
+        ends = self.ends(local, timer)
+        oldest = ends[way].oldest
+        if oldest is None or len(ends) == 1:
+            return 0, frozenset()
+        snapshot = self.known[local].snapshot
+        top = [0, *self._named.named(snapshot["chain"].parts["top_chain_hash"])][-1]
+        asked = {
+            candidate: self._named.numbers[candidate] if candidate else top
+            for candidate in snapshot["reconcile_response_dictionary"]
+        }
+        return asked[oldest], frozenset(asked.values()) - {asked[oldest]}
+
+    # Blocks
+
+    def pattern(self, local: int) -> int:
+        """One local state for all that differ only in which block is which, where that makes no difference."""
+        if not self.bounds.blocks_alike or local == DEAD:
+            return local
+        pattern = self._patterns.get(local)
+        if pattern is None:
+            pattern = self._patterns[local] = self._exchanged(local, tuple(range(1, len(self.about(local)) + 1)))
+        return pattern
+
+    def about(self, local: int) -> Ordinals:
+        """The blocks that it is about, each once, in an order that is the same for all of one pattern."""
+        about = self._about.get(local)
+        if about is None:
+            nothing = local == DEAD or self.known[local].flaw is not None
+            about = self._about[local] = () if nothing else self._named.of(self.known[local].snapshot)
+        return about
+
+    def exchanged(self, local: int, blocks: Ordinals) -> int:
+        """The same agent with these blocks in the place of those that it is `about`."""
+        if blocks == self.about(local):
+            return local
+        key = self.pattern(local), blocks
+        number = self._of_pattern.get(key)
+        if number is None:
+            number = self._of_pattern[key] = self._exchanged(local, blocks)
+        return number
+
+    def _exchanged(self, local: int, blocks: Ordinals) -> int:
+        known, about = self.known[local], self.about(local)
+        if blocks == about:
+            return local
+        agent = self._agents[known.agent_id]
+        self._loaded.pop(known.agent_id, None)
+        put_back(agent, self._named.exchanged(known.snapshot, dict(zip(about, blocks, strict=True))))
+        return self._intern(agent, take(agent))
+
+    def _made(self, ordinal: int) -> Block:
+        """The block that an agent completes if it is the `ordinal`th of all."""
+        agent = self._agent(FIRST)
+        _log(agent, ordinal)
+        if agent.state.current_block:
+            raise ReductionError("an event is left over where a block is completed: try again with --whole")
+        (block,) = agent.state.blocks_to_be_committed
+        return block
 
     def complete(self, local: int, ordinal: int) -> Step:
         """The agent completes a block, the `ordinal`th of all."""
@@ -290,10 +377,10 @@ class LocalStates:
 
         And what came of it.
         """
+        for (local, timer), ends in self._ends.items():
+            yield from ((local, self.timers[timer], end.step) for end in ends)
         for (local, kind, number), step in self._steps.items():
-            if kind == -1:
-                yield local, self.timers[number], step
-            elif kind != -3:
+            if kind != -3:
                 yield local, None if kind == -2 else self.messages[number], step
 
     def _restored(self, local: int) -> Agent:
@@ -364,12 +451,12 @@ class LocalStates:
         for block_hash, agent_id, ordinal in blocks:
             if block_hash not in self._blocks:
                 self._blocks[block_hash] = agent_id
-                self._ordinals[block_hash] = frozenset((ordinal,))
+                self._named.numbers[block_hash] = ordinal
                 self.completed.append((block_hash, agent_id, ordinal))
 
     def _block_in_words(self, block_hash: str) -> str:
-        ordinals = sorted(self._ordinals.get(bytes.fromhex(block_hash), ()))
-        return f"#{ordinals[-1]}" if ordinals else block_hash[:12]
+        ordinal = self._named.numbers.get(bytes.fromhex(block_hash))
+        return f"#{ordinal}" if ordinal else block_hash[:12]
 
     def message(self, message: Message) -> int:
         """Its number."""
@@ -382,7 +469,7 @@ class LocalStates:
         """Ordinals of the blocks that a message names, by themselves or as those of a chain."""
         fields = (getattr(self.messages[message], name) for name in self.messages[message].__slots__)
         hashes = [field.block_hash if isinstance(field, Block) else field for field in fields]
-        return frozenset().union(*(self._ordinals.get(digest, ()) for digest in hashes if isinstance(digest, bytes)))
+        return frozenset().union(*(self._named.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     # States
 
@@ -390,12 +477,69 @@ class LocalStates:
         """The same agent when all answers to what was asked have come, or are lost: who voted matters no more."""
         number = self._settled.get(local)
         if number is None:
-            parts = {}
-            if local != DEAD and local not in self.flawed and self.known[local].snapshot["voting_timer"].active:
-                count = self.known[local].snapshot["vote_count"]
-                parts = {"vote_count": {"yes": int(count["yes"] > count["no"]), "no": 0}, "voters": set()}
+            parts = {} if local == DEAD or local in self.flawed else self._tallies_settled(local)
             number = self._settled[local] = self._with(local, parts) if parts else local
+            self._check_that_it_ends_alike(local, number)
         return number
+
+    def _tallies_settled(self, local: int) -> Snapshot:
+        """What is left of its tallies: no more than what they decide."""
+        snapshot = self.known[local].snapshot
+        parts: Snapshot = {}
+        if snapshot["voting_timer"].active:
+            count = snapshot["vote_count"]
+            parts |= {"vote_count": {"yes": int(count["yes"] > count["no"]), "no": 0}, "voters": set()}
+        if self._every_count:
+            return parts
+        if snapshot["voting_timer"].active:
+            began_with = self._named.named(snapshot["top_chain_hash_at_initiation"])
+            if len(self.known[local].chain) + len(snapshot["reconcile_stack"]) > len(began_with):
+                parts["top_chain_hash_at_initiation"] = b""  # blocks stay: the chain will not be that one again
+        if snapshot["phase_one_timer"].active:
+            parts |= self._phase_1_decided(local)
+        if snapshot["phase_two_timer"].active and not self.settings.top_needs_majority:
+            parts |= self._phase_2_decided(local)
+        return parts
+
+    def _phase_1_decided(self, local: int) -> Snapshot:
+        """What is left of the tally of phase 1, if it makes no difference what those say who have not answered yet."""
+        snapshot, timer = self.known[local].snapshot, self.timers.index("phase one")
+        yes, no = (snapshot["reconcile_vote_count"][answer] for answer in ("yes", "no"))
+        silent = self._silent(snapshot)
+        clear = {tally: self._ends_with(local, timer, *tally) for tally in ((1, 0), (0, 1))}
+        ends = self._ends_with(local, timer, yes, no)
+        at_last = [self._ends_with(local, timer, *tally) for tally in ((yes + silent, no), (yes, no + silent))]
+        if not yes + no or at_last != [ends, ends]:
+            return {}
+        yes, no = next(tally for tally, as_clear in clear.items() if as_clear == ends)
+        return {"reconcile_vote_count": {"yes": yes, "no": no}, "reconcile_responders": {*self._others}}
+
+    def _ends_with(self, local: int, timer: int, yes: int, no: int) -> list[End]:
+        return self.ends(self._with(local, {"reconcile_vote_count": {"yes": yes, "no": no}}), timer)
+
+    def _phase_2_decided(self, local: int) -> Snapshot:
+        """The same of phase 2, of which those candidates are left that most have named."""
+        snapshot = self.known[local].snapshot
+        candidates = snapshot["reconcile_response_dictionary"]
+        most, next_most, *_ = sorted([*(count for count, _ in candidates.values()), 0, 0], reverse=True)
+        silent = self._silent(snapshot)
+        if silent and most - next_most <= silent:
+            return {}
+        left = {candidate: [1, candidates[candidate][1]] for candidate in most_named(candidates)}
+        return {"reconcile_response_dictionary": left, "reconcile_responders": {*self._others}}
+
+    def _silent(self, snapshot: Snapshot) -> int:
+        """How many have not answered yet."""
+        return self.bounds.agents - 1 - len(snapshot["reconcile_responders"])
+
+    def _check_that_it_ends_alike(self, local: int, settled: int) -> None:
+        """A timer has to make the same of an agent whose tallies are settled as it would have made of it."""
+        if settled != local and any(
+            {end.step._replace(local=self.settled(end.step.local)) for end in self.ends(local, timer)}
+            != {end.step._replace(local=self.settled(end.step.local)) for end in self.ends(settled, timer)}
+            for timer in self.known[local].running
+        ):
+            raise ReductionError("an agent asks more of a tally than it should: try again with --whole")
 
     def renamed(self, local: int, names: Names) -> int:
         """The same agent when the others are called otherwise."""
@@ -410,6 +554,10 @@ class LocalStates:
             number = self._renamed[key] = self._with(local, parts)
         return number
 
+    def _names_others(self, snapshot: Snapshot) -> bool:
+        """Whether it tells some of the others from the rest."""
+        return any(0 < len(snapshot[name]) < len(self._others) for name in NAMES_OF_OTHERS)
+
     def _with(self, local: int, parts: Snapshot) -> int:
         """The same agent but for who is in its tallies."""
         known = self.known[local]
@@ -418,7 +566,7 @@ class LocalStates:
         number = self._numbers.setdefault(key, len(self.known))
         if number == len(self.known):
             anonymous = self._parts.anonymous(known.agent_id, known.flaw, snapshot)
-            names_others = any(snapshot[name] for name in NAMES_OF_OTHERS)
+            names_others = self._names_others(snapshot)
             self.known.append(replace(known, snapshot=snapshot, anonymous=anonymous, names_others=names_others))
         return number
 
@@ -451,9 +599,7 @@ class LocalStates:
         number = self._numbers.setdefault(key, len(self.known))
         if number == len(self.known):
             state = agent.state
-            below: frozenset[int] = frozenset()
-            for block, chain_hash in state.chain.with_chain_hashes():
-                below = self._ordinals[chain_hash] = below | self._ordinals.get(block.block_hash, frozenset())
+            self._named.learn_chain(state.chain)
             self.known.append(
                 Known(
                     agent.agent_id,
@@ -464,7 +610,7 @@ class LocalStates:
                     tuple(self._parts.name(block.block_hash) for block in state.chain),
                     flaw or flaw_of(state, self._blocks, self.bounds.captured),
                     self._parts.anonymous(agent.agent_id, flaw, snapshot),
-                    any(snapshot[name] for name in NAMES_OF_OTHERS),
+                    self._names_others(snapshot),
                     is_deceived(state, self._blocks, self.bounds.captured),
                 )
             )
@@ -476,11 +622,13 @@ class LocalStates:
         """What another process needs to know of it."""
         known = self.known[local]
         flaw = known.flaw if known.flaw is not None and known.flaw.kind in FLAWS_OF_STEPS else None
-        return known.agent_id, known.snapshot, flaw
+        initiated = self._named.named(known.snapshot["top_chain_hash_at_initiation"])
+        return known.agent_id, known.snapshot, flaw, initiated
 
     def adopt(self, content: Content) -> int:
         """The number of a state that another process has come upon."""
-        agent_id, snapshot, flaw = content
+        agent_id, snapshot, flaw, initiated = content
+        self._named.learn_chain_hash(snapshot["top_chain_hash_at_initiation"], initiated)
         agent = self._agents[agent_id]
         self._loaded.pop(agent_id, None)
         put_back(agent, snapshot)
@@ -518,6 +666,14 @@ def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHand
         return branch
 
     return replace(handler, run=run)
+
+
+def _end(timer: int, oldest: bytes | None, agent: Agent) -> None:
+    """End a timer; of the candidates of phase 2 this one is the oldest, unless it is the inception block."""
+    if oldest is not None:
+        counted = agent.state.reconcile_response_dictionary[oldest]
+        counted[1] = min(counted[1], 1)
+    agent.end_timer(agent.state.timers[timer], NOW_S)
 
 
 def _log(agent: Agent, ordinal: int) -> None:

@@ -4,16 +4,31 @@ It is chosen by what the agents are and how their timers stand to each other, ne
 have got: so it is the same on any machine, and in whatever order states were come upon.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from itertools import groupby, islice, permutations, product
-from typing import Any
+from itertools import chain, groupby, islice, permutations, product
+from typing import Any, NamedTuple
 
+from harness.prove.blocks import Ordinals
 from harness.prove.local import DEAD, LocalStates
 from harness.prove.parts import NAMES_OF_OTHERS
 from harness.prove.zones import Zones
 
 Places = tuple[int, ...]
 """For each place of a state the place at which its agent stood before."""
+
+
+class Ordered(NamedTuple):
+    """Agents in order, the zone with their timers in that order, and where each of them stood.
+
+    `blocks` has for each block that they are about, from 1, which it was before; none if it still is what it was.
+    """
+
+    agents: tuple[int, ...]
+    zone: int
+    places: Places
+    blocks: Ordinals = ()
+
 
 MOST_KNOWN = 200_000
 """So many orders are remembered; then they are chosen again."""
@@ -29,10 +44,9 @@ class Order:
         self._local = local
         self._zones = zones
         self._name_of = name_of
-        self._known: dict[tuple[tuple[int, ...], int], tuple[tuple[int, ...], int, Places]] = {}
+        self._known: dict[tuple[tuple[int, ...], int], Ordered] = {}
 
-    def of(self, locals_: tuple[int, ...], zone: int) -> tuple[tuple[int, ...], int, Places]:
-        """The agents in order, the zone with their timers in that order, and where each of them stood."""
+    def of(self, locals_: tuple[int, ...], zone: int) -> Ordered:
         key = locals_, zone
         ordered = self._known.get(key)
         if ordered is None:
@@ -41,18 +55,28 @@ class Order:
             ordered = self._known[key] = self._put_in_order(locals_, zone)
         return ordered
 
-    def _put_in_order(self, locals_: tuple[int, ...], zone: int) -> tuple[tuple[int, ...], int, Places]:
+    def _put_in_order(self, locals_: tuple[int, ...], zone: int) -> Ordered:
         timers = self._timers(locals_)
         orders = list(islice(self._orders(locals_, zone, timers), MOST_ORDERS))
         places = orders[0]
         if len(orders) > 1:
             places = min(orders, key=lambda places: self._looks(locals_, zone, timers, places))
-        if places == self._as_they_are:
-            return locals_, zone, places
-        agents = tuple([self._renamed(locals_[old], new, places) for new, old in enumerate(places)])
-        if zone:
-            zone = self._zones.permuted(zone, tuple([timer for place in places for timer in timers[place]]))
-        return agents, zone, places
+        blocks = self._blocks(locals_, places)
+        number = {block: new for new, block in enumerate(blocks, 1)}
+        if places != self._as_they_are:
+            locals_ = tuple([self._renamed(locals_[old], new, places) for new, old in enumerate(places)])
+            if zone:
+                zone = self._zones.permuted(zone, tuple([timer for place in places for timer in timers[place]]))
+        if blocks:
+            about, exchanged = self._local.about, self._local.exchanged
+            locals_ = tuple([exchanged(local, tuple([number[block] for block in about(local)])) for local in locals_])
+        return Ordered(locals_, zone, places, blocks)
+
+    def _blocks(self, locals_: Sequence[int], places: Places) -> Ordinals:
+        """The blocks that agents in this order are about, as one comes upon them; none if blocks keep their numbers."""
+        if not self._local.bounds.blocks_alike:
+            return ()
+        return tuple(dict.fromkeys(chain.from_iterable(self._local.about(locals_[place]) for place in places)))
 
     def _timers(self, locals_: Sequence[int]) -> list[range]:
         """For each place which of the zone's timers are its agent's."""
@@ -65,17 +89,21 @@ class Order:
 
     def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
         """All orders of the agents by what can be said of each; those of whom the same can be said in any."""
-        known = self._local.known
+        known, pattern = self._local.known, self._local.pattern
         bounds = self._zones.bounds(zone) if zone else [()]
         looks: list[tuple[Any, ...]] = [
-            (DEAD,) if local == DEAD else (known[local].anonymous, *bounds[own.start : own.stop])
+            (DEAD,) if local == DEAD else (known[pattern(local)].anonymous, *bounds[own.start : own.stop])
             for local, own in zip(locals_, timers, strict=True)
         ]
-        if len(set(looks)) == len(looks):
-            yield tuple(sorted(range(len(locals_)), key=looks.__getitem__))
+        some_named = any(local != DEAD and known[local].names_others for local in locals_)
+        groups = _groups(looks)
+        if not some_named and all(len(group) == 1 or self._are_one(group, locals_, timers) for group in groups):
+            yield tuple(chain.from_iterable(groups))
             return
+        if self._local.bounds.blocks_alike:
+            looks = self._with_blocks(locals_, looks)
         named: list[list[set[int]]] = []
-        if any(local != DEAD and known[local].names_others for local in locals_):
+        if some_named:
             named = [self._named(local, place) for place, local in enumerate(locals_)]
             looks = [
                 (
@@ -88,18 +116,34 @@ class Order:
                 )
                 for place, here in enumerate(named)
             ]
-        groups = [
-            list(group) for _, group in groupby(sorted(range(len(locals_)), key=looks.__getitem__), looks.__getitem__)
+        orders = [
+            _unlike(group, locals_) if self._change_places_freely(group, timers, named) else permutations(group)
+            for group in _groups(looks)
         ]
-        matter = [not self._change_places_freely(group, timers, named) for group in groups]
-        orders = [permutations(group) if many else (tuple(group),) for group, many in zip(groups, matter, strict=True)]
         for chosen in product(*orders):
             yield tuple(place for group in chosen for place in group)
+
+    def _are_one(self, group: Sequence[int], locals_: Sequence[int], timers: Sequence[range]) -> bool:
+        """Whether agents are in one local state, without timers."""
+        return not timers[group[0]] and len({locals_[place] for place in group}) == 1
+
+    def _with_blocks(self, locals_: Sequence[int], looks: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """How agents look, and which others have the blocks that they are about, and where."""
+        ranks = {look: rank for rank, look in enumerate(sorted(set(looks)))}
+        where: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        for local, look in zip(locals_, looks, strict=True):
+            for position, block in enumerate(self._local.about(local)):
+                where[block].append((ranks[look], position))
+        return [
+            (look, *[tuple(sorted(where[block])) for block in self._local.about(local)])
+            for local, look in zip(locals_, looks, strict=True)
+        ]
 
     def _change_places_freely(
         self, group: Sequence[int], timers: Sequence[range], named: Sequence[Sequence[set[int]]]
     ) -> bool:
-        """Whether agents that look alike are one as the other: without timers, and in nobody's tally or in the same."""
+        """Whether agents that look alike are one as the other but for their blocks: without timers, and in nobody's
+        tally or in the same."""
         if timers[group[0]]:
             return False
         return all(
@@ -127,7 +171,9 @@ class Order:
         ]
         matrix = self._zones.matrix(zone)
         order = (0, *(timer for place in places for timer in timers[place])) if zone else ()
-        return named, [[matrix[i][j] for j in order] for i in order]
+        number = {block: new for new, block in enumerate(self._blocks(locals_, places))}
+        about = [[number[block] for block in self._local.about(locals_[old])] for old in places] if number else []
+        return named, about, [[matrix[i][j] for j in order] for i in order]
 
     def _renamed(self, local: int, new: int, places: Places) -> int:
         """The agent at its new place, calling the others by theirs."""
@@ -140,3 +186,18 @@ class Order:
             if other_new != new:
                 names[self._name_of(other_old, places[new]) - 2] = self._name_of(other_new, new)
         return self._local.renamed(local, tuple(names))
+
+
+def _groups(looks: Sequence[Any]) -> list[list[int]]:
+    """The places of those that look alike, in the order of their looks."""
+    in_order = sorted(range(len(looks)), key=looks.__getitem__)
+    return [list(group) for _, group in groupby(in_order, looks.__getitem__)]
+
+
+def _unlike(group: Sequence[int], locals_: Sequence[int]) -> Iterator[Places]:
+    """All orders of these places that differ in the local states there."""
+    if not group:
+        yield ()
+    for first in {locals_[place]: place for place in reversed(group)}.values():
+        rest = [place for place in group if place != first]
+        yield from ((first, *others) for others in _unlike(rest, locals_))

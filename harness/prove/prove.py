@@ -20,7 +20,7 @@ from harness.prove.livelock import Livelock
 from harness.prove.liveness import Liveness
 from harness.prove.local import ReductionError
 from harness.prove.progress import Budget, Ended, Figures, GivenUpError, Progress
-from harness.prove.script import Script
+from harness.prove.script import NO_CLOCKS, Script
 from harness.prove.swarm import AGENTS, ZONE, Swarm
 from harness.run.finding import claim
 
@@ -139,7 +139,9 @@ class Proof:
             "blocks": bounds.blocks,
             "network": bounds.network,
             "faults": list(bounds.faults),
-            "timers": "any" if bounds.timers_any else "apart" if bounds.apart else "duration",
+            "timers": "any" if bounds.timers_any else "duration",
+            "coincidences": bounds.coincidences,
+            "clocks": "any" if bounds.clocks_any else "agreed",
             "settings": dict(bounds.settings),
             "stagger": dict(bounds.stagger),
             **(self._captors_json() if bounds.captured is not None else {}),
@@ -281,6 +283,8 @@ def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
 
 def _example(graph: Graph, number: int, sentence: str, path: Path, name: str) -> Example:
     way = graph.path(number)
-    played = play(Script(graph, way).document(name))
-    said = f"{sentence.capitalize()}: {len(way) - 1} instants after the beginning."
-    return keep(played, path, graph.swarm.bounds, len(way) - 1, [said])
+    script = Script(graph, way)
+    played = play(script.document(name))
+    said = [f"{sentence.capitalize()}: {len(way) - 1} instants after the beginning."]
+    said += [f"On this way it comes to that only {NO_CLOCKS}."] if script.contradictory else []
+    return keep(played, path, graph.swarm.bounds, len(way) - 1, said)

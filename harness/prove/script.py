@@ -12,6 +12,7 @@ from itertools import pairwise
 from math import inf
 from typing import Any, NamedTuple
 
+from harness.prove.ages import Ages
 from harness.prove.bounds import EVENT_FILLS_BLOCK
 from harness.prove.explore import Graph
 from harness.prove.instant import Action, Wave
@@ -30,6 +31,8 @@ MOMENT_S = 0.001
 SOON_S = 0.1
 """When the next instant follows sooner, messages take a MOMENT_S, so that what begins then begins with the rest."""
 SETTLES_S = 60
+NO_CLOCKS = "if ties of phase 2 go as no clocks make them go"
+"""Of two blocks now the one has to be the older and then the other, or an agent's clock has to go back."""
 
 Document = dict[str, Any]
 
@@ -80,6 +83,9 @@ class Script:
         self._agents = [_Agent(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
         self._sent: Counter[tuple[int, str]] = Counter()
         self._events: list[Document] = []
+        self._ages = Ages()
+        self.contradictory = False
+        """Whether ties go as no clocks make them go: known with the document."""
         self._timeline: list[Document] = []
         self._fates: list[Document] = []
         self._late: dict[int, dict[int, float]] = defaultdict(dict)
@@ -95,6 +101,7 @@ class Script:
             self._latency_s = LATENCY_S if next_s - at_s > SOON_S else MOMENT_S
             self._play(move, at_s)
         self._let_nothing_end_before_the_end()
+        self.contradictory = not self._ages.date(self._events)
         if self._wording is not None:
             self._wording.word()
         bounds = self._swarm.bounds
@@ -183,7 +190,8 @@ class Script:
                 now = max(nominal_s, earliest)
                 if now > nominal_s + 1e-9:
                     self._late[agent.agent_id][number] = now - nominal_s
-                step = self._swarm.local.end_timer(agent.local, action.number)
+                self._ages.asked(*self._swarm.local.older(agent.local, action.number, action.way))
+                step = self._swarm.local.end_timer(agent.local, action.number, action.way)
             else:
                 now = other_s
                 if action.what != "lie":  # all hear it at once
@@ -194,6 +202,7 @@ class Script:
         self._end_s = max(self._end_s, acted_s)
         for wave in _in_order(move.wave):
             air = self._hear(wave, self._as_in(wave, air), acted_s)
+        self._ages.renumber(move.blocks)
         self._agents = [self._agents[old] for old in move.places]
         for agent, local in zip(self._agents, move.state[AGENTS:], strict=True):
             agent.local = local
@@ -201,6 +210,7 @@ class Script:
     def _other(self, agent: _Agent, action: Action, now: float) -> Step:
         if action.what == "complete":
             self._events.append({"at_s": now, "agent": agent.agent_id})
+            self._ages.completed(action.number)
             step = self._swarm.local.complete(agent.local, action.number)
             if self._wording is not None:
                 self._wording.completed(agent.agent_id, action.number, now)

@@ -7,6 +7,7 @@ what it will have one day; a value of a kind that is not known here is an error,
 
 from collections import Counter, deque
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 from ucp.agent import Agent
@@ -97,6 +98,21 @@ def _is_part(part: Any, value: Any) -> bool:
     return bool(part == value)
 
 
+def replaced(value: Any, hash_of: Callable[[bytes], bytes], block_of: Callable[[Block], Block]) -> Any:
+    """A part of the state with other hashes and blocks in it."""
+    if isinstance(value, bytes):
+        return hash_of(value)
+    if isinstance(value, Block):
+        return block_of(value)
+    if isinstance(value, _ChainState):
+        return value.replaced(hash_of, block_of)
+    if isinstance(value, dict):
+        return {replaced(key, hash_of, block_of): replaced(item, hash_of, block_of) for key, item in value.items()}
+    if isinstance(value, list | deque | tuple | set):
+        return type(value)(replaced(item, hash_of, block_of) for item in value)
+    return value
+
+
 def keyed(value: Any, name_of: NameOf) -> Any:
     """A part of the state as numbers and tuples, equal for equal parts and whichever machine it is."""
     key = _KEYED.get(type(value))
@@ -146,6 +162,11 @@ class _ChainState:
         chain.__class__ = self.kind
         for name, value in self.parts.items():
             setattr(chain, name, _copied(value))
+
+    def replaced(self, hash_of: Callable[[bytes], bytes], block_of: Callable[[Block], Block]) -> "_ChainState":
+        other = copy(self)
+        other.parts = {name: replaced(value, hash_of, block_of) for name, value in self.parts.items()}
+        return other
 
 
 def _copied(value: Any) -> Any:

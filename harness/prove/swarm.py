@@ -9,16 +9,18 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations, permutations, product
 from typing import NamedTuple
 
-from harness.prove.bounds import FAULTS, Bounds
+from harness.prove.blocks import Ordinals
+from harness.prove.bounds import FAULTS, MAX_LIES, Bounds
 from harness.prove.captor import Captor
 from harness.prove.flaws import Flaw
 from harness.prove.instant import Action, Agents, Instants, Wave
 from harness.prove.local import DEAD, LocalStates, Started
-from harness.prove.order import Order, Places
+from harness.prove.order import Order, Ordered, Places
 from harness.prove.zones import NOTHING_RUNS, Zones
 
 State = tuple[int, ...]
-"""Blocks completed, what may yet befall (a bit for each fault and the capture, and how many lies), zone, the agents."""
+"""Blocks completed, what may yet befall (a bit for each fault and the capture, how many lies, how many coincidences),
+zone, the agents."""
 MOST_KNOWN = 200_000
 """So many instants are remembered; then they are worked out again."""
 ONCE = (*FAULTS, "captured")
@@ -26,6 +28,8 @@ ONCE = (*FAULTS, "captured")
 ALL_LEFT = -1
 LIES = 1 << len(ONCE)
 """One more lie that may be told."""
+COINCIDENCES = LIES << (MAX_LIES.bit_length())
+"""One more moment that may be the same as another by chance, where that is bounded."""
 BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 """Where they stand in it."""
 
@@ -39,6 +43,8 @@ class Move(NamedTuple):
     wave: Wave | None
     started: tuple[Started, ...]
     """By the places before."""
+    blocks: Ordinals
+    """Which the first, second, ... block of `state` was before; none if it still is what it was."""
 
 
 class _Outcome(NamedTuple):
@@ -63,14 +69,15 @@ class _Instant(NamedTuple):
 class Swarm:
     """All global states of `bounds` are made here.
 
-    `every_order`: answers are heard in every order, though they are only counted, for the local states in between.
+    `every_count`: for all local states that there are: answers are heard in every order, though they are only counted,
+    and counts are kept, though they decide nothing any more.
     """
 
-    def __init__(self, bounds: Bounds, *, every_order: bool = False) -> None:
+    def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
         self.bounds = bounds
-        self.local = LocalStates(bounds)
+        self.local = LocalStates(bounds, every_count=every_count)
         self.zones = Zones()
-        self._instants = Instants(self.local, bounds, every_order=every_order)
+        self._instants = Instants(self.local, bounds, every_order=every_count)
         self._order = Order(self.local, self.zones, self.name_of) if bounds.alike else None
         self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], _Instant] = {}
         self._as_they_are = tuple(range(bounds.agents))
@@ -79,26 +86,36 @@ class Swarm:
         self.captor = None if bounds.captured is None else Captor(bounds, self.local)
         if bounds.captured is not None:
             faults += (1 << ONCE.index("captured")) + bounds.lies * LIES
+        faults += (bounds.coincidences or 0) * COINCIDENCES
         self.initial: State = (0, faults, NOTHING_RUNS, *(self.local.initial[agent_id] for agent_id in own))
 
     # What an instant begins with
 
     def firsts(self, state: State) -> list[Action]:
-        """The timers that may be the next to end."""
+        """The timers that may be the next to end, each in all ways in which it may."""
+        return [action for actions in self._firsts(state) for action in actions]
+
+    def _firsts(self, state: State) -> list[list[Action]]:
+        """The same by timer."""
         running = self._running(state[AGENTS:])
-        if self.bounds.timers_any:
-            return [Action(place, "timer", timer) for place, timer in running]
+        if not self.bounds.timers_any:
+            running = [running[first - 1] for first in self.zones.firsts(state[ZONE])]
         return [
-            Action(running[first - 1][0], "timer", running[first - 1][1]) for first in self.zones.firsts(state[ZONE])
+            [Action(place, "timer", timer, way) for way in range(len(self.local.ends(state[AGENTS + place], timer)))]
+            for place, timer in running
         ]
 
-    def tied(self, state: State) -> dict[Action, frozenset[Action]]:
-        """The timers that may be the next to end, each with those that have to end at that very moment, and itself."""
-        firsts = self.firsts(state)
-        if self.bounds.timers_any:
-            return {action: frozenset((action,)) for action in firsts}
-        tied = self.zones.tied(state[ZONE])
-        return {action: frozenset(firsts[other] for other in tied[index]) for index, action in enumerate(firsts)}
+    def alternatives(self, state: State) -> Iterator[tuple[Action, frozenset[Action]]]:
+        """Each timer that may be the next to end, with those that have to end at that very moment, and itself.
+
+        And that for all that blocks may be to them: which of two is the older nobody can choose.
+        """
+        firsts = self._firsts(state)
+        tied = [(index,) for index in range(len(firsts))] if self.bounds.timers_any else self.zones.tied(state[ZONE])
+        for first, others in enumerate(tied):
+            together = [first, *[other for other in others if other != first]]
+            for actions in product(*(firsts[index] for index in together)):
+                yield actions[0], frozenset(actions)
 
     def ending(self, state: State) -> Iterator[tuple[Action, ...]]:
         """All sets of timers that may end in one instant, of each agent one at most; some of the sets cannot."""
@@ -108,7 +125,7 @@ class Swarm:
         for count in range(1, len(by_place) + 1):
             for places in combinations(by_place, count):
                 for actions in product(*(by_place[place] for place in places)):
-                    if not (self.bounds.apart and self.coincidences(state, actions)):
+                    if self._may_coincide(state, actions):
                         yield actions
 
     def actions(self, state: State) -> Iterator[tuple[Action, ...]]:
@@ -117,15 +134,15 @@ class Swarm:
         left = self.bounds.blocks - state[BLOCKS]
         for ending in self.ending(state):
             yield ending
-            if self.bounds.apart:
-                continue
             idle_hands = [place for place in alive if all(place != action.place for action in ending)]
             for count in range(1, min(left, len(idle_hands)) + 1):
                 for places in self._unlike(state, permutations(idle_hands, count)):
                     completed = (
                         Action(place, "complete", state[BLOCKS] + 1 + index) for index, place in enumerate(places)
                     )
-                    yield (*ending, *completed)
+                    actions = (*ending, *completed)
+                    if self._may_coincide(state, actions):
+                        yield actions
         if left:
             for (place,) in self._unlike(state, ((place,) for place in alive)):
                 yield (Action(place, "complete", state[BLOCKS] + 1),)
@@ -140,8 +157,11 @@ class Swarm:
         assert self.bounds.captured is not None, "it has somebody's keys"
         if state[LEFT] >> ONCE.index("captured") & 1:
             yield (Action(self.bounds.captured - 1, "captured"),)
-        elif state[LEFT] >= LIES:
+        elif _lies(state):
             yield from captor.lies(state[AGENTS:])
+
+    def _may_coincide(self, state: State, actions: Sequence[Action]) -> bool:
+        return self.bounds.coincidences is None or self.coincidences(state, actions) * COINCIDENCES <= state[LEFT]
 
     def coincidences(self, state: State, actions: Sequence[Action]) -> int:
         """How many moments have to be the same by chance for this to happen in one instant, and before all else."""
@@ -183,17 +203,19 @@ class Swarm:
                 self._known.clear()
             instant = self._known[key] = self._instant(*key, tell=False)
         if self._can_be(state, instant):
-            for agents, zone, _ in self._ordered(state, instant):
-                yield (state[BLOCKS] + instant.completed, _left(state, instant), zone, *agents)
+            left = self._left(state, actions, instant)
+            for agents, zone, *_ in self._ordered(state, instant, left):
+                yield (state[BLOCKS] + instant.completed, left, zone, *agents)
 
     def moves(self, state: State, actions: tuple[Action, ...], lossy: bool) -> Iterator[Move]:
         """The same, with how each comes about."""
         instant = self._instant(state[AGENTS:], actions, lossy, tell=True)
         if self._can_be(state, instant):
-            ordered = self._ordered(state, instant)
-            for outcome, (agents, zone, places) in zip(instant.outcomes, ordered, strict=True):
-                after = (state[BLOCKS] + instant.completed, _left(state, instant), zone, *agents)
-                yield Move(actions, after, places, outcome.wave, outcome.started)
+            left = self._left(state, actions, instant)
+            ordered = self._ordered(state, instant, left)
+            for outcome, there in zip(instant.outcomes, ordered, strict=True):
+                after = (state[BLOCKS] + instant.completed, left, there.zone, *there.agents)
+                yield Move(actions, after, there.places, outcome.wave, outcome.started, there.blocks)
 
     def _can_be(self, state: State, instant: _Instant) -> bool:
         """Whether these timers can end at once, before all others; it is known that each can by itself."""
@@ -201,17 +223,26 @@ class Swarm:
             return True
         return self.zones.after(state[ZONE], instant.ended, ()) is not None
 
-    def _ordered(self, state: State, instant: _Instant) -> Iterator[tuple[tuple[int, ...], int, Places]]:
+    def _ordered(self, state: State, instant: _Instant, left: int) -> Iterator[Ordered]:
+        completed = state[BLOCKS] + instant.completed
+        only_timers = self.bounds.reduced and completed >= self.bounds.blocks and not left % COINCIDENCES
         for outcome in instant.outcomes:
             zone = NOTHING_RUNS
             if not self.bounds.timers_any:
                 after = self.zones.after(state[ZONE], instant.ended, outcome.running)
                 assert after is not None, "these timers can end at once"
-                zone = after
+                zone = self.zones.adrift(after) if only_timers else after
             if self._order is None:
-                yield outcome.agents, zone, self._as_they_are
+                yield Ordered(outcome.agents, zone, self._as_they_are)
             else:
                 yield self._order.of(outcome.agents, zone)
+
+    def _left(self, state: State, actions: Sequence[Action], instant: _Instant) -> int:
+        """What may still befall."""
+        left = (state[LEFT] & instant.left) - instant.lies * LIES
+        if self.bounds.coincidences:
+            left -= self.coincidences(state, actions) * COINCIDENCES
+        return left
 
     def _instant(self, locals_: tuple[int, ...], actions: tuple[Action, ...], lossy: bool, *, tell: bool) -> _Instant:
         at = {timer: index + 1 for index, timer in enumerate(self._running(locals_))}
@@ -271,7 +302,7 @@ class Swarm:
 
         Somebody believed what the vehicle never sent, or holds a block in its name that it never completed.
         """
-        if state[LEFT] // LIES < self.bounds.lies:
+        if _lies(state) < self.bounds.lies:
             yield "1"
         if any(local != DEAD and self.local.known[local].deceived for local in state[AGENTS:]):
             yield "4"
@@ -284,6 +315,6 @@ class Swarm:
         return {self.local.known[local].chain for local in state[AGENTS:] if local != DEAD}
 
 
-def _left(state: State, instant: _Instant) -> int:
-    """What may still befall."""
-    return (state[LEFT] & instant.left) - instant.lies * LIES
+def _lies(state: State) -> int:
+    """How many lies may yet be told."""
+    return state[LEFT] % COINCIDENCES // LIES

@@ -108,7 +108,7 @@ class Votes:
     def _by_timer(self, state: State) -> Iterator[Iterator[State]]:
         """For each timer that may be the next to end what may follow if it does."""
         ending = [*self._swarm.ending(state)]
-        for action, tied in self._swarm.tied(state).items():
+        for action, tied in self._swarm.alternatives(state):
             if (action,) in ending:
                 yield (
                     after

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 
 Matrix = tuple[tuple[int, ...], ...]
 NOTHING_RUNS = 0
+EVER_US = 10**15
+"""Longer than anything runs."""
 
 
 class Zones:
@@ -22,6 +24,7 @@ class Zones:
         self._tied: dict[int, list[tuple[int, ...]]] = {}
         self._bounds: dict[int, list[tuple[int, ...]]] = {}
         self._permuted: dict[tuple[int, tuple[int, ...]], int] = {}
+        self._adrift: dict[int, int] = {}
         self._coincidences: dict[tuple[int, tuple[int, ...]], int] = {}
         self._intern(((0,),))
 
@@ -81,6 +84,19 @@ class Zones:
             matrix, order = self._matrices[zone], (0, *places)
             self._permuted[key] = self._intern(tuple(tuple(matrix[i][j] for j in order) for i in order))
         return self._permuted[key]
+
+    def adrift(self, zone: int) -> int:
+        """The zone whose timers differ as in this one, and may all have as much longer to run as you like.
+
+        Where nothing can happen before the first of them ends it makes no difference how long that takes.
+        """
+        if zone not in self._adrift:
+            matrix = [list(row) for row in self._matrices[zone]]
+            for timer in range(1, len(matrix)):
+                matrix[timer][0] = EVER_US + min(matrix[timer][1:])
+                matrix[0][timer] = min(0, *(row[timer] for row in matrix[1:]))
+            self._adrift[zone] = self._intern(tuple(map(tuple, matrix)))
+        return self._adrift[zone]
 
     def coincidences(self, zone: int, ended: tuple[int, ...]) -> int:
         """How many moments have to be the same by chance for these to be the next to end, and at once.

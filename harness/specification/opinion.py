@@ -164,8 +164,10 @@ def _config(bounds: Bounds) -> str:
         raise BoundsError("the specification is of --network lossless and lossy: any is looked at in another way")
     if bounds.faults:
         raise BoundsError("the specification has no faults: leave --faults out")
-    if bounds.apart:
-        raise BoundsError("the specification lets things happen at once by chance: it has no --timers apart")
+    if bounds.coincidences is not None:
+        raise BoundsError("the specification does not count coincidences: leave --coincidences out")
+    if bounds.clocks_any:
+        raise BoundsError("the specification has clocks that agree: leave --clocks any out")
     if bounds.captured is not None:
         raise BoundsError("the specification has nobody who lies: leave --captured out")
     if bounds.stagger:

@@ -4,8 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from harness.archive.record import Cycle
 from harness.prove import Bounds, Progress, in_words, prove
+from harness.prove.example import Example
 from harness.prove.explore import explore
+from harness.prove.livelock import Livelock
 from harness.prove.progress import Budget
 from harness.prove.swarm import Swarm
 from harness.prove.votes import Votes
@@ -24,7 +27,25 @@ def test_each_form_becomes_a_scenario_that_goes_round(tmp_path: Path, blocks: in
     assert livelock.cycle.period_s == pytest.approx(15.0)
     assert livelock.cycle.agents == [1, 2]
     assert {"vote_timer_expiration", "reconcile_finalize"} <= {step.handler for step in livelock.cycle.steps}
-    assert any("two moments have to be the same by chance" in line for line in in_words(proof))
+    assert any("two moments are the same by chance" in line for line in in_words(proof))
+
+
+@pytest.mark.parametrize(
+    ("coincidences", "goes_round", "contradictory", "expected"),
+    [
+        (0, True, False, "which takes no coincidence"),
+        (0, False, False, "crosses in the same way in every round"),
+        (2, True, False, "2 times two moments are the same by chance"),
+        (0, False, True, "as no clocks make them go"),
+        (None, False, False, "if timers can end like that"),
+    ],
+)
+def test_what_it_takes_is_said(
+    tmp_path: Path, coincidences: int | None, goes_round: bool, contradictory: bool, expected: str
+) -> None:
+    cycle = Cycle(since_s=1.0, period_s=15.0, agents=[1]) if goes_round else None
+    example = Example(tmp_path / "x.yaml", 1, {}, 1)
+    assert expected in Livelock(1, coincidences, (), example, cycle, contradictory).in_words()
 
 
 def test_a_way_round_is_found_also_if_not_everything_is_looked_at(
@@ -56,7 +77,7 @@ def test_of_timers_in_any_order_nothing_is_said_of_coincidence(tmp_path: Path) -
 
 
 def test_nothing_goes_round_if_nothing_is_at_once_by_chance(tmp_path: Path) -> None:
-    proof = prove(Bounds(2, 4, "lossless", apart=True), out=tmp_path / "none.yaml")
+    proof = prove(Bounds(2, 4, "lossless", coincidences=0), out=tmp_path / "none.yaml")
     assert proof.exit_status == 0
     assert proof.liveness is not None
     assert not proof.liveness.cycles
@@ -68,7 +89,7 @@ def test_one_more_vote_is_enough_for_three_agents_and_two_blocks(tmp_path: Path)
     proof = prove(Bounds(3, 2, "lossy"), out=tmp_path / "three.yaml")
     assert proof.liveness is not None
     assert proof.liveness.lost is proof.reluctant is None
-    assert proof.liveness.astray == [78, 0]
+    assert proof.liveness.astray == [68, 0]
 
 
 def test_what_needs_more_than_one_vote_is_a_scenario(tmp_path: Path) -> None:
