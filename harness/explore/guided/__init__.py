@@ -2,6 +2,7 @@
 
 change.py    a scenario changed by chance into another
 trial.py     one run, with a liveness phase at its end: what it reached, and what it showed
+ways.py      when timers ended in it, and who voted in vain on which way: what comes near a livelock
 identity.py  what a finding is, whichever run shows it
 hunt.py      changing, playing, keeping
 corpus.py    what is kept between nights, in a directory

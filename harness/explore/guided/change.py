@@ -16,6 +16,7 @@ from ucp.settings import Settings
 MOST_FATES = 12
 MOST_ENTRIES = 6
 """Of its timeline."""
+LINED_UP = 0.6
 AFTER_LAST_S = 30.0
 """So long after its last event a changed scenario goes on: a vote and a reconcile are over."""
 FEW_BLOCKS = 4
@@ -30,6 +31,8 @@ READINGS: dict[str, tuple[Any, ...]] = {
 TIMERS_S = tuple(
     getattr(Settings(), name) for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s")
 )
+NEAR_S = 0.03
+"""So near to each other two moments are when a message from the one arrives after the other."""
 DELAYS_S = (0.0, 0.06, 0.2, 1.0, 4.99, 5.02, 9.99, 10.02, 15.0, 20.0)
 """Of single messages: later than the next one, than a timer, than a round."""
 LATE_S = (0.001, 0.01, 0.03, 0.06, 0.2, 0.5)
@@ -46,8 +49,15 @@ class Limits(NamedTuple):
     last_s: float
 
 
-def changed(document: Document, other: Document, limits: Limits, lots: Random) -> Document:
-    """One to eight changes; now and then some of another document before them, or other agents of the roster."""
+def changed(
+    document: Document, other: Document, limits: Limits, lots: Random, timers_ended_s: Sequence[float] = ()
+) -> Document:
+    """One to eight changes; now and then some of another document before them, or other agents of the roster.
+
+    `timers_ended_s` is when timers ended in the document's run.
+    """
+    if timers_ended_s and lots.random() < LINED_UP:
+        document = _lined_up(document, timers_ended_s, lots)
     if lots.random() < 0.1:
         document = _spliced(document, other, lots)
     if lots.random() < 0.05:
@@ -112,6 +122,24 @@ def _in_step(document: Document, lots: Random) -> Document:
         others = [agent for agent in document["agents"] if agent != events[other]["agent"]]
         events[index]["agent"] = lots.choice(others)
     return with_events(document, events)
+
+
+def _lined_up(document: Document, timers_ended_s: Sequence[float], lots: Random) -> Document:
+    """Blocks are completed when a timer ended: those of some agents, or one that there is, or all from one on."""
+    moment = lots.choice(timers_ended_s)
+
+    def near() -> float:
+        return round(max(0.5, moment + lots.choice((0.0, lots.uniform(-NEAR_S, NEAR_S)))), 3)
+
+    events = list(script(document))
+    index = lots.randrange(len(events) + 1)
+    if index == len(events):
+        agents = lots.sample(document["agents"], lots.randint(1, len(document["agents"])))
+        return with_events(document, [*events, *({"at_s": near(), "agent": agent} for agent in agents)])
+    later_s = near() - events[index]["at_s"]
+    until = len(events) if lots.random() < 0.5 else index + 1
+    moved = [{**event, "at_s": round(event["at_s"] + later_s, 3)} for event in events[index:until]]
+    return with_events(document, [*events[:index], *moved, *events[until:]])
 
 
 def with_events(document: Document, events: Sequence[Document]) -> Document:

@@ -95,7 +95,7 @@ class Finding(BaseModel):
 class _Findings(BaseModel):
     model_config = ConfigDict(populate_by_name=True)
 
-    schema_: Literal["ucp-findings/1"] = Field(default="ucp-findings/1", alias="schema")
+    schema_: Literal["ucp-findings/2"] = Field(default="ucp-findings/2", alias="schema")
     findings: Annotated[list[Finding], Field(max_length=MOST_FINDINGS)] = []
 
 

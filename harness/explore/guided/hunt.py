@@ -21,6 +21,7 @@ from harness.explore.guided.beyond import Beyond
 from harness.explore.guided.change import Limits, changed
 from harness.explore.guided.identity import Identity
 from harness.explore.guided.trial import Apart, Tried, tried, with_liveness_phase
+from harness.explore.guided.ways import Ways
 from harness.run.sweep import Failed, sweep
 from harness.scenario import Scenario
 
@@ -29,7 +30,12 @@ ROUND = 64
 MOST_KEPT = 3000
 """Documents that are kept; those that gave least for their length go first."""
 MOST_FAILED = 100
+MOST_WAYS = 100_000
+"""When so many ways are known on which votes failed, others are not told from them: 50 MB."""
+WORTH_OF_WAYS = 100
+"""Local states for which new ways count on which votes failed."""
 NEWEST = 24
+NEAR = 0.6
 SEEDS = 1 << 16
 
 
@@ -46,17 +52,25 @@ class Candidate(NamedTuple):
 
 @dataclass
 class Kept:
-    """A candidate that reached something new: `gave` local states for `steps` handler runs."""
+    """A candidate that gave something new: `gave` local states, or what counts as such, for `steps` handler runs."""
 
     candidate: Candidate
     gave: int
     steps: int
+    failed: int
+    """Votes that failed one after the other, on ways on which nobody had gone before."""
+    timers_ended_s: tuple[float, ...]
     picked: int = 0
 
     @property
     def worth(self) -> float:
         """How promising it is to change it."""
         return (1 + self.gave) / (1 + self.picked) / (100 + self.steps)
+
+    @property
+    def nearness(self) -> float:
+        """How promising it is to look for a livelock near it; 0 if votes did not fail in vain."""
+        return self.failed**2 / (1 + self.picked) / (100 + self.steps)
 
 
 @dataclass(frozen=True)
@@ -66,6 +80,8 @@ class News:
     reached: Reached
     found: tuple[Identity, ...]
     apart: Apart | None
+    timers_ended_s: tuple[float, ...]
+    in_vain: Ways
 
     @classmethod
     def of(cls, run: Tried, known: Reached) -> "News":
@@ -76,7 +92,7 @@ class News:
             run.reached.steps,
             run.reached.untold,
         )
-        return cls(new, run.found, run.apart)
+        return cls(new, run.found, run.apart, run.timers_ended_s, run.in_vain)
 
 
 @dataclass
@@ -101,6 +117,8 @@ class Hunt:
     _dropped: list[Candidate] = field(default_factory=list)
     _apart: set[Apart] = field(default_factory=set)
     """How chains differed at rest: of each way the first is played again, with a final reconcile."""
+    _in_vain: set[Ways] = field(default_factory=set)
+    """How agents went on while votes failed: of each way the first run is kept."""
     _to_reconcile: list[Candidate] = field(default_factory=list)
 
     def begin(self, candidates: Iterable[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
@@ -153,9 +171,14 @@ class Hunt:
         pairs = _taken_down(news.reached.pairs, self.reached.pairs, self.pairs_beyond)
         branches = any(branch not in self.reached.branches for branch in news.reached.branches)
         self.reached.add(news.reached)
+        failed = 0
+        if news.in_vain and news.in_vain not in self._in_vain and len(self._in_vain) < MOST_WAYS:
+            self._in_vain.add(news.in_vain)
+            failed = sum(way.count("voting") for way in news.in_vain)
+            gave += WORTH_OF_WAYS
         if not (gave or branches or pairs):
             return False
-        self.kept.append(Kept(candidate, gave, news.reached.steps))
+        self.kept.append(Kept(candidate, gave, news.reached.steps, failed, news.timers_ended_s))
         if len(self.kept) > MOST_KEPT:
             least = min(self.kept[:-NEWEST], key=lambda kept: kept.worth)
             self.kept.remove(least)
@@ -176,13 +199,20 @@ class Hunt:
         lots, kept = self.lots, self._pick(worth)
         kept.picked += 1
         other = lots.choice(self.kept).candidate.document
-        document = with_key(changed(kept.candidate.document, other, self.limits, lots), "final_reconcile", None)
+        document = changed(kept.candidate.document, other, self.limits, lots, kept.timers_ended_s)
+        document = with_key(document, "final_reconcile", None)
         return Candidate(document, kept.candidate.seed if lots.random() < 0.8 else lots.randrange(SEEDS))
 
     def _pick(self, worth: Sequence[float]) -> Kept:
-        """One of the newest as often as any of the others, which are picked by their worth, here summed up."""
+        """One of the newest as often as any of the others, which are picked by their worth, here summed up; or, more
+        often than that, by how near a livelock they came.
+        """
         if self.lots.random() < 0.5:
             return self.lots.choice(self.kept[-NEWEST:])
+        if self.lots.random() < NEAR:
+            near = [kept for kept in self.kept if kept.failed]
+            if near:
+                return self.lots.choices(near, [kept.nearness for kept in near])[0]
         return self.lots.choices(self.kept, cum_weights=worth)[0]
 
 

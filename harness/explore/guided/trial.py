@@ -9,8 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from harness.archive.record import Cycle
-from harness.checker import Result
+from harness.checker import Evidence, Result
 from harness.checker.evidence import Watch
 from harness.checker.uniform_chain import common_prefix
 from harness.coverage import Reached, Watcher
@@ -18,6 +17,7 @@ from harness.coverage.simulated import simulate_watched
 from harness.explore.document import Document, at, cut_after, document_of, timeline, with_key
 from harness.explore.guided.change import AFTER_LAST_S, FEW_BLOCKS, Limits, with_events
 from harness.explore.guided.identity import Identity, identities
+from harness.explore.guided.ways import Ways, in_vain, timers_ended
 from harness.explore.recording import Logged, record
 from harness.gc_pause import gc_paused
 from harness.play.simulation.foreign.failure import AgentFailedError
@@ -48,15 +48,25 @@ class Tried:
     found: tuple[Identity, ...]
     apart: Apart | None = None
     """How chains differ at rest, where nobody has been told to reconcile finally."""
+    timers_ended_s: tuple[float, ...] = ()
+    """When timers of agents ended, up to when conditions were cleared; in order."""
+    in_vain: Ways = ()
+    """How agents went on in the liveness phase while votes failed, and none was approved."""
 
 
 @gc_paused()
 def tried(scenario: Scenario, seed: int) -> Tried:
     """Play it. Raises HarnessError if it cannot be played."""
     watcher = Watcher()
-    result, cycle = _played(scenario, seed, watcher.step)
+    result, evidence = _played(scenario, seed, watcher.step)
     apart = None if scenario.final_reconcile or result.bad else _apart(result)
-    return Tried(watcher.reached, identities(result, cycle, scenario), apart)
+    found = identities(result, evidence.cycle if evidence else None, scenario)
+    if evidence is None:
+        return Tried(watcher.reached, found)
+    ended = timers_ended(evidence)
+    moments = tuple(sorted({round(each.at_s, 3) for each in ended if each.at_s <= scenario.duration_s}))
+    ways = in_vain([each for each in ended if each.at_s > scenario.duration_s])
+    return Tried(watcher.reached, found, apart, moments, ways)
 
 
 def _apart(result: Result) -> Apart | None:
@@ -69,16 +79,16 @@ def _apart(result: Result) -> Apart | None:
 
 def found_in(scenario: Scenario, seed: int) -> tuple[Identity, ...]:
     """What the very run of the scenario shows. Raises HarnessError if it cannot be played."""
-    result, cycle = _played(scenario, seed, lambda state, run: None)
-    return identities(result, cycle, scenario)
+    result, evidence = _played(scenario, seed, lambda state, run: None)
+    return identities(result, evidence.cycle if evidence else None, scenario)
 
 
-def _played(scenario: Scenario, seed: int, watch: Watch) -> tuple[Result, Cycle | None]:
+def _played(scenario: Scenario, seed: int, watch: Watch) -> tuple[Result, Evidence | None]:
     try:
         simulated = simulate_watched(scenario, seed, watch)
     except AgentFailedError as error:
         return ended_by(error), None
-    return simulated.result, simulated.evidence.cycle
+    return simulated.result, simulated.evidence
 
 
 def with_liveness_phase(document: Document) -> Document:

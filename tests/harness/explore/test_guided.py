@@ -1,23 +1,30 @@
 """A hunt finds what seeds alone do not, is the same however many play it, and goes on from night to night."""
 
+import dataclasses
 import json
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
+from harness.archive.record import Cycle
+from harness.checker.judgement import Judgement
+from harness.coverage import Reached
 from harness.errors import RunDirectoryError
-from harness.explore.document import document_of
+from harness.explore.document import document_of, script
 from harness.explore.guided import Night, spend
 from harness.explore.guided.change import changed
 from harness.explore.guided.corpus import MOST_BYTES, opened
-from harness.explore.guided.hunt import Candidate, Hunt
+from harness.explore.guided.hunt import Candidate, Hunt, Kept
+from harness.explore.guided.identity import identities
 from harness.explore.guided.trial import (
+    Tried,
     beginnings,
     found_in,
     tried,
@@ -26,6 +33,7 @@ from harness.explore.guided.trial import (
 )
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
+from harness.scenario.library import find
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 
 ORDINARY = {
@@ -67,6 +75,69 @@ def test_equal_lots_make_equal_changes_and_most_can_be_played() -> None:
         except ValidationError:
             continue
     assert playable > 100
+
+
+def test_blocks_are_completed_when_a_timer_ended() -> None:
+    limits, ((document, _), *_) = beginnings(ordinary(agents=3), range(1))
+
+    def lined_up(timers_ended_s: tuple[float, ...]) -> int:
+        lots = Random(1)
+        documents = [changed(document, document, limits, lots, timers_ended_s) for _ in range(200)]
+        return sum(any(abs(event["at_s"] - 17.123) <= 0.03 for event in script(document)) for document in documents)
+
+    assert lined_up((17.123,)) > 40
+    assert lined_up(()) < 5
+
+
+def test_of_a_run_it_is_known_when_timers_ended_and_which_votes_failed_in_vain() -> None:
+    round_about = tried(load_scenario(find(Path("refused_by_the_third"))), 1)
+    assert 11.0 in round_about.timers_ended_s
+    assert round_about.timers_ended_s == tuple(sorted(round_about.timers_ended_s))
+    assert len(round_about.in_vain) == 2
+    assert {timer for way in round_about.in_vain for timer in way} == {"voting", "phase one", "phase two"}
+    at_rest = tried(Scenario.model_validate({**ORDINARY, "network": {}}), 1)
+    assert (bool(at_rest.timers_ended_s), at_rest.in_vain) == (True, ())
+
+
+def test_who_votes_in_vain_in_a_new_way_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the local states of it are all known."""
+    limits, ((document, seed), *_) = beginnings(ordinary(), range(1))
+    ways = iter((("voting", "phase one", "voting"),) * 2 + (("voting", "voting"),))
+    monkeypatch.setattr(
+        "harness.explore.guided.hunt.tried", lambda scenario, seed: Tried(Reached(), (), in_vain=(next(ways),))
+    )
+    hunt = Hunt(limits, Random(1))
+    assert [kept for _, kept in hunt.begin([Candidate(document, seed)] * 3, 1)] == [True, False, True]
+
+
+def test_what_came_near_a_livelock_is_changed_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits, ((document, seed), *_) = beginnings(ordinary(), range(1))
+    monkeypatch.setattr("harness.explore.guided.hunt.tried", lambda scenario, seed: Tried(Reached(), ()))
+    near = Kept(Candidate(document, seed), gave=1, steps=100, failed=3, timers_ended_s=())
+    others = [dataclasses.replace(near, failed=0) for _ in range(100)]
+    hunt = Hunt(limits, Random(1), kept=[near, *others])
+    for _ in hunt.round(1):
+        pass
+    assert near.picked > 5 > max(other.picked for other in others[:50])
+
+
+def test_livelocks_are_told_apart_by_the_timers_on_the_way_round() -> None:
+    def shape(*ways: str) -> str:
+        letters = {"v": "vote", "1": "reconcile_phase_1", "2": "reconcile_phase_2", "f": "finalize"}
+        steps = [
+            {"agent_id": agent_id, "after_s": float(number), "handler": f"{letters[letter]}_timer_expiration"}
+            for agent_id, way in enumerate(ways, 1)
+            for number, letter in enumerate(way)
+        ]
+        cycle = Cycle.model_validate({"since_s": 1, "period_s": 20, "agents": [1, 2], "steps": steps})
+        judgement = Judgement("Liveness", "never finishes", "round in circles")
+        result = SimpleNamespace(judgements={"liveness": judgement}, bad=["liveness"], chains={})
+        (identity,) = identities(result, cycle, ordinary())  # type: ignore[arg-type]
+        return identity.shape
+
+    assert shape("v12", "12v") == "2 agents going round every 20 s (voting, phase one, phase two)"
+    assert shape("2v12v1", "vf12") == shape("v12", "12v"), "twice round, entered elsewhere, with what is no timer"
+    assert shape("v12", "v1") == shape("1v", "2v1") != shape("v12", "v12")
 
 
 def test_in_the_liveness_phase_everybody_hears_everybody() -> None:
@@ -144,7 +215,7 @@ def test_an_agent_alone_that_others_refuse_for_ever_is_shown_by_a_short_document
         "timeline": [{"at_s": 112.943, "network": {"loss": 0.0}}],
     }
     (finding,) = tried(Scenario.model_validate(document), 3).found
-    assert str(finding) == "liveness never finishes, 1 agent going round every 20 s"
+    assert str(finding) == "liveness never finishes, 1 agent going round every 20 s (voting, phase one, phase two)"
 
 
 def test_nights_tell_new_ongoing_and_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,7 +255,7 @@ def test_hostile_files_are_left_out_with_a_sentence(tmp_path: Path) -> None:
     (directory / "runs" / "00000000000b-seed-1.yaml").write_text("{" + " " * MOST_BYTES)
     (directory / "runs" / "00000000000c-seed-1.yaml").symlink_to("/dev/zero")
     (directory / "runs" / "mine.txt").write_text("mine")
-    (directory / "findings.json").write_text('{"schema": "ucp-findings/1", "findings": [{}]}')
+    (directory / "findings.json").write_text('{"schema": "ucp-findings/2", "findings": [{}]}')
     (directory / "nights" / "20260101T000000Z.json").write_text('{"local_states": 1' + "0" * 400 + "}")
     again = night(directory, runs=1)
     assert len(again.left_out) == len(hostile) + 6, again.left_out
