@@ -16,6 +16,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from harness.errors import WRONG_REQUEST, HarnessError, MachineError
+from harness.gc_pause import gc_paused
 
 MAX_NAME = 200
 """More of a file's name is not shown."""
@@ -157,7 +158,8 @@ class Commands(TyperGroup):
 def loaded(name: str) -> Any:
     """The command in full, or the group of commands."""
     module, _, attribute = COMMANDS[name][0].partition(":")
-    command = getattr(import_module(module), attribute)
+    with gc_paused():
+        command = getattr(import_module(module), attribute)
     if isinstance(command, TyperCommand):
         return command
     if isinstance(command, typer.Typer):

@@ -1,7 +1,7 @@
 """Python's cycle collector, for what makes a million objects and no cycle: it would look at them again and again.
 
-For handler runs, made by a simulation or read for a report, that is a third of the time. A simulated run leaves no
-cycles: all of it goes when it is let go.
+For handler runs, made by a simulation or read for a report, that is a third of the time; of the import of a command
+an eighth. A simulated run leaves no cycles: all of it goes when it is let go.
 """
 
 import contextlib
