@@ -15,7 +15,7 @@ from harness.cli import COMMANDS
 from tests.harness.command import COMMAND, harness, sentences, write_scenario
 from tests.harness.mission import CONNECTED, fly, write_run
 
-ITS_OWN = {"harness", "harness.cli", "harness.errors"}
+ITS_OWN = {"harness", "harness.cli", "harness.errors", "harness.gc_pause"}
 
 
 def test_help_imports_no_command() -> None:
@@ -28,6 +28,16 @@ print(*(name for name in sys.modules if name.split(".")[0] in ("harness", "ucp",
 """
     listed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert set(listed.stdout.split()) == ITS_OWN
+
+
+def test_whoever_flies_no_vehicle_imports_no_mavlink() -> None:
+    script = """
+import sys
+import harness.commands.check, harness.commands.run
+print(*(name for name in sys.modules if name.startswith("pymavlink")))
+"""
+    listed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert listed.stdout.split() == []
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,13 @@ from netem.errors import UmlError
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences, write_scenario
 
 QUICK = {"agents": 2, "duration_s": 20, "speedup": 20, "events": {"source": "random", "mean_s": 2}}
+WAITING = """
+import sys
+from pathlib import Path
+from netem import uml
+waiting = "trap 'echo Ctrl-C; exit 130' INT; echo here; while :; do sleep 0.1; done"
+sys.exit(uml.run(["sh", "-c", waiting], cwd=Path("/"), env={"PATH": uml.SYSTEM_PATH}))
+"""
 
 
 @pytest.mark.uml
@@ -33,30 +41,42 @@ def test_a_run_leaves_verdict_report_and_status_as_on_the_host(tmp_path: Path) -
 
 
 @pytest.mark.uml
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.whoever
-def test_an_interrupted_run_is_exported_and_judged(tmp_path: Path, number: signal.Signals) -> None:
-    with _Started(tmp_path) as started:
-        started.wait_for_mission()
-        started.process.send_signal(number)
+def test_a_shell_reaches_inside_and_an_interrupted_run_is_exported_and_judged(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    scenario = write_scenario(tmp_path, **{**QUICK, "duration_s": 100_000})
+    asked = ("run", str(scenario), "--kernel", "uml", "--vehicles", "none", "--out", str(run))
+    with _Started(tmp_path, *COMMAND, *asked) as started:
+        started.wait_for("mission;")
+        assert f"{run}: in User Mode Linux\n" in harness("shell").stdout
+        inside = harness("shell", run, 2, "--", "sh", "-c", "ip -brief address; exit 7", deadline_s=DEADLINE_S)
+        assert (inside.returncode, "10.77.0.2/14" in inside.stdout) == (7, True), inside
+        started.process.send_signal(signal.SIGINT)
         rest, errors = started.process.communicate(timeout=DEADLINE_S)
     assert started.process.returncode == 130
     assert "interrupted at mission second" in errors
     assert "holds" in rest
-    assert {path.name for path in tmp_path.glob("run/agents/*.chain.json")} == {"1.chain.json", "2.chain.json"}
-    assert (tmp_path / "run" / "report.html").exists()
+    assert {path.name for path in run.glob("agents/*.chain.json")} == {"1.chain.json", "2.chain.json"}
+    assert (run / "report.html").exists()
     started.wait_until_nothing_is_left()
 
 
 @pytest.mark.uml
-def test_a_shell_reaches_inside_and_a_killed_harness_leaves_nothing_behind(tmp_path: Path) -> None:
-    with _Started(tmp_path) as started:
-        started.wait_for_mission()
+@pytest.mark.whoever
+def test_sigterm_reaches_the_command_as_ctrl_c(tmp_path: Path) -> None:
+    with _Started(tmp_path, sys.executable, "-c", WAITING) as started:
+        started.wait_for("here")
+        started.process.terminate()
+        rest, _ = started.process.communicate(timeout=DEADLINE_S)
+    assert (started.process.returncode, rest) == (130, "Ctrl-C\n")
+    started.wait_until_nothing_is_left()
+
+
+@pytest.mark.uml
+@pytest.mark.whoever
+def test_whoever_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
+    with _Started(tmp_path, sys.executable, "-c", WAITING) as started:
+        started.wait_for("here")
         assert started.left()
-        run = tmp_path / "run"
-        assert f"{run}: in User Mode Linux\n" in harness("shell").stdout
-        inside = harness("shell", run, 2, "--", "sh", "-c", "ip -brief address; exit 7", deadline_s=DEADLINE_S)
-        assert (inside.returncode, "10.77.0.2/14" in inside.stdout) == (7, True), inside
         started.process.kill()
         started.process.wait()
         started.wait_until_nothing_is_left()
@@ -118,26 +138,25 @@ def _run(script: str) -> int:
 
 
 class _Started:
-    """A long run in User Mode Linux; `temporary` is where it keeps what should be gone in the end."""
+    """A program that starts User Mode Linux; `temporary` is where it keeps what should be gone in the end."""
 
-    def __init__(self, folder: Path) -> None:
-        scenario = write_scenario(folder, **{**QUICK, "duration_s": 100_000})
+    def __init__(self, folder: Path, *command: str) -> None:
         self.temporary = folder / "tmp"
         self.temporary.mkdir()
         self.process = subprocess.Popen(
-            [*COMMAND, "run", str(scenario), "--kernel", "uml", "--vehicles", "none", "--out", str(folder / "run")],
+            command,
             env={**os.environ, "TMPDIR": str(self.temporary)},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
 
-    def wait_for_mission(self) -> None:
+    def wait_for(self, word: str) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            if "mission;" in line:
+            if word in line:
                 return
-        pytest.fail(f"it ended before the mission: {self.process.communicate()}")
+        pytest.fail(f"it ended before it said {word}: {self.process.communicate()}")
 
     def left(self) -> list[str]:
         """The processes of its User Mode Linux: their command lines name its directory."""

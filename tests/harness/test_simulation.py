@@ -85,13 +85,13 @@ timelines = st.lists(
     st.sampled_from(
         [
             {"at_s": 50, "partition": [[1, 2], [3]]},
-            {"at_s": 150, "heal": True},
-            {"at_s": 200, "loss": 0.5},
-            {"at_s": 260, "pause": [2]},
-            {"at_s": 300, "kill": [1]},
-            {"at_s": 300.01, "restart": [1]},
-            {"at_s": 330, "resume": [2]},
-            {"at_s": 211, "reboot": [3], "down_s": 10, "disk": "kept"},
+            {"at_s": 110, "heal": True},
+            {"at_s": 150, "loss": 0.5},
+            {"at_s": 195, "pause": [2]},
+            {"at_s": 225, "kill": [1]},
+            {"at_s": 225.01, "restart": [1]},
+            {"at_s": 250, "resume": [2]},
+            {"at_s": 158, "reboot": [3], "down_s": 10, "disk": "kept"},
         ]
     ),
     unique_by=lambda entry: float(entry["at_s"]),  # type: ignore[arg-type]
@@ -111,7 +111,7 @@ def playable(timeline: list[dict[str, Any]]) -> bool:
     schedule=st.sampled_from(
         [
             [],
-            [{"ramp": {"delay": [8.0, 0.0]}, "from_s": 100, "until_s": 200, "every_s": 50}],
+            [{"ramp": {"delay": [8.0, 0.0]}, "from_s": 75, "until_s": 150, "every_s": 37.5}],
             [{"nemesis": "bridge", "every_s": 60, "for_s": 30}, {"ramp": {"loss": [0, 0.6], "delay": [0.0, 4.0]}}],
         ]
     ),
@@ -134,7 +134,7 @@ def test_what_is_not_delivered_would_have_changed_nothing(
     """Delivering all N² messages gives the same exports, figures and effective handler runs, to the last byte."""
     one = scenario(
         agents=agents,
-        duration_s=400,
+        duration_s=300,
         network=network,
         timeline=timeline,
         schedule=schedule,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,9 +17,13 @@ PROGRAMS = Path(__file__).with_name("registers")
 SECONDS = 3
 
 
-@pytest.fixture(params=["as here", "preloaded"])
+KERNEL = shutil.which("linux.uml")
+WAYS = ["as here"] if uml_registers.needed(Path(KERNEL) if KERNEL else None) else ["as here", "preloaded"]
+
+
+@pytest.fixture(params=WAYS)
 def guest(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """User Mode Linux as this processor has it, and with the library that keeps registers, wanted or not."""
+    """User Mode Linux as this processor has it, and with the library that keeps registers where it is not wanted."""
     if request.param == "preloaded":
         monkeypatch.setenv(uml_registers.FORCE, "1")
     require_uml()

@@ -47,20 +47,21 @@ def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def scenario(tmp_path: Path) -> Path:
-    path = tmp_path / "week.yaml"
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("asked") / "week.yaml"
     path.write_text(json.dumps(SCENARIO))
     return path
 
 
-@pytest.fixture
-def records(tmp_path: Path, scenario: Path) -> Path:
+@pytest.fixture(scope="module")
+def records(tmp_path_factory: pytest.TempPathFactory, scenario: Path) -> Path:
     """What came home from a flight with a right core."""
-    played = harness("run", scenario, "--backend", "sim", "--seed", 1, "--out", tmp_path / "run")
-    assert (tmp_path / "run/run.json").exists(), played.stderr
-    home = tmp_path / "home"
-    shutil.copytree(tmp_path / "run/agents", home)
+    directory = tmp_path_factory.mktemp("flown")
+    played = harness("run", scenario, "--backend", "sim", "--seed", 1, "--out", directory / "run")
+    assert (directory / "run/run.json").exists(), played.stderr
+    home = directory / "home"
+    shutil.copytree(directory / "run/agents", home)
     return home
 
 

@@ -2,7 +2,6 @@
 
 import base64
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +14,7 @@ from harness.depot.page import draw
 from harness.depot.reconcile import reconcile
 from tests.harness.depot.exports import brought, document, made, write_exports
 from tests.harness.mission import write_exports as write_flown
-from tests.harness.report.browser import Browser, open_browser
+from tests.harness.report.browser import Browser
 from tests.harness.report.test_page import HOSTILE, Reader
 from tests.harness.test_chain_command import fly_vehicles
 
@@ -111,12 +110,6 @@ def test_of_columns_that_nobody_could_tell_apart_a_page_stays_small(tmp_path: Pa
 
 
 # In a browser
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with open_browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

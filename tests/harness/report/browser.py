@@ -35,7 +35,7 @@ def chromium_or_skip() -> str:
 
 
 class Browser:
-    """One page. `complaints` collects what its console and its security policy have to say."""
+    """One page at a time. `complaints` collects what its console and its security policy have to say."""
 
     def __init__(self, to_browser: int, from_browser: int) -> None:
         self._to, self._from = to_browser, from_browser
@@ -44,10 +44,19 @@ class Browser:
         self._loaded = False
         self._session: str | None = None
         self.complaints: list[str] = []
-        target = self._call("Target.createTarget", url="about:blank")["targetId"]
+
+    @contextlib.contextmanager
+    def fresh(self) -> Iterator["Browser"]:
+        """With an empty page that shares nothing with pages before it, as if the browser had just been started."""
+        self.complaints = []
+        context = self._call("Target.createBrowserContext")["browserContextId"]
+        target = self._call("Target.createTarget", url="about:blank", browserContextId=context)["targetId"]
         self._session = self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log"):
             self._call(f"{domain}.enable")
+        yield self
+        self._session = None
+        self._call("Target.disposeBrowserContext", browserContextId=context)
 
     def show(self, page: Path | str, *, width: int, scheme: Literal["light", "dark"], height: int = 800) -> None:
         self._call(
