@@ -30,18 +30,18 @@ extern void *dlsym(void *handle, const char *name);
 #define SPARE 496      /* for a number: eight of those that software may use */
 #define IN_USE 512     /* a bit for each part that is not as it was in the beginning */
 #define AVX_512 0xe0UL /* of these: what AVX-512 adds */
-#define FRAME 832      /* all up to AVX */
-#define KNOWN 2696     /* all up to AVX-512 and protection keys: what User Mode Linux has room for */
+#define FRAME 832      /* all up to AVX, on any processor: only where the rest lies differs between makers */
+#define ROOM 2696      /* what User Mode Linux has room for */
 
 #define NUMBERS 16384  /* that are remembered: a handler may take a second */
 
 static unsigned char state[1 << 20];
 static struct {
 	unsigned long number;
-	unsigned char rest[KNOWN - FRAME];
+	unsigned char rest[ROOM - FRAME];
 } remembered[NUMBERS];
 
-static void remember(unsigned char *known)
+static void remember(unsigned char *known, unsigned long length)
 {
 	static unsigned long last;
 	unsigned long number = 0;
@@ -49,17 +49,17 @@ static void remember(unsigned char *known)
 	if (*(unsigned long *)(known + IN_USE) & AVX_512) {
 		number = ++last;
 		remembered[number % NUMBERS].number = number;
-		__builtin_memcpy(remembered[number % NUMBERS].rest, known + FRAME, KNOWN - FRAME);
+		__builtin_memcpy(remembered[number % NUMBERS].rest, known + FRAME, length - FRAME);
 	}
 	*(unsigned long *)(known + SPARE) = number;
 }
 
-static void recall(unsigned char *known)
+static void recall(unsigned char *known, unsigned long length)
 {
 	unsigned long number = *(unsigned long *)(known + SPARE);
 
 	if (number && remembered[number % NUMBERS].number == number)
-		__builtin_memcpy(known + FRAME, remembered[number % NUMBERS].rest, KNOWN - FRAME);
+		__builtin_memcpy(known + FRAME, remembered[number % NUMBERS].rest, length - FRAME);
 }
 
 long ptrace(int request, int pid, void *address, void *data)
@@ -67,6 +67,7 @@ long ptrace(int request, int pid, void *address, void *data)
 	static ptrace_function *next;
 	struct iovec whole = {state, sizeof state};
 	struct iovec *known = data;
+	int all_known;
 
 	if (!next)
 		next = (ptrace_function *)dlsym(RTLD_NEXT, "ptrace");
@@ -77,14 +78,15 @@ long ptrace(int request, int pid, void *address, void *data)
 		return -1;
 	if (known->length > whole.length)
 		known->length = whole.length;
+	all_known = known->length > FRAME && known->length <= ROOM;
 	if (request == PTRACE_GETREGSET) {
 		__builtin_memcpy(known->base, state, known->length);
-		if (known->length == KNOWN)
-			remember(known->base);
+		if (all_known)
+			remember(known->base, known->length);
 		return 0;
 	}
 	__builtin_memcpy(state, known->base, known->length);
-	if (known->length == KNOWN)
-		recall(state);
+	if (all_known)
+		recall(state, known->length);
 	return next(PTRACE_SETREGSET, pid, NT_X86_XSTATE, &whole);
 }
