@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from harness.prove.alone import collect
 from harness.prove.bounds import Bounds
 from harness.prove.explore import explore
-from harness.prove.local import DEAD, LocalStates
+from harness.prove.known import DEAD
+from harness.prove.local import LocalStates
 from harness.prove.progress import Ended
 from harness.prove.shape import Held, Shape, shape_of
 from harness.prove.swarm import Swarm

@@ -5,7 +5,12 @@ snapshot.py   an agent's whole state: copied, put back, as a key
 flaws.py      what must never be at one agent
 parts.py      the parts of states, each once
 blocks.py     which blocks a state is about, and the same state about others
-local.py      local states by number; each step computed once, by the real agent
+known.py      local states by number, and by which names they know the others
+agents.py     the real agents, put into whatever state is looked at
+step.py       what an input makes of an agent
+local.py      each step from each local state, computed once, by the real agent
+tallies.py    what tallies decide, so that the rest of them may be forgotten
+reduction.py  what agents must not do where states that behave alike are one
 reference.py  whether a step is that of a right agent
 zones.py      how long timers have yet to run, compared with each other
 instant.py    what an instant makes of the agents: who hears what in which order, and loses what

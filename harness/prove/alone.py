@@ -14,9 +14,11 @@ from dataclasses import dataclass, field
 from harness.prove.bounds import Bounds
 from harness.prove.captor import Heard
 from harness.prove.flaws import Flaw
+from harness.prove.known import DEAD
 from harness.prove.letters import Material
-from harness.prove.local import DEAD, LocalStates, Step
+from harness.prove.local import LocalStates
 from harness.prove.progress import Ended, Progress, memory_bytes
+from harness.prove.step import Step
 from harness.prove.zones import NOTHING_RUNS, Zones
 
 LOOK_EVERY = 500
@@ -237,7 +239,7 @@ class _Division:
         """The blocks that must have been completed for the message to be sent: it names them, or a chain of them."""
         named = self._names.get(message)
         if named is None:
-            named = self._names[message] = self.local.blocks_named(message)
+            named = self._names[message] = self.local.blocks.named_in(self.local.messages[message])
         return named
 
     def _go(

@@ -10,9 +10,12 @@ from functools import cache
 from harness.prove.snapshot import Snapshot, replaced
 from ucp.block import Block, InceptionBlock, next_chain_hash
 from ucp.chain import Chain
+from ucp.messages import Message
 
 Ordinals = tuple[int, ...]
 """Blocks by number: the how manieth of all it is."""
+Completed = tuple[bytes, int, int]
+"""A block that was completed: its hash, of whom, by the agent's number here, and its number."""
 
 
 class Blocks:
@@ -21,10 +24,31 @@ class Blocks:
     def __init__(self, inception: InceptionBlock, make: Callable[[int], Block]) -> None:
         self.numbers: dict[bytes, int] = {}
         """Of a block, by its hash."""
+        self.makers: dict[bytes, int] = {}
+        """Who completed it, by its hash."""
+        self.completed: list[Completed] = []
+        """As they were."""
         self._inception = inception
         self._chains: dict[bytes, Ordinals] = {inception.chain_hash: ()}
         """The blocks of a chain, the oldest first, by its chain hash."""
         self._block = cache(make)
+
+    def note_completed(self, blocks: Iterable[Completed]) -> None:
+        """These blocks were completed, here or in another process."""
+        for block_hash, agent_id, ordinal in blocks:
+            if block_hash not in self.makers:
+                self.makers[block_hash] = agent_id
+                self.numbers[block_hash] = ordinal
+                self.completed.append((block_hash, agent_id, ordinal))
+
+    def completed_by(self, agent_id: int, ordinal: int) -> bytes:
+        """The hash of the `ordinal`th block of all, which this agent has completed."""
+        return next(made for made, maker, number in self.completed if (maker, number) == (agent_id, ordinal))
+
+    def in_words(self, block_hash: str) -> str:
+        """A block for people, by its hash."""
+        ordinal = self.numbers.get(bytes.fromhex(block_hash))
+        return f"#{ordinal}" if ordinal else block_hash[:12]
 
     def learn_chain(self, chain: Chain) -> None:
         below: Ordinals = ()
@@ -38,6 +62,12 @@ class Blocks:
         """The blocks that a hash names: a block's itself, a chain's all of it; none if it is neither."""
         number = self.numbers.get(digest)
         return self._chains.get(digest, ()) if number is None else (number,)
+
+    def named_in(self, message: Message) -> frozenset[int]:
+        """The blocks that a message names, by themselves or as those of a chain."""
+        fields = (getattr(message, name) for name in message.__slots__)
+        hashes = [field.block_hash if isinstance(field, Block) else field for field in fields]
+        return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
         """Which blocks the state is about, each once: in an order that is the same for states that are alike but for

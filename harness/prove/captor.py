@@ -11,8 +11,9 @@ from typing import NamedTuple
 from harness.play.rogue.lies import NOBODYS, made_block
 from harness.prove.bounds import Bounds
 from harness.prove.instant import Action
+from harness.prove.known import DEAD
 from harness.prove.letters import Asked, Material, asked, letters
-from harness.prove.local import DEAD, LocalStates
+from harness.prove.local import LocalStates
 from ucp.block import Block
 from ucp.clock import MICROSECONDS
 from ucp.messages import BlockAddRequest, BlockResponse, CommitBlock, Message

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 
 from harness.errors import HarnessError
 from harness.prove.attractor import Check
+from harness.prove.blocks import Completed
 from harness.prove.expansion import Expansion, expanded
-from harness.prove.local import DEAD
+from harness.prove.known import DEAD
 from harness.prove.progress import memory_bytes
 from harness.prove.swarm import AGENTS, ZONE, State, Swarm
 from harness.prove.votes import UndecidedError, Votes
@@ -35,7 +36,7 @@ class Told(NamedTuple):
 
     locals: News
     zones: News
-    completed: list[tuple[bytes, int, int]]
+    completed: list[Completed]
     states: "array[int]"
 
 
@@ -109,7 +110,7 @@ class _Line:
         self._swarm = swarm
         self._locals = _Numbers(len(local.known), local.content, local.adopt)
         self._zones = _Numbers(len(zones), zones.matrix, zones.adopt)
-        self._completed = len(local.completed)
+        self._completed = len(local.blocks.completed)
 
     def told(self, states: Sequence[State]) -> Told:
         flat = array("q")
@@ -117,14 +118,14 @@ class _Line:
             flat.extend(state[:ZONE])
             flat.append(self._zones.code(state[ZONE]))
             flat.extend(map(self._locals.code, state[AGENTS:]))
-        completed = self._swarm.local.completed[self._completed :]
+        completed = self._swarm.local.blocks.completed[self._completed :]
         self._completed += len(completed)
         return Told(self._locals.news(), self._zones.news(), completed, flat)
 
     def heard(self, told: Told) -> list[State]:
         """The states, by our numbers."""
-        self._swarm.local.note_completed(told.completed)
-        self._completed = len(self._swarm.local.completed)
+        self._swarm.local.blocks.note_completed(told.completed)
+        self._completed = len(self._swarm.local.blocks.completed)
         self._locals.learn(told.locals)
         self._zones.learn(told.zones)
         flat, size = told.states, AGENTS + self._swarm.bounds.agents

@@ -12,7 +12,9 @@ from itertools import chain, product
 from typing import NamedTuple
 
 from harness.prove.bounds import Bounds
-from harness.prove.local import DEAD, LocalStates, Started, Step
+from harness.prove.known import DEAD
+from harness.prove.local import LocalStates
+from harness.prove.step import Started, Step
 
 Heard = tuple[tuple[int, int], ...]
 """What reaches an agent in one go: (sender, as the agent knows it, and message), in the order of the senders."""

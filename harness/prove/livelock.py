@@ -13,7 +13,7 @@ from typing import Any
 from harness.archive.record import Cycle
 from harness.prove.example import Example, keep, play
 from harness.prove.explore import Graph
-from harness.prove.local import DEAD
+from harness.prove.known import DEAD
 from harness.prove.script import NO_CLOCKS, Completion, Script
 from harness.prove.swarm import AGENTS
 

@@ -10,7 +10,8 @@ from itertools import chain, groupby, islice, permutations, product
 from typing import Any, NamedTuple
 
 from harness.prove.blocks import Ordinals
-from harness.prove.local import DEAD, LocalStates
+from harness.prove.known import DEAD
+from harness.prove.local import LocalStates
 from harness.prove.parts import NAMES_OF_OTHERS
 from harness.prove.zones import Zones
 

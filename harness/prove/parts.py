@@ -30,6 +30,12 @@ class Parts:
             self._digests[id(part)] = blake2b(repr(key[1]).encode(), digest_size=8).digest()
         return part
 
+    def of(self, snapshot: Snapshot, like: Snapshot) -> Snapshot:
+        """The same state of parts that there are; of `like` all are."""
+        return {
+            name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
+        }
+
     def key(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> tuple[Any, ...]:
         """Equal for equal states, whose snapshots are of parts that there are."""
         numbers = self._numbers

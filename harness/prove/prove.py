@@ -18,8 +18,8 @@ from harness.prove.explore import Graph, explore
 from harness.prove.flaws import Flaw
 from harness.prove.livelock import Livelock
 from harness.prove.liveness import Liveness
-from harness.prove.local import ReductionError
 from harness.prove.progress import Budget, Ended, Figures, GivenUpError, Progress
+from harness.prove.reduction import ReductionError
 from harness.prove.script import NO_CLOCKS, Script
 from harness.prove.swarm import AGENTS, ZONE, Swarm
 from harness.run.finding import claim

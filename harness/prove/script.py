@@ -16,7 +16,8 @@ from harness.prove.ages import Ages
 from harness.prove.bounds import EVENT_FILLS_BLOCK
 from harness.prove.explore import Graph
 from harness.prove.instant import Action, Wave
-from harness.prove.local import DEAD, Step
+from harness.prove.known import DEAD
+from harness.prove.step import Step
 from harness.prove.swarm import AGENTS, Move
 from harness.prove.times import Run, instants_s, windows_s
 from harness.prove.wording import Wording

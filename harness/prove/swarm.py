@@ -14,8 +14,10 @@ from harness.prove.bounds import FAULTS, MAX_LIES, Bounds
 from harness.prove.captor import Captor
 from harness.prove.flaws import Flaw
 from harness.prove.instant import Action, Agents, Instants, Wave
-from harness.prove.local import DEAD, LocalStates, Started
+from harness.prove.known import DEAD
+from harness.prove.local import LocalStates
 from harness.prove.order import Order, Ordered, Places
+from harness.prove.step import Started
 from harness.prove.zones import NOTHING_RUNS, Zones
 
 State = tuple[int, ...]

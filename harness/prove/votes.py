@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from harness.prove.attractor import Attractor, ByTimer, Check
 from harness.prove.expansion import quiet
 from harness.prove.instant import Action
-from harness.prove.local import DEAD
+from harness.prove.known import DEAD
 from harness.prove.swarm import AGENTS, BLOCKS, State, Swarm
 
 MOST_LOOKED_AT = 50_000

@@ -31,7 +31,7 @@ class Wording:
     def completed(self, agent_id: int, ordinal: int, at_s: float) -> None:
         """An agent has completed a block, the `ordinal`th of all."""
         self._count[agent_id] += 1
-        self._names[self._local.completed_by(agent_id, ordinal)] = f"{agent_id}.{self._count[agent_id]}"
+        self._names[self._local.blocks.completed_by(agent_id, ordinal)] = f"{agent_id}.{self._count[agent_id]}"
         self._completed_s.append(at_s)
 
     def sees(self, local: int) -> None:

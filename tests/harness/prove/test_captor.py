@@ -16,8 +16,9 @@ from harness.prove import Bounds, BoundsError, in_words, prove
 from harness.prove.alone import collect
 from harness.prove.captor import Captor
 from harness.prove.explore import Graph, explore
+from harness.prove.known import DEAD
 from harness.prove.letters import NOBODYS, Asked, Material, asked, letters
-from harness.prove.local import DEAD, LocalStates
+from harness.prove.local import LocalStates
 from harness.prove.script import Script
 from harness.prove.shape import Held, shape_of
 from harness.prove.snapshot import NOW_S, put_back, take
@@ -202,10 +203,10 @@ def lie(agents: list[Agent], now: float, lots: Random) -> None:
 
 def test_every_letter_is_let_in_and_nothing_else() -> None:
     local = explored().swarm.local
-    dropped = set().union(*(agent.dropped for agent in local._agents.values()))
+    dropped = set().union(*(agent.dropped for agent in local.agents.by_id.values()))
     assert dropped == {"not signed by its sender", "block not signed by its maker"}
-    assert {reason for agent in local._revoked.values() for reason in agent.dropped} == {"revoked sender"}
-    assert any(agent.received for agent in local._agents.values())
+    assert {reason for agent in local.agents.revoked.values() for reason in agent.dropped} == {"revoked sender"}
+    assert any(agent.received for agent in local.agents.by_id.values())
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from harness.prove import Bounds, liveness
 from harness.prove.crew import Crew
 from harness.prove.explore import Graph, explore
-from harness.prove.local import DEAD
+from harness.prove.known import DEAD
 from harness.prove.snapshot import key_of, put_back, take
 from harness.prove.swarm import AGENTS, Swarm
 from ucp.agent import Agent
