@@ -3,7 +3,7 @@
 The checker is that of any other run; the evidence comes straight from the agents, without files between.
 """
 
-from collections.abc import Coroutine, Mapping
+from collections.abc import Coroutine, Iterable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -133,10 +133,10 @@ class InMemory:
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Nobody asks where vehicles were."""
 
-    def keep_chains(self, simulation: Simulation) -> None:
-        self._kept = self._exports(simulation)
+    def keep_chains(self, at_s: float, lives: Iterable[Incarnation]) -> None:
+        self._kept = self._exports(at_s, lives)
 
-    def export(self, simulation: Simulation) -> None:
+    def export(self, at_s: float, lives: Iterable[Incarnation]) -> None:
         """The evidence is made of the agents themselves."""
 
     def evidence(self, simulation: Simulation) -> Evidence:
@@ -154,7 +154,7 @@ class InMemory:
             }
         )
         return Evidence(
-            self._exports(simulation),
+            self._exports(simulation.now(), simulation.exporting()),
             self._traces,
             record,
             [],
@@ -164,14 +164,14 @@ class InMemory:
             verified=simulation.verified,
         )
 
-    def _exports(self, simulation: Simulation) -> dict[int, Export]:
+    def _exports(self, at_s: float, lives: Iterable[Incarnation]) -> dict[int, Export]:
         return {
-            life.agent.agent_id: Export.model_validate(simulation.export_of(life))
+            life.agent.agent_id: Export.model_validate(life.export(at_s))
             if life.state is None
             else self._maker.export(
                 life.state,
-                simulation.timestamp_us(life),
+                life.timestamp_us(at_s),
                 cast("SecuredAgent", life.secured).signatures if life.secured else None,
             )
-            for life in simulation.exporting()
+            for life in lives
         }

@@ -278,7 +278,7 @@ class Simulation(Clockwork):
         return False
 
     async def keep_chains(self) -> None:
-        self._recorder.keep_chains(self)
+        self._recorder.keep_chains(self._now, self.exporting())
 
     async def reconcile(self, agent_id: int) -> None:
         number = self._number[agent_id]
@@ -296,7 +296,7 @@ class Simulation(Clockwork):
 
     async def snapshot(self) -> RunOutcome:
         played = self._played_by_now()
-        self._recorder.export(self)
+        self._recorder.export(self._now, self.exporting())
         return played
 
     def fail(self, error: "AgentFailedError | AgentLacksError") -> None:

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from random import Random
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from harness.gc_pause import gc_paused
 from harness.play.mission import Sought
@@ -25,7 +25,6 @@ from harness.play.simulation.seals import seals_of
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import Medium
-from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
 from ucp.messages import Message, datagram_bytes
@@ -208,7 +207,7 @@ class Clockwork:
                 self._hear(number, life)
             _, event_id, data, timestamp_us = what
             if timestamp_us is None:
-                timestamp_us = self.timestamp_us(life)
+                timestamp_us = life.timestamp_us(self._now)
             self._recorder.logged(self._now, agent.agent_id, len(data))
             agent.add_event(LoggableEvent(timestamp_us, event_id, data), life.local_s(self._now))
             self._expect_event(number, life)
@@ -407,20 +406,6 @@ class Clockwork:
             what = happening[3]
             if not isinstance(what, InFlight | StrayDatagram):
                 self._happen(number, life, what)
-
-    # An agent's clock
-
-    def _local_at_end(self, life: Incarnation) -> float:
-        """What the agent takes for mission time, or did at its end."""
-        return life.local_s(self._now if life.ended_at is None else life.ended_at)
-
-    def timestamp_us(self, life: Incarnation) -> int:
-        """What the agent's clock shows, or showed at its end, in microseconds; never less than 0."""
-        return max(0, round(self._local_at_end(life) * MICROSECONDS))
-
-    def export_of(self, life: Incarnation) -> dict[str, Any]:
-        """The agent's chain export, as a document."""
-        return life.agent.export(self._local_at_end(life), self.timestamp_us(life))
 
 
 def _own(life: Incarnation) -> OwnAgent:

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from harness.play.simulation.agents import VirtualAgent
 from harness.play.simulation.air import Happening
 from harness.scenario.scenario import Clock
+from ucp.clock import MICROSECONDS
 from ucp.events import RandomEvents
 from ucp.state import AgentState
 
@@ -64,6 +65,14 @@ class Incarnation:
         """What the agent takes for mission time."""
         return mission_s if self.clock is None else self.clock.shows(mission_s)
 
+    def timestamp_us(self, mission_s: float) -> int:
+        """What the agent's clock shows, or showed at its end, in microseconds; never less than 0."""
+        return max(0, round(self._last_local_s(mission_s) * MICROSECONDS))
+
+    def export(self, mission_s: float) -> dict[str, Any]:
+        """The agent's chain export, as a document."""
+        return self.agent.export(self._last_local_s(mission_s), self.timestamp_us(mission_s))
+
     def mission_s(self, local_s: float) -> float:
         """When the agent's clock shows `local_s`."""
         return local_s if self.clock is None else self.clock.mission_s(local_s)
@@ -73,6 +82,10 @@ class Incarnation:
         """In mission seconds; 0 if it never did, whatever the agent's clock then showed; None if nobody knows."""
         local_s = self.agent.chain_changed_at
         return self.mission_s(local_s) if local_s else local_s
+
+    def _last_local_s(self, mission_s: float) -> float:
+        """What the agent takes for mission time, or did at its end."""
+        return self.local_s(mission_s if self.ended_at is None else self.ended_at)
 
 
 class BlockNames:

@@ -1,10 +1,9 @@
 """A simulated run on disk: the files of a run directory that agents as processes would write themselves."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from harness.archive.directory import RunDirectory
-from harness.play.simulation.backend import Simulation
 from harness.play.simulation.lives import Incarnation
 from netem.radio import Place
 from ucp.files import TraceFile, write_json_atomically
@@ -41,15 +40,15 @@ class OnDisk:
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         self._rundir.append_tracks(at_s, places)
 
-    def keep_chains(self, simulation: Simulation) -> None:
-        self.export(simulation)
+    def keep_chains(self, at_s: float, lives: Iterable[Incarnation]) -> None:
+        self.export(at_s, lives)
         self._rundir.keep_exports_before_final_reconcile()
 
-    def export(self, simulation: Simulation) -> None:
+    def export(self, at_s: float, lives: Iterable[Incarnation]) -> None:
         """Raises OSError."""
-        for life in simulation.exporting():
+        for life in lives:
             path = self._rundir.agents / f"{life.agent.agent_id}.chain.json"
-            write_json_atomically(path, simulation.export_of(life))
+            write_json_atomically(path, life.export(at_s))
 
     def problems(self) -> dict[int, str]:
         """Why the trace of which agent ends early."""

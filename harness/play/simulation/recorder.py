@@ -1,21 +1,18 @@
 """Who takes down what happens in virtual time and cannot be asked for at the end."""
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
 
+from harness.play.simulation.lives import Incarnation
 from netem.radio import Place
 from ucp.trace import Entry
-
-if TYPE_CHECKING:
-    from harness.play.simulation.backend import Simulation
-    from harness.play.simulation.lives import Incarnation
 
 
 class Recorder(Protocol):
     tracing: bool
     """Whether handler runs are wanted; if not, `write` is not called."""
 
-    def begin(self, life: "Incarnation") -> None:
+    def begin(self, life: Incarnation) -> None:
         """An agent starts, or starts anew."""
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
@@ -32,8 +29,8 @@ class Recorder(Protocol):
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Here are the vehicles now, if any fly."""
 
-    def keep_chains(self, simulation: "Simulation") -> None:
-        """A final reconcile is about to put the chains in order."""
+    def keep_chains(self, at_s: float, lives: Iterable[Incarnation]) -> None:
+        """A final reconcile is about to put the chains of these agents in order."""
 
-    def export(self, simulation: "Simulation") -> None:
-        """Somebody wants to see the chains as they are now. Raises OSError."""
+    def export(self, at_s: float, lives: Iterable[Incarnation]) -> None:
+        """Somebody wants to see the chains of these agents as they are now. Raises OSError."""

@@ -135,7 +135,7 @@ def _export(simulation: Simulation, files: OnDisk) -> None:
     while True:
         try:
             simulation.end()
-            files.export(simulation)
+            files.export(simulation.now(), simulation.exporting())
             return
         except (AgentFailedError, AgentLacksError) as error:
             simulation.fail(error)
