@@ -28,11 +28,12 @@ from harness.play.radio_range import TRACK_S, RadioRange
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
 from harness.scenario.fates import Fate
-from harness.scenario.faults import Fault, VehicleFault
+from harness.scenario.faults import Fault
 from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import CaptureError, LabUnavailable, NetemError
+from sitl.circumstances import Circumstance
 from sitl.vehicle import VehicleKind
 from ucp.clock import MICROSECONDS, MissionClock
 
@@ -264,17 +265,17 @@ class ProcessRun:
         hearers = [agent for agent in self.agents if agent.agent_id in heard_by and agent.awake]
         await asyncio.gather(*(agent.ask("revoke", revocation=revocation) for agent in hearers))
 
-    async def befall(self, agent_id: int, fault: VehicleFault) -> None:
+    async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
         if not self._fleet:
-            raise ScenarioError(f"`{fault.what}` needs vehicles, and this run has none")
+            raise ScenarioError(f"`{what}` needs vehicles, and this run has none")
         at_s = round(self.clock.now(), 3)
-        if not fault.by_hand:
-            self._watchers.task(self._befall(agent_id, fault, at_s))
-        elif problem := await self._fleet.befall(agent_id, fault, at_s):
+        if not by_hand:
+            self._watchers.task(self._befall(agent_id, what, circumstance, at_s))
+        elif problem := await self._fleet.befall(agent_id, what, circumstance, at_s):
             raise ScenarioError(problem)  # whoever asked for it waits for an answer
 
-    async def _befall(self, agent_id: int, fault: VehicleFault, at_s: float) -> None:
-        if problem := await self._fleet.befall(agent_id, fault, at_s):
+    async def _befall(self, agent_id: int, what: str, circumstance: Circumstance, at_s: float) -> None:
+        if problem := await self._fleet.befall(agent_id, what, circumstance, at_s):
             self.played.unmatched_fates.append(problem)
 
     def _agent(self, agent_id: int) -> AgentProcess:

@@ -10,9 +10,9 @@ from harness.play.process.lab import MissionLab
 from harness.play.process.vehicle import VehicleProcess
 from harness.play.process.watchers import Watchers
 from harness.scenario import Scenario
-from harness.scenario.faults import VehicleFault
 from netem.radio import Place
 from sitl.address import Address
+from sitl.circumstances import Circumstance
 from sitl.ground_station import GroundStation
 from sitl.system_ids import system_ids
 from sitl.vehicle import Home, VehicleError, VehicleKind
@@ -126,9 +126,9 @@ class Fleet:
     def fall(self, vehicle_id: int) -> None:
         self._watchers.start(self._vehicles[vehicle_id].fall(), of=f"flight {vehicle_id}")
 
-    async def befall(self, vehicle_id: int, fault: VehicleFault, at_s: float) -> str | None:
+    async def befall(self, vehicle_id: int, what: str, circumstance: Circumstance, at_s: float) -> str | None:
         """As VehicleProcess.befall: returns why the vehicle does not simulate it, if so."""
-        return await self._vehicles[vehicle_id].befall(fault.what, fault.circumstance, at_s)
+        return await self._vehicles[vehicle_id].befall(what, circumstance, at_s)
 
     # The end
 

@@ -28,6 +28,7 @@ from harness.scenario.changes import Change, Injected, NetworkChange, disconnect
 from harness.scenario.fates import Fate
 from harness.scenario.faults import VehicleFault
 from netem.radio import Place
+from sitl.circumstances import Circumstance
 from sitl.track import Track
 from ucp.trace import HandlerRun
 
@@ -437,7 +438,7 @@ class Simulation(Clockwork):
                 life.secured.revoke(revocation, life.local_s(self._now))
                 self._after(number, life)
 
-    async def befall(self, agent_id: int, fault: VehicleFault) -> None:
+    async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
         raise AssertionError("was refused")
 
     async def pause(self, agent_id: int) -> None:

@@ -8,15 +8,13 @@ its own in this directory is a new fault, which everything else then knows.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from pydantic import Field
 
 from harness.scenario.model import VehicleId
 from harness.scenario.vehicles import Vehicles
-
-if TYPE_CHECKING:
-    from harness.scenario.faults.vehicle_fault import VehicleFault
+from sitl.circumstances import Circumstance
 
 Agents = Annotated[list[VehicleId], Field(min_length=1)]
 Disk = Literal["kept", "lost"]
@@ -62,8 +60,8 @@ class Lives(Protocol):
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
         """Have these vehicles hear, from the ground, that the agent's keys are revoked."""
 
-    async def befall(self, agent_id: int, fault: "VehicleFault") -> None:
-        """Have the agent's vehicle simulate the fault's circumstance; whether it does is on record at the end."""
+    async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
+        """Have the agent's vehicle simulate this, `what` in words; whether it does is on record at the end."""
 
 
 @dataclass(frozen=True)

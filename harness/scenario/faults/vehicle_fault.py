@@ -35,7 +35,7 @@ class VehicleFault(Fault):
                 raise ValueError(f"befalls a {' or a '.join(self.of_types)}, and vehicle {vehicle} is a {kind}")
 
     async def strike(self, lives: Lives, agent_id: int) -> None:
-        await lives.befall(agent_id, self)
+        await lives.befall(agent_id, self.what, self.circumstance, by_hand=self.by_hand)
 
     @property
     def whose(self) -> str:
