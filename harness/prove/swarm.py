@@ -145,12 +145,14 @@ class Swarm:
                     actions = (*ending, *completed)
                     if self._may_coincide(state, actions):
                         yield actions
+        singly: list[Action] = []
         if left:
             for (place,) in self._unlike(state, ((place,) for place in alive)):
-                yield (Action(place, "complete", state[BLOCKS] + 1),)
+                singly.append(Action(place, "complete", state[BLOCKS] + 1))
         for bit, fault in enumerate(FAULTS):
             if state[LEFT] >> bit & 1:
-                yield from ((Action(place, fault),) for place in alive)
+                singly += [Action(place, fault) for place in alive]
+        yield from ((action,) for action in singly if self._may_coincide(state, (action,)))
         if self.captor is not None:
             yield from self._of_the_captor(self.captor, state)
 
@@ -172,7 +174,9 @@ class Swarm:
         at = {timer: index + 1 for index, timer in enumerate(self._running(state[AGENTS:]))}
         ended = tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer"))
         if not ended:
-            return len({(action.what, action.number) for action in actions}) - 1
+            chosen = actions[0].what in ("captured", "lie")  # by somebody who may wait for his moment
+            between = not chosen and self.zones.no_time_passes(state[ZONE])
+            return len({(action.what, action.number) for action in actions}) - 1 + between
         if self.zones.after(state[ZONE], ended, ()) is None:
             return len(actions)  # they never end at once
         return self.zones.coincidences(state[ZONE], ended) + len(actions) - len(ended)

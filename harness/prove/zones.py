@@ -43,6 +43,10 @@ class Zones:
         least = self._matrices[zone][0]
         return [timer for timer in range(1, len(least)) if not least[timer]]
 
+    def no_time_passes(self, zone: int) -> bool:
+        """Whether some timer has to end at the very moment at which the last one did."""
+        return any(row[0] == 0 for row in self._matrices[zone][1:])
+
     def tied(self, zone: int) -> list[tuple[int, ...]]:
         """For each of `firsts` which of them have to end at the very moment at which it does, if it is the next."""
         tied = self._tied.get(zone)

@@ -8,11 +8,13 @@ from harness.archive.record import Cycle
 from harness.prove import Bounds, Progress, in_words, prove
 from harness.prove.example import Example
 from harness.prove.explore import explore
+from harness.prove.instant import Action
 from harness.prove.livelock import Livelock
 from harness.prove.progress import Budget
-from harness.prove.swarm import Swarm
+from harness.prove.swarm import AGENTS, BLOCKS, ZONE, Swarm
 from harness.prove.votes import Votes
 from harness.prove.zones import NOTHING_RUNS, Zones
+from tests.harness.prove.test_explore import explored
 
 
 @pytest.mark.parametrize(("blocks", "network"), [(4, "lossless"), (3, "lossy")])
@@ -125,3 +127,30 @@ def test_a_coincidence_is_a_difference_that_was_open() -> None:
     at_once = zones.after(NOTHING_RUNS, (), (ten_s, ten_s))
     assert at_once is not None
     assert zones.coincidences(at_once, (1, 2)) == 0
+
+
+def test_a_block_between_two_timers_that_end_at_once_is_a_coincidence() -> None:
+    free, none = explored(3, 3, "lossy"), explored(3, 3, "lossy", coincidences=0)
+    assert len(none.states) < len(free.states)
+    between = 0
+    for graph, expected in ((free, 1), (none, None)):
+        for state in graph.states:
+            now = any(row[0] == 0 for row in graph.swarm.zones.matrix(state[ZONE])[1:])
+            if now and state[BLOCKS] < 3:
+                blocks = [actions for actions in graph.swarm.actions(state) if actions[0].what == "complete"]
+                assert bool(blocks) == (expected is not None)
+                assert {graph.swarm.coincidences(state, actions) for actions in blocks} <= {expected}
+                between += 1
+    assert between
+
+
+def test_a_fault_between_them_is_one_too_and_a_captor_waits_for_his_moment() -> None:
+    graph = explored(3, 2, "lossy", ("death",))
+    swarm, between = graph.swarm, 0
+    for state in graph.states:
+        now = any(row[0] == 0 for row in swarm.zones.matrix(state[ZONE])[1:])
+        between += now
+        for place in range(len(state[AGENTS:])):
+            assert swarm.coincidences(state, (Action(place, "death"),)) == now
+            assert swarm.coincidences(state, (Action(place, "captured"),)) == 0
+    assert between
