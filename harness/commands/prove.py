@@ -40,6 +40,10 @@ def prove_command(
         str,
         typer.Option(help="Which of two blocks is the older: agreed, the one completed first; any: either, each time."),
     ] = "agreed",
+    losses: Annotated[
+        int | None,
+        typer.Option(help="How often, at most, an agent loses a message; without it any number."),
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="A setting of all agents; may be repeated.")
     ] = None,
@@ -102,6 +106,7 @@ def prove_command(
         captured=captured,
         lies=1 if lies is None else lies,
         clocks_any=clocks == "any",
+        losses=losses,
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:

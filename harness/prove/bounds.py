@@ -17,6 +17,7 @@ MAX_AGENTS = 9
 MAX_BLOCKS = 9
 MAX_LIES = 9
 MAX_COINCIDENCES = 9
+MAX_LOSSES = 9
 EVENT_FILLS_BLOCK = {"max_block_bytes": 267}
 """An event completes a block."""
 
@@ -34,7 +35,8 @@ class Bounds:
     behave alike are one. `steps`: each step of the agents is held against that of right ones, too. `stagger`: agents'
     timers differ, as a scenario's `stagger` says. `captured`: somebody has this agent's keys, and after a moment of his
     choice speaks in its name: `lies` messages, each heard by any of the agents, or any number in the network "any".
-    `clocks_any`: of two blocks any may be the older, whoever completed them when: each time that it is asked.
+    `clocks_any`: of two blocks any may be the older, whoever completed them when: each time that it is asked. `losses`:
+    so many times, at most, somebody loses a message that would have made a difference to him.
     """
 
     agents: int = 2
@@ -51,6 +53,7 @@ class Bounds:
     captured: int | None = None
     lies: int = 1
     clocks_any: bool = False
+    losses: int | None = None
 
     def __post_init__(self) -> None:
         for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):
@@ -63,6 +66,10 @@ class Bounds:
                 raise BoundsError(f"--faults must be some of {', '.join(FAULTS)}, not {fault!r}")
         self._check_captured()
         self._check_time()
+        if self.losses is not None and not 0 <= self.losses <= MAX_LOSSES:
+            raise BoundsError(f"--losses must be 0..{MAX_LOSSES}, not {self.losses}")
+        if self.losses is not None and self.network != "lossy":
+            raise BoundsError("--losses is for --network lossy, where messages are lost")
         if self.stagger and self.network == "any":
             raise BoundsError("--stagger is not for --network any, where each agent is looked at by itself")
         for name, step_s in self.stagger.items():
@@ -131,6 +138,8 @@ class Bounds:
         if self.coincidences is not None:
             parts += [f"{self.coincidences or 'no'} coincidence{'s' * (self.coincidences != 1)}"]
         parts += ["any block the older"] if self.clocks_any else []
+        if self.losses is not None:
+            parts += [f"{self.losses or 'no'} loss{'es' * (self.losses != 1)}"]
         parts += [f"{name} {value}" for name, value in self.settings.items()]
         parts += [f"stagger {name} {step_s}" for name, step_s in self.stagger.items()]
         parts += [f"quirk {name}" for name in self.quirks]

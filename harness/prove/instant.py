@@ -9,7 +9,7 @@ For each agent the outcomes of all orders, and of all losses, are worked out onc
 
 from collections.abc import Iterator, Sequence
 from itertools import chain, product
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from harness.prove.bounds import Bounds
 from harness.prove.known import DEAD
@@ -61,10 +61,23 @@ class Wave(NamedTuple):
     heard: tuple[tuple[int, ...], ...]
 
 
-_Choice = tuple[int, Started, tuple[tuple[int, int], ...], tuple[int, ...]]
-"""Of one agent: its local state, what it has started, what it says, and what it has heard, in order."""
+class Way(NamedTuple):
+    """How agents came to be what they are in an instant: its last round of hearing.
+
+    `lost`: so many messages, of each that hears of it for itself, were not heard on it; 0 where that is not counted.
+    """
+
+    lost: int
+    wave: Wave | None
 
 
+_Said = tuple[tuple[int, int], ...]
+"""What is on the air: (place of the sender, message)."""
+_Choice = tuple[int, Started, _Said, tuple[int, ...], int]
+"""Of one agent: its local state, what it has started, what it says, what it has heard, in order, and how much not."""
+
+
+_Key = TypeVar("_Key")
 _Outcome = tuple[Step, tuple[int, ...]]
 """What becomes of an agent, and an order in which it hears what it does: positions in what reaches it."""
 
@@ -76,9 +89,10 @@ class Instants:
         self._local = local
         self._bounds = bounds
         self._twice = "duplicate" in bounds.faults
+        self._counts_losses = bounds.losses is not None
         self._any_order_of_counting = bounds.reduced and not self._twice and not every_order
         self._outcomes: dict[tuple[int, Heard, bool, bool], list[_Outcome]] = {}
-        self._choices_of: dict[tuple[int, int, Started, tuple[tuple[int, int], ...], bool, bool], list[_Choice]] = {}
+        self._choices_of: dict[tuple[int, int, Started, _Said, bool, bool], list[_Choice]] = {}
         self._places = range(bounds.agents)
         self._names = [
             [other + 2 if bounds.alike and other < place else other + 1 for other in self._places]
@@ -95,9 +109,9 @@ class Instants:
         return len(self._outcomes_of(local, reached, lossy=False, answered=wave.before is not None)) > 1
 
     def outcomes(
-        self, locals_: tuple[int, ...], actions: Sequence[Action], lossy: bool, *, tell: bool
-    ) -> dict[Agents, Wave | None]:
-        """All that may come of it; with one way to each, if it is to be told."""
+        self, locals_: tuple[int, ...], actions: Sequence[Action], most_lost: int, *, tell: bool
+    ) -> dict[Agents, Way]:
+        """All that may come of it, each in the way on which least is lost; with its rounds, if that is to be told."""
         agents, started = list(locals_), [()] * len(locals_)  # type: list[int], list[Started]
         air: list[tuple[int, int]] = []
         for action in actions:
@@ -108,27 +122,29 @@ class Instants:
                 started[place] = ()
             started[place] = self._still(started[place], step)
             air += [(place, message) for message in step.sent]
-        waiting: dict[tuple[Agents, tuple[tuple[int, int], ...]], Wave | None]
-        waiting = {(Agents(tuple(agents), tuple(started)), tuple(air)): None}
-        silent: dict[Agents, Wave | None] = {}
+        waiting: dict[tuple[Agents, _Said], Way]
+        waiting = {(Agents(tuple(agents), tuple(started)), tuple(air)): Way(0, None)}
+        silent: dict[Agents, Way] = {}
         flawed = self._local.flawed
         rounds = 0
         while waiting:
             rounds += 1
-            after: dict[tuple[Agents, tuple[tuple[int, int], ...]], Wave | None] = {}
+            after: dict[tuple[Agents, _Said], Way] = {}
             for (there, said), way in waiting.items():
                 if not said or not flawed.isdisjoint(there.locals):
-                    silent.setdefault(there, way)
+                    _keep(silent, there, way)
                     continue
-                for heard, answers, orders in self._hear(there, said, lossy, rounds):
-                    if (heard, answers) not in after:
-                        after[heard, answers] = Wave(way, said, orders) if tell else None
+                for heard, answers, orders, lost in self._hear(there, said, most_lost - way.lost, rounds):
+                    known = after.get((heard, answers))
+                    if known is None or way.lost + lost < known.lost:
+                        wave = Wave(way.wave, said, orders) if tell else None
+                        after[heard, answers] = Way(way.lost + lost, wave)
             waiting = after
         if not self._bounds.settles:
             return silent
-        settled: dict[Agents, Wave | None] = {}
+        settled: dict[Agents, Way] = {}
         for there, way in silent.items():
-            settled.setdefault(Agents(tuple(map(self._local.settled, there.locals)), there.started), way)
+            _keep(settled, Agents(tuple(map(self._local.settled, there.locals)), there.started), way)
         return settled
 
     def _act(self, local: int, action: Action) -> Step:
@@ -143,31 +159,19 @@ class Instants:
         return Step(DEAD, (), ())
 
     def _hear(
-        self, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, rounds: int
-    ) -> Iterator[tuple[Agents, tuple[tuple[int, int], ...], tuple[tuple[int, ...], ...]]]:
-        answered = rounds >= ANSWERED
+        self, there: Agents, said: _Said, most_lost: int, rounds: int
+    ) -> Iterator[tuple[Agents, _Said, tuple[tuple[int, ...], ...], int]]:
+        answered, lossy = rounds >= ANSWERED, most_lost > 0
         choices = [self._choices(place, there, said, lossy, answered) for place in self._places]
-        for chosen in product(*choices):
-            locals_, started, answers, orders = zip(*chosen, strict=True)
-            yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders
+        for chosen in _within(choices, most_lost) if lossy and self._counts_losses else product(*choices):
+            locals_, started, answers, orders, lost = zip(*chosen, strict=True)
+            yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders, sum(lost)
 
-    def _settled(self, local: int, answered: bool) -> int:
-        return self._local.settled(local) if answered and self._bounds.settles else local
-
-    def _lets_be(self, local: int, place: int, said: tuple[tuple[int, int], ...]) -> bool:
-        """Whether nothing of what is said makes any difference to the agent at `place`, so that no order of it does."""
-        if local == DEAD:
-            return True
-        lets_be, names = self._local.lets_be, self._names[place]
-        return all(sender == place or lets_be(local, names[sender], message) for sender, message in said)
-
-    def _choices(
-        self, place: int, there: Agents, said: tuple[tuple[int, int], ...], lossy: bool, answered: bool
-    ) -> list[_Choice]:
+    def _choices(self, place: int, there: Agents, said: _Said, lossy: bool, answered: bool) -> list[_Choice]:
         """What may become of the agent at `place`."""
         local, before = there.locals[place], there.started[place]
         if local == DEAD:
-            return [(DEAD, (), (), ())]
+            return [(DEAD, (), (), (), 0)]
         key = place, local, before, said, lossy, answered
         choices = self._choices_of.get(key)
         if choices is None:
@@ -181,6 +185,7 @@ class Instants:
                     self._still(before, step),
                     tuple((place, message) for message in step.sent),
                     tuple(mine[position] for position in order),
+                    len(mine) - len(set(order)) if lossy and self._counts_losses else 0,
                 )
                 for step, order in self._outcomes_of(local, heard, lossy, answered)
             ]
@@ -217,11 +222,11 @@ class Instants:
                 return outcomes
             if self._bounds.reduced:
                 if answered and self._bounds.settles:
-                    settled = {
-                        step._replace(local=self._local.settled(step.local)): way for step, way in reversed(outcomes)
-                    }
+                    settled: dict[Step, tuple[int, ...]] = {}
+                    for step, way in reversed(outcomes):
+                        _keep_fullest(settled, step._replace(local=self._local.settled(step.local)), way)
                     outcomes = list(settled.items())
-                if lossy:
+                if lossy and not self._counts_losses:  # to lose what it says more may be several losses
                     outcomes = [outcome for outcome in outcomes if not _is_covered(outcome[0], outcomes)]
             if len(self._outcomes) >= MOST_KNOWN:
                 self._outcomes.clear()
@@ -250,8 +255,10 @@ class Instants:
             sender, message = heard[position]
             if not all(only_counts(at, sender, message) for at in ways):
                 return None
-            counted = {hear(at, sender, message).local: (*way, position) for at, way in ways.items()}
-            ways = ways | counted if lossy else counted
+            after = dict(ways) if lossy else {}
+            for at, way in ways.items():
+                _keep_fullest(after, hear(at, sender, message).local, (*way, position))
+            ways = after
         return [(Step(at, (), ()), (*way, *others)) for at, way in ways.items()]
 
     def _in_any_order(self, local: int, heard: Heard, lossy: bool, in_order: bool) -> Iterator[_Outcome]:
@@ -289,8 +296,8 @@ class Instants:
         outcomes: dict[Step, tuple[int, ...]] = {}
         for (step, left), way in ways.items():
             ends_here = lossy or step.local in self._local.flawed or all(left[position] < copies for position in matter)
-            if ends_here and len(way) >= len(outcomes.get(step, ())):
-                outcomes[step] = way
+            if ends_here:
+                _keep_fullest(outcomes, step, way)
         others = [position for position in range(len(heard)) if position not in matter]
         for step, way in outcomes.items():
             yield step, (*way, *others)
@@ -314,6 +321,33 @@ class Instants:
                         seen.add(step.local)
                         waiting.append(step.local)
         return sorted(matter)
+
+
+def _keep(ways: dict[Agents, Way], there: Agents, way: Way) -> None:
+    """The way there on which less is lost."""
+    known = ways.get(there)
+    if known is None or way.lost < known.lost:
+        ways[there] = way
+
+
+def _keep_fullest(ways: dict[_Key, tuple[int, ...]], there: _Key, way: tuple[int, ...]) -> None:
+    """The way there on which more is heard, be it once or twice."""
+    known = ways.get(there)
+    if known is None or len(set(way)) > len(set(known)):
+        ways[there] = way
+
+
+def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[_Choice, ...]]:
+    """All combinations in which no more is lost than that."""
+    combined: list[tuple[int, tuple[_Choice, ...]]] = [(0, ())]
+    for of_one in choices:
+        combined = [
+            (lost + choice[-1], (*chosen, choice))
+            for lost, chosen in combined
+            for choice in of_one
+            if lost + choice[-1] <= most_lost
+        ]
+    return [chosen for _, chosen in combined]
 
 
 def _is_covered(step: Step, outcomes: Sequence[_Outcome]) -> bool:

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from harness.archive.record import Cycle
-from harness.prove.example import Example, keep, play
+from harness.prove.example import Example, Played, keep, play
 from harness.prove.explore import Graph
 from harness.prove.known import DEAD
 from harness.prove.script import NO_CLOCKS, Completion, Script
@@ -34,13 +34,14 @@ class Livelock:
     `coincidences`: so many moments have to be the same by chance on this way, to within the time that a message takes;
     another may need fewer; None if timers end in any order, which leaves that open.
     `cycle` is what the simulation was found to go round in when it played the example; None if it went another way.
-    `contradictory`: ties go as no clocks make them go.
+    `losses`: so many messages are lost by somebody on this way. `contradictory`: ties go as no clocks make them go.
     """
 
     ways: int
     coincidences: int | None
     completions: tuple[Completion, ...]
     example: Example
+    losses: int
     cycle: Cycle | None
     contradictory: bool = False
 
@@ -48,6 +49,7 @@ class Livelock:
         return {
             "ways": self.ways,
             "coincidences": self.coincidences,
+            "losses": self.losses,
             "contradictory": self.contradictory,
             "completions": [completion._asdict() for completion in self.completions],
             "cycle": None if self.cycle is None else self.cycle.model_dump(mode="json"),
@@ -56,6 +58,11 @@ class Livelock:
 
     def in_words(self) -> str:
         """What it takes to get there."""
+        if not self.losses:
+            return self._timings_in_words()
+        return f"{self._timings_in_words()}; {self.losses} loss{'es lead' if self.losses > 1 else ' leads'} there"
+
+    def _timings_in_words(self) -> str:
         if self.contradictory:
             return NO_CLOCKS
         if self.coincidences is None:
@@ -90,6 +97,14 @@ def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
     return min(tuple(looks[first:] + looks[:first]) for first in range(len(looks)))
 
 
+class _Round(NamedTuple):
+    """A way to where the swarm goes round, and once round."""
+
+    begin: list[int]
+    cycle: list[int]
+    script: Script
+
+
 def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> Iterator[Livelock]:
     """Of each form one, written to `path` and beside it."""
     for number, alike in enumerate(islice(forms(graph, cycles), MOST_FORMS), 1):
@@ -100,27 +115,26 @@ def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> It
 def _shown(graph: Graph, alike: Sequence[list[int]], path: Path, name: str) -> Livelock:
     """With as few coincidences as the nearest have, and blocks as free as can be: one that the simulation goes, too."""
     bounds = graph.swarm.bounds
-    tried: list[tuple[int, int, int, list[int], list[int], Script]] = []
+    tried: list[tuple[int, int, _Round]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MOST_PLAYED]:
         begin = graph.path(cycle[0])
         script = Script(graph, [*begin, *cycle[1:], cycle[0]])
         bound = 0 if bounds.timers_any else sum(each.earliest_s == each.latest_s for each in script.completions())
-        tried.append((script.coincidences, bound, len(tried), begin, cycle, script))
-    first = None
-    for coincidences, _, _, begin, cycle, script in sorted(tried, key=lambda each: each[:3]):
-        played = play(script.document(name))
-        went = coincidences, begin, cycle, played, script.contradictory
-        if "liveness" in played.judged:
+        tried.append((script.coincidences, bound, _Round(begin, cycle, script)))
+    first: tuple[_Round, Played] | None = None
+    for _, _, each in sorted(tried, key=lambda one: one[:2]):
+        went = each, play(each.script.document(name))
+        if "liveness" in went[1].judged:
             first = went
             break
-        if first is None or (first[-1] and not script.contradictory):
+        if first is None or (first[0].script.contradictory and not each.script.contradictory):
             first = went
     assert first is not None, "there is a way round"
-    coincidences, begin, cycle, played, contradictory = first
+    (begin, cycle, script), played = first
     several = Script(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
     completions = () if bounds.timers_any else tuple(several.completions())
     sentence = f"The swarm can go round in circles for ever: {len(begin) - 1} instants after the beginning."
-    said = [sentence, *([f"It does {NO_CLOCKS}."] if contradictory else [])]
+    said = [sentence, *([f"It does {NO_CLOCKS}."] if script.contradictory else [])]
     example = keep(played, path, bounds, len(begin) - 1 + len(cycle), said)
-    known = None if bounds.timers_any else coincidences
-    return Livelock(len(alike), known, completions, example, played.cycle, contradictory)
+    known = None if bounds.timers_any else script.coincidences
+    return Livelock(len(alike), known, completions, example, script.losses, played.cycle, script.contradictory)

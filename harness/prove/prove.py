@@ -142,6 +142,7 @@ class Proof:
             "timers": "any" if bounds.timers_any else "duration",
             "coincidences": bounds.coincidences,
             "clocks": "any" if bounds.clocks_any else "agreed",
+            "losses": bounds.losses,
             "settings": dict(bounds.settings),
             "stagger": dict(bounds.stagger),
             **(self._captors_json() if bounds.captured is not None else {}),

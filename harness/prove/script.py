@@ -87,6 +87,8 @@ class Script:
         self._ages = Ages()
         self.contradictory = False
         """Whether ties go as no clocks make them go: known with the document."""
+        self.losses = 0
+        """So many messages are lost by somebody on the way: known with the document, too."""
         self._timeline: list[Document] = []
         self._fates: list[Document] = []
         self._late: dict[int, dict[int, float]] = defaultdict(dict)
@@ -268,6 +270,7 @@ class Script:
             for number, flight in enumerate(air):
                 if flight.sender != agent.agent_id and number not in heard:
                     flight.lost_by.append(agent.agent_id)
+                    self.losses += 1
             last_s = acted_s
             for number in heard:
                 heard_by_anybody.add(number)

@@ -10,10 +10,10 @@ from itertools import combinations, permutations, product
 from typing import NamedTuple
 
 from harness.prove.blocks import Ordinals
-from harness.prove.bounds import FAULTS, MAX_LIES, Bounds
+from harness.prove.bounds import FAULTS, MAX_COINCIDENCES, MAX_LIES, Bounds
 from harness.prove.captor import Captor
 from harness.prove.flaws import Flaw
-from harness.prove.instant import Action, Agents, Instants, Wave
+from harness.prove.instant import Action, Agents, Instants, Wave, Way
 from harness.prove.known import DEAD
 from harness.prove.local import LocalStates
 from harness.prove.order import Order, Ordered, Places
@@ -21,8 +21,8 @@ from harness.prove.step import Started
 from harness.prove.zones import NOTHING_RUNS, Zones
 
 State = tuple[int, ...]
-"""Blocks completed, what may yet befall (a bit for each fault and the capture, how many lies, how many coincidences),
-zone, the agents."""
+"""Blocks completed, what may yet befall (a bit for each fault and the capture, how many lies,
+coincidences and losses), zone, the agents."""
 MOST_KNOWN = 200_000
 """So many instants are remembered; then they are worked out again."""
 ONCE = (*FAULTS, "captured")
@@ -32,6 +32,10 @@ LIES = 1 << len(ONCE)
 """One more lie that may be told."""
 COINCIDENCES = LIES << (MAX_LIES.bit_length())
 """One more moment that may be the same as another by chance, where that is bounded."""
+LOSSES = COINCIDENCES << (MAX_COINCIDENCES.bit_length())
+"""One more message that an agent may lose, where that is bounded."""
+ANY_NUMBER = 1 << 30
+"""Of losses."""
 BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 """Where they stand in it."""
 
@@ -55,7 +59,7 @@ class _Outcome(NamedTuple):
     agents: tuple[int, ...]
     running: tuple[int, ...]
     started: tuple[Started, ...]
-    wave: Wave | None
+    way: Way
 
 
 class _Instant(NamedTuple):
@@ -81,14 +85,14 @@ class Swarm:
         self.zones = Zones()
         self._instants = Instants(self.local, bounds, every_order=every_count)
         self._order = Order(self.local, self.zones, self.name_of) if bounds.alike else None
-        self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], bool], _Instant] = {}
+        self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], int], _Instant] = {}
         self._as_they_are = tuple(range(bounds.agents))
         own = [1] * bounds.agents if bounds.alike else range(1, bounds.agents + 1)
         faults = sum(1 << ONCE.index(name) for name in bounds.faults if name != "duplicate")
         self.captor = None if bounds.captured is None else Captor(bounds, self.local)
         if bounds.captured is not None:
             faults += (1 << ONCE.index("captured")) + bounds.lies * LIES
-        faults += (bounds.coincidences or 0) * COINCIDENCES
+        faults += (bounds.coincidences or 0) * COINCIDENCES + (bounds.losses or 0) * LOSSES
         self.initial: State = (0, faults, NOTHING_RUNS, *(self.local.initial[agent_id] for agent_id in own))
 
     # What an instant begins with
@@ -165,7 +169,9 @@ class Swarm:
             yield from captor.lies(state[AGENTS:])
 
     def _may_coincide(self, state: State, actions: Sequence[Action]) -> bool:
-        return self.bounds.coincidences is None or self.coincidences(state, actions) * COINCIDENCES <= state[LEFT]
+        if self.bounds.coincidences is None:
+            return True
+        return self.coincidences(state, actions) <= state[LEFT] % LOSSES // COINCIDENCES
 
     def coincidences(self, state: State, actions: Sequence[Action]) -> int:
         """How many moments have to be the same by chance for this to happen in one instant, and before all else."""
@@ -202,7 +208,7 @@ class Swarm:
 
     def after(self, state: State, actions: tuple[Action, ...], lossy: bool) -> Iterator[State]:
         """The states that may come of these actions in one instant; none if their timers cannot end at once."""
-        key = state[AGENTS:], actions, lossy
+        key = state[AGENTS:], actions, self._most_lost(state, lossy)
         instant = self._known.get(key)
         if instant is None:
             if len(self._known) >= MOST_KNOWN:
@@ -210,18 +216,26 @@ class Swarm:
             instant = self._known[key] = self._instant(*key, tell=False)
         if self._can_be(state, instant):
             left = self._left(state, actions, instant)
-            for agents, zone, *_ in self._ordered(state, instant, left):
-                yield (state[BLOCKS] + instant.completed, left, zone, *agents)
+            for outcome, there in zip(instant.outcomes, self._ordered(state, instant, left), strict=True):
+                still = left - outcome.way.lost * LOSSES
+                yield (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
 
     def moves(self, state: State, actions: tuple[Action, ...], lossy: bool) -> Iterator[Move]:
         """The same, with how each comes about."""
-        instant = self._instant(state[AGENTS:], actions, lossy, tell=True)
+        instant = self._instant(state[AGENTS:], actions, self._most_lost(state, lossy), tell=True)
         if self._can_be(state, instant):
             left = self._left(state, actions, instant)
             ordered = self._ordered(state, instant, left)
             for outcome, there in zip(instant.outcomes, ordered, strict=True):
-                after = (state[BLOCKS] + instant.completed, left, there.zone, *there.agents)
-                yield Move(actions, after, there.places, outcome.wave, outcome.started, there.blocks)
+                still = left - outcome.way.lost * LOSSES
+                after = (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
+                yield Move(actions, after, there.places, outcome.way.wave, outcome.started, there.blocks)
+
+    def _most_lost(self, state: State, lossy: bool) -> int:
+        """So many messages may be lost in an instant."""
+        if not lossy:
+            return 0
+        return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
 
     def _can_be(self, state: State, instant: _Instant) -> bool:
         """Whether these timers can end at once, before all others; it is known that each can by itself."""
@@ -250,7 +264,9 @@ class Swarm:
             left -= self.coincidences(state, actions) * COINCIDENCES
         return left
 
-    def _instant(self, locals_: tuple[int, ...], actions: tuple[Action, ...], lossy: bool, *, tell: bool) -> _Instant:
+    def _instant(
+        self, locals_: tuple[int, ...], actions: tuple[Action, ...], most_lost: int, *, tell: bool
+    ) -> _Instant:
         at = {timer: index + 1 for index, timer in enumerate(self._running(locals_))}
         left = ALL_LEFT
         for action in actions:
@@ -262,8 +278,8 @@ class Swarm:
             left,
             int(any(action.what == "lie" for action in actions)),
             tuple(
-                _Outcome(there.locals, self._running_after(at, there), there.started if tell else (), wave)
-                for there, wave in self._instants.outcomes(locals_, actions, lossy, tell=tell).items()
+                _Outcome(there.locals, self._running_after(at, there), there.started if tell else (), way)
+                for there, way in self._instants.outcomes(locals_, actions, most_lost, tell=tell).items()
             ),
         )
 

@@ -166,6 +166,8 @@ def _config(bounds: Bounds) -> str:
         raise BoundsError("the specification has no faults: leave --faults out")
     if bounds.coincidences is not None:
         raise BoundsError("the specification does not count coincidences: leave --coincidences out")
+    if bounds.losses is not None:
+        raise BoundsError("the specification does not count losses: leave --losses out")
     if bounds.clocks_any:
         raise BoundsError("the specification has clocks that agree: leave --clocks any out")
     if bounds.captured is not None:

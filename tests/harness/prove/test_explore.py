@@ -1,6 +1,7 @@
 """All states: whole and reduced, and whatever agents do by chance is among them."""
 
 from collections.abc import Iterator, Sequence
+from math import inf
 from random import Random
 from typing import Any
 
@@ -110,10 +111,13 @@ def test_whatever_agents_do_by_chance_is_among_it(agents: int, blocks: int, loss
             assert there in seen
 
 
-def by_chance(count: int, blocks: int, loss: float, lots: Random, *, clocks_apart: bool = False) -> Iterator[Seen]:
+def by_chance(
+    count: int, blocks: int, loss: float, lots: Random, *, clocks_apart: bool = False, most_lost: float = inf
+) -> Iterator[Seen]:
     """What is seen whenever nothing is on the air: messages take no time, blocks come at any time.
 
-    With clocks that are apart the agents' timestamps are years from each other.
+    With clocks that are apart the agents' timestamps are years from each other. `most_lost`: so often, at most, an
+    agent loses a message.
     """
     settings = Settings(max_block_bytes=267)
     agents = [Agent(agent_id, range(1, count + 1), b"proof", settings) for agent_id in range(1, count + 1)]
@@ -136,16 +140,23 @@ def by_chance(count: int, blocks: int, loss: float, lots: Random, *, clocks_apar
             acted.end_timer(timer, now)
         else:
             return
-        deliver(agents, loss, now, lots)
+        most_lost -= deliver(agents, loss, now, lots, most_lost)
         yield seen_of(agents)
 
 
-def deliver(agents: Sequence[Agent], loss: float, now: float, lots: Random) -> None:
+def deliver(agents: Sequence[Agent], loss: float, now: float, lots: Random, most_lost: float = inf) -> int:
+    """How many were lost."""
+    lost = 0
     while said := [(agent, sent) for agent in agents for sent in agent.messages_to_send()]:
         for receiver in agents:
-            heard = [(sender, sent) for sender, sent in said if sender is not receiver and lots.random() >= loss]
-            for sender, (sequence, message) in heard:
-                receiver.receive_message(sender.agent_id, sequence, message, now)
+            for sender, (sequence, message) in said:
+                if sender is receiver:
+                    continue
+                if lost < most_lost and lots.random() < loss:
+                    lost += 1
+                else:
+                    receiver.receive_message(sender.agent_id, sequence, message, now)
+    return lost
 
 
 def first(pair: tuple[float, Agent]) -> float:

@@ -33,21 +33,22 @@ def test_each_form_becomes_a_scenario_that_goes_round(tmp_path: Path, blocks: in
 
 
 @pytest.mark.parametrize(
-    ("coincidences", "goes_round", "contradictory", "expected"),
+    ("coincidences", "losses", "goes_round", "contradictory", "expected"),
     [
-        (0, True, False, "which takes no coincidence"),
-        (0, False, False, "crosses in the same way in every round"),
-        (2, True, False, "2 times two moments are the same by chance"),
-        (0, False, True, "as no clocks make them go"),
-        (None, False, False, "if timers can end like that"),
+        (0, 0, True, False, "which takes no coincidence"),
+        (0, 1, True, False, "which takes no coincidence; 1 loss leads there"),
+        (0, 3, False, False, "crosses in the same way in every round; 3 losses lead there"),
+        (2, 0, True, False, "2 times two moments are the same by chance"),
+        (0, 0, False, True, "as no clocks make them go"),
+        (None, 0, False, False, "if timers can end like that"),
     ],
 )
 def test_what_it_takes_is_said(
-    tmp_path: Path, coincidences: int | None, goes_round: bool, contradictory: bool, expected: str
+    tmp_path: Path, coincidences: int | None, losses: int, goes_round: bool, contradictory: bool, expected: str
 ) -> None:
     cycle = Cycle(since_s=1.0, period_s=15.0, agents=[1]) if goes_round else None
     example = Example(tmp_path / "x.yaml", 1, {}, 1)
-    assert expected in Livelock(1, coincidences, (), example, cycle, contradictory).in_words()
+    assert expected in Livelock(1, coincidences, (), example, losses, cycle, contradictory).in_words()
 
 
 def test_a_way_round_is_found_also_if_not_everything_is_looked_at(

@@ -114,7 +114,19 @@ def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:
     assert not any("✔" in line for line in in_words(proof))
 
 
-@pytest.mark.parametrize("wrong", [{"agents": 0}, {"settings": {"a": 1}}, {"quirks": {"a": True}}, {"faults": ("a",)}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"agents": 0},
+        {"settings": {"a": 1}},
+        {"quirks": {"a": True}},
+        {"faults": ("a",)},
+        {"losses": -1},
+        {"losses": 10},
+        {"losses": 1, "network": "lossless"},
+        {"losses": 1, "network": "any"},
+    ],
+)
 def test_impossible_bounds_are_one_sentence(wrong: dict[str, object]) -> None:
     with pytest.raises(BoundsError):
         Bounds(**wrong)  # type: ignore[arg-type]
