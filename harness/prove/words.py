@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from harness.prove.bounds import Bounds
 from harness.prove.example import Example
 from harness.prove.prove import PLAYED, Proof
 
@@ -23,6 +24,8 @@ def in_words(proof: Proof) -> Iterator[str]:
         f"  {figures.states:,} states{left}, {figures.transitions:,} transitions, {figures.local_states:,} "
         f"local states, {figures.zones:,} zones, {instants}, in {figures.seconds:.1f} s"
     )
+    if proof.ended in ("memory", "time") and (tighter := _tighter(proof.bounds)):
+        yield f"  what comes to an end sooner: the same with {' or '.join(tighter)}"
     for kind, claim in proof.claims.items():
         yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
         if (shown := proof.shown.get(kind)) is not None:
@@ -43,6 +46,17 @@ def in_words(proof: Proof) -> Iterator[str]:
         if proof.flaw is not None and PLAYED[proof.flaw.kind] not in example.judged:
             yield "    not shown by playing: the simulation goes another way"
         yield from _played(example)
+
+
+def _tighter(bounds: Bounds) -> list[str]:
+    """Options that leave less to look at."""
+    if bounds.network == "any" or bounds.timers_any:
+        return []
+    options = ["--losses 1"] if bounds.network == "lossy" and bounds.losses is None else []
+    options += ["--coincidences 0"] if bounds.coincidences is None else []
+    if not bounds.clocks_any and not bounds.quirks and bounds.captured is None:
+        options.append("--clocks any")
+    return options
 
 
 def _played(example: Example) -> Iterator[str]:
