@@ -107,13 +107,13 @@ def test_a_full_lab_is_gone_after_its_orchestrator_even_if_it_is_stopped_itself(
         assert orchestrator.stdout is not None
         while orchestrator.stdout.readline() != b"full\n":
             assert orchestrator.poll() is None
-        # The orchestrator, setpriv's unshare, its init, and two of each program at least.
+        # The orchestrator, setpriv's unshare, its init, and two of each program at least, once they have begun.
+        play(until(lambda: len(processes_of(tmp_path)) >= 3 + 6 * 2, "all programs run"))
         everybody = processes_of(tmp_path)
         for pid in everybody - {orchestrator.pid}:
             with suppress(ProcessLookupError):  # a program that sets conditions ends by itself
                 os.kill(pid, signal.SIGSTOP)
         orchestrator.send_signal(number)
-    assert len(everybody) >= 3 + 6 * 2
     play(until(lambda: not processes_of(tmp_path), "every process is gone"))
 
 

@@ -37,15 +37,20 @@ class Page:
         self._socket = socket
         self._unread: list[list[Any]] = []
         self._number = 0
+        self.hand: dict[str, Any] | None = None
+        """What can be asked for, as it was last told: that may be before the run is."""
 
     async def next(self, kind: str) -> list[Any]:
         """The next change of that kind."""
-        while True:
-            while self._unread:
-                if (change := self._unread.pop(0))[0] == kind:
-                    return change
-            text = await asyncio.wait_for(self._socket.receive_str(), DEADLINE_S)
-            self._unread = [json.loads(line) for line in text.splitlines()]
+        async with asyncio.timeout(DEADLINE_S):
+            while True:
+                while self._unread:
+                    change = self._unread.pop(0)
+                    if change[0] == "hand":
+                        self.hand = change[1]
+                    if change[0] == kind:
+                        return change
+                self._unread = [json.loads(line) for line in (await self._socket.receive_str()).splitlines()]
 
     async def ask(self, **asked: Any) -> dict[str, Any]:
         self._number += 1
@@ -60,8 +65,8 @@ def test_what_a_page_asks_for_happens_and_is_on_record(tmp_path: Path) -> None:
         async with aiohttp.ClientSession() as client, client.ws_connect(f"{address}live", max_msg_size=0) as socket:
             page = Page(socket)
             assert (await page.next("run"))[1]["live"] is True
-            while (await page.next("hand"))[1]["closed"] is not None:
-                pass
+            while page.hand is None or page.hand["closed"] is not None:
+                await page.next("hand")
             held_s = (await page.ask(do="pause"))["at_s"]
             assert (await page.ask(do="step", seconds=10))["at_s"] >= held_s + 10
             parted_s = (await page.ask(do="happen", entry={"partition": [[1, 2], [3, 4]]}))["at_s"]
