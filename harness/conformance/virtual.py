@@ -9,7 +9,7 @@ import json
 import math
 import os
 import signal
-from asyncio.subprocess import PIPE, Process
+from asyncio.subprocess import PIPE, Process, SubprocessStreamProtocol
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -18,6 +18,7 @@ from typing import Any
 
 from harness.conformance.air import (
     ANSWER_LIMIT_S,
+    GRACE_S,
     START_LIMIT_S,
     AgentEndedError,
     NoAgentError,
@@ -40,27 +41,29 @@ NO_AGENT = "the agent does not answer in virtual time"
 class Program:
     """A process of the agent."""
 
-    def __init__(self, process: Process, errors: Path) -> None:
+    def __init__(self, process: Process, transport: asyncio.SubprocessTransport, errors: Path) -> None:
         self._process = process
+        self._transport = transport
         self._errors = errors
         self.broken = False
 
     @classmethod
     async def start(cls, command: Sequence[str], errors: Path) -> "Program":
+        loop = asyncio.get_running_loop()
         try:
             with errors.open("ab") as file:
-                process = await asyncio.create_subprocess_exec(
+                transport, protocol = await loop.subprocess_exec(
+                    lambda: SubprocessStreamProtocol(ANSWER_BYTES, loop),
                     *command,
                     "--virtual",
                     stdin=PIPE,
                     stdout=PIPE,
                     stderr=file,
-                    limit=ANSWER_BYTES,
                     start_new_session=True,
                 )
         except OSError as error:
             raise NoAgentError(f"the agent could not be started: {error.strerror}") from None
-        return cls(process, errors)
+        return cls(Process(transport, protocol, loop), transport, errors)
 
     async def ask(self, line: dict[str, Any], limit_s: float = ANSWER_LIMIT_S) -> dict[str, Any]:
         """Its answer. Raises AgentEndedError, UnsupportedError."""
@@ -76,7 +79,10 @@ class Program:
             raise AgentEndedError(f"no answer that can be read: {str(error) or 'it is silent'}") from None
         if answer is None:
             self.broken = True
-            await self._process.wait()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._process.wait(), GRACE_S)
+            if self._process.returncode is None:
+                raise AgentEndedError("it has closed its standard output, and goes on")
             raise AgentEndedError(f"it ended with status {self._process.returncode}: {last_line(self._errors)}")
         if not isinstance(answer, dict):
             self.broken = True
@@ -88,9 +94,13 @@ class Program:
         return answer
 
     async def close(self) -> None:
-        """With all that it has started, which would keep its pipes open."""
+        """With all that it has started.
+
+        asyncio tells of its end once its pipes are closed, and somebody else may hold them, or it has said too much.
+        """
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
+        self._transport.close()
         await self._process.wait()
 
 

@@ -1,15 +1,17 @@
 """`ucp-harness conformance`, as a user gives it; and what is made of its results."""
 
+import asyncio
 import sys
 from pathlib import Path
 
 import pytest
 
-from harness.conformance.air import NoAgentError
+from harness.conformance.air import AgentEndedError, NoAgentError
 from harness.conformance.run import Asked, conform
 from harness.conformance.states import VARIANTS, explore
 from harness.conformance.table import to_junit
 from harness.conformance.vectors import Vectors
+from harness.conformance.virtual import Program
 from harness.wrong_agents import quirky
 from tests.harness.command import harness, sentences
 
@@ -77,3 +79,33 @@ def test_a_program_that_does_not_answer_is_no_agent(
 ) -> None:
     with pytest.raises(NoAgentError, match="the agent does not start"):
         conform(Asked(command, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one)
+
+
+@pytest.mark.parametrize(
+    "script",
+    ["yes", "exec >&-; sleep 1000", "setsid sleep 30 & sleep 1000"],
+    ids=["says too much", "says nothing more", "leaves somebody with its pipes"],
+)
+def test_whatever_a_program_does_with_its_pipes_it_can_be_closed(script: str, tmp_path: Path) -> None:
+    async def end() -> None:
+        program = await Program.start(("sh", "-c", f"echo; {script}"), tmp_path / "errors.log")
+        await asyncio.sleep(1.0)  # so much is said meanwhile that nobody takes it
+        await asyncio.wait_for(program.close(), 10.0)
+
+    asyncio.run(end())
+
+
+def test_a_program_that_closes_its_standard_output_and_goes_on_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("harness.conformance.virtual.GRACE_S", 0.1)
+
+    async def ask() -> None:
+        program = await Program.start(("sh", "-c", "exec >&-; sleep 1000"), tmp_path / "errors.log")
+        try:
+            with pytest.raises(AgentEndedError, match="closed its standard output, and goes on"):
+                await program.ask({"t": 0.0})
+        finally:
+            await program.close()
+
+    asyncio.run(ask())
