@@ -54,7 +54,7 @@ def _tighter(bounds: Bounds) -> list[str]:
         return []
     options = ["--losses 1"] if bounds.network == "lossy" and bounds.losses is None else []
     options += ["--coincidences 0"] if bounds.coincidences is None else []
-    if not bounds.clocks_any and not bounds.quirks and bounds.captured is None:
+    if bounds.alike and not bounds.clocks_any:  # only where agents are alike it makes blocks alike, too
         options.append("--clocks any")
     return options
 
