@@ -6,7 +6,6 @@ Ways round are of one form if the same timers run in their states, whoever runs 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,11 +13,11 @@ from harness.archive.record import Cycle
 from harness.prove.example import Example, Played, keep, play
 from harness.prove.explore import Graph
 from harness.prove.known import DEAD
-from harness.prove.script import NO_CLOCKS, Completion, Script
+from harness.prove.script import NO_CLOCKS, Completion, Document, Script
 from harness.prove.swarm import AGENTS
 
 MOST_FORMS = 12
-"""So many forms are played, the nearest first."""
+"""So many forms are played: those that clocks can show before those that they cannot, and of these the nearest."""
 MOST_PLAYED = 5
 """So many ways of one form are played, to find one that the simulation goes too."""
 ROUNDS = 3
@@ -68,7 +67,7 @@ class Livelock:
         if self.coincidences is None:
             return "if timers can end like that, and one of them may wait for ever"
         if not self.coincidences and self.cycle is None:
-            return "without a coincidence, if what is sent at the same moment crosses in the same way in every round"
+            return "without a coincidence, if what is sent at the same moment is heard in the same order in every round"
         if not self.coincidences:
             return "which takes no coincidence"
         moments = "two moments are" if self.coincidences == 1 else f"{self.coincidences} times two moments are"
@@ -98,43 +97,54 @@ def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
 
 
 class _Round(NamedTuple):
-    """A way to where the swarm goes round, and once round."""
+    """A way to where the swarm goes round, and once round, with its scenario."""
 
     begin: list[int]
     cycle: list[int]
     script: Script
+    document: Document
 
 
 def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> Iterator[Livelock]:
     """Of each form one, written to `path` and beside it."""
-    for number, alike in enumerate(islice(forms(graph, cycles), MOST_FORMS), 1):
+    by_form = [(len(alike), _nearest(graph, alike)) for alike in forms(graph, cycles)]
+    by_form.sort(key=lambda form: form[1][0].script.contradictory)
+    for number, (ways, rounds) in enumerate(by_form[:MOST_FORMS], 1):
         file = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
-        yield _shown(graph, alike, file, name if number == 1 else f"{name} {number}")
+        yield _shown(graph, ways, rounds, file, name if number == 1 else f"{name} {number}")
 
 
-def _shown(graph: Graph, alike: Sequence[list[int]], path: Path, name: str) -> Livelock:
-    """With as few coincidences as the nearest have, and blocks as free as can be: one that the simulation goes, too."""
-    bounds = graph.swarm.bounds
-    tried: list[tuple[int, int, _Round]] = []
+def _nearest(graph: Graph, alike: Sequence[list[int]]) -> list[_Round]:
+    """Some ways of one form: first those that clocks can show, with the fewest coincidences, and with blocks as free as
+    can be."""
+    tried: list[tuple[bool, int, int, _Round]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MOST_PLAYED]:
         begin = graph.path(cycle[0])
         script = Script(graph, [*begin, *cycle[1:], cycle[0]])
-        bound = 0 if bounds.timers_any else sum(each.earliest_s == each.latest_s for each in script.completions())
-        tried.append((script.coincidences, bound, _Round(begin, cycle, script)))
-    first: tuple[_Round, Played] | None = None
-    for _, _, each in sorted(tried, key=lambda one: one[:2]):
-        went = each, play(each.script.document(name))
-        if "liveness" in went[1].judged:
-            first = went
+        document = script.document("")
+        any_time = graph.swarm.bounds.timers_any
+        bound = 0 if any_time else sum(each.earliest_s == each.latest_s for each in script.completions())
+        tried.append((script.contradictory, script.coincidences, bound, _Round(begin, cycle, script, document)))
+    return [each for *_, each in sorted(tried, key=lambda one: one[:3])]
+
+
+def _shown(graph: Graph, ways: int, rounds: Sequence[_Round], path: Path, name: str) -> Livelock:
+    """The first of them that the simulation goes, too; if it goes none, the first."""
+    bounds = graph.swarm.bounds
+    went: tuple[_Round, Played] | None = None
+    for each in rounds:
+        played = play({**each.document, "name": name})
+        goes_round = "liveness" in played.judged
+        if went is None or goes_round:
+            went = each, played
+        if goes_round:
             break
-        if first is None or (first[0].script.contradictory and not each.script.contradictory):
-            first = went
-    assert first is not None, "there is a way round"
-    (begin, cycle, script), played = first
+    assert went is not None, "there is a way round"
+    (begin, cycle, script, _), played = went
     several = Script(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
     completions = () if bounds.timers_any else tuple(several.completions())
     sentence = f"The swarm can go round in circles for ever: {len(begin) - 1} instants after the beginning."
     said = [sentence, *([f"It does {NO_CLOCKS}."] if script.contradictory else [])]
     example = keep(played, path, bounds, len(begin) - 1 + len(cycle), said)
     known = None if bounds.timers_any else script.coincidences
-    return Livelock(len(alike), known, completions, example, script.losses, played.cycle, script.contradictory)
+    return Livelock(ways, known, completions, example, script.losses, played.cycle, script.contradictory)

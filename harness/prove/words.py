@@ -40,6 +40,9 @@ def in_words(proof: Proof) -> Iterator[str]:
         ways = f"{livelock.ways} way{'s' if livelock.ways > 1 else ''}"
         yield f"  {ways} of one form, {livelock.in_words()}: {livelock.example.replay}"
         yield from _played(livelock.example)
+    live = proof.liveness
+    if live is not None and (more := len(live.cycles) - sum(livelock.ways for livelock in proof.livelocks)):
+        yield f"  {more} more, of other forms, {'was' if more == 1 else 'were'} not played"
     example = proof.example
     if example is not None and not proof.livelocks:
         yield f"  a shortest way there, {example.instants} instants: {example.replay}"

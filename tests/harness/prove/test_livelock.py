@@ -6,10 +6,11 @@ import pytest
 
 from harness.archive.record import Cycle
 from harness.prove import Bounds, Progress, in_words, prove
+from harness.prove.cycles import cycles
 from harness.prove.example import Example
 from harness.prove.explore import explore
 from harness.prove.instant import Action
-from harness.prove.livelock import Livelock
+from harness.prove.livelock import Livelock, show
 from harness.prove.progress import Budget
 from harness.prove.swarm import AGENTS, BLOCKS, ZONE, Swarm
 from harness.prove.votes import Votes
@@ -37,7 +38,7 @@ def test_each_form_becomes_a_scenario_that_goes_round(tmp_path: Path, blocks: in
     [
         (0, 0, True, False, "which takes no coincidence"),
         (0, 1, True, False, "which takes no coincidence; 1 loss leads there"),
-        (0, 3, False, False, "crosses in the same way in every round; 3 losses lead there"),
+        (0, 3, False, False, "is heard in the same order in every round; 3 losses lead there"),
         (2, 0, True, False, "2 times two moments are the same by chance"),
         (0, 0, False, True, "as no clocks make them go"),
         (None, 0, False, False, "if timers can end like that"),
@@ -49,6 +50,20 @@ def test_what_it_takes_is_said(
     cycle = Cycle(since_s=1.0, period_s=15.0, agents=[1]) if goes_round else None
     example = Example(tmp_path / "x.yaml", 1, {}, 1)
     assert expected in Livelock(1, coincidences, (), example, losses, cycle, contradictory).in_words()
+
+
+def test_forms_that_clocks_can_show_come_first_and_what_is_not_played_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = explored(4, 4, "lossless", clocks_any=True)
+    ways = cycles(graph)
+    for number, each in enumerate((ways, ways[::-1])):
+        shown = [livelock.contradictory for livelock in show(graph, each, tmp_path / f"{number}.yaml", "round")]
+        assert shown == [False, True]
+    monkeypatch.setattr("harness.prove.livelock.MOST_FORMS", 1)
+    proof = prove(Bounds(4, 4, "lossless", clocks_any=True), out=tmp_path / "some.yaml")
+    assert [livelock.contradictory for livelock in proof.livelocks] == [False]
+    assert "  1 more, of other forms, was not played" in [*in_words(proof)]
 
 
 def test_a_way_round_is_found_also_if_not_everything_is_looked_at(
