@@ -44,6 +44,9 @@ def prove_command(
         int | None,
         typer.Option(help="How often, at most, an agent loses a message; without it any number."),
     ] = None,
+    no_crossing: Annotated[
+        bool, typer.Option("--no-crossing", help="All that comes of one act is heard before anybody else acts.")
+    ] = False,
     settings: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="A setting of all agents; may be repeated.")
     ] = None,
@@ -107,6 +110,7 @@ def prove_command(
         lies=1 if lies is None else lies,
         clocks_any=clocks == "any",
         losses=losses,
+        crossing=not no_crossing,
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:

@@ -36,7 +36,8 @@ class Bounds:
     timers differ, as a scenario's `stagger` says. `captured`: somebody has this agent's keys, and after a moment of his
     choice speaks in its name: `lies` messages, each heard by any of the agents, or any number in the network "any".
     `clocks_any`: of two blocks any may be the older, whoever completed them when: each time that it is asked. `losses`:
-    so many times, at most, somebody loses a message that would have made a difference to him.
+    so many times, at most, somebody loses a message that would have made a difference to him. `crossing`: agents
+    may act at once, so that their messages cross; if not, all that comes of one act is heard before the next.
     """
 
     agents: int = 2
@@ -54,6 +55,7 @@ class Bounds:
     lies: int = 1
     clocks_any: bool = False
     losses: int | None = None
+    crossing: bool = True
 
     def __post_init__(self) -> None:
         for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):
@@ -70,6 +72,8 @@ class Bounds:
             raise BoundsError(f"--losses must be 0..{MAX_LOSSES}, not {self.losses}")
         if self.losses is not None and self.network != "lossy":
             raise BoundsError("--losses is for --network lossy, where messages are lost")
+        if not self.crossing and self.network == "any":
+            raise BoundsError("--no-crossing is not for --network any, where a message takes as long as it likes")
         if self.stagger and self.network == "any":
             raise BoundsError("--stagger is not for --network any, where each agent is looked at by itself")
         for name, step_s in self.stagger.items():
@@ -134,6 +138,7 @@ class Bounds:
             lies = "as many lies as it likes" if self.network == "any" else f"{self.lies} lie{'s' * (self.lies != 1)}"
             parts.append(f"agent {self.captured} captured, {lies}")
         parts += [f"faults {', '.join(self.faults)}"] if self.faults else []
+        parts += [] if self.crossing else ["nothing crosses"]
         parts += ["timers in any order"] if self.timers_any else []
         if self.coincidences is not None:
             parts += [f"{self.coincidences or 'no'} coincidence{'s' * (self.coincidences != 1)}"]

@@ -143,6 +143,7 @@ class Proof:
             "coincidences": bounds.coincidences,
             "clocks": "any" if bounds.clocks_any else "agreed",
             "losses": bounds.losses,
+            "crossing": bounds.crossing,
             "settings": dict(bounds.settings),
             "stagger": dict(bounds.stagger),
             **(self._captors_json() if bounds.captured is not None else {}),

@@ -124,11 +124,15 @@ class Swarm:
                 yield actions[0], frozenset(actions)
 
     def ending(self, state: State) -> Iterator[tuple[Action, ...]]:
-        """All sets of timers that may end in one instant, of each agent one at most; some of the sets cannot."""
+        """All sets of timers that may end in one instant, of each agent one at most; some of the sets cannot.
+
+        Where nothing crosses they end one by one.
+        """
         by_place: dict[int, list[Action]] = {}
         for action in self.firsts(state):
             by_place.setdefault(action.place, []).append(action)
-        for count in range(1, len(by_place) + 1):
+        most = len(by_place) if self.bounds.crossing else 1
+        for count in range(1, most + 1):
             for places in combinations(by_place, count):
                 for actions in product(*(by_place[place] for place in places)):
                     if self._may_coincide(state, actions):
@@ -140,6 +144,8 @@ class Swarm:
         left = self.bounds.blocks - state[BLOCKS]
         for ending in self.ending(state):
             yield ending
+            if not self.bounds.crossing:
+                continue
             idle_hands = [place for place in alive if all(place != action.place for action in ending)]
             for count in range(1, min(left, len(idle_hands)) + 1):
                 for places in self._unlike(state, permutations(idle_hands, count)):

@@ -57,6 +57,7 @@ def _tighter(bounds: Bounds) -> list[str]:
         return []
     options = ["--losses 1"] if bounds.network == "lossy" and bounds.losses is None else []
     options += ["--coincidences 0"] if bounds.coincidences is None else []
+    options += ["--no-crossing"] if bounds.crossing else []
     if bounds.alike and not bounds.clocks_any:  # only where agents are alike it makes blocks alike, too
         options.append("--clocks any")
     return options

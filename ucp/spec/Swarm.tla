@@ -12,6 +12,7 @@ CONSTANTS
     Agents,      \* so many
     MostBlocks,  \* are completed in all
     Lossy,       \* each agent for itself may lose any message
+    Crossing,    \* agents act at once, and hear of each other after that; otherwise one by one
     Timed,       \* timers end when they are over; otherwise whenever they run
     VoteTimeout, Phase1Timeout, Phase2Timeout, Phase3Timeout, FinalizeGap,   \* in some common unit
     VoteNamesChain, ChangedBeforeTally, Phase1TiePops, Phase2TieTakesBlock, AsPrinted
@@ -117,7 +118,8 @@ Instant ==
                     IF id \in DOMAIN ends THEN Run(Expire(now[id], ends[id]))
                     ELSE IF id \in Range(makers) THEN Run(Complete(now[id], Completed + order(id)))
                     ELSE now[id]]
-            IN /\ DOMAIN ends # {} \/ makers # <<>>
+                acting == Cardinality(DOMAIN ends) + Len(makers)
+            IN /\ acting = 1 \/ (Crossing /\ acting > 1)
                /\ swarm' \in Settled([id \in Everybody |-> Silent(acted[id])],
                                      UNION {InOrder(acted[id]) : id \in Everybody}, TRUE)
 

@@ -45,6 +45,21 @@ def test_they_come_to_the_same_states(
     assert opinion.exit_status == bool(livelock)
 
 
+@pytest.mark.parametrize(
+    ("agents", "blocks", "network", "timers_any", "states"),
+    [(2, 3, "lossless", True, 117), (2, 4, "lossless", False, 487), (2, 2, "lossy", True, 329)],
+)
+def test_they_come_to_the_same_states_where_nothing_crosses(
+    agents: int, blocks: int, network: Any, timers_any: bool, states: int
+) -> None:
+    bounds = Bounds(agents, blocks, network, timers_any=timers_any, settings=NO_GAP, crossing=False)
+    opinion = second_opinion(bounds)
+    assert (opinion.states, opinion.specified) == (states, states)
+    assert opinion.agrees
+    assert opinion.to_json()["crossing"] is False
+    assert opinion.livelock is opinion.specified_livelock is (None if network == "lossy" else False)
+
+
 def test_what_is_printed_and_cannot_be_meant_is_rejected_by_both() -> None:
     opinion = second_opinion(Bounds(2, 2, "lossless", timers_any=True, quirks={"change_without_new_vote": True}))
     assert (opinion.flaw, opinion.violated) == ("2", "2")
