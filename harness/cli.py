@@ -5,6 +5,7 @@ was wrong. 3: this machine cannot do it. 4: `prove` could not look at everything
 """
 
 import errno
+import io
 import os
 import sys
 from importlib import import_module
@@ -189,10 +190,28 @@ def _harness(
     """Test harness for the Uniform Chain Protocol."""
 
 
+class _Output(io.FileIO):
+    """Standard output. A reader that has seen enough (`| head`) ends what is printed, and nothing else."""
+
+    def write(self, data: Any, /) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            return memoryview(data).nbytes
+
+
 def main() -> NoReturn:
     """The console script: a user's mistake ends in one sentence and the right exit status, never in a traceback."""
     if sys.stdout is None:  # it was closed before we began: nobody wants to read
         sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    else:
+        sys.stdout = io.TextIOWrapper(
+            io.BufferedWriter(_Output(sys.stdout.fileno(), "w", closefd=False)),
+            sys.stdout.encoding,
+            sys.stdout.errors,
+            line_buffering=bool(sys.stdout.line_buffering),
+        )
     try:
         try:
             app()

@@ -1,7 +1,5 @@
 """`ucp-harness replay`: what one agent saw, played again."""
 
-import os
-import sys
 from bdb import BdbQuit
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -46,7 +44,7 @@ def replay_command(
         raise typer.BadParameter("--json is for programs, which play the whole record: leave out --step and --break")
     if debug and not breaks:
         raise typer.BadParameter("--debug calls the debugger at each --break: name one, such as --break 812")
-    console = Paper(highlight=False)
+    console = Console(highlight=False)
     try:
         if step or breaks:
             _ask(console, open_record(record, agent), until, step, breaks or [], debug)
@@ -105,11 +103,3 @@ def _complain_of(record: Record) -> None:
 def _show(console: Console, lines: Iterable[Text]) -> None:
     for line in lines:
         console.print(line, soft_wrap=True)
-
-
-class Paper(Console):
-    """Prints on; a reader that has seen enough (`| head`) ends the printing, and nothing else."""
-
-    def on_broken_pipe(self) -> None:
-        self.quiet = True
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import sys
 import time
 from collections.abc import Iterable
@@ -79,15 +78,11 @@ def end_sweep(record: "MatrixRecord | ScaleRecord", table: RenderableType | None
 
 
 def print_lines(texts: Iterable[str]) -> None:
-    """Plain lines. A reader that has seen enough (`| head`) ends them, and nothing else."""
+    """Plain lines."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal that lacks a vehicle's characters
-    try:
-        for text in texts:
-            sys.stdout.write(text + "\n")
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+    for text in texts:
+        sys.stdout.write(text + "\n")
 
 
 def print_json(document: Any) -> None:

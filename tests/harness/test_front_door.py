@@ -89,6 +89,21 @@ def test_a_full_standard_output_is_no_verdict(tmp_path: Path) -> None:
         assert sentences(ended.stderr) == ["standard output cannot be written: No space left on device"]
 
 
+@pytest.mark.parametrize("options", [[], ["--json"]])
+@pytest.mark.parametrize(("blocks", "status"), [(3, 0), (4, 1)])
+def test_a_reader_that_has_seen_enough_changes_no_verdict(
+    tmp_path: Path, options: list[str], blocks: int, status: int
+) -> None:
+    reads, writes = os.pipe()
+    os.close(reads)
+    bounds = ["--agents", "2", "--blocks", str(blocks), "--network", "lossless", "--out", str(tmp_path / "way.yaml")]
+    ended = subprocess.run(
+        [*COMMAND, "prove", *bounds, *options], stdout=writes, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(writes)
+    assert (ended.returncode, ended.stderr) == (status, "")
+
+
 def test_what_is_no_file_is_no_scenario(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "scenario.yaml")
     for path in (tmp_path / "scenario.yaml", "/dev/zero", tmp_path):
