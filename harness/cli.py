@@ -205,12 +205,12 @@ def main() -> NoReturn:
     """The console script: a user's mistake ends in one sentence and the right exit status, never in a traceback."""
     if sys.stdout is None:  # it was closed before we began: nobody wants to read
         sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
-    else:
+    elif sys.stdout is (own := sys.__stdout__):
         sys.stdout = io.TextIOWrapper(
-            io.BufferedWriter(_Output(sys.stdout.fileno(), "w", closefd=False)),
-            sys.stdout.encoding,
-            sys.stdout.errors,
-            line_buffering=bool(sys.stdout.line_buffering),
+            io.BufferedWriter(_Output(own.fileno(), "w", closefd=False)),
+            own.encoding,
+            own.errors,
+            line_buffering=own.line_buffering,
         )
     try:
         try:
