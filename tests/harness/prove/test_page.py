@@ -1,0 +1,90 @@
+"""The tables of docs/proof.md say what is found: each row of it that takes a moment is looked at again."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from harness.prove import Bounds, Proof, prove
+
+PAGE = Path(__file__).parents[3] / "docs" / "proof.md"
+MOST_S = 0.5
+"""Rows that take longer are left to whoever measures them."""
+
+Row = dict[str, str]
+
+
+def rows() -> Iterator[Row]:
+    """Each row of a table of bounds, with the options that all of the table's have, as the comment above it says."""
+    lines = iter(PAGE.read_text().splitlines())
+    for line in lines:
+        if options := re.fullmatch(r"<!-- prove(.*) -->", line):
+            names = cells(next(lines))
+            assert set(next(lines)) <= set("|-:")
+            while (row := next(lines)).startswith("|"):
+                yield {**dict(zip(names, cells(row), strict=True)), "options": options[1]}
+
+
+def cells(line: str) -> list[str]:
+    plain = line.replace("**", "").replace("`", "").replace("\N{EN DASH}", "-")
+    return [cell.strip() for cell in plain.strip("|").split("|")]
+
+
+def bounds_of(row: Row) -> Bounds:
+    settings = [word for word in row.get("settings", "-").split(", ") if word != "-"]
+    phrases = {"timers in any order", "any block the older", "clocks agree"}
+    by_default = "any" if "--clocks any" in row["options"] else "agreed"
+    clocks = "agreed" if "clocks agree" in settings else "any" if "any block the older" in settings else by_default
+    coincidences = row.get("coincidences", "0" if "--coincidences 0" in row["options"] else "-")
+    return Bounds(
+        int(row["agents"]),
+        int(row["blocks"]),
+        row.get("network", "lossy"),  # type: ignore[arg-type]  # it is checked
+        tuple(name for name in row.get("faults", "-").split(", ") if name != "-"),
+        timers_any="timers in any order" in settings,
+        coincidences=at_most(coincidences),
+        losses=at_most(row.get("losses", "-")),
+        clocks_any=row.get("clocks", clocks) == "any",
+        crossing="--no-crossing" not in row["options"],
+        settings={
+            name: yaml.safe_load(value) for name, value in (word.split() for word in settings if word not in phrases)
+        },
+    )
+
+
+def at_most(cell: str) -> int | None:
+    return None if cell in ("-", "any number") else int(cell)
+
+
+def one_chain(proof: Proof) -> str:
+    """As the page says it: after how many more votes, and how many states cannot yet with 0, 1, ... of them."""
+    live = proof.liveness
+    if live is None:
+        return "not looked at"
+    *cannot, last = [f"{states:,}" for states in live.astray]
+    if live.lost is not None:
+        return f"never, from {last} ({'; '.join(dict.fromkeys([*cannot, last]))})"
+    if not cannot:
+        return "without another vote"
+    return f"{len(cannot)} more vote{'s' if len(cannot) > 1 else ''} ({', '.join(cannot)})"
+
+
+SMALL = [row for row in rows() if float(row.get("seconds") or row["processor seconds"]) <= MOST_S]
+
+
+def test_the_page_has_tables() -> None:
+    assert len(SMALL) > 25
+    assert {row["options"] for row in SMALL} == {"", " --no-crossing"}
+
+
+@pytest.mark.parametrize("row", SMALL, ids=lambda row: f"{row['agents']}/{row['blocks']} {row['states']}")
+def test_a_row_says_what_is_found(row: Row, tmp_path: Path) -> None:
+    proof = prove(bounds_of(row), out=tmp_path / "row.yaml")
+    assert proof.complete
+    assert proof.flaw is None, "everything holds in every state"
+    assert row.get("in every state", "holds") == "holds"
+    livelocks = "not looked at" if proof.liveness is None else str(len(proof.liveness.cycles))
+    found = f"{proof.figures.states:,}", f"{proof.figures.transitions:,}", one_chain(proof), livelocks
+    assert found == (row["states"], row["transitions"], row["one chain"], row["livelocks"])
