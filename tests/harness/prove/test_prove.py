@@ -17,6 +17,7 @@ from harness.prove import INCOMPLETE, Bounds, BoundsError, Limits, Progress, in_
 from harness.prove.alone import collect
 from harness.prove.crew import Crew
 from harness.prove.explore import LOOK_EVERY, explore
+from harness.prove.progress import memory_bytes
 from harness.prove.swarm import Swarm
 from tests.harness.command import COMMAND, harness, sentences
 
@@ -106,6 +107,14 @@ def test_every_step_of_right_agents_is_right() -> None:
     proof = prove(Bounds(2, 2, "lossy", ("reboot",), steps=True))
     assert proof.exit_status == 0
     assert any("every step" in line and line.startswith("✔") for line in in_words(proof))
+
+
+def test_the_bound_of_memory_is_of_what_is_taken_not_of_what_once_was() -> None:
+    before = memory_bytes()
+    once = b"x" * 500_000_000
+    assert memory_bytes() > before + 400_000_000
+    del once
+    assert memory_bytes() < before + 100_000_000
 
 
 def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ STAGGER = {"stagger": {"phase1_timeout_s": 0.5}}
 def after_the_fork(agents: int, holders: list[int], keys: dict[str, Any]) -> Liveness:
     """What may come of it if nothing is lost any more, and somebody completes a block at any moment."""
     bounds = Bounds(agents, len(holders) + 1, "lossless", **keys)
-    graph = explore(forked(bounds, holders), most_bytes=1e9, most_s=300)
+    graph = explore(forked(bounds, holders), most_bytes=8e9, most_s=300)
     assert graph.ended == "complete"
     return liveness.look(graph)
 
