@@ -82,18 +82,20 @@ def _in_traces(evidence: "Evidence", busy: Sequence[int], times: int) -> Cycle |
         return None
     for agent_id, trace in evidence.traces.items():
         runs = _own_runs(trace)
-        if agent_id not in busy or not runs:
+        is_busy, going_round = agent_id in busy, _round(runs, times)
+        quiet_s = ended_at_s - runs[-1].t if runs else 0.0
+        if not runs or (not is_busy and (going_round is None or quiet_s > going_round.period_s)):
             since_s = max(since_s, trace.chain_changed_at())
-        elif runs[-1].t + longest(trace, ALL_TIMERS) < ended_at_s:
+        elif is_busy and quiet_s > longest(trace, ALL_TIMERS):
             since_s = max(since_s, runs[-1].t)
-        elif going_round := _round(runs, times):
+        elif going_round is not None:  # also one that happens to be idle at the end: others have it reconcile
             rounds[agent_id] = going_round
             since_s = max(since_s, going_round.since_s)
         else:
             return None
     if not set(busy) <= set(evidence.traces):
         return None
-    if not rounds:
+    if rounds.keys().isdisjoint(busy):
         return Cycle(since_s=since_s, agents=list(busy))
     period_s = max(each.period_s for each in rounds.values())
     from_s = max(since_s, connected_s)

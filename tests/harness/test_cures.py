@@ -65,7 +65,7 @@ def in_short(outcomes: list[str]) -> str:
 def test_a_cure_ends_what_the_page_says(cure: str, cells: list[str]) -> None:
     played = [
         outcome(yaml.safe_load((SCENARIOS / f"{name}.yaml").read_text()), cure)
-        for name in ("in_step", "refused_by_the_third", "by_turns")
+        for name in ("in_step", "refused_by_the_third", "by_turns", "drawn_in")
     ]
     played += [
         in_short([outcome(refused(agents, partition=partition), cure) for agents in SIZES])

@@ -13,8 +13,11 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import Judgement
 from harness.play.simulation.backend import Simulation
 from harness.run.simulate import Simulated, simulate
+from harness.scenario import Scenario
+from harness.scenario.load import load_scenario
 from tests.harness.command import harness, write_scenario
 from tests.harness.test_recurrence import in_step
+from tests.harness.test_scenarios import LIVELOCKS, SCENARIOS
 from tests.harness.virtual import scenario
 from ucp.quirks import CRASHED
 
@@ -83,6 +86,19 @@ def test_traces_alone_show_the_same_handler_runs_over_and_over(monkeypatch: pyte
     )
     assert repeated and int(repeated[1]) == (1860 - 11) // 15
     assert {"5", "6", "liveness"} == set(run.result.bad)
+
+
+@pytest.mark.parametrize("name", LIVELOCKS)
+def test_traces_show_it_whenever_the_run_ends(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also while some of those who take part are idle."""
+    without_looking(monkeypatch)
+    document = load_scenario(SCENARIOS / f"{name}.yaml").model_dump(exclude={"expect"}, exclude_unset=True)
+    idle = set()
+    for more_s in range(0, 30, 2):
+        run = simulate(Scenario.model_validate({**document, "settle": {"limit_s": 250 + more_s}}), seed=1, tracing=True)
+        assert liveness(run).verdict == "never finishes", f"{run.played.mission_s:.0f} s"
+        idle.add(len(run.evidence.busy))
+    assert len(idle) > 1 or name != "drawn_in"
 
 
 def test_a_few_times_in_a_row_may_be_a_coincidence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -138,3 +138,10 @@ def test_who_is_looked_at_twice_in_the_same_wait_has_not_come_again() -> None:
     )
     assert run.played.cycle is None
     assert run.result.judgements["liveness"].verdict == "finished"
+
+
+@pytest.mark.parametrize(("late", "proven"), [("2+0.001", True), ("2+0.001 9000+1", False)])
+def test_timers_that_were_told_to_be_late_prove_nothing_only_until_they_have_ended(late: str, proven: bool) -> None:
+    run = simulate(in_step(lateness={1: late}, network={"delay": 0.01}), seed=1)
+    assert not run.played.settled
+    assert (run.played.cycle is not None) == proven

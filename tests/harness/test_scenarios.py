@@ -215,6 +215,10 @@ def three_losses(run: Simulated, seed: int) -> None:
     assert going_round(run) == (42.1, 20.0)
 
 
+def drawn_in(run: Simulated, seed: int) -> None:
+    assert going_round(run) == (71.06, 25.0)
+
+
 def by_turns(run: Simulated, seed: int) -> None:
     assert going_round(run) == (26.011, 30.0)
 
@@ -326,6 +330,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         refused_by_the_third,
         refused_for_ever,
         three_losses,
+        drawn_in,
         by_turns,
         rogue,
         captured,
@@ -339,7 +344,7 @@ PLAYED = [(name, seed) for name in CLAIMS for seed in SEEDS_OF.get(name, SEEDS)]
 """Each scenario, and the seeds with which it shows what it says."""
 
 
-LIVELOCKS = ("in_step", "refused_by_the_third", "refused_for_ever", "three_losses", "by_turns")
+LIVELOCKS = ("in_step", "refused_by_the_third", "refused_for_ever", "three_losses", "drawn_in", "by_turns")
 BAD = ("rogue", "captured", *LIVELOCKS, "missed_commit", "field_test_2020")
 
 RECONCILED = [

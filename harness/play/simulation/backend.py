@@ -247,7 +247,7 @@ class Simulation(Clockwork):
         """None while there is more to come than agents themselves do, or lots decide what becomes of them."""
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
-        unknown = self._anybody_is_unknown or self._rogue is not None or bool(self._late)
+        unknown = self._anybody_is_unknown or self._rogue is not None
         if self._generating or moving or unknown or delays is None:
             return None
         return Recurrence(delays)
@@ -270,8 +270,12 @@ class Simulation(Clockwork):
                 if life.state is not None
             ]
             fates = self._script.standing(self._now)
-            order = self._air.order_of_timers(wakes_s)
-            if fates is not None and recurrence.look(swarm, order, fates, self._script.last_s or 0.0):
+            order = [
+                *self._air.order_of_timers(wakes_s),
+                *(name for late in self._late.values() for name in late.running),
+            ]
+            all_on_time = all(late.all_have_ended for late in self._late.values())
+            if all_on_time and fates is not None and recurrence.look(swarm, order, fates, self._script.last_s or 0.0):
                 self.played.cycle = recurrence.cycle(swarm)
                 return True
             await self.until(min(mission_s, next_s))

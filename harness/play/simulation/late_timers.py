@@ -34,6 +34,13 @@ class LateTimers:
                 self.running[timer.name] = Running(timer.name, self._started, deadline)
                 self._started += 1
 
+    @property
+    def all_have_ended(self) -> bool:
+        """Whether none of those that are told to be late runs or is to come: from now on all end when they should."""
+        late = self._late_by_s.keys()
+        running = {timer.number for timer in self.running.values()}
+        return self._started > max(late, default=-1) and running.isdisjoint(late)
+
     def next(self, at: Callable[[float], float]) -> tuple[float, Running] | None:
         """When which ends next, in mission seconds; `at` is when the agent's clock shows something."""
         ends = ((at(timer.deadline) + self._late_by_s.get(timer.number, 0.0), timer) for timer in self.running.values())

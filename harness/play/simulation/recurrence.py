@@ -68,10 +68,11 @@ class Recurrence:
         """Whether no two timers ended so close to each other that rounding decides which was first."""
         self._delays_matter = False
 
-    def look(self, swarm: Sequence[Waiting], order: Sequence[int], fates: tuple[int, ...], fate_at: float) -> bool:
+    def look(self, swarm: Sequence[Waiting], order: Sequence[object], fates: tuple[int, ...], fate_at: float) -> bool:
         """Whether the swarm has been here before, and always comes back. Nothing is on its way, and some timer runs.
 
-        `order` is that in which timers end. `fates` is how far they have counted, and `fate_at` when one last decided.
+        `order` is that in which timers end, of one agent's, too, if it matters. `fates` is how far they have counted,
+        and `fate_at` when one last decided.
         """
         wakes = sorted(agent.wakes_s for agent in swarm if agent.wakes_s is not None)
         if wakes[0] <= self._next_s + 2 * self._latest or self._as_timers_left_it != _what_messages_may_change(swarm):
