@@ -138,6 +138,18 @@ def test_livelocks_are_told_apart_by_the_timers_on_the_way_round() -> None:
     assert shape("v12", "12v") == "2 agents going round every 20 s (voting, phase one, phase two)"
     assert shape("2v12v1", "vf12") == shape("v12", "12v"), "twice round, entered elsewhere, with what is no timer"
     assert shape("v12", "v1") == shape("1v", "2v1") != shape("v12", "v12")
+    assert shape("v12", "v12", "1").startswith("3 agents"), "whoever takes part is one of them, idle or not"
+    assert shape("v12", "v12", "f") == shape("v12", "v12")
+
+
+def test_a_livelock_is_one_whoever_is_idle_when_it_is_looked_at() -> None:
+    drawn_in = load_scenario(find(Path("drawn_in"))).model_dump(exclude={"expect"}, exclude_unset=True)
+    shapes = set()
+    for later_s in range(0, 25, 5):
+        scenario = Scenario.model_validate({**drawn_in, "duration_s": 106 + later_s})
+        shapes |= {identity.shape for identity in found_in(scenario, 1)}
+    (shape,) = shapes
+    assert shape.startswith("4 agents going round every 25 s (phase one; ")
 
 
 def test_in_the_liveness_phase_everybody_hears_everybody() -> None:
