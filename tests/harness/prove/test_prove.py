@@ -122,10 +122,12 @@ def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:
     assert proof.exit_status == INCOMPLETE
     assert not any("✔" in line for line in in_words(proof))
     assert "the same with --losses 1 or --coincidences 0 or --no-crossing or --clocks any" in [*in_words(proof)][2]
-    least = Bounds(3, 3, "lossy", losses=1, coincidences=0, clocks_any=True, crossing=False)
-    proof = prove(least, Limits(most_s=0.0))
+    least = Bounds(4, 4, "lossy", losses=2, coincidences=0, clocks_any=True, crossing=False)
+    proof = prove(least, Limits(most_s=0.0), tmp_path / "least.yaml")
+    assert proof.ended == "time"
     assert not any("sooner" in line for line in in_words(proof))
-    staggered = prove(Bounds(3, 3, "lossless", stagger={"phase1_timeout_s": 0.5}), Limits(most_s=0.0))
+    bounds = Bounds(3, 3, "lossless", stagger={"phase1_timeout_s": 0.5})
+    staggered = prove(bounds, Limits(most_s=0.0), tmp_path / "staggered.yaml")
     assert [*in_words(staggered)][2].endswith("the same with --coincidences 0 or --no-crossing")
 
 
