@@ -103,8 +103,8 @@ def test_what_playing_does_not_show_is_said(tmp_path: Path) -> None:
     assert any("not shown by playing" in line for line in in_words(proof))
 
 
-def test_every_step_of_right_agents_is_right() -> None:
-    proof = prove(Bounds(2, 2, "lossy", ("reboot",), steps=True))
+def test_every_step_of_right_agents_is_right(tmp_path: Path) -> None:
+    proof = prove(Bounds(2, 2, "lossy", ("reboot",), steps=True), out=tmp_path / "steps.yaml")
     assert proof.exit_status == 0
     assert any("every step" in line and line.startswith("✔") for line in in_words(proof))
 
