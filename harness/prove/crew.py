@@ -9,6 +9,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import count
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
@@ -26,6 +27,8 @@ WORTH_A_CREW = 500
 """So many states that have not been looked at are shared among the cores."""
 CHUNK = 100
 """So many states, at most, are looked at before they are told of."""
+MOST_TOLD = 500_000
+"""A process remembers so many states that it has told of; then it tells of them again."""
 
 News = list[tuple[int, Any]]
 """Numbers of whoever tells, and what they stand for."""
@@ -146,6 +149,7 @@ class _Hand:
         self._swarm = swarm
         self._line = _Line(swarm)
         self._told: dict[State, int] = {}
+        self._telling = count()
         self._votes = Votes(swarm)
 
     def __call__(self, task: Told | Forks) -> Answer:
@@ -154,11 +158,13 @@ class _Hand:
 
     def _following(self, task: Told) -> Following:
         fresh: list[State] = []
+        if len(self._told) >= MOST_TOLD:
+            self._told.clear()
 
         def number_of(state: State) -> int:
             number = self._told.get(state)
             if number is None:
-                number = self._told[state] = len(self._told)
+                number = self._told[state] = next(self._telling)
                 fresh.append(state)
             return number
 
@@ -221,8 +227,8 @@ class _Other:
         """What follows each of the states from number `first` on; new states are added with `add`."""
         fresh = iter(self._line.heard(answer.told))
         numbers = self._numbers
-        for parent, (count, expansion) in enumerate(answer.expansions, first):
-            for _ in range(count):
+        for parent, (new, expansion) in enumerate(answer.expansions, first):
+            for _ in range(new):
                 numbers.append(add(next(fresh), parent))
             yield Expansion(
                 expansion.ways,

@@ -12,6 +12,7 @@ from harness.prove.collecting import cycles_left_alone
 from harness.prove.crew import Crew
 from harness.prove.expansion import Expansion, expanded
 from harness.prove.flaws import Flaw
+from harness.prove.packed import Followers, States
 from harness.prove.progress import LOOK_EVERY, Budget, Ended, Progress
 from harness.prove.swarm import State, Swarm
 
@@ -27,10 +28,9 @@ class Graph:
     """
 
     swarm: Swarm
-    states: list[State] = field(default_factory=list)
-    number: dict[State, int] = field(default_factory=dict)
+    states: States = field(init=False)
     parents: "array[int]" = field(default_factory=lambda: array("q"))
-    quiet: list[tuple[tuple[int, ...], ...]] = field(default_factory=list)
+    quiet: Followers = field(default_factory=Followers)
     crossing: dict[int, tuple[int, ...]] = field(default_factory=dict)
     transitions: int = 0
     depth: int = 0
@@ -45,15 +45,17 @@ class Graph:
     crew_steps: int = 0
     """Memory and processor time of other processes, and the steps that they have computed."""
 
+    def __post_init__(self) -> None:
+        self.states = States(self.swarm.bounds.agents)
+
     @property
     def flaw(self) -> Flaw | None:
         return None if self.flawed is None else self.swarm.flaw(self.states[self.flawed])
 
     def reach(self, state: State, parent: int) -> int:
         """Its number; a new one if it is new. It should have no flaw."""
-        number = self.number.setdefault(state, len(self.states))
-        if number == len(self.states):
-            self.states.append(state)
+        number = self.states.add(state)
+        if number == len(self.parents):
             self.parents.append(parent)
             if self.flawed is None and self.swarm.flaw(state) is not None:
                 self.flawed = number
