@@ -25,7 +25,10 @@ MOST_AT_ONCE = 100
 
 
 class Agents:
-    """One of each on the roster; if a vehicle is captured they are behind the real gate."""
+    """One of each on the roster; if a vehicle is captured they are behind the real gate.
+
+    Where they are `nameless` each has its own settings, but the first's ID.
+    """
 
     def __init__(self, bounds: Bounds) -> None:
         self._bounds = bounds
@@ -54,7 +57,8 @@ class Agents:
             handlers = [_calling(handler, after_each) for handler in handlers or HANDLERS.values()]
         settings, tracing = self._bounds.agent_settings(agent_id), after_each is not None
         make = Agent if self._gate is None else partial(self._gate.agent, revoked=revoked)
-        return make(agent_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
+        own_id = FIRST if self._bounds.nameless else agent_id
+        return make(own_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
 
     def put_into(self, agent_id: int, snapshot: Snapshot) -> Agent:
         """The agent, which is in this state now."""

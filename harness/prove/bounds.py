@@ -111,14 +111,22 @@ class Bounds:
             raise BoundsError("--clocks any is for right agents: leave out --quirk and --captured")
 
     @property
+    def nameless(self) -> bool:
+        """Whether it makes no difference which ID an agent has: to itself it is the first then.
+
+        Not where each is looked at by itself, against all that the others say by their IDs.
+        """
+        return self.reduced and self.captured is None and self.network != "any"
+
+    @property
     def alike(self) -> bool:
         """Whether it makes no difference who is who."""
-        return self.reduced and not self.stagger and self.captured is None
+        return self.nameless and not self.stagger
 
     @property
     def blocks_alike(self) -> bool:
         """Whether it makes no difference which block is which."""
-        return self.alike and self.clocks_any
+        return self.nameless and self.clocks_any
 
     @property
     def settles(self) -> bool:

@@ -95,7 +95,7 @@ class Instants:
         self._choices_of: dict[tuple[int, int, Started, _Said, bool, bool], list[_Choice]] = {}
         self._places = range(bounds.agents)
         self._names = [
-            [other + 2 if bounds.alike and other < place else other + 1 for other in self._places]
+            [other + 2 if bounds.nameless and other < place else other + 1 for other in self._places]
             for place in self._places
         ]
 

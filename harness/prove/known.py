@@ -29,7 +29,8 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A local state. `waits` says whether the agent reconciles, `chain` is the number of its chain.
+    """A local state of the agent with this ID on the roster. `waits` says whether it reconciles, `chain` numbers its
+    chain's blocks.
 
     `deceived`: it holds a block in the captured vehicle's name which that never completed.
     """
@@ -61,7 +62,7 @@ class KnownStates:
         self.known: list[Known] = []
         self.flawed: set[int] = set()
         """Those that must never be."""
-        self._alike = bounds.alike
+        self._nameless = bounds.nameless
         self._parts = Parts()
         self._numbers: dict[tuple[Any, ...], int] = {}
         self._renamed: dict[tuple[int, Names], int] = {}
@@ -130,10 +131,10 @@ class KnownStates:
     def names_in_order(self, local: int, sender: int) -> Names | None:
         """Names by which the others are in order: those in tallies first, then the sender; None if they are.
 
-        Where it makes no difference who is who, what an agent does is the same but for these names (docs/proof.md).
+        Where IDs make no difference, what an agent does is the same but for these names (docs/proof.md).
         """
         known = self.known[local]
-        if not self._alike or known.agent_id != FIRST or known.flaw is not None:
+        if not self._nameless or known.flaw is not None:
             return None
         tallies = [known.snapshot[name] for name in NAMES_OF_OTHERS]
         in_order = sorted(self.others, key=lambda other: (*(other not in tally for tally in tallies), other != sender))
@@ -145,7 +146,7 @@ class KnownStates:
         Or if they have other names to the agent, as it has heard of somebody before.
         """
         known = self.known[local]
-        if not self._alike or known.agent_id != FIRST or known.names_others or known.flaw is not None:
+        if not self._nameless or known.names_others or known.flaw is not None:
             return None
         in_order = tuple(dict.fromkeys((*senders, *self.others)))
         return None if in_order == self.others else _back(in_order)

@@ -58,7 +58,9 @@ class LocalStates(KnownStates):
         self._ends: dict[tuple[int, int], list[End]] = {}
         self._lets_be: dict[tuple[int, int, int], bool] = {}
         self._counts: dict[tuple[int, int, int], bool] = {}
-        self.initial = {agent_id: self._intern(agent, take(agent)) for agent_id, agent in self.agents.by_id.items()}
+        self.initial = {
+            agent_id: self._intern(agent_id, agent, take(agent)) for agent_id, agent in self.agents.by_id.items()
+        }
 
     # Steps
 
@@ -79,7 +81,7 @@ class LocalStates(KnownStates):
 
     def lets_be(self, local: int, sender: int, message: int) -> bool:
         """Whether it makes no difference at all that the agent hears this."""
-        if self._alike and not self.known[local].names_others:
+        if self._nameless and not self.known[local].names_others:
             sender = FIRST_OTHER  # it is one to the agent who says it
         key = local, sender, message
         lets_be = self._lets_be.get(key)
@@ -231,7 +233,7 @@ class LocalStates(KnownStates):
             self.blocks.note_completed((digest, agent.agent_id, completes) for digest in made)
         if self._reference is not None:
             snapshot = None if boots else before.snapshot
-            wrong = self._reference.deviation(agent, crashed, snapshot, give, self.blocks.in_words)
+            wrong = self._reference.deviation(before.agent_id, agent, crashed, snapshot, give, self.blocks.in_words)
         if crashed is None:
             crashed = end_at_once(agent)
         if crashed is not None:
@@ -255,7 +257,8 @@ class LocalStates(KnownStates):
             if hears and any(self.timers[timer] == "voting" for timer, _ in started):
                 raise ReductionError("an agent begins a vote because of a message: try again with --whole")
             check_that_nothing_is_lost(before.snapshot, agent.state)
-        return Step(self._intern(agent, after, before.snapshot, flaw, keep=not boots), sent, started)
+        local = self._intern(before.agent_id, agent, after, before.snapshot, flaw, keep=not boots)
+        return Step(local, sent, started)
 
     def message(self, message: Message) -> int:
         """Its number."""
@@ -299,7 +302,7 @@ class LocalStates(KnownStates):
             return local
         exchanged = self.blocks.exchanged(known.snapshot, dict(zip(about, blocks, strict=True)))
         agent = self.agents.put_into(known.agent_id, exchanged)
-        return self._intern(agent, take(agent))
+        return self._intern(known.agent_id, agent, take(agent))
 
     # States
 
@@ -309,6 +312,7 @@ class LocalStates(KnownStates):
 
     def _intern(
         self,
+        agent_id: int,
         agent: Agent,
         taken: Snapshot,
         before: Snapshot | None = None,
@@ -316,14 +320,14 @@ class LocalStates(KnownStates):
         *,
         keep: bool = True,
     ) -> int:
-        """The number of the state that the agent is in, as it was `taken`; it was in `before`.
+        """The number of the state that this agent is in, as it was `taken`; it was in `before`.
 
         `keep`: it will be given more inputs.
         """
         snapshot = self._parts.of(taken, before or {})
         if keep:
-            self.agents.leave_in(agent.agent_id, snapshot)
-        return self.number(agent.agent_id, agent.state, snapshot, flaw)
+            self.agents.leave_in(agent_id, snapshot)
+        return self.number(agent_id, agent.state, snapshot, flaw)
 
     def content(self, local: int) -> Content:
         """What another process needs to know of it."""
@@ -337,4 +341,4 @@ class LocalStates(KnownStates):
         agent_id, snapshot, flaw, initiated = content
         self.blocks.learn_chain_hash(snapshot["top_chain_hash_at_initiation"], initiated)
         agent = self.agents.put_into(agent_id, snapshot)
-        return self._intern(agent, take(agent), None, flaw)
+        return self._intern(agent_id, agent, take(agent), None, flaw)

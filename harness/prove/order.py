@@ -1,4 +1,4 @@
-"""Of all orders of the agents one that stands for all: agents that are alike change places freely.
+"""Of all orders of the agents one that stands for all: agents that are alike change places freely, and blocks numbers.
 
 It is chosen by what the agents are and how their timers stand to each other, never by the numbers that states and zones
 have got: so it is the same on any machine, and in whatever order states were come upon.
@@ -58,7 +58,9 @@ class Order:
 
     def _put_in_order(self, locals_: tuple[int, ...], zone: int) -> Ordered:
         timers = self._timers(locals_)
-        orders = list(islice(self._orders(locals_, zone, timers), MOST_ORDERS))
+        orders = [self._as_they_are]
+        if self._local.bounds.alike:
+            orders = list(islice(self._orders(locals_, zone, timers), MOST_ORDERS))
         places = orders[0]
         if len(orders) > 1:
             places = min(orders, key=lambda places: self._looks(locals_, zone, timers, places))

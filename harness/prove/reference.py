@@ -33,14 +33,19 @@ class Reference:
         self._right: dict[int, Agent] = {}
 
     def deviation(
-        self, agent: Agent, crashed: str | None, before: Snapshot | None, give: Give, name_of: Callable[[str], str]
+        self,
+        agent_id: int,
+        agent: Agent,
+        crashed: str | None,
+        before: Snapshot | None,
+        give: Give,
+        name_of: Callable[[str], str],
     ) -> tuple[str, str] | None:
         """Handler and sentence if the right agent does not do what `agent` did; None if it does.
 
         `before` is the state in which the agent was given the input, None if it had just been switched on. `name_of`
         names a block for people, by its hash.
         """
-        agent_id = agent.agent_id
         if before is None or agent_id not in self._right:
             self._right[agent_id] = self._make(agent_id, True, None)
         right = self._right[agent_id]

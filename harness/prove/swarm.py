@@ -2,7 +2,7 @@
 
 A global state is how many blocks were completed, which faults are left, the zone of the timers that run, and the
 agents' local states: a tuple of small numbers. Where `bounds.alike`, agents that are alike change places freely:
-of all orders of the agents one stands for all.
+of all orders of the agents one stands for all; and where `bounds.blocks_alike` of all orders of the blocks.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -84,7 +84,7 @@ class Swarm:
         self.local = LocalStates(bounds, every_count=every_count)
         self.zones = Zones()
         self._instants = Instants(self.local, bounds, every_order=every_count)
-        self._order = Order(self.local, self.zones, self.name_of) if bounds.alike else None
+        self._order = Order(self.local, self.zones, self.name_of) if bounds.alike or bounds.blocks_alike else None
         self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], int], _Instant] = {}
         self._as_they_are = tuple(range(bounds.agents))
         own = [1] * bounds.agents if bounds.alike else range(1, bounds.agents + 1)

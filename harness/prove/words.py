@@ -58,7 +58,7 @@ def _tighter(bounds: Bounds) -> list[str]:
     options = ["--losses 1"] if bounds.network == "lossy" and bounds.losses is None else []
     options += ["--coincidences 0"] if bounds.coincidences is None else []
     options += ["--no-crossing"] if bounds.crossing else []
-    if bounds.alike and not bounds.clocks_any:  # only where agents are alike it makes blocks alike, too
+    if bounds.nameless and not bounds.clocks_any:
         options.append("--clocks any")
     return options
 

@@ -1,6 +1,6 @@
 """Blocks that are alike: where any may be the older, states that differ only in which block is which are one."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import permutations
 from pathlib import Path
 from random import Random
@@ -19,7 +19,12 @@ from tests.harness.prove.test_explore import Seen, all_seen, by_chance, explored
 
 
 def alike(seen: Seen) -> Seen:
-    """One of all that are the same but for which block is which."""
+    """One of all that are the same but for who is who and which block is which."""
+    return min(tuple(sorted(called)) for called in renumbered(seen))
+
+
+def renumbered(seen: Seen) -> Iterator[Seen]:
+    """All that are the same but for which block is which."""
     there = sorted({block for agent in seen for held in agent[:3] for block in held})
 
     def called(order: Sequence[int]) -> Seen:
@@ -28,9 +33,9 @@ def alike(seen: Seen) -> Seen:
         def each(blocks: tuple[int, ...]) -> tuple[int, ...]:
             return tuple(names[block] for block in blocks)
 
-        return tuple(sorted((each(chain), each(deque), each(stack), *rest) for chain, deque, stack, *rest in seen))
+        return tuple((each(chain), each(deque), each(stack), *rest) for chain, deque, stack, *rest in seen)
 
-    return min(called(order) for order in permutations(range(1, len(there) + 1)))
+    yield from (called(order) for order in permutations(range(1, len(there) + 1)))
 
 
 def all_alike(graph: Graph) -> set[Seen]:

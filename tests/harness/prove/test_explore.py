@@ -13,12 +13,14 @@ from harness.prove.explore import Graph, explore
 from harness.prove.known import DEAD
 from harness.prove.snapshot import key_of, put_back, take
 from harness.prove.swarm import AGENTS, Swarm
+from harness.scenario.stagger import Stagger, staggered
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.settings import Settings
 
-Seen = tuple[tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], bool, tuple[str, ...]], ...]
+View = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], bool, tuple[str, ...]]
+Seen = tuple[View, ...]
 
 
 def explored(*arguments: Any, **options: Any) -> Graph:
@@ -27,34 +29,39 @@ def explored(*arguments: Any, **options: Any) -> Graph:
     return graph
 
 
-def seen_of(agents: Sequence[Agent]) -> Seen:
-    """What one sees of agents, whoever is who: which blocks are where, and which timers run."""
-    return tuple(
-        sorted(
-            (
-                tuple(block.timestamp_us // MICROSECONDS for block in agent.state.chain),
-                tuple(block.timestamp_us // MICROSECONDS for block in agent.state.blocks_to_be_committed),
-                tuple(block.timestamp_us // MICROSECONDS for block in agent.state.reconcile_stack),
-                agent.state.reconcile_in_progress,
-                tuple(timer.name for timer in agent.state.timers if timer.deadline is not None),
-            )
-            for agent in agents
-        )
+def view_of(agent: Agent) -> View:
+    """What one sees of an agent: which blocks are where, and which timers run."""
+    return (
+        tuple(block.timestamp_us // MICROSECONDS for block in agent.state.chain),
+        tuple(block.timestamp_us // MICROSECONDS for block in agent.state.blocks_to_be_committed),
+        tuple(block.timestamp_us // MICROSECONDS for block in agent.state.reconcile_stack),
+        agent.state.reconcile_in_progress,
+        tuple(timer.name for timer in agent.state.timers if timer.deadline is not None),
     )
 
 
-def all_seen(graph: Graph) -> set[Seen]:
+def seen_of(agents: Sequence[Agent]) -> Seen:
+    """What one sees of agents, whoever is who."""
+    return tuple(sorted(map(view_of, agents)))
+
+
+def by_place(graph: Graph) -> set[Seen]:
+    """What one sees of the agents of each state that are still there, in the order of their places."""
     local = graph.swarm.local
     seen = set()
     for state in graph.states:
-        agents = []
+        views = []
         for number in state[AGENTS:]:
             if number != DEAD:
                 agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
                 put_back(agent, local.known[number].snapshot)
-                agents.append(agent)
-        seen.add(seen_of(agents))
+                views.append(view_of(agent))
+        seen.add(tuple(views))
     return seen
+
+
+def all_seen(graph: Graph) -> set[Seen]:
+    return {tuple(sorted(seen)) for seen in by_place(graph)}
 
 
 @pytest.mark.parametrize(
@@ -82,11 +89,17 @@ def test_how_answers_are_counted_makes_no_difference(network: Any) -> None:
     assert all_seen(one) == all_seen(every)
 
 
-@pytest.mark.parametrize("most_told", [500_000, 1])
-def test_on_two_cores_it_is_the_same(most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("bounds", "most_told"),
+    [
+        (Bounds(3, 2, "lossy", ("reboot",)), 500_000),
+        (Bounds(3, 2, "lossy", ("reboot",)), 1),
+        (Bounds(3, 2, "lossy", stagger={"phase1_timeout_s": 0.5}, clocks_any=True), 500_000),
+    ],
+)
+def test_on_two_cores_it_is_the_same(bounds: Bounds, most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.prove.crew.WORTH_A_CREW", 10)
     monkeypatch.setattr("harness.prove.crew.MOST_TOLD", most_told)
-    bounds = Bounds(3, 2, "lossy", ("reboot",))
     alone = explore(Swarm(bounds), most_bytes=8e9, most_s=60)
     swarm = Swarm(bounds)
     with Crew(swarm, 2) as crew:
@@ -114,15 +127,23 @@ def test_whatever_agents_do_by_chance_is_among_it(agents: int, blocks: int, loss
 
 
 def by_chance(
-    count: int, blocks: int, loss: float, lots: Random, *, clocks_apart: bool = False, most_lost: float = inf
+    count: int,
+    blocks: int,
+    loss: float,
+    lots: Random,
+    *,
+    clocks_apart: bool = False,
+    most_lost: float = inf,
+    stagger: Stagger | None = None,
 ) -> Iterator[Seen]:
     """What is seen whenever nothing is on the air: messages take no time, blocks come at any time.
 
     With clocks that are apart the agents' timestamps are years from each other. `most_lost`: so often, at most, an
     agent loses a message.
     """
-    settings = Settings(max_block_bytes=267)
-    agents = [Agent(agent_id, range(1, count + 1), b"proof", settings) for agent_id in range(1, count + 1)]
+    settings = [staggered(Settings(max_block_bytes=267), stagger or {}, place) for place in range(count)]
+    roster = range(1, count + 1)
+    agents = [Agent(own_id, roster, b"proof", own) for own_id, own in zip(roster, settings, strict=True)]
     completed = sorted(lots.uniform(0, 40) if lots.random() < 0.7 else 5.0 * lots.randint(0, 6) for _ in range(blocks))
     ordinal = 0
     ahead = [index * clocks_apart for index in lots.sample(range(count), count)]
