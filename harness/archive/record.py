@@ -126,7 +126,7 @@ class Cycle(_Model):
     periods: int | None = None
     proven: bool = False
     agents: Annotated[list[int], Field(min_length=1)]
-    """Those that are not idle."""
+    """Those that go round, of whom some may be idle at any moment; of a standstill those that are not idle."""
     steps: list[CycleStep] = []
     """One period, in order."""
     waits: list[CycleWait] = []

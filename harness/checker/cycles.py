@@ -39,7 +39,7 @@ SHORTEST_PAUSE_S = 0.05
 
 
 def cycle_of(evidence: "Evidence") -> Cycle | None:
-    """What agents that are not idle at the end go round in; None if that is not shown."""
+    """What agents go round in, some of which are not idle at the end; None if that is not shown."""
     busy = evidence.busy
     if not busy:
         return None
@@ -107,7 +107,7 @@ def _in_traces(evidence: "Evidence", busy: Sequence[int], times: int) -> Cycle |
         since_s=round(since_s, 3),
         period_s=round(period_s, 3),
         periods=seen,
-        agents=list(busy),
+        agents=sorted({*busy, *rounds}),
         steps=sorted(
             (
                 CycleStep(agent_id=agent_id, after_s=round(run.t - begin_s, 3), handler=run.handler, branch=run.branch)

@@ -93,12 +93,16 @@ def test_traces_show_it_whenever_the_run_ends(name: str, monkeypatch: pytest.Mon
     """Also while some of those who take part are idle."""
     without_looking(monkeypatch)
     document = load_scenario(SCENARIOS / f"{name}.yaml").model_dump(exclude={"expect"}, exclude_unset=True)
-    idle = set()
+    idle, go_round = set(), set()
     for more_s in range(0, 30, 2):
         run = simulate(Scenario.model_validate({**document, "settle": {"limit_s": 250 + more_s}}), seed=1, tracing=True)
         assert liveness(run).verdict == "never finishes", f"{run.played.mission_s:.0f} s"
+        assert run.evidence.cycle is not None
+        assert set(run.evidence.busy) <= set(run.evidence.cycle.agents)
         idle.add(len(run.evidence.busy))
+        go_round.add(tuple(run.evidence.cycle.agents))
     assert len(idle) > 1 or name != "drawn_in"
+    assert len(go_round) == 1, "whoever goes round is told, idle or not"
 
 
 def test_a_few_times_in_a_row_may_be_a_coincidence(monkeypatch: pytest.MonkeyPatch) -> None:

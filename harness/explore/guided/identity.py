@@ -69,8 +69,7 @@ def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) 
         return f"chains of {', '.join(map(str, holders))} agents"
     if key != "liveness" or cycle is None:
         return ""
-    part = {*cycle.agents, *(step.agent_id for step in cycle.steps if step.handler in TIMERS)}  # also whoever is idle
-    going = f"{len(part)} agent{'s' if len(part) > 1 else ''}"
+    going = f"{len(cycle.agents)} agent{'s' if len(cycle.agents) > 1 else ''}"
     if cycle.period_s is None:
         return f"{going} standing still"
     form = "; ".join(_form(cycle))

@@ -113,11 +113,12 @@ class Recurrence:
     def cycle(self, swarm: Sequence[Waiting]) -> dict[str, Any]:
         """The cycle that the last look has found; `harness.archive.record.Cycle`."""
         agents = {agent.state.agent_id for agent in swarm}
+        went_on = {step["agent_id"] for step in self._steps}
         return {
             "since_s": round(self._kept_at, 3),
             "period_s": round(self._next_s - self._kept_at, 3),
             "proven": True,
-            "agents": [agent.state.agent_id for agent in swarm if not agent.state.idle],
+            "agents": sorted(went_on | {agent.state.agent_id for agent in swarm if not agent.state.idle}),
             "steps": self._steps,
             "waits": [
                 {"agent_id": agent_id, "for_agents": sorted(silent)}

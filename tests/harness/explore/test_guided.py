@@ -129,7 +129,9 @@ def test_livelocks_are_told_apart_by_the_timers_on_the_way_round() -> None:
             for agent_id, way in enumerate(ways, 1)
             for number, letter in enumerate(way)
         ]
-        cycle = Cycle.model_validate({"since_s": 1, "period_s": 20, "agents": [1, 2], "steps": steps})
+        cycle = Cycle.model_validate(
+            {"since_s": 1, "period_s": 20, "agents": [*range(1, len(ways) + 1)], "steps": steps}
+        )
         judgement = Judgement("Liveness", "never finishes", "round in circles")
         result = SimpleNamespace(judgements={"liveness": judgement}, bad=["liveness"], chains={})
         (identity,) = identities(result, cycle, ordinary())  # type: ignore[arg-type]
@@ -138,8 +140,7 @@ def test_livelocks_are_told_apart_by_the_timers_on_the_way_round() -> None:
     assert shape("v12", "12v") == "2 agents going round every 20 s (voting, phase one, phase two)"
     assert shape("2v12v1", "vf12") == shape("v12", "12v"), "twice round, entered elsewhere, with what is no timer"
     assert shape("v12", "v1") == shape("1v", "2v1") != shape("v12", "v12")
-    assert shape("v12", "v12", "1").startswith("3 agents"), "whoever takes part is one of them, idle or not"
-    assert shape("v12", "v12", "f") == shape("v12", "v12")
+    assert shape("v12", "v12", "1").startswith("3 agents")
 
 
 def test_a_livelock_is_one_whoever_is_idle_when_it_is_looked_at() -> None:
