@@ -215,6 +215,10 @@ def three_losses(run: Simulated, seed: int) -> None:
     assert going_round(run) == (42.1, 20.0)
 
 
+def two_losses(run: Simulated, seed: int) -> None:
+    assert going_round(run) == (48.0, 20.5)
+
+
 def drawn_in(run: Simulated, seed: int) -> None:
     assert going_round(run) == (71.06, 25.0)
 
@@ -330,6 +334,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         refused_by_the_third,
         refused_for_ever,
         three_losses,
+        two_losses,
         drawn_in,
         by_turns,
         rogue,
@@ -344,7 +349,15 @@ PLAYED = [(name, seed) for name in CLAIMS for seed in SEEDS_OF.get(name, SEEDS)]
 """Each scenario, and the seeds with which it shows what it says."""
 
 
-LIVELOCKS = ("in_step", "refused_by_the_third", "refused_for_ever", "three_losses", "drawn_in", "by_turns")
+LIVELOCKS = (
+    "in_step",
+    "refused_by_the_third",
+    "refused_for_ever",
+    "three_losses",
+    "two_losses",
+    "drawn_in",
+    "by_turns",
+)
 BAD = ("rogue", "captured", *LIVELOCKS, "missed_commit", "field_test_2020")
 
 RECONCILED = [

@@ -20,6 +20,7 @@ from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from tests.harness.command import Running, sentences, write_scenario
+from tests.harness.test_scenarios import LIVELOCKS
 from tests.harness.virtual import scenario
 from tests.machine import require, unavailable
 from ucp.messages import BlockAddRequest, datagram_bytes
@@ -277,9 +278,8 @@ def test_a_run_directory_says_what_a_simulation_in_memory_says(tmp_path: Path) -
 @pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*[!x].yaml")), ids=lambda path: path.stem)
 def test_every_scenario_that_runs_as_processes_runs_in_virtual_time(path: Path) -> None:
     simulated = simulate(load_scenario(path), 1, tracing=True)
-    never_finish = ("in_step", "by_turns", "drawn_in", "refused_by_the_third", "refused_for_ever", "three_losses")
-    assert simulated.played.settled == (path.stem not in never_finish)
-    found = (*never_finish, "rogue", "captured", "missed_commit", "field_test_2020")
+    assert simulated.played.settled == (path.stem not in LIVELOCKS)
+    found = (*LIVELOCKS, "rogue", "captured", "missed_commit", "field_test_2020")
     assert bool(simulated.result.bad) == (path.stem in found)
 
 

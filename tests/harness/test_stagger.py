@@ -1,5 +1,8 @@
 """Timers that run longer from agent to agent."""
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 
 from harness.checker.records import headers
@@ -9,8 +12,10 @@ from harness.prove.explore import explore
 from harness.prove.liveness import look
 from harness.prove.swarm import Swarm
 from harness.run.simulate import simulate
-from harness.scenario.load import parse
+from harness.scenario.load import load_scenario, parse
+from harness.scenario.network import NetworkModel
 from tests.harness.test_recurrence import in_step
+from tests.harness.test_scenarios import SCENARIOS
 
 
 def test_each_agent_is_told_timers_of_its_own_and_records_agree() -> None:
@@ -32,6 +37,21 @@ def test_agents_in_step_get_out_of_step() -> None:
     for timer in ("vote_timeout_s", "phase1_timeout_s"):
         staggered = scenario.model_copy(update={"stagger": {timer: 0.5}})
         assert simulate(staggered, 1).result.judgements["liveness"].verdict == "finished"
+
+
+def test_staggered_two_losses_are_enough_for_one_that_all_refuse() -> None:
+    """Each of them is; but not with timers that are alike, nor where phase 2 needs a majority."""
+    scenario = load_scenario(SCENARIOS / "two_losses.yaml")
+    first, second = scenario.fates
+
+    def liveness(seed: int = 1, **changes: Any) -> str:
+        return simulate(scenario.model_copy(update=changes), seed).result.judgements["liveness"].verdict
+
+    assert {liveness(seed, network=NetworkModel()) for seed in range(8)} == {"never finishes"}
+    assert liveness() == "never finishes"
+    assert liveness(fates=[first]) == liveness(fates=[second]) == liveness(stagger={}) == "finished"
+    majority = replace(scenario.settings, top_needs_majority=True)
+    assert liveness(settings=majority) == "finished"
 
 
 def test_no_way_round_is_left_within_bounds() -> None:
