@@ -10,15 +10,17 @@ import sys
 from random import Random
 from typing import Any
 
+from harness.matrix.cures import STAGGER
 from harness.run.simulate import simulate
 from harness.run.sweep import Failed, cores, sweep
 from harness.scenario import Scenario
 
 TOP, ASKS, BLOCK = {"top_needs_majority": True}, {"asks_after_commit": True}, {"phase2_tie": "block"}
-STAGGER = {"phase1_timeout_s": 0.5}
+PHASE_1 = {"phase1_timeout_s": 0.5}
 CURES: dict[str, dict[str, Any]] = {
     "none": {},
     "phase2_tie: block": {"settings": BLOCK},
+    "stagger phase 1": {"stagger": PHASE_1},
     "stagger": {"stagger": STAGGER},
     "asks_after_commit, stagger": {"settings": ASKS, "stagger": STAGGER},
     "top_needs_majority": {"settings": TOP},

@@ -47,7 +47,7 @@ def refused(agents: int, *, partition: bool) -> dict[str, Any]:
 
 def outcome(document: dict[str, Any], cure: str) -> str:
     """What the page says of a run: "round", or how many chains all come to rest with."""
-    document = {key: value for key, value in document.items() if key not in ("expect", "about")}
+    document = {key: value for key, value in document.items() if key not in ("expect", "about", "stagger")}
     for part in cure.split("`")[1::2]:
         for key, value in yaml.safe_load(part).items():
             document[key] = document.get(key, {}) | value
@@ -65,7 +65,7 @@ def in_short(outcomes: list[str]) -> str:
 def test_a_cure_ends_what_the_page_says(cure: str, cells: list[str]) -> None:
     played = [
         outcome(yaml.safe_load((SCENARIOS / f"{name}.yaml").read_text()), cure)
-        for name in ("in_step", "refused_by_the_third", "by_turns", "drawn_in")
+        for name in ("in_step", "refused_by_the_third", "by_turns", "drawn_in", "in_resonance", "two_losses")
     ]
     played += [
         in_short([outcome(refused(agents, partition=partition), cure) for agents in SIZES])

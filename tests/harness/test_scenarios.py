@@ -219,6 +219,10 @@ def two_losses(run: Simulated, seed: int) -> None:
     assert going_round(run) == (48.0, 20.5)
 
 
+def in_resonance(run: Simulated, seed: int) -> None:
+    assert going_round(run) == (37.6, 26.0)
+
+
 def drawn_in(run: Simulated, seed: int) -> None:
     assert going_round(run) == (71.06, 25.0)
 
@@ -335,6 +339,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         refused_for_ever,
         three_losses,
         two_losses,
+        in_resonance,
         drawn_in,
         by_turns,
         rogue,
@@ -355,6 +360,7 @@ LIVELOCKS = (
     "refused_for_ever",
     "three_losses",
     "two_losses",
+    "in_resonance",
     "drawn_in",
     "by_turns",
 )

@@ -7,6 +7,7 @@ import pytest
 
 from harness.checker.records import headers
 from harness.errors import ScenarioError
+from harness.matrix.cures import STAGGER
 from harness.prove import Bounds, BoundsError
 from harness.prove.explore import explore
 from harness.prove.liveness import look
@@ -14,6 +15,7 @@ from harness.prove.swarm import Swarm
 from harness.run.simulate import simulate
 from harness.scenario.load import load_scenario, parse
 from harness.scenario.network import NetworkModel
+from harness.scenario.stagger import Stagger
 from tests.harness.test_recurrence import in_step
 from tests.harness.test_scenarios import SCENARIOS
 
@@ -54,11 +56,25 @@ def test_staggered_two_losses_are_enough_for_one_that_all_refuse() -> None:
     assert liveness(settings=majority) == "finished"
 
 
-def test_no_way_round_is_left_within_bounds() -> None:
-    for timer in ("vote_timeout_s", "phase1_timeout_s"):
-        graph = explore(Swarm(Bounds(2, 3, "lossy", stagger={timer: 0.5})), most_bytes=4e9, most_s=60)  # type: ignore[dict-item]
-        assert graph.ended == "complete"
-        assert not look(graph).cycles
+def test_where_phase_1_alone_is_staggered_agents_may_go_round_in_resonance() -> None:
+    """Two of one's phases 1 are as long as one of another's with a phase 3: whatever the stagger, and the messages."""
+    scenario = load_scenario(SCENARIOS / "in_resonance.yaml")
+
+    def liveness(seed: int = 1, **changes: Any) -> str:
+        return simulate(scenario.model_copy(update=changes), seed, tracing=True).result.judgements["liveness"].verdict
+
+    assert {liveness(seed, network=NetworkModel()) for seed in range(8)} == {"never finishes"}
+    assert {liveness(stagger={"phase1_timeout_s": step_s}) for step_s in (0.4, 0.6, 1.0)} == {"never finishes"}
+    assert liveness(stagger={}) == liveness(stagger=STAGGER) == "finished"
+    for fate in scenario.fates:
+        assert liveness(fates=[one for one in scenario.fates if one is not fate]) == "finished"
+
+
+@pytest.mark.parametrize("stagger", [{"vote_timeout_s": 0.5}, {"phase1_timeout_s": 0.5}, STAGGER])
+def test_nobody_is_left_in_step_within_bounds(stagger: Stagger) -> None:
+    graph = explore(Swarm(Bounds(2, 3, "lossy", stagger=stagger)), most_bytes=4e9, most_s=60)
+    assert graph.ended == "complete"
+    assert not look(graph).cycles
 
 
 def test_what_cannot_be_staggered() -> None:

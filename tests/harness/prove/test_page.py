@@ -1,17 +1,24 @@
-"""The tables of docs/proof.md say what is found: each row of it that takes a moment is looked at again."""
+"""The tables of docs/proof.md and docs/livelocks.md say what is found: what takes a moment is looked at again."""
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 import yaml
 
 from harness.prove import Bounds, Proof, prove
+from harness.prove.explore import explore
+from harness.prove.liveness import look
+from harness.prove.swarm import Swarm
 
-PAGE = Path(__file__).parents[3] / "docs" / "proof.md"
+DOCS = Path(__file__).parents[3] / "docs"
+PAGE = DOCS / "proof.md"
 MOST_S = 0.5
 """Rows that take longer are left to whoever measures them."""
+FEW_STATES = 1_000
+"""So many take a moment."""
 
 Row = dict[str, str]
 
@@ -88,3 +95,40 @@ def test_a_row_says_what_is_found(row: Row, tmp_path: Path) -> None:
     livelocks = "not looked at" if proof.liveness is None else str(len(proof.liveness.cycles))
     found = f"{proof.figures.states:,}", f"{proof.figures.transitions:,}", one_chain(proof), livelocks
     assert found == (row["states"], row["transitions"], row["one chain"], row["livelocks"])
+
+
+class Cell(NamedTuple):
+    """One of the table of ways round: bounds, and what the page says of them."""
+
+    bounds: Bounds
+    said: str
+
+
+def ways_round() -> Iterator[Cell]:
+    """The cells of docs/livelocks.md that have few states."""
+    table = (DOCS / "livelocks.md").read_text().partition("<!-- ways round -->\n")[2].partition("\n\n")[0]
+    head, _, *lines = table.splitlines()
+    columns = [[part.split()[0] for part in name.split(", ")] for name in cells(head)[1:]]
+    for line in lines:
+        changes: dict[str, Any] = {}
+        for part in line.split("`")[1::2]:
+            changes |= yaml.safe_load(part)
+        for (agents, blocks, network), said in zip(columns, cells(line)[1:], strict=True):
+            if said and int(re.sub(r"\D", "", said.split()[1])) <= FEW_STATES:
+                yield Cell(Bounds(int(agents), int(blocks), network, clocks_any=True, **changes), said)  # type: ignore[arg-type]
+
+
+CELLS = [*ways_round()]
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.bounds.in_words())
+def test_there_are_as_many_ways_round_as_the_page_says(cell: Cell) -> None:
+    graph = explore(Swarm(cell.bounds), most_bytes=4e9, most_s=60)
+    assert graph.ended == "complete"
+    assert f"{len(look(graph).cycles)} ({len(graph.states):,})" == cell.said
+
+
+def test_cells_with_and_without_a_way_round_are_looked_at() -> None:
+    assert len(CELLS) > 20
+    assert {cell.said.startswith("0 ") for cell in CELLS if cell.bounds.stagger} == {True}
+    assert {cell.said.startswith("0 ") for cell in CELLS if not cell.bounds.stagger} == {True, False}
