@@ -12,6 +12,7 @@ from harness.prove.explore import explore
 from harness.prove.progress import Ended, Progress
 from harness.prove.prove import INCOMPLETE, Limits
 from harness.prove.swarm import Swarm
+from harness.scenario.stagger import Staggered
 from harness.specification import states
 from harness.specification.settings import readings, unspecified
 from harness.specification.tlc import checked, command, in_tla
@@ -20,12 +21,19 @@ from ucp.clock import MICROSECONDS
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
 """Quirks that the specification has, too: what the thesis prints, and cannot mean."""
-TIMEOUTS = {
+TIMEOUTS: dict[str, Staggered] = {
     "VoteTimeout": "vote_timeout_s",
     "Phase1Timeout": "phase1_timeout_s",
     "Phase2Timeout": "phase2_timeout_s",
     "Phase3Timeout": "phase3_timeout_s",
     "FinalizeGap": "finalize_gap_s",
+}
+STAGGERS: dict[str, Staggered] = {
+    "VoteStagger": "vote_timeout_s",
+    "Phase1Stagger": "phase1_timeout_s",
+    "Phase2Stagger": "phase2_timeout_s",
+    "Phase3Stagger": "phase3_timeout_s",
+    "FinalizeStagger": "finalize_gap_s",
 }
 INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
 """In the specification, and as `prove` calls what they forbid."""
@@ -77,6 +85,7 @@ class Opinion:
             "network": bounds["network"],
             "crossing": bounds["crossing"],
             "timers": "any" if bounds["timers_any"] else "duration",
+            "stagger": bounds["stagger"],
             "settings": dict(self.bounds.settings),
             "quirks": dict(self.bounds.quirks),
             "ended": self.ended,
@@ -173,15 +182,15 @@ def _config(bounds: Bounds) -> str:
         raise BoundsError("the specification has clocks that agree: leave --clocks any out")
     if bounds.captured is not None:
         raise BoundsError("the specification has nobody who lies: leave --captured out")
-    if bounds.stagger:
-        raise BoundsError("the specification has one duration for all agents: leave --stagger out")
     unknown = [name for name in bounds.quirks if name not in AS_PRINTED]
     if unknown:
         raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}, not {unknown[0]}")
     settings = bounds.agent_settings()
     if (name := unspecified(settings)) is not None:
         raise BoundsError(f"the specification is of the thesis alone: leave --settings {name} out")
-    durations = {name: round(getattr(settings, key) * MICROSECONDS) for name, key in TIMEOUTS.items()}
+    seconds = {name: getattr(settings, timer) for name, timer in TIMEOUTS.items()}
+    seconds |= {name: bounds.stagger.get(timer, 0.0) for name, timer in STAGGERS.items()}
+    durations = {name: round(duration_s * MICROSECONDS) for name, duration_s in seconds.items()}
     unit = gcd(*durations.values())
     constants = {
         "Agents": bounds.agents,

@@ -31,11 +31,9 @@ OnTop(below, hash) ==
 
 \* A timer that the running handler has started has 2, and one that was active before has 1.
 Started == 2
-Durations ==
-    [t \in {"voting", "phase one", "phase two", "phase three"} |-> Started]
-        @@ ("finalize gap" :> IF FinalizeGap THEN Started ELSE 0)
+DurationOf(id, t) == IF t = "finalize gap" /\ ~FinalizeGap THEN 0 ELSE Started
 
-INSTANCE UCP WITH H <- OnTop, InceptionChainHash <- 1, Duration <- Durations, AsPrinted <- {}
+INSTANCE UCP WITH H <- OnTop, InceptionChainHash <- 1, Duration <- DurationOf, AsPrinted <- {}
 
 ---------------------------------------------------------------------------
 (* How records are written: numbers in the place of words                  *)

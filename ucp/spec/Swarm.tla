@@ -14,24 +14,25 @@ CONSTANTS
     Lossy,       \* each agent for itself may lose any message
     Crossing,    \* agents act at once, and hear of each other after that; otherwise one by one
     Timed,       \* timers end when they are over; otherwise whenever they run
-    VoteTimeout, Phase1Timeout, Phase2Timeout, Phase3Timeout, FinalizeGap,   \* in some common unit
+    VoteTimeout, Phase1Timeout, Phase2Timeout, Phase3Timeout, FinalizeGap,   \* of agent 1, in some common unit
+    VoteStagger, Phase1Stagger, Phase2Stagger, Phase3Stagger, FinalizeStagger,   \* longer by it from agent to agent
     VoteNamesChain, ChangedBeforeTally, Phase1TiePops, Phase2TieTakesBlock, AsPrinted
 
 VARIABLE swarm
 
 \* Of an active timer there is one more than what is left of it.
 Counted(units) == IF Timed THEN units + 1 ELSE 1
-Durations ==
-    [t \in {"voting", "phase one", "phase two", "phase three", "finalize gap"} |->
-        CASE t = "voting" -> Counted(VoteTimeout)
-          [] t = "phase one" -> Counted(Phase1Timeout)
-          [] t = "phase two" -> Counted(Phase2Timeout)
-          [] t = "phase three" -> Counted(Phase3Timeout)
-          [] t = "finalize gap" -> IF FinalizeGap = 0 THEN 0 ELSE Counted(FinalizeGap)]
+Lasts(id, t) ==
+    CASE t = "voting" -> VoteTimeout + (id - 1) * VoteStagger
+      [] t = "phase one" -> Phase1Timeout + (id - 1) * Phase1Stagger
+      [] t = "phase two" -> Phase2Timeout + (id - 1) * Phase2Stagger
+      [] t = "phase three" -> Phase3Timeout + (id - 1) * Phase3Stagger
+      [] t = "finalize gap" -> FinalizeGap + (id - 1) * FinalizeStagger
+DurationOf(id, t) == IF t = "finalize gap" /\ Lasts(id, t) = 0 THEN 0 ELSE Counted(Lasts(id, t))
 
 \* Blocks are 1, 2, ... in the order in which they are completed; of chain hash 31 the blocks are 3 and 1.
 INSTANCE UCP WITH H <- LAMBDA below, hash : 10 * below + hash, InceptionChainHash <- 0,
-                  Duration <- Durations, SizeMaxEvent <- 1, SizeMaxBlock <- 1
+                  Duration <- DurationOf, SizeMaxEvent <- 1, SizeMaxBlock <- 1
 
 Everybody == 1 .. Agents
 Init == swarm = [id \in Everybody |-> Fresh(id)]

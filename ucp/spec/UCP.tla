@@ -15,7 +15,7 @@ EXTENDS Integers, Sequences, FiniteSets
 CONSTANTS
     H(_, _),              \* Eq. 3.2: chain hash of the block below, block hash |-> chain hash
     InceptionChainHash,   \* CH_0, eq. 3.4
-    Duration,             \* what each timer counts down from
+    Duration(_, _),       \* what a timer counts down from: agent ID, timer |-> number
     SizeMaxEvent,         \* Algorithm 1
     SizeMaxBlock,
     VoteNamesChain,       \* readings with a setting, each off in the base
@@ -77,7 +77,7 @@ Holds(a, blockHash) ==
     \/ \E b \in Range(a.blocksToBeCommittedDeque) \cup Range(a.reconcileStack) : b.hash = blockHash
 
 Active(a, t) == a.timer[t] > 0
-Start(a, t) == [a EXCEPT !.timer[t] = Duration[t]]
+Start(a, t) == [a EXCEPT !.timer[t] = Duration(a.id, t)]
 Stop(a, t) == [a EXCEPT !.timer[t] = 0]
 Trigger(a, event) == [a EXCEPT !.triggered = Append(@, event)]
 NetworkSend(a, message) == [a EXCEPT !.sent = Append(@, message)]
@@ -280,7 +280,7 @@ ReconcileFinalize(a) ==
     THEN Trigger([a EXCEPT !.reconcileInProgress = FALSE], "Process Next Deque Block")
     ELSE LET committed == Commit([a EXCEPT !.reconcileStack = Front(@)], Last(a.reconcileStack))
              told == NetworkSend(committed, CommitBlock(committed))
-         IN IF told.reconcileStack # <<>> /\ Duration["finalize gap"] > 0
+         IN IF told.reconcileStack # <<>> /\ Duration(a.id, "finalize gap") > 0
             THEN Start(told, "finalize gap")
             ELSE ReconcileFinalize(told)
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from harness.prove import Bounds
+from harness.scenario.stagger import Stagger
 from harness.specification import second_opinion, tlc
 from tests.harness.command import harness, sentences
 from tests.machine import require_tlc
@@ -58,6 +59,16 @@ def test_they_come_to_the_same_states_where_nothing_crosses(
     assert opinion.agrees
     assert opinion.to_json()["crossing"] is False
     assert opinion.livelock is opinion.specified_livelock is (None if network == "lossy" else False)
+
+
+def test_with_timers_that_differ_they_come_to_the_same_states_and_neither_goes_round() -> None:
+    """Where both do if timers are alike."""
+    stagger: Stagger = {"phase1_timeout_s": 2.5}
+    opinion = second_opinion(Bounds(2, 4, "lossless", settings=NO_GAP, stagger=stagger))
+    assert (opinion.states, opinion.specified) == (2627, 2627)
+    assert opinion.agrees
+    assert opinion.livelock is opinion.specified_livelock is False
+    assert opinion.to_json()["stagger"] == stagger
 
 
 def test_what_is_printed_and_cannot_be_meant_is_rejected_by_both() -> None:
