@@ -23,6 +23,7 @@ swarm.py      global states, and all that may happen next
 expansion.py  what may follow one state
 collecting.py Python's collector rests meanwhile
 crew.py       other processes that look at states, too
+packed.py     what is kept of each state, in little room
 explore.py    all of them, breadth first
 attractor.py  from which states a goal is come to, whichever timer is the next to end
 cycles.py     ways that lead back to where they began
