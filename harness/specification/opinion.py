@@ -21,20 +21,14 @@ from ucp.clock import MICROSECONDS
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
 """Quirks that the specification has, too: what the thesis prints, and cannot mean."""
-TIMEOUTS: dict[str, Staggered] = {
-    "VoteTimeout": "vote_timeout_s",
-    "Phase1Timeout": "phase1_timeout_s",
-    "Phase2Timeout": "phase2_timeout_s",
-    "Phase3Timeout": "phase3_timeout_s",
-    "FinalizeGap": "finalize_gap_s",
+TIMERS: dict[Staggered, tuple[str, str]] = {
+    "vote_timeout_s": ("VoteTimeout", "VoteStagger"),
+    "phase1_timeout_s": ("Phase1Timeout", "Phase1Stagger"),
+    "phase2_timeout_s": ("Phase2Timeout", "Phase2Stagger"),
+    "phase3_timeout_s": ("Phase3Timeout", "Phase3Stagger"),
+    "finalize_gap_s": ("FinalizeGap", "FinalizeStagger"),
 }
-STAGGERS: dict[str, Staggered] = {
-    "VoteStagger": "vote_timeout_s",
-    "Phase1Stagger": "phase1_timeout_s",
-    "Phase2Stagger": "phase2_timeout_s",
-    "Phase3Stagger": "phase3_timeout_s",
-    "FinalizeStagger": "finalize_gap_s",
-}
+"""The constants of the specification for how long each lasts, and for how much longer from agent to agent."""
 INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
 """In the specification, and as `prove` calls what they forbid."""
 
@@ -188,9 +182,11 @@ def _config(bounds: Bounds) -> str:
     settings = bounds.agent_settings()
     if (name := unspecified(settings)) is not None:
         raise BoundsError(f"the specification is of the thesis alone: leave --settings {name} out")
-    seconds = {name: getattr(settings, timer) for name, timer in TIMEOUTS.items()}
-    seconds |= {name: bounds.stagger.get(timer, 0.0) for name, timer in STAGGERS.items()}
-    durations = {name: round(duration_s * MICROSECONDS) for name, duration_s in seconds.items()}
+    durations = {
+        name: round(duration_s * MICROSECONDS)
+        for timer, names in TIMERS.items()
+        for name, duration_s in zip(names, (getattr(settings, timer), bounds.stagger.get(timer, 0.0)), strict=True)
+    }
     unit = gcd(*durations.values())
     constants = {
         "Agents": bounds.agents,
