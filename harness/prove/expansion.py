@@ -1,14 +1,14 @@
 """What may follow one state."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import NamedTuple
 
-from harness.prove.instant import Action
+from harness.prove.instant import Actions
 from harness.prove.swarm import State, Swarm
 
 NumberOf = Callable[[State], int]
-_Following = dict[tuple[Action, ...], dict[int, None]]
+_Following = dict[Actions, dict[int, None]]
 """The states that may follow, in order, by what happens."""
 
 
@@ -29,22 +29,27 @@ def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
     lossy = swarm.bounds.network == "lossy"
     ways = 0
     losing_nothing: _Following = {}
-    for actions in swarm.actions(state):
+    ending = [*swarm.ending(state)]
+    for actions in swarm.actions(state, ending):
         numbers = [number_of(after) for after in swarm.after(state, actions, lossy)]
         ways += len(numbers)
         if not lossy:
             losing_nothing[actions] = dict.fromkeys(numbers)
-    return quiet(swarm, state, number_of, losing_nothing)._replace(ways=ways)
+    return _quiet(swarm, state, number_of, ending, losing_nothing)._replace(ways=ways)
 
 
-def quiet(swarm: Swarm, state: State, number_of: NumberOf, known: _Following | None = None) -> Expansion:
-    """Where the state goes on when nothing is lost and no new block comes; some of that may be known."""
-    known = known or {}
+def quiet(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
+    """Where the state goes on when nothing is lost and no new block comes."""
+    return _quiet(swarm, state, number_of, [*swarm.ending(state)], {})
+
+
+def _quiet(swarm: Swarm, state: State, number_of: NumberOf, ending: Sequence[Actions], known: _Following) -> Expansion:
+    """The same; `known` may have some of it."""
     after = {
         actions: known[actions]
         if actions in known
         else dict.fromkeys(map(number_of, swarm.after(state, actions, lossy=False)))
-        for actions in swarm.ending(state)
+        for actions in ending
     }
     by_timer = []
     for action, tied in swarm.alternatives(state):

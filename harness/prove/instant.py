@@ -43,6 +43,10 @@ class Action(NamedTuple):
     way: int = 0
 
 
+Actions = tuple[Action, ...]
+"""What happens in one instant."""
+
+
 class Agents(NamedTuple):
     """The agents, and the timers that each has started in this instant."""
 
@@ -73,6 +77,8 @@ class Way(NamedTuple):
 
 _Said = tuple[tuple[int, int], ...]
 """What is on the air: (place of the sender, message)."""
+_Agent = tuple[int, int, Started]
+"""One agent: its place, its local state, and the timers that it has started in this instant."""
 _Choice = tuple[int, Started, _Said, tuple[int, ...], int]
 """Of one agent: its local state, what it has started, what it says, what it has heard, in order, and how much not."""
 
@@ -92,7 +98,8 @@ class Instants:
         self._counts_losses = bounds.losses is not None
         self._any_order_of_counting = bounds.reduced and not self._twice and not every_order
         self._outcomes: dict[tuple[int, Heard, bool, bool], list[_Outcome]] = {}
-        self._choices_of: dict[tuple[int, int, Started, _Said, bool, bool], list[_Choice]] = {}
+        self._choices_of: dict[tuple[_Said, bool, bool], dict[_Agent, list[_Choice]]] = {}
+        self._choices_known = 0
         self._places = range(bounds.agents)
         self._names = [
             [other + 2 if bounds.nameless and other < place else other + 1 for other in self._places]
@@ -162,33 +169,38 @@ class Instants:
         self, there: Agents, said: _Said, most_lost: int, rounds: int
     ) -> Iterator[tuple[Agents, _Said, tuple[tuple[int, ...], ...], int]]:
         answered, lossy = rounds >= ANSWERED, most_lost > 0
-        choices = [self._choices(place, there, said, lossy, answered) for place in self._places]
+        if self._choices_known >= MOST_KNOWN:
+            self._choices_of.clear()
+            self._choices_known = 0
+        known = self._choices_of.setdefault((said, lossy, answered), {})
+        choices = [
+            known.get(agent) or self._choices(known, agent, said, lossy, answered)
+            for agent in zip(self._places, there.locals, there.started, strict=True)
+        ]
         for chosen in _within(choices, most_lost) if lossy and self._counts_losses else product(*choices):
             locals_, started, answers, orders, lost = zip(*chosen, strict=True)
             yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders, sum(lost)
 
-    def _choices(self, place: int, there: Agents, said: _Said, lossy: bool, answered: bool) -> list[_Choice]:
-        """What may become of the agent at `place`."""
-        local, before = there.locals[place], there.started[place]
+    def _choices(
+        self, known: dict[_Agent, list[_Choice]], agent: _Agent, said: _Said, lossy: bool, answered: bool
+    ) -> list[_Choice]:
+        """What may become of this agent, from now on `known`."""
+        place, local, before = agent
         if local == DEAD:
             return [(DEAD, (), (), (), 0)]
-        key = place, local, before, said, lossy, answered
-        choices = self._choices_of.get(key)
-        if choices is None:
-            mine = [number for number, (sender, _) in enumerate(said) if sender != place]
-            heard = tuple((self.name_of(said[number][0], place), said[number][1]) for number in mine)
-            if len(self._choices_of) >= MOST_KNOWN:
-                self._choices_of.clear()
-            choices = self._choices_of[key] = [
-                (
-                    step.local,
-                    self._still(before, step),
-                    tuple((place, message) for message in step.sent),
-                    tuple(mine[position] for position in order),
-                    len(mine) - len(set(order)) if lossy and self._counts_losses else 0,
-                )
-                for step, order in self._outcomes_of(local, heard, lossy, answered)
-            ]
+        mine = [number for number, (sender, _) in enumerate(said) if sender != place]
+        heard = tuple((self.name_of(said[number][0], place), said[number][1]) for number in mine)
+        self._choices_known += 1
+        choices = known[agent] = [
+            (
+                step.local,
+                self._still(before, step),
+                tuple((place, message) for message in step.sent),
+                tuple(mine[position] for position in order),
+                len(mine) - len(set(order)) if lossy and self._counts_losses else 0,
+            )
+            for step, order in self._outcomes_of(local, heard, lossy, answered)
+        ]
         return choices
 
     def _still(self, before: Started, step: Step) -> Started:

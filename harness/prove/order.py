@@ -64,22 +64,25 @@ class Order:
         places = orders[0]
         if len(orders) > 1:
             places = min(orders, key=lambda places: self._looks(locals_, zone, timers, places))
-        blocks = self._blocks(locals_, places)
-        number = {block: new for new, block in enumerate(blocks, 1)}
         if places != self._as_they_are:
-            locals_ = tuple([self._renamed(locals_[old], new, places) for new, old in enumerate(places)])
+            agents = tuple([self._renamed(locals_[old], new, places) for new, old in enumerate(places)])
             if zone:
                 zone = self._zones.permuted(zone, tuple([timer for place in places for timer in timers[place]]))
-        if blocks:
-            about, exchanged = self._local.about, self._local.exchanged
-            locals_ = tuple([exchanged(local, tuple([number[block] for block in about(local)])) for local in locals_])
-        return Ordered(locals_, zone, places, blocks)
+        else:
+            agents = locals_
+        blocks = self._blocks(agents)
+        if blocks == tuple(range(1, len(blocks) + 1)):
+            return Ordered(agents, zone, places)
+        number = {block: new for new, block in enumerate(blocks, 1)}
+        about, exchanged = self._local.about, self._local.exchanged
+        agents = tuple([exchanged(local, tuple([number[block] for block in about(local)])) for local in agents])
+        return Ordered(agents, zone, places, blocks)
 
-    def _blocks(self, locals_: Sequence[int], places: Places) -> Ordinals:
-        """The blocks that agents in this order are about, as one comes upon them; none if blocks keep their numbers."""
+    def _blocks(self, agents: Sequence[int]) -> Ordinals:
+        """The blocks that these agents are about, as one comes upon them; none if blocks keep their numbers."""
         if not self._local.bounds.blocks_alike:
             return ()
-        return tuple(dict.fromkeys(chain.from_iterable(self._local.about(locals_[place]) for place in places)))
+        return tuple(dict.fromkeys(chain.from_iterable(map(self._local.about, agents))))
 
     def _timers(self, locals_: Sequence[int]) -> list[range]:
         """For each place which of the zone's timers are its agent's."""
@@ -98,8 +101,11 @@ class Order:
             (DEAD,) if local == DEAD else (known[pattern(local)].anonymous, *bounds[own.start : own.stop])
             for local, own in zip(locals_, timers, strict=True)
         ]
-        some_named = any(local != DEAD and known[local].names_others for local in locals_)
         groups = _groups(looks)
+        if len(groups) == len(locals_):
+            yield tuple(chain.from_iterable(groups))
+            return
+        some_named = any(local != DEAD and known[local].names_others for local in locals_)
         if not some_named and all(len(group) == 1 or self._are_one(group, locals_, timers) for group in groups):
             yield tuple(chain.from_iterable(groups))
             return
@@ -174,7 +180,7 @@ class Order:
         ]
         matrix = self._zones.matrix(zone)
         order = (0, *(timer for place in places for timer in timers[place])) if zone else ()
-        number = {block: new for new, block in enumerate(self._blocks(locals_, places))}
+        number = {block: new for new, block in enumerate(self._blocks([locals_[old] for old in places]))}
         about = [[number[block] for block in self._local.about(locals_[old])] for old in places] if number else []
         return named, about, [[matrix[i][j] for j in order] for i in order]
 

@@ -6,6 +6,7 @@ of all orders of the agents one stands for all; and where `bounds.blocks_alike` 
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
 from itertools import combinations, permutations, product
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from harness.prove.blocks import Ordinals
 from harness.prove.bounds import FAULTS, MAX_COINCIDENCES, MAX_LIES, Bounds
 from harness.prove.captor import Captor
 from harness.prove.flaws import Flaw
-from harness.prove.instant import Action, Agents, Instants, Wave, Way
+from harness.prove.instant import Action, Actions, Agents, Instants, Wave, Way
 from harness.prove.known import DEAD
 from harness.prove.local import LocalStates
 from harness.prove.order import Order, Ordered, Places
@@ -43,7 +44,7 @@ BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 class Move(NamedTuple):
     """One way on: what is done, what comes of it, and who then stands where. `wave` is the last round of hearing."""
 
-    actions: tuple[Action, ...]
+    actions: Actions
     state: State
     places: Places
     wave: Wave | None
@@ -85,7 +86,8 @@ class Swarm:
         self.zones = Zones()
         self._instants = Instants(self.local, bounds, every_order=every_count)
         self._order = Order(self.local, self.zones, self.name_of) if bounds.alike or bounds.blocks_alike else None
-        self._known: dict[tuple[tuple[int, ...], tuple[Action, ...], int], _Instant] = {}
+        self._known: dict[tuple[tuple[int, ...], Actions, int], _Instant] = {}
+        self._running = lru_cache(MOST_KNOWN)(self._running_of)
         self._as_they_are = tuple(range(bounds.agents))
         own = [1] * bounds.agents if bounds.alike else range(1, bounds.agents + 1)
         faults = sum(1 << ONCE.index(name) for name in bounds.faults if name != "duplicate")
@@ -105,7 +107,7 @@ class Swarm:
         """The same by timer."""
         running = self._running(state[AGENTS:])
         if not self.bounds.timers_any:
-            running = [running[first - 1] for first in self.zones.firsts(state[ZONE])]
+            running = tuple([running[first - 1] for first in self.zones.firsts(state[ZONE])])
         return [
             [Action(place, "timer", timer, way) for way in range(len(self.local.ends(state[AGENTS + place], timer)))]
             for place, timer in running
@@ -123,7 +125,7 @@ class Swarm:
             for actions in product(*(firsts[index] for index in together)):
                 yield actions[0], frozenset(actions)
 
-    def ending(self, state: State) -> Iterator[tuple[Action, ...]]:
+    def ending(self, state: State) -> Iterator[Actions]:
         """All sets of timers that may end in one instant, of each agent one at most; some of the sets cannot.
 
         Where nothing crosses they end one by one.
@@ -138,21 +140,24 @@ class Swarm:
                     if self._may_coincide(state, actions):
                         yield actions
 
-    def actions(self, state: State) -> Iterator[tuple[Action, ...]]:
-        """All sets of what may happen in one instant: timers that end at once, and blocks completed meanwhile."""
+    def actions(self, state: State, ending: Iterable[Actions] | None = None) -> Iterator[Actions]:
+        """All sets of what may happen in one instant: timers that end at once, and blocks completed meanwhile.
+
+        `ending` has what there is of it, if that is known.
+        """
         alive = [place for place, local in enumerate(state[AGENTS:]) if local != DEAD]
         left = self.bounds.blocks - state[BLOCKS]
-        for ending in self.ending(state):
-            yield ending
+        for timers in self.ending(state) if ending is None else ending:
+            yield timers
             if not self.bounds.crossing:
                 continue
-            idle_hands = [place for place in alive if all(place != action.place for action in ending)]
+            idle_hands = [place for place in alive if all(place != action.place for action in timers)]
             for count in range(1, min(left, len(idle_hands)) + 1):
                 for places in self._unlike(state, permutations(idle_hands, count)):
                     completed = (
                         Action(place, "complete", state[BLOCKS] + 1 + index) for index, place in enumerate(places)
                     )
-                    actions = (*ending, *completed)
+                    actions = (*timers, *completed)
                     if self._may_coincide(state, actions):
                         yield actions
         singly: list[Action] = []
@@ -166,7 +171,7 @@ class Swarm:
         if self.captor is not None:
             yield from self._of_the_captor(self.captor, state)
 
-    def _of_the_captor(self, captor: Captor, state: State) -> Iterator[tuple[Action, ...]]:
+    def _of_the_captor(self, captor: Captor, state: State) -> Iterator[Actions]:
         """It takes the vehicle, and then says one thing after the other, which any of the agents hear."""
         assert self.bounds.captured is not None, "it has somebody's keys"
         if state[LEFT] >> ONCE.index("captured") & 1:
@@ -183,8 +188,7 @@ class Swarm:
         """How many moments have to be the same by chance for this to happen in one instant, and before all else."""
         if self.bounds.timers_any:
             return 0
-        at = {timer: index + 1 for index, timer in enumerate(self._running(state[AGENTS:]))}
-        ended = tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer"))
+        ended = self._ended(state[AGENTS:], actions)
         if not ended:
             chosen = actions[0].what in ("captured", "lie")  # by somebody who may wait for his moment
             between = not chosen and self.zones.no_time_passes(state[ZONE])
@@ -212,7 +216,7 @@ class Swarm:
 
     # What comes of it
 
-    def after(self, state: State, actions: tuple[Action, ...], lossy: bool) -> Iterator[State]:
+    def after(self, state: State, actions: Actions, lossy: bool) -> Iterator[State]:
         """The states that may come of these actions in one instant; none if their timers cannot end at once."""
         key = state[AGENTS:], actions, self._most_lost(state, lossy)
         instant = self._known.get(key)
@@ -226,7 +230,7 @@ class Swarm:
                 still = left - outcome.way.lost * LOSSES
                 yield (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
 
-    def moves(self, state: State, actions: tuple[Action, ...], lossy: bool) -> Iterator[Move]:
+    def moves(self, state: State, actions: Actions, lossy: bool) -> Iterator[Move]:
         """The same, with how each comes about."""
         instant = self._instant(state[AGENTS:], actions, self._most_lost(state, lossy), tell=True)
         if self._can_be(state, instant):
@@ -270,16 +274,14 @@ class Swarm:
             left -= self.coincidences(state, actions) * COINCIDENCES
         return left
 
-    def _instant(
-        self, locals_: tuple[int, ...], actions: tuple[Action, ...], most_lost: int, *, tell: bool
-    ) -> _Instant:
+    def _instant(self, locals_: tuple[int, ...], actions: Actions, most_lost: int, *, tell: bool) -> _Instant:
         at = {timer: index + 1 for index, timer in enumerate(self._running(locals_))}
         left = ALL_LEFT
         for action in actions:
             if action.what in ONCE:
                 left &= ~(1 << ONCE.index(action.what))
         return _Instant(
-            tuple(sorted(at[action.place, action.number] for action in actions if action.what == "timer")),
+            self._ended(locals_, actions),
             sum(action.what == "complete" for action in actions),
             left,
             int(any(action.what == "lie" for action in actions)),
@@ -303,12 +305,18 @@ class Swarm:
                     running.append(at.get((place, timer)) or -self.local.durations_us[timer] - 1)
         return tuple(running)
 
-    def _running(self, locals_: Sequence[int]) -> list[tuple[int, int]]:
+    def _ended(self, locals_: tuple[int, ...], actions: Sequence[Action]) -> tuple[int, ...]:
+        """The timers that end, from 1, in the order of the zone."""
+        ended = [(action.place, action.number) for action in actions if action.what == "timer"]
+        running = self._running(locals_)
+        return tuple(sorted([running.index(timer) + 1 for timer in ended]))
+
+    def _running_of(self, locals_: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
         """(place, timer) of all timers that run, in the order of the zone."""
         known = self.local.known
-        return [
-            (place, timer) for place, local in enumerate(locals_) if local != DEAD for timer in known[local].running
-        ]
+        return tuple(
+            [(place, timer) for place, local in enumerate(locals_) if local != DEAD for timer in known[local].running]
+        )
 
     def name_of(self, other: int, place: int) -> int:
         """What the agent at `place` calls the one at `other`."""
