@@ -1,6 +1,7 @@
 """All states: whole and reduced, and whatever agents do by chance is among them."""
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from math import inf
 from random import Random
 from typing import Any
@@ -48,16 +49,14 @@ def seen_of(agents: Sequence[Agent]) -> Seen:
 def by_place(graph: Graph) -> set[Seen]:
     """What one sees of the agents of each state that are still there, in the order of their places."""
     local = graph.swarm.local
-    seen = set()
-    for state in graph.states:
-        views = []
-        for number in state[AGENTS:]:
-            if number != DEAD:
-                agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
-                put_back(agent, local.known[number].snapshot)
-                views.append(view_of(agent))
-        seen.add(tuple(views))
-    return seen
+    agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
+
+    @cache
+    def view(number: int) -> View:
+        put_back(agent, local.known[number].snapshot)
+        return view_of(agent)
+
+    return {tuple([view(number) for number in state[AGENTS:] if number != DEAD]) for state in graph.states}
 
 
 def all_seen(graph: Graph) -> set[Seen]:
