@@ -102,11 +102,8 @@ class Order:
             for local, own in zip(locals_, timers, strict=True)
         ]
         groups = _groups(looks)
-        if len(groups) == len(locals_):
-            yield tuple(chain.from_iterable(groups))
-            return
         some_named = any(local != DEAD and known[local].names_others for local in locals_)
-        if not some_named and all(len(group) == 1 or self._are_one(group, locals_, timers) for group in groups):
+        if all(len(group) == 1 or (not some_named and self._are_one(group, locals_, timers)) for group in groups):
             yield tuple(chain.from_iterable(groups))
             return
         if self._local.bounds.blocks_alike:
