@@ -151,6 +151,9 @@ def _pairs(option: str, texts: list[str] | None) -> dict[str, Any]:
 
 
 def _how_far(progress: Progress) -> str:
+    if progress.asked is not None:
+        return f"{progress.states:,} states, all looked at; now asked: {progress.asked}"
     frontier = progress.states - progress.looked_at
     rate = progress.transitions / max(progress.seconds, 0.001)
-    return f"{progress.states:,} states, {frontier:,} of them not looked at, {progress.depth} instants, {rate:,.0f}/s"
+    known = f"{progress.states:,} states, {frontier:,} of them not looked at"
+    return f"{known}, {progress.depth} instants, {rate:,.0f} transitions/s"

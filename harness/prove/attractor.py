@@ -7,7 +7,7 @@ from itertools import accumulate
 ByTimer = tuple[tuple[int, ...], ...]
 """For each timer of a state that may be the next to end the numbers of the states that may follow if it does."""
 
-Check = Callable[[], None]
+Check = Callable[[], object]
 """Is called again and again, and raises GivenUpError when memory or time have come to an end."""
 
 

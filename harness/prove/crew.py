@@ -23,6 +23,8 @@ from harness.prove.swarm import AGENTS, ZONE, State, Swarm
 from harness.prove.votes import UndecidedError, Votes
 from harness.run.sweep import Failed, Worker, signals_held
 
+WAIT_S = 0.5
+"""So long it is waited for an answer until memory and time are looked at once more."""
 WORTH_A_CREW = 500
 """So many states that have not been looked at are shared among the cores."""
 CHUNK = 100
@@ -275,25 +277,24 @@ class Crew:
         """Whether to ask it, if so many states wait."""
         return self._size > 1 and waiting >= WORTH_A_CREW
 
-    def expansions(self, states: Sequence[State], first: int, add: Callable[[State, int], int]) -> Iterator[Expansion]:
+    def expansions(
+        self, states: Sequence[State], first: int, add: Callable[[State, int], int], check: Check = lambda: None
+    ) -> Iterator[Expansion]:
         """What follows each of `states` from number `first` on, in order, also of those that are added meanwhile."""
-        for other, number, answer in self._answers(_Other.give, states, first):
+        for other, number, answer in self._answers(_Other.give, states, check, first):
             assert isinstance(answer, Following)
             yield from other.taken_in(answer, number, add)
 
-    def needed(self, forks: Sequence[State], check: Check) -> list[int | None]:
-        """How many more votes these states need, as `Votes` says it. Raises UndecidedError."""
-        votes: list[int | None] = []
-        for _, _, answer in self._answers(_Other.give_forks, forks):
+    def needed(self, forks: Sequence[State], check: Check) -> Iterator[int | None]:
+        """How many more votes each of these states needs, as `Votes` says it. Raises UndecidedError."""
+        for _, _, answer in self._answers(_Other.give_forks, forks, check):
             assert isinstance(answer, Needed)
-            check()
             if answer.votes is None:
                 raise UndecidedError
-            votes += answer.votes
-        return votes
+            yield from answer.votes
 
     def _answers(
-        self, give: Give, states: Sequence[State], first: int = 0
+        self, give: Give, states: Sequence[State], check: Check, first: int = 0
     ) -> Iterator[tuple[_Other, int, Following | Needed]]:
         """Each with whose it is and the first state that it is of; in order, also of states added meanwhile."""
         if not self._others:
@@ -313,6 +314,7 @@ class Crew:
                 given += size
             if not due:
                 return
+            check()
             for number in _answered(busy, wait_for_one=due[0] not in answers):
                 other = busy.pop(number)
                 answers[number] = other, other.receive()
@@ -324,6 +326,6 @@ class Crew:
 
 
 def _answered(busy: Mapping[int, _Other], *, wait_for_one: bool) -> list[int]:
-    """Those of the questions, by the number of their first state, that are answered."""
-    ready = wait([other.connection for other in busy.values()], timeout=None if wait_for_one else 0)
+    """Those of the questions, by the number of their first state, that are answered; none if that takes long."""
+    ready = wait([other.connection for other in busy.values()], timeout=WAIT_S if wait_for_one else 0)
     return [number for number, other in busy.items() if other.connection in ready]

@@ -13,7 +13,7 @@ from harness.prove.crew import Crew
 from harness.prove.expansion import Expansion, expanded
 from harness.prove.flaws import Flaw
 from harness.prove.packed import Followers, States
-from harness.prove.progress import LOOK_EVERY, Budget, Ended, Progress
+from harness.prove.progress import LOOK_EVERY, Budget, Ended, GivenUpError, Progress
 from harness.prove.swarm import State, Swarm
 
 NO_PARENT = -1
@@ -72,6 +72,9 @@ class Graph:
         if expansion.crossing:
             self.crossing[number] = expansion.crossing
 
+    def progress(self, seconds: float, asked: str | None = None) -> Progress:
+        return Progress(len(self.states), self.looked_at, self.transitions, self.depth, seconds, asked)
+
     def path(self, number: int) -> list[int]:
         """The states on the way to this one, from the beginning."""
         path = [number]
@@ -101,6 +104,8 @@ def explore(
             if ended is not None:
                 graph.ended = ended
                 break
+    except GivenUpError as given_up:
+        graph.ended = given_up.ended
     except KeyboardInterrupt:
         graph.ended = "interrupted"
     graph.seconds = budget.seconds
@@ -110,22 +115,22 @@ def explore(
 def _all(graph: Graph, budget: Budget, crew: Crew | None) -> Iterator[Progress]:
     graph.reach(graph.swarm.initial, NO_PARENT)
     layer_ends = 1
-    for looked_at, expansion in enumerate(_expansions(graph, crew), 1):
+    for looked_at, expansion in enumerate(_expansions(graph, budget, crew), 1):
         graph.take_in(expansion)
         graph.looked_at = looked_at
         if looked_at == layer_ends:
             graph.depth += 1
             layer_ends = len(graph.states)
         if looked_at % LOOK_EVERY == 0 or graph.flawed is not None:
-            yield Progress(len(graph.states), looked_at, graph.transitions, graph.depth, budget.seconds)
+            yield graph.progress(budget.seconds)
 
 
-def _expansions(graph: Graph, crew: Crew | None) -> Iterator[Expansion]:
+def _expansions(graph: Graph, budget: Budget, crew: Crew | None) -> Iterator[Expansion]:
     """What follows each state, in order, also of those that are reached meanwhile; by a crew if it is many."""
     swarm, states, looked_at = graph.swarm, graph.states, 0
     while looked_at < len(states):
         if crew is not None and crew.is_worth_it(len(states) - looked_at):
-            for expansion in crew.expansions(states, looked_at, graph.reach):
+            for expansion in crew.expansions(states, looked_at, graph.reach, lambda: budget.check(crew.memory_bytes)):
                 graph.crew_bytes, graph.crew_s, graph.crew_steps = crew.memory_bytes, crew.processor_s, crew.steps
                 yield expansion
             return

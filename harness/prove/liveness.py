@@ -3,8 +3,9 @@
 Both are asked of what follows when nothing is lost any more and no new block comes, beside some more votes.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from harness.prove.attractor import Attractor, Check
 from harness.prove.collecting import cycles_left_alone
@@ -12,6 +13,9 @@ from harness.prove.crew import Crew
 from harness.prove.cycles import cycles
 from harness.prove.explore import Graph
 from harness.prove.votes import UndecidedError, Votes
+
+Watch = Callable[[str], None]
+"""Is told again and again what is asked now, and raises GivenUpError when memory or time have come to an end."""
 
 
 @dataclass
@@ -35,18 +39,18 @@ class Liveness:
 
 
 @cycles_left_alone()
-def look(graph: Graph, check: Check = lambda: None, crew: Crew | None = None) -> Liveness:
+def look(graph: Graph, watch: Watch = lambda asked: None, crew: Crew | None = None) -> Liveness:
     """Of a graph that is complete; a crew, if there is one, lets those vote who are at rest with several chains."""
-    at_rest = dict(_at_rest(graph, check))
+    at_rest = dict(_at_rest(graph, partial(watch, "who is at rest")))
     forks = [number for number, chains in at_rest.items() if chains > 1]
-    result = Liveness(len(forks), forks[0] if forks else None, cycles(graph, check))
-    safe = Attractor(graph.quiet, graph.swarm.bounds.timers_any, check)
+    result = Liveness(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "ways round")))
+    safe = Attractor(graph.quiet, graph.swarm.bounds.timers_any, partial(watch, "ways to one chain"))
     safe.add(number for number, chains in at_rest.items() if chains <= 1)
     result.astray.append(safe.left)
     if not safe.left:
         return result
     try:
-        needed = _needed(graph, forks, check, crew)
+        needed = _needed(graph, forks, watch, crew)
     except UndecidedError:
         result.decided = False
         return result
@@ -70,10 +74,16 @@ def _at_rest(graph: Graph, check: Check) -> Iterator[tuple[int, int]]:
             yield number, len(graph.swarm.chains(state))
 
 
-def _needed(graph: Graph, forks: Sequence[int], check: Check, crew: Crew | None) -> dict[int, int | None]:
+def _needed(graph: Graph, forks: Sequence[int], watch: Watch, crew: Crew | None) -> dict[int, int | None]:
     """How many more votes each of these states needs; None if one for each agent is not enough."""
+    needed: dict[int, int | None] = {}
+
+    def check() -> None:
+        watch(f"what votes lead to ({len(needed):,} of {len(forks):,} forks)")
+
     states = [graph.states[number] for number in forks]
-    if crew is not None and crew.is_worth_it(len(states)):
-        return dict(zip(forks, crew.needed(states, check), strict=True))
-    votes = Votes(graph.swarm, check)
-    return {fork: votes.needed(state) for fork, state in zip(forks, states, strict=True)}
+    shared = crew is not None and crew.is_worth_it(len(states))
+    votes = crew.needed(states, check) if crew is not None and shared else map(Votes(graph.swarm, check).needed, states)
+    for fork, need in zip(forks, votes, strict=True):
+        needed[fork] = need
+    return needed

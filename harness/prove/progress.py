@@ -9,19 +9,25 @@ from typing import Literal
 
 LOOK_EVERY = 200
 """States between two looks at memory, clock and whoever watches."""
+LOOK_EVERY_S = 0.1
+"""Seconds between two such looks, where it is not states that are looked at."""
 _STATM = Path("/proc/self/statm")
 Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """States known, of these looked at, ways between them, how many instants from the beginning."""
+    """States known, of these looked at, ways between them, how many instants from the beginning.
+
+    `asked` is what the whole graph is asked, once there are no other states.
+    """
 
     states: int
     looked_at: int
     transitions: int
     depth: int
     seconds: float
+    asked: str | None = None
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class Budget:
         self._began = time.monotonic()
         self._most_bytes = most_bytes
         self._most_s = most_s
-        self._calls = 0
+        self._next_look_s = 0.0
 
     @property
     def seconds(self) -> float:
@@ -70,11 +76,18 @@ class Budget:
             return "memory"
         return "time" if self.seconds > self._most_s else None
 
-    def check(self, elsewhere_bytes: float = 0.0) -> None:
-        """Raises GivenUpError if it is used up; to be called again and again, for it mostly does not look."""
-        self._calls += 1
-        if self._calls % LOOK_EVERY == 0 and (ended := self.ended(elsewhere_bytes)) is not None:
+    def check(self, elsewhere_bytes: float = 0.0) -> bool:
+        """Whether it looked; to be called again and again, for it mostly does not.
+
+        Raises GivenUpError if it is used up.
+        """
+        seconds = self.seconds
+        if seconds < self._next_look_s:
+            return False
+        self._next_look_s = seconds + LOOK_EVERY_S
+        if (ended := self.ended(elsewhere_bytes)) is not None:
             raise GivenUpError(ended)
+        return True
 
 
 def memory_bytes() -> int:

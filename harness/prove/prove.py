@@ -249,8 +249,13 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
         proof = Proof(bounds, figures, graph.ended, graph.flaw)
         if proof.complete:
             budget = Budget(limits.most_bytes, limits.most_s - graph.seconds)
+
+            def asked_now(asked: str) -> None:
+                if budget.check(crew.memory_bytes):
+                    watch(graph.progress(graph.seconds + budget.seconds, asked))
+
             try:
-                proof.liveness = liveness.look(graph, lambda: budget.check(crew.memory_bytes), crew)
+                proof.liveness = liveness.look(graph, asked_now, crew)
             except GivenUpError as given_up:
                 proof.whole_ended = given_up.ended
             except KeyboardInterrupt:

@@ -207,7 +207,6 @@ def test_ctrl_c_while_a_crew_begins_is_not_lost(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.prove.progress.LOOK_EVERY", 1)
     monkeypatch.setattr(
         import_module("harness.prove.prove"), "explore", lambda *_, **__: replace(explored, seconds=61.0)
     )
@@ -215,6 +214,31 @@ def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: py
     proof = prove(Bounds(2, 2, "lossy"), Limits(most_bytes=8e9, most_s=60), tmp_path / "none.yaml")
     assert (proof.ended, proof.whole_ended, proof.exit_status) == ("complete", "time", INCOMPLETE)
     assert [line[0] for line in in_words(proof) if "one chain" in line or "livelock" in line] == ["-", "-"]
+
+
+def test_what_the_whole_graph_is_asked_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.prove.progress.LOOK_EVERY_S", 0.0)
+    told: list[Progress] = []
+    proof = prove(Bounds(2, 3, "lossless"), out=tmp_path / "asked.yaml", watch=told.append)
+    assert proof.liveness is not None
+    asked = dict.fromkeys(progress.asked for progress in told if progress.asked is not None)
+    forks = proof.liveness.forks
+    assert [*asked][:3] == ["who is at rest", "ways round", "ways to one chain"]
+    assert [*asked][3:] == [f"what votes lead to ({known} of {forks} forks)" for known in range(forks)]
+    assert {(progress.states, progress.looked_at) for progress in told if progress.asked is not None} == {
+        (proof.figures.states, proof.figures.states)
+    }
+
+
+def test_time_is_up_also_for_who_is_long_about_one_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.prove.crew.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.prove.crew.WAIT_S", 0.01)
+    monkeypatch.setattr("harness.prove.crew.expanded", lambda *_: time.sleep(60))
+    swarm = Swarm(Bounds(3, 3, "lossy"))
+    with Crew(swarm, 2) as crew:
+        graph = explore(swarm, most_bytes=8e9, most_s=0.5, crew=crew)
+    assert graph.ended == "time"
+    assert not multiprocessing.active_children()
 
 
 def test_each_agent_by_itself_against_all_that_could_be_said(tmp_path: Path) -> None:
