@@ -12,14 +12,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from harness.backend_names import BACKEND_NAMES
+from harness.pytest_plugin.stash import TRIAL
 
 if TYPE_CHECKING:
     from harness.pytest_plugin.findings import Findings
     from harness.pytest_plugin.swarm_in_test import SwarmInTest
-    from harness.pytest_plugin.trial import Trial
-
-TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
-"""The run that a test is about."""
 
 MARKERS = (
     "swarm(agents=5, backend='sim', seed=1, ...): what the fixture `swarm` is; any key of a scenario",

@@ -9,10 +9,10 @@ import pytest
 from harness.backend_names import BACKEND_NAMES, BackendName
 from harness.errors import ScenarioError
 from harness.play.progress import Silent
-from harness.pytest_plugin import TRIAL
 from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.findings import Findings
 from harness.pytest_plugin.options import Options
+from harness.pytest_plugin.stash import TRIAL
 from harness.pytest_plugin.swarm_in_test import SwarmInTest
 from harness.pytest_plugin.trial import Trial, one_sentence
 from harness.run.run import Run, run

@@ -12,10 +12,10 @@ from harness.archive.vocabulary import first_of, unknown_words
 from harness.backend_names import BackendName
 from harness.errors import HarnessError, ScenarioError
 from harness.play.backends import in_virtual_time
-from harness.pytest_plugin import TRIAL
 from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.fixtures import play
 from harness.pytest_plugin.options import Options
+from harness.pytest_plugin.stash import TRIAL
 from harness.pytest_plugin.trial import Trial, one_sentence
 from harness.scenario.expect import Expect
 from harness.stories.telling import Telling
