@@ -230,10 +230,15 @@ def test_what_the_whole_graph_is_asked_is_told(tmp_path: Path, monkeypatch: pyte
     }
 
 
+def take_long(*_: object) -> None:
+    time.sleep(20)
+    raise RuntimeError("nobody has stopped it")
+
+
 def test_time_is_up_also_for_who_is_long_about_one_state(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.prove.crew.WORTH_A_CREW", 10)
     monkeypatch.setattr("harness.prove.crew.WAIT_S", 0.01)
-    monkeypatch.setattr("harness.prove.crew.expanded", lambda *_: time.sleep(60))
+    monkeypatch.setattr("harness.prove.crew.expanded", take_long)
     swarm = Swarm(Bounds(3, 3, "lossy"))
     with Crew(swarm, 2) as crew:
         graph = explore(swarm, most_bytes=8e9, most_s=0.5, crew=crew)
