@@ -82,8 +82,8 @@ def _needed(graph: Graph, forks: Sequence[int], watch: Watch, crew: Crew | None)
         watch(f"what votes lead to ({len(needed):,} of {len(forks):,} forks)")
 
     states = [graph.states[number] for number in forks]
-    shared = crew is not None and crew.is_worth_it(len(states))
-    votes = crew.needed(states, check) if crew is not None and shared else map(Votes(graph.swarm, check).needed, states)
+    shared = crew if crew is not None and crew.is_worth_it(len(states)) else None
+    votes = map(Votes(graph.swarm, check).needed, states) if shared is None else shared.needed(states, check)
     for fork, need in zip(forks, votes, strict=True):
         needed[fork] = need
     return needed
