@@ -223,6 +223,7 @@ def test_what_the_whole_graph_is_asked_is_told(tmp_path: Path, monkeypatch: pyte
     assert proof.liveness is not None
     asked = dict.fromkeys(progress.asked for progress in told if progress.asked is not None)
     forks = proof.liveness.forks
+    assert forks
     assert [*asked][:3] == ["who is at rest", "ways round", "ways to one chain"]
     assert [*asked][3:] == [f"what votes lead to ({known} of {forks} forks)" for known in range(forks)]
     assert {(progress.states, progress.looked_at) for progress in told if progress.asked is not None} == {
