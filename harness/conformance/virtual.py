@@ -9,7 +9,7 @@ import json
 import math
 import os
 import signal
-from asyncio.subprocess import PIPE, Process, SubprocessStreamProtocol
+import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -19,6 +19,7 @@ from typing import Any
 from harness.conformance.air import (
     ANSWER_LIMIT_S,
     GRACE_S,
+    LOOK_AGAIN_S,
     START_LIMIT_S,
     AgentEndedError,
     NoAgentError,
@@ -41,38 +42,61 @@ NO_AGENT = "the agent does not answer in virtual time"
 class Program:
     """A process of the agent."""
 
-    def __init__(self, process: Process, transport: asyncio.SubprocessTransport, errors: Path) -> None:
+    def __init__(
+        self,
+        process: subprocess.Popen[bytes],
+        given: asyncio.StreamWriter,
+        reading: asyncio.ReadTransport,
+        answers: asyncio.StreamReader,
+        errors: Path,
+    ) -> None:
         self._process = process
-        self._transport = transport
+        self._given = given
+        self._reading = reading
+        self._answers = answers
         self._errors = errors
         self.broken = False
 
     @classmethod
     async def start(cls, command: Sequence[str], errors: Path) -> "Program":
-        loop = asyncio.get_running_loop()
+        """Not by asyncio's own subprocess_exec: where that is cancelled, it waits for ever for pipes nobody closes."""
         try:
             with errors.open("ab") as file:
-                transport, protocol = await loop.subprocess_exec(
-                    lambda: SubprocessStreamProtocol(ANSWER_BYTES, loop),
-                    *command,
-                    "--virtual",
-                    stdin=PIPE,
-                    stdout=PIPE,
+                process = subprocess.Popen(
+                    [*command, "--virtual"],
+                    bufsize=0,
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
                     stderr=file,
                     start_new_session=True,
                 )
         except OSError as error:
             raise NoAgentError(f"the agent could not be started: {error.strerror}") from None
-        return cls(Process(transport, protocol, loop), transport, errors)
+        try:
+            return await cls._connected(process, errors)
+        except BaseException:
+            await _end(process)
+            raise
+
+    @classmethod
+    async def _connected(cls, process: subprocess.Popen[bytes], errors: Path) -> "Program":
+        loop = asyncio.get_running_loop()
+        answers, protocol = asyncio.StreamReader(ANSWER_BYTES), asyncio.StreamReaderProtocol(asyncio.StreamReader())
+        reading, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(answers), process.stdout)
+        try:
+            writing, _ = await loop.connect_write_pipe(lambda: protocol, process.stdin)
+        except BaseException:
+            reading.close()
+            raise
+        return cls(process, asyncio.StreamWriter(writing, protocol, None, loop), reading, answers, errors)
 
     async def ask(self, line: dict[str, Any], limit_s: float = ANSWER_LIMIT_S) -> dict[str, Any]:
         """Its answer. Raises AgentEndedError, UnsupportedError."""
-        assert self._process.stdin is not None and self._process.stdout is not None, "they are pipes"
         try:
             async with asyncio.timeout(limit_s):
-                self._process.stdin.write(json.dumps(line).encode("ascii") + b"\n")
-                await self._process.stdin.drain()
-                text = await self._process.stdout.readline()
+                self._given.write(json.dumps(line).encode("ascii") + b"\n")
+                await self._given.drain()
+                text = await self._answers.readline()
                 answer = json.loads(text) if text else None
         except (TimeoutError, OSError, ValueError, RecursionError) as error:
             self.broken = True
@@ -80,7 +104,7 @@ class Program:
         if answer is None:
             self.broken = True
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._process.wait(), GRACE_S)
+                await asyncio.wait_for(_ended(self._process), GRACE_S)
             if self._process.returncode is None:
                 raise AgentEndedError("it has closed its standard output, and goes on")
             raise AgentEndedError(f"it ended with status {self._process.returncode}: {last_line(self._errors)}")
@@ -94,14 +118,24 @@ class Program:
         return answer
 
     async def close(self) -> None:
-        """With all that it has started.
+        """With all that it has started, whoever else holds its pipes."""
+        if not self._given.is_closing():
+            self._given.transport.abort()
+        self._reading.close()
+        await _end(self._process)
 
-        asyncio tells of its end once its pipes are closed, and somebody else may hold them, or it has said too much.
-        """
-        with suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._transport.close()
-        await self._process.wait()
+
+async def _end(process: subprocess.Popen[bytes]) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    for pipe in filter(None, (process.stdin, process.stdout)):
+        pipe.close()
+    await _ended(process)
+
+
+async def _ended(process: subprocess.Popen[bytes]) -> None:
+    while process.poll() is None:
+        await asyncio.sleep(LOOK_AGAIN_S)
 
 
 class InVirtualTime(Subject):

@@ -1,7 +1,9 @@
 """`ucp-harness conformance`, as a user gives it; and what is made of its results."""
 
 import asyncio
+import os
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ from harness.conformance.table import to_junit
 from harness.conformance.vectors import Vectors
 from harness.conformance.virtual import Program
 from harness.wrong_agents import quirky
-from tests.harness.command import harness, sentences
+from tests.harness.command import harness, processes, sentences
 
 OURS = (sys.executable, "-P", "-m", "ucp.node")
 
@@ -93,6 +95,29 @@ def test_whatever_a_program_does_with_its_pipes_it_can_be_closed(script: str, tm
         await asyncio.wait_for(program.close(), 10.0)
 
     asyncio.run(end())
+
+
+def test_where_its_start_is_cancelled_nothing_of_it_is_left(tmp_path: Path) -> None:
+    async def begin_and_cancel(steps: int) -> bool:
+        script = 'cd "$0"; sleep 1000 & wait'
+        starting = asyncio.create_task(Program.start(("sh", "-c", script, str(tmp_path)), Path(os.devnull)))
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        too_late = starting.done()
+        starting.cancel()
+        await asyncio.wait([starting], timeout=10.0)
+        assert starting.done(), f"cancelled after {steps} steps it goes on for ever"
+        if too_late:
+            await starting.result().close()
+        return too_late
+
+    before = set(Path("/proc/self/fd").iterdir())
+    assert any(asyncio.run(begin_and_cancel(steps)) for steps in range(20)), "it was never let start"
+    assert set(Path("/proc/self/fd").iterdir()) == before
+    until = time.monotonic() + 10.0
+    while left := processes(tmp_path):
+        assert time.monotonic() < until, left
+        time.sleep(0.01)
 
 
 def test_a_program_that_closes_its_standard_output_and_goes_on_is_told(
