@@ -1,4 +1,4 @@
-"""Netlink attributes (RFC 3549; linux/netlink.h) as bytes, for messages that are many or that pyroute2 does not know.
+"""Netlink attributes (RFC 3549; linux/netlink.h) as bytes.
 
 A lab of 100 vehicles with a condition for each pair is 20,000 requests, and 10,000 answers when it is read back.
 """

@@ -13,16 +13,11 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any
-
-from pyroute2.netlink.rtnl import RTM_GETLINK, RTM_NEWADDR, RTM_NEWLINK, RTM_NEWROUTE
-from pyroute2.netlink.rtnl.ifaddrmsg import ifaddrmsg
-from pyroute2.netlink.rtnl.ifinfmsg import ifinfmsg
-from pyroute2.netlink.rtnl.rtmsg import rtmsg
 
 from netem import addresses, namespaces
 from netem.errors import LabError
-from netem.netlink import NEW, Netlink, Request
+from netem.fabric_requests import address, bridge, default_route, forwarding, set_up, veth_pair
+from netem.netlink import Netlink, Request
 
 BRIDGE = "air"
 
@@ -32,8 +27,6 @@ _ETH0 = 2
 _BRIDGE_INDEX = 2
 _FIRST_PORT_INDEX = 3
 
-_UP = {"flags": 1, "change": 1}  # IFF_UP
-_FORWARDING = 3  # BR_STATE_FORWARDING
 _CARRIER_DEADLINE_S = 5.0
 
 
@@ -47,7 +40,7 @@ class Fabric:
         self._namespaces = dict(networks)
         _silence_ipv6()
         _bypass_firewall()
-        self.netlink.send([_link("lo", index=_LO), _bridge()])
+        self.netlink.send([set_up("lo", _LO), bridge(BRIDGE, _BRIDGE_INDEX)])
         inside = {vehicle: self._namespace(vehicle) for vehicle in self.vehicles}
         self.netlink.send([self._cable(vehicle) for vehicle in self.vehicles])
         for vehicle, netlink in inside.items():
@@ -77,28 +70,21 @@ class Fabric:
             namespaces.enter_network(self.home)
 
     def _cable(self, vehicle: int) -> Request:
-        far_end = {
-            "index": _ETH0,
-            "attrs": [
-                ("IFLA_IFNAME", "eth0"),
-                ("IFLA_ADDRESS", addresses.mac(vehicle)),
-                ("IFLA_NET_NS_FD", self._namespaces[vehicle]),
-            ],
-        }
-        name = addresses.port(vehicle)
-        data = {"attrs": [("VETH_INFO_PEER", far_end)]}
-        kind = {"attrs": [("IFLA_INFO_KIND", "veth"), ("IFLA_INFO_DATA", data)]}
-        attributes = [("IFLA_IFNAME", name), ("IFLA_MASTER", _BRIDGE_INDEX), ("IFLA_LINKINFO", kind)]
-        return _link(f"create veth pair {name}", self.port_index(vehicle), attributes, NEW)
+        return veth_pair(
+            addresses.port(vehicle),
+            self.port_index(vehicle),
+            _BRIDGE_INDEX,
+            far_name="eth0",
+            far_index=_ETH0,
+            mac=addresses.mac(vehicle),
+            network=self._namespaces[vehicle],
+        )
 
     def _await_carrier(self) -> None:
         """Wait until the bridge forwards on every port: the kernel notices a cable a moment later."""
         deadline = time.monotonic() + _CARRIER_DEADLINE_S
         while True:
-            question = ifinfmsg()
-            question["family"] = 7  # AF_BRIDGE: the ports, with their state
-            ports = self.netlink.dump("list the ports of the bridge", RTM_GETLINK, question)
-            ready = {port["index"] for port in ports if _state(port) == _FORWARDING}
+            ready = forwarding(self.netlink)
             if missing := [v for v in self.vehicles if self.port_index(v) not in ready]:
                 if time.monotonic() > deadline:
                     names = ", ".join(map(addresses.port, missing[:5]))
@@ -106,11 +92,6 @@ class Fabric:
                 time.sleep(0.002)
             else:
                 return
-
-
-def _state(port: Any) -> int | None:
-    info = port.get_attr("IFLA_PROTINFO")
-    return None if info is None else info.get_attr("IFLA_BRPORT_STATE")
 
 
 def _silence_ipv6() -> None:
@@ -136,39 +117,12 @@ def _sysctl(name: str, value: bytes) -> None:
         os.close(fd)
 
 
-def _link(what: str, index: int, attributes: Sequence[Any] = (), flags: int = 0) -> Request:
-    """Create or change a link, and set it up."""
-    message = ifinfmsg()
-    message.update({"index": index, **_UP, "attrs": list(attributes)})
-    return Request(what, RTM_NEWLINK, message, flags)
-
-
-def _bridge() -> Request:
-    # No spanning tree, so that a port forwards at once; no snooping, so that multicast reaches everyone,
-    # as it does over the air.
-    settings = [("IFLA_BR_STP_STATE", 0), ("IFLA_BR_FORWARD_DELAY", 0), ("IFLA_BR_MCAST_SNOOPING", 0)]
-    kind = {"attrs": [("IFLA_INFO_KIND", "bridge"), ("IFLA_INFO_DATA", {"attrs": settings})]}
-    attributes = [("IFLA_IFNAME", BRIDGE), ("IFLA_LINKINFO", kind)]
-    return _link(f"create bridge {BRIDGE}", _BRIDGE_INDEX, attributes, NEW)
-
-
 def _configure(vehicle: int) -> list[Request]:
     where = f"vehicle {vehicle}"
     own = addresses.address(vehicle)
-    address = ifaddrmsg()
-    address.update({"family": 2, "prefixlen": addresses.PREFIX_LENGTH, "index": _ETH0})
-    address["attrs"] = [
-        ("IFA_LOCAL", own),
-        ("IFA_ADDRESS", own),
-        ("IFA_BROADCAST", addresses.BROADCAST),
-    ]
-    route = rtmsg()
-    # Main table, static, unicast, on-link: whoever is on the air is next door.
-    route.update({"family": 2, "table": 254, "proto": 4, "type": 1, "scope": 253})
-    route["attrs"] = [("RTA_OIF", _ETH0)]
     return [
-        _link(f"{where}: lo", index=_LO),
-        _link(f"{where}: eth0", index=_ETH0),
-        Request(f"{where}: address {own}", RTM_NEWADDR, address, NEW),
-        Request(f"{where}: default route", RTM_NEWROUTE, route, NEW),
+        set_up(f"{where}: lo", _LO),
+        set_up(f"{where}: eth0", _ETH0),
+        address(f"{where}: address {own}", _ETH0, own, addresses.PREFIX_LENGTH, addresses.BROADCAST),
+        default_route(f"{where}: default route", _ETH0),
     ]

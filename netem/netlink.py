@@ -1,4 +1,4 @@
-"""A netlink socket that sends requests in batches: pyroute2's codec, without its request per round trip.
+"""A netlink socket that sends requests in batches: rtnetlink(7), without a round trip for each request.
 
 A lab of 100 vehicles is some 900 requests; one system call and one wait for each of them would be most
 of the time it takes to come up. The socket stays with the namespace in which it was opened.
@@ -11,7 +11,6 @@ import socket
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from netem.errors import NetlinkError
 
@@ -21,6 +20,10 @@ NLM_F_ACK = 0x004
 NLM_F_DUMP = 0x300
 NLM_F_EXCL = 0x200
 NLM_F_CREATE = 0x400
+RTM_NEWLINK, RTM_GETLINK, RTM_NEWADDR, RTM_NEWROUTE = 16, 18, 20, 24
+RTM_NEWQDISC, RTM_DELQDISC, RTM_GETQDISC = 36, 37, 38
+RTM_NEWTCLASS, RTM_DELTCLASS = 40, 41
+RTM_NEWTFILTER, RTM_DELTFILTER, RTM_GETTFILTER = 44, 45, 46
 _NLM_F_CAPPED = 0x100
 _NLM_F_ACK_TLVS = 0x200
 _NLMSG_ERROR = 2
@@ -43,7 +46,7 @@ class Request:
 
     what: str
     type: int
-    message: Any  # a pyroute2 nlmsg, or the bytes after the header
+    message: bytes  # what comes after the header
     flags: int = 0
 
 
@@ -93,10 +96,10 @@ class Netlink:
         if error is not None:
             raise error
 
-    def dump(self, what: str, kind: int, message: Any) -> list[Any]:
-        """Everything that the kernel lists for a GET request, decoded by the class of `message` (bytes stay bytes)."""
+    def dump(self, what: str, kind: int, message: bytes) -> list[bytes]:
+        """Everything that the kernel lists for a GET request; of each what comes after the header."""
         self._socket.send(self._encode(message, kind, NLM_F_DUMP))
-        entries: list[Any] = []
+        entries: list[bytes] = []
         while True:
             for kind, flags, _, payload in self._receive():
                 if kind == _NLMSG_DONE:
@@ -105,20 +108,12 @@ class Netlink:
                     if error := _refusal(what, flags, payload):
                         raise error
                     return entries
-                entries.append(payload if isinstance(message, bytes) else _decode(message, kind, flags, payload))
+                entries.append(payload)
 
-    def _encode(self, message: Any, kind: int, flags: int) -> bytes:
+    def _encode(self, message: bytes, kind: int, flags: int) -> bytes:
         self._sequence += 1
-        if isinstance(message, bytes):
-            length = _HEADER.size + len(message)
-            return _HEADER.pack(length, kind, flags | NLM_F_REQUEST, self._sequence, 0) + message
-        header = message["header"]
-        header["type"] = kind
-        header["flags"] = flags | NLM_F_REQUEST
-        header["sequence_number"] = self._sequence
-        message.reset()
-        message.encode()
-        return bytes(message.data)
+        length = _HEADER.size + len(message)
+        return _HEADER.pack(length, kind, flags | NLM_F_REQUEST, self._sequence, 0) + message
 
     def _receive(self) -> list[tuple[int, int, int, bytes]]:
         data = self._socket.recv(1 << 18)
@@ -129,12 +124,6 @@ class Netlink:
             messages.append((kind, flags, sequence, data[offset + _HEADER.size : offset + length]))
             offset += (length + 3) & ~3
         return messages
-
-
-def _decode(example: Any, kind: int, flags: int, payload: bytes) -> Any:
-    decoded = type(example)(_HEADER.pack(_HEADER.size + len(payload), kind, flags, 0, 0) + payload)
-    decoded.decode()
-    return decoded
 
 
 def _refusal(what: str, flags: int, payload: bytes) -> NetlinkError | None:

@@ -16,7 +16,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
-from pyroute2.netlink.rtnl import (
+from netem import distributions
+from netem.attributes import attribute, nested, number, parse, parse_number, text
+from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
+from netem.netlink import (
+    NEW,
+    NLM_F_CREATE,
     RTM_DELQDISC,
     RTM_DELTCLASS,
     RTM_DELTFILTER,
@@ -25,12 +30,9 @@ from pyroute2.netlink.rtnl import (
     RTM_NEWQDISC,
     RTM_NEWTCLASS,
     RTM_NEWTFILTER,
+    Netlink,
+    Request,
 )
-
-from netem import distributions
-from netem.attributes import attribute, nested, number, parse, parse_number, text
-from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
-from netem.netlink import NEW, NLM_F_CREATE, Netlink, Request
 
 MAX_KIND = 0x7FFF
 """The highest number of a class that leaves a number for its netem."""

@@ -33,7 +33,7 @@ from harness.scenario import Scenario
 from netem import uml
 from ucp.files import write_atomically
 
-PACKAGES = ("ucp-harness", "pymavlink", "pyroute2")
+PACKAGES = ("ucp-harness", "pymavlink")
 
 
 @dataclass(frozen=True)

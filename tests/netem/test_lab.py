@@ -99,6 +99,14 @@ def test_an_idle_lab_is_silent(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
+def test_the_first_process_loads_little() -> None:
+    """A lab is up as soon as it is: what it imports is most of what it waits for."""
+    words = subprocess.check_output(
+        [sys.executable, "-P", "-c", "import sys, netem.init; print(*sys.modules)"], text=True
+    )
+    assert not set(words.split()) & {"asyncio", "ssl", "logging", "pydantic", "scapy", "harness", "ucp"}
+
+
 def test_a_program_gets_exactly_the_environment_folder_and_files_it_was_given(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         script = "pwd; env | sort; ls /proc/self/fd | tr '\\n' ' '; cat; echo wrong >&2"
