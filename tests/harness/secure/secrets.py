@@ -38,9 +38,10 @@ def forms(secret: bytes) -> Iterator[bytes]:
     yield secret
     yield secret.hex().encode()
     yield secret.hex().upper().encode()
-    for shift in range(3):  # what stands around it moves it; its first and last characters are others' too
-        yield base64.b64encode(bytes(shift) + secret)[4:-4]
-        yield base64.urlsafe_b64encode(bytes(shift) + secret)[4:-4]
+    for shift in range(3):  # what stands around it moves it; the characters that are of it alone are these
+        its_own = slice(-(-4 * shift // 3), 4 * (shift + len(secret)) // 3)
+        yield base64.b64encode(bytes(shift) + secret)[its_own]
+        yield base64.urlsafe_b64encode(bytes(shift) + secret)[its_own]
     yield str(int.from_bytes(secret, "big")).encode()
     yield str(int.from_bytes(secret, "little")).encode()
     yield ", ".join(map(str, secret)).encode()
