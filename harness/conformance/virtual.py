@@ -81,7 +81,8 @@ class Program:
     @classmethod
     async def _connected(cls, process: subprocess.Popen[bytes], errors: Path) -> "Program":
         loop = asyncio.get_running_loop()
-        answers, protocol = asyncio.StreamReader(ANSWER_BYTES), asyncio.StreamReaderProtocol(asyncio.StreamReader())
+        answers = asyncio.StreamReader(ANSWER_BYTES)
+        protocol = asyncio.StreamReaderProtocol(asyncio.StreamReader())  # which tells a writer when there is room
         reading, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(answers), process.stdout)
         try:
             writing, _ = await loop.connect_write_pipe(lambda: protocol, process.stdin)

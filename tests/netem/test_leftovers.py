@@ -81,6 +81,7 @@ def test_a_killed_orchestrator_leaves_nothing(tmp_path: Path, after_s: float) ->
         during = interfaces()
         orchestrator.kill()
     assert orchestrator.pid in marked, "the mark does not show, so its absence would prove nothing"
+    assert str(Path("/proc/self/ns/net").readlink()) in namespaces(), "nor would the absence of a namespace"
     assert during == before
     play(until(lambda: not processes_of(tmp_path), "every process is gone"))
     play(until(lambda: not inhabited & namespaces(), "every namespace is gone"))
