@@ -12,8 +12,8 @@ from collections import Counter
 from random import Random
 from typing import Any
 
+from harness.run.parallel import Failed, sweep
 from harness.run.simulate import simulate
-from harness.run.sweep import Failed, sweep
 from harness.scenario import Scenario
 
 JOBS = 2

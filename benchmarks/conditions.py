@@ -17,9 +17,9 @@ from statistics import fmean
 from typing import get_args
 
 from harness.errors import CANNOT_HERE
-from netem.doctor import examine
 from netem.errors import NetemError
 from netem.lab import EngineName
+from netem.lab_doctor import examine
 from netem.measure import PACKETS, Measured, Observer, measure, studies
 from netem.observers import in_lab, in_medium
 

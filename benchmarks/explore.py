@@ -12,11 +12,11 @@ import sys
 import time
 from random import Random
 
-from harness.coverage import Existing, Reached, existing
-from harness.explore.guided.hunt import Candidate, Hunt
-from harness.explore.guided.trial import beginnings, tried
-from harness.prove import Bounds
+from harness.proof import Bounds
+from harness.proof.coverage import Existing, Reached, existing
 from harness.scenario import Scenario
+from harness.sweep.explore.guided.hunt import Candidate, Hunt
+from harness.sweep.explore.guided.hunt_trial import beginnings, tried
 
 LOSS = {"network": {"loss": 0.15}}
 SCENARIOS = {

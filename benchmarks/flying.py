@@ -98,7 +98,7 @@ def _what(pid: int, run: Path) -> str:
     for folder in ("vehicles", "agents"):
         if directory.is_relative_to(run / folder):
             return folder
-    return "the page's server" if b"harness.watch" in started_as else "the harness"
+    return "the page's server" if b"harness.report.live" in started_as else "the harness"
 
 
 async def fly(run: Path, asked: Path, seconds: float) -> None:

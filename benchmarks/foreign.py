@@ -15,9 +15,9 @@ from collections import Counter
 from pathlib import Path
 
 from harness.errors import UnsupportedError
-from harness.play.simulation.foreign.programs import SHARED
+from harness.play.simulation.foreign.program_pool import SHARED
+from harness.run.parallel import Failed, sweep
 from harness.run.simulate import Simulated, simulate
-from harness.run.sweep import Failed, sweep
 from harness.scenario import Scenario, library, load_scenario
 
 OURS = [sys.executable, "-P", "-m", "ucp.node"]

@@ -21,11 +21,11 @@ from harness.run.simulate import InMemory, simulate, simulate_in_memory
 from harness.scenario import Scenario
 from ucp.block import Block
 from ucp.messages import BlockAddRequest, BlockResponse, ChainContainResponse, CommitBlock, Message, encode
-from ucp.secure.agent import SecuredAgent, boot_of
 from ucp.secure.bundle import KeySet
+from ucp.secure.crypto_suite import SenderKeys
 from ucp.secure.envelope import CLEAR, SIGNATURE_BYTES
+from ucp.secure.secured_agent import SecuredAgent, boot_of
 from ucp.secure.session import Session
-from ucp.secure.suite import SenderKeys
 from ucp.trace import Recorded
 
 ROSTER = (1, 2, 3)

@@ -10,9 +10,9 @@ import sys
 from random import Random
 from typing import Any
 
-from harness.matrix.cures import STAGGER
+from docs.generate.cures import STAGGER
+from harness.run.parallel import Failed, cores, sweep
 from harness.run.simulate import simulate
-from harness.run.sweep import Failed, cores, sweep
 from harness.scenario import Scenario
 
 TOP, ASKS, BLOCK = {"top_needs_majority": True}, {"asks_after_commit": True}, {"phase2_tie": "block"}

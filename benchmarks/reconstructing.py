@@ -27,12 +27,12 @@ from benchmarks import clean_runs
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
 from harness.errors import HarnessError
-from harness.field.homecoming import sort_out
+from harness.field.ingest import sort_out
 from harness.field.reconstruct import reconstruct
 from harness.play.backends import BACKENDS
 from harness.play.mission import play_on
 from harness.play.progress import Silent
-from harness.run.sweep import sweep
+from harness.run.parallel import sweep
 from harness.scenario import Scenario
 
 JOBS = 2

@@ -20,8 +20,8 @@ from harness.archive.directory import RunDirectory
 from harness.field.replay import Player, Record, open_record
 from harness.gc_pause import gc_paused
 from harness.play import mission
-from harness.play.simulation.backend import Simulation
-from harness.play.simulation.on_disk import OnDisk
+from harness.play.simulation.run_files import OnDisk
+from harness.play.simulation.simulation import Simulation
 
 AGENTS, AGENT = 20, 3
 DURATION_S = 7200.0

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from harness.errors import HarnessError
-from harness.matrix.model import load_matrix
+from harness.run.parallel import Failed, cores, sweep
 from harness.run.simulate import simulate
-from harness.run.sweep import Failed, cores, sweep
 from harness.scenario import Scenario, library, load_scenario, read_yaml
+from harness.sweep.matrix.matrix_file import load_matrix
 
 INJECTIONS = "what its rogue node injects, of which agents with keys believe less"
 REVOCATIONS = "its revocations, which nobody without keys hears"

@@ -22,11 +22,11 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from benchmarks.played_by import LOSS as LOSS_OF_MATRIX
 from benchmarks.played_by import scenario as scenario_of_matrix
-from harness.matrix.play import simulated
 from harness.play.progress import Silent
 from harness.run.run import run
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
+from harness.sweep.matrix.cell_play import simulated
 from ucp.block import Block
 from ucp.messages import (
     BlockAddRequest,
@@ -41,9 +41,9 @@ from ucp.messages import (
     decode,
     encode,
 )
-from ucp.secure.agent import boot_of
 from ucp.secure.bundle import KeySet
 from ucp.secure.envelope import read_clear, sealed_bytes
+from ucp.secure.secured_agent import boot_of
 from ucp.secure.session import Session
 
 ROSTER = (1, 2)

@@ -2,7 +2,8 @@
 
 Another revision of the project is checked out beside, and agents of both start in turn, alone on loopback: believe the
 ratios, of the same round. Ready is when the control socket answers; the processor time is of the whole process by then.
-With `-- COMMAND...` another agent, which gets the mission file as ucp/CONTRACT.md says, instead of the other revision.
+With `-- COMMAND...` another agent, which gets the mission file as ucp/contract/CONTRACT.md says, instead of the other
+revision.
 """
 
 from __future__ import annotations

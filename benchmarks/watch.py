@@ -20,11 +20,11 @@ from tempfile import TemporaryDirectory
 import aiohttp
 
 from harness.play.progress import Silent
+from harness.report.live.change_log import Story
+from harness.report.live.feed import Feed
+from harness.report.live.server import UPDATE_S, Server
 from harness.run.run import run
 from harness.scenario import Scenario
-from harness.watch.feed import Feed
-from harness.watch.server import UPDATE_S, Server
-from harness.watch.story import Story
 
 Written = list[tuple[float, Path, bytes]]
 

@@ -28,7 +28,7 @@ from netem.conditions import NetworkConditions
 from netem.engine import Engine
 from netem.errors import ConditionsError, EngineError, NetemError
 from netem.fabric import Fabric
-from netem.wire import Receiver, WireError, encode
+from netem.lab_protocol import Receiver, WireError, encode
 
 _MAX_UNREAD = 64 << 20  # bytes waiting for an orchestrator that does not read
 

@@ -27,10 +27,10 @@ from types import TracebackType
 from typing import Literal, Self
 
 from netem import addresses, namespaces
-from netem.channel import Channel
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import ConditionsError, LabError, LabUnavailable, SpawnError
+from netem.lab_channel import Channel
 
 EngineName = Literal["netem", "nftables"]
 

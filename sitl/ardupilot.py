@@ -22,10 +22,9 @@ from pathlib import Path
 from sitl.airframes import BINARIES, Airframe, airframe
 from sitl.installed import current, install_command, sha256
 from sitl.parameters import in_lines
-from sitl.places import autotest
 from sitl.setup import USUAL as USUAL_SETUP
 from sitl.setup import Debugger, Setup
-from sitl.state import Version
+from sitl.start_places import autotest
 from sitl.vehicle import (
     Home,
     Launch,
@@ -36,6 +35,7 @@ from sitl.vehicle import (
     VehicleType,
     check_launch,
 )
+from sitl.vehicle_state import Version
 
 OWN_DEFAULTS = "vehicle.parm"
 ENVIRONMENT = "ARDUPILOT_SITL"  # a directory that holds binaries and, better, their default parameters

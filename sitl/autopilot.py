@@ -1,7 +1,7 @@
 """The embedded vehicle's autopilot: modes, arming, flight and missions; no socket, no clock, no parser.
 
-`Autopilot` is the vehicle. Who talks to it does so through a `Channel` (channel.py), and what it says about itself at
-intervals is in streams.py. Times are simulated seconds since boot.
+`Autopilot` is the vehicle. Who talks to it does so through a `Channel` (serial_channel.py), and what it says about
+itself at intervals is in streams.py. Times are simulated seconds since boot.
 
 It answers as ArduPilot does where a client can tell the difference: arming is refused until the position is known, a
 mode set in the first seconds after boot is acknowledged and then undone, a copter begins a mission when it is told to,

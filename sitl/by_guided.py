@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.by_mission import MissionFlight
 from sitl.kinematics import Point
-from sitl.link import Link
-from sitl.mission import SPEED_TYPES, on_earth
+from sitl.mission_upload import SPEED_TYPES, on_earth
+from sitl.pilot_link import Link
 from sitl.procedure import Commander, HopelessError, Step
 from sitl.route import Waypoint, is_near, landing_begins, limit_s
 from sitl.take_off import TakeOff

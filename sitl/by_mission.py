@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.link import Link
-from sitl.mission import Mission, Upload
+from sitl.mission_upload import Mission, Upload
+from sitl.pilot_link import Link
 from sitl.procedure import ARM, HEARTBEAT, READY, Commander, HopelessError, Step
 from sitl.route import Waypoint, limit_s
 from sitl.vehicle import VehicleType

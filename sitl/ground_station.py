@@ -16,7 +16,7 @@ from typing import Any, Self, cast
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.address import Address, connected
-from sitl.frames import FrameSplitter
+from sitl.mavlink_frames import FrameSplitter
 from sitl.operator import CommandLog
 
 MOST_DATAGRAMS_PER_S = 1000

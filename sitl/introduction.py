@@ -12,7 +12,7 @@ from itertools import islice
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.link import Link
+from sitl.pilot_link import Link
 from sitl.procedure import HEARTBEAT, Step
 
 PATIENCE = 10

@@ -11,7 +11,7 @@ import selectors
 import socket
 
 from sitl.autopilot import Autopilot
-from sitl.channel import Channel
+from sitl.serial_channel import Channel
 
 READ_BYTES = 65_536
 MAX_UNSENT_BYTES = 65_536

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.link import Link
+from sitl.pilot_link import Link
 from sitl.procedure import ARM, HEARTBEAT, Commander, Step
 from sitl.route import CLIMBED
 from sitl.vehicle import VehicleType

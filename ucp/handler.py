@@ -1,7 +1,7 @@
 """What an event handler is: one of Algorithms 1-20, and all that it declares.
 
 A handler declares the branches that it can take, the messages that it may send, the timers that it may start and the
-local events that it may trigger. `ucp.core` holds it to that, and `ucp.diagram` draws the protocol from it.
+local events that it may trigger. `ucp.core` holds it to that, and `docs.generate.handlers` draws the protocol from it.
 """
 
 import re

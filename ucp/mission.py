@@ -1,4 +1,4 @@
-"""The mission file: all that one agent is told before it starts (schema `ucp-mission/1`, see CONTRACT.md)."""
+"""The mission file: all that one agent is told before it starts (schema `ucp-mission/1`, see contract/CONTRACT.md)."""
 
 import base64
 import json
@@ -14,7 +14,7 @@ from ucp.events import DEFAULT_LOG, MAX_MEAN_S, MEAN_TIME_BETWEEN_EVENTS_S, Even
 from ucp.features import FEATURES
 from ucp.sealed import SEAL_BYTES, sealed_to
 from ucp.settings import Settings
-from ucp.shown import shown, shown_key
+from ucp.short_value import shown, shown_key
 
 SCHEMA = "ucp-mission/1"
 MAX_MISSION_BYTES = 4 * 1024 * 1024

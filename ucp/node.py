@@ -2,8 +2,8 @@
 
 It drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source, and leaves its files beside
 the mission file: `<id>.chain.json`, `<id>.trace.jsonl`, `<id>.log`, and the control socket `<id>.control` while it
-runs; and its store, if the mission names one. SIGTERM exports the chain and ends it. CONTRACT.md says what any agent
-under test must do; this is the default.
+runs; and its store, if the mission names one. SIGTERM exports the chain and ends it. contract/CONTRACT.md says what
+any agent under test must do; this is the default.
 """
 
 import base64
@@ -18,12 +18,12 @@ from random import Random
 from typing import TYPE_CHECKING, Any, cast
 
 from ucp.agent import Agent
+from ucp.agent_files import LogFile, TraceFile, write_json_atomically
 from ucp.clock import MissionClock
 from ucp.control import CommandError, ControlServer, UnsupportedCommandError
 from ucp.events import EVENT_HEADER_BYTES, LoggableEvent, RandomEvents
 from ucp.export import export_chain
 from ucp.features import UNSUPPORTED
-from ucp.files import LogFile, TraceFile, write_json_atomically
 from ucp.loop import Loop, Timer
 from ucp.messages import MalformedDatagramError
 from ucp.mission import Mission, MissionError, UnsupportedMissionError, is_epoch, load_mission
@@ -32,7 +32,7 @@ from ucp.store import Store, StoreError
 from ucp.trace import Commanded, Entry, HandlerRun, header_line
 
 if TYPE_CHECKING:
-    from ucp.secure.agent import SecuredAgent
+    from ucp.secure.secured_agent import SecuredAgent
 
 MAX_READ_BYTES = 65536
 DATAGRAMS_PER_TURN = 64
@@ -92,7 +92,7 @@ class Node:
         if mission.security is None:
             return Agent
         try:
-            from ucp.secure.vehicle import secured_agent  # needs the extra `secure`
+            from ucp.secure.secured_vehicle import secured_agent  # needs the extra `secure`
         except ModuleNotFoundError as error:
             raise UnsupportedMissionError(
                 f"needs the feature 'secured', and {error.name} is not installed here"

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.dataclass import dataclass
 from ucp.events import MAX_EVENT_BYTES
-from ucp.shown import shown
+from ucp.short_value import shown
 
 MAX_TIMER_S = 1e9
 """Thirty years."""

@@ -1,4 +1,4 @@
-"""What an agent says of itself when it is asked for its status, whoever drives it (see CONTRACT.md)."""
+"""What an agent says of itself when it is asked for its status, whoever drives it (see contract/CONTRACT.md)."""
 
 from typing import Any
 

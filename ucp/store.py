@@ -23,7 +23,7 @@ from typing import Any, BinaryIO
 from ucp.block import BLOCK_HEADER, Block
 from ucp.dataclass import dataclass, field
 from ucp.messages import decode_block
-from ucp.shown import shown
+from ucp.short_value import shown
 from ucp.state import AgentState
 
 SCHEMA = "ucp-store/1"

@@ -2,8 +2,8 @@
 
 It reads lines of JSON from standard input, each one input with the time at which it comes, and answers each with a line
 on standard output: what it broadcasts, when its next timer ends, and what its trace says of it. It has no socket, no
-file and no clock, and when the next mission line comes it has forgotten the last. CONTRACT.md says what any agent does
-that can be driven so.
+file and no clock, and when the next mission line comes it has forgotten the last. contract/CONTRACT.md says what any
+agent does that can be driven so.
 """
 
 import base64
@@ -28,7 +28,7 @@ from ucp.store import SecuredState, StoredState, block_on_disk
 from ucp.trace import Commanded, HandlerRun, in_base64
 
 if TYPE_CHECKING:
-    from ucp.secure.agent import SecuredAgent
+    from ucp.secure.secured_agent import SecuredAgent
 
 LATEST_S = 1e12
 """Mission seconds; the timestamp of no event would have room for more."""
@@ -244,7 +244,7 @@ def _maker(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
     if mission.security is None:
         return Agent
     try:
-        from ucp.secure.vehicle import secured_in_virtual_time  # needs the extra `secure`
+        from ucp.secure.secured_vehicle import secured_in_virtual_time  # needs the extra `secure`
     except ModuleNotFoundError as error:
         why = f"this mission needs the feature 'secured', and {error.name} is not installed here"
         raise InputError(why, unsupported=True) from None

@@ -18,7 +18,9 @@ CELL, LEFT, TOP, BOX = 26, 110, 96, 22
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     if MARK not in markdown:
         return markdown
-    rooms = re.findall(r"\[(\w+)/\]\(\.\./harness/\w+\)", markdown.split("In [harness/](../harness)")[1])
+    rooms = re.findall(
+        r"^\| \[(\w+)/\]\(\.\./harness/\w+\)", markdown.split("In [harness/](../harness)")[1], re.MULTILINE
+    )
     return markdown.replace(MARK, picture(rooms, uses(rooms)))
 
 

@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any
 from harness.archive import traces
 from harness.archive.connectivity import NETWORK_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
-from harness.archive.record import RunRecord
-from harness.archive.runs import RUNS
+from harness.archive.run_listing import RUNS
+from harness.archive.run_record import RunRecord
 from harness.archive.tracks import TRACKS_FILE
 from harness.errors import MachineError, RunDirectoryError
 from netem.radio import Place
-from ucp.files import write_json_atomically
+from ucp.agent_files import write_json_atomically
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -74,7 +74,7 @@ class RunDirectory:
         return path
 
     def write_mission(self, directory: Path, agent_id: int, mission: Mapping[str, Any]) -> Path:
-        """Write what ucp/CONTRACT.md tells an agent at its start, and return the file."""
+        """Write what ucp/contract/CONTRACT.md tells an agent at its start, and return the file."""
         path = directory / f"{agent_id}.mission.json"
         write_json_atomically(path, dict(mission))
         return path

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from typing import Literal
 
-from harness.archive.record import FaultRecord
+from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Trace
 from ucp.trace import HandlerRun
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from harness.archive.lenient import fit
-from harness.archive.record import SCHEMA, JudgedRecord, RunRecord
+from harness.archive.lenient_model import fit
+from harness.archive.run_record import SCHEMA, JudgedRecord, RunRecord
 from harness.errors import RunDirectoryError
 
 MAX_BYTES = 64 * 1024 * 1024

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from harness.archive.history import lives
-from harness.archive.record import FaultRecord
+from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Trace
 from ucp.trace import HandlerRun
 

@@ -108,7 +108,7 @@ class Trace:
     """`runs` of all lives of the agent; those with index n >= starts[k] are of life k + 2, after the kth restart.
 
     `asides` are the lines of other things, each with the number of runs that stand before it. A trace from the field
-    (`harness.field.homecoming`) may have `gaps`; one of a run has none, and ends where it is damaged.
+    (`harness.field.ingest`) may have `gaps`; one of a run has none, and ends where it is damaged.
     """
 
     header: Header

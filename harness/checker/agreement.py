@@ -10,7 +10,7 @@ nothing. Where everybody was switched off it is all of them, and a chance only o
 
 import math
 
-from harness.checker import cycles
+from harness.checker import recurring_cycles
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Judgement, agents
 
@@ -23,7 +23,7 @@ def never(name: str, evidence: Evidence) -> Judgement | None:
     cycle = evidence.cycle
     if cycle is None or evidence.connected_since_s is None or evidence.missing or evidence.paused_at_end:
         return None
-    return Judgement(name, "violated", f"fully connected, and yet {cycles.in_short(cycle)}")
+    return Judgement(name, "violated", f"fully connected, and yet {recurring_cycles.in_short(cycle)}")
 
 
 REASONS_TOLD = 3

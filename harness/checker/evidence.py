@@ -13,13 +13,13 @@ from pydantic import BaseModel, ConfigDict
 from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
-from harness.archive.record import AgentRecord, Counters, Cycle, JudgedRecord
+from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_files, read_captures
+from harness.archive.run_record import AgentRecord, Counters, Cycle, JudgedRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, Unknown, first_of, unknown_words
-from harness.checker.cycles import cycle_of
-from harness.checker.replay import Life, replay
+from harness.checker.recurring_cycles import cycle_of
+from harness.checker.trace_replay import Life, replay
 from harness.errors import RunDirectoryError
-from harness.packets.files import DIRECTORY, Captures, capture_files, read_captures
 from harness.play.rogue.line import OF_NO_INJECTION
 from ucp.block import HASH_BYTES
 from ucp.state import AgentState
@@ -28,7 +28,7 @@ from ucp.trace import HandlerRun, Sent
 if TYPE_CHECKING:
     from harness.checker.records import Examination
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.suite import Signed
+    from ucp.secure.crypto_suite import Signed
 
 Sending = tuple[tuple[float, Sent], ...]
 """What an agent sent when with one type and sequence number: one message in each of its lives, at most."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.suite import Signed
+    from ucp.secure.crypto_suite import Signed
 
 NAME = "genuine"
 
@@ -54,7 +54,7 @@ class _Signatures:
     """Signatures of blocks, each of which is checked once."""
 
     def __init__(self, keys: "PublicKeys", verified: "Callable[[Signed], bool] | None") -> None:
-        from ucp.secure.suite import verify
+        from ucp.secure.crypto_suite import verify
 
         self._keys = keys
         self._verified = verified or verify

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.archive.archive import RunArchive
-from harness.archive.record import InjectedMessages, RogueInjection
+from harness.archive.run_record import InjectedMessages, RogueInjection
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import unknown_words
 from harness.play.rogue.sequences import injection_of

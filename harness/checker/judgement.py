@@ -6,7 +6,7 @@ A check that could not look is `not applicable`, never `holds`.
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from harness.scenario.verdicts import Kind, Verdict, kind_of
+from harness.scenario.verdict_names import Kind, Verdict, kind_of
 
 MAX_EVIDENCE = 50
 """More pieces of evidence than anyone reads are counted in the reason and not listed."""

@@ -4,7 +4,7 @@ One that does not either never will, which has to be shown, or needs more time t
 blocks are still being committed, and so tell how fast.
 """
 
-from harness.checker import cycles
+from harness.checker import recurring_cycles
 from harness.checker.agreement import without
 from harness.checker.evidence import Evidence
 from harness.checker.figures import uniform_at_s
@@ -21,7 +21,9 @@ def check(evidence: Evidence) -> Judgement:
     if not evidence.busy:
         return Judgement(NAME, "finished", _finished(evidence))
     if evidence.cycle is not None:
-        return Judgement(NAME, "never finishes", cycles.in_words(evidence.cycle), cycles.findings(evidence.cycle))
+        return Judgement(
+            NAME, "never finishes", recurring_cycles.in_words(evidence.cycle), recurring_cycles.findings(evidence.cycle)
+        )
     findings = [Finding(agent_id, _left_to_do(evidence, agent_id)) for agent_id in evidence.busy]
     return Judgement(NAME, "not finished", _not_finished(evidence), findings[:MAX_EVIDENCE])
 
@@ -56,7 +58,7 @@ def _finished(evidence: Evidence) -> str:
 
 
 def _not_finished(evidence: Evidence) -> str:
-    still = f"{cycles.named(evidence.busy)} {'were' if len(evidence.busy) > 1 else 'was'} not idle"
+    still = f"{recurring_cycles.named(evidence.busy)} {'were' if len(evidence.busy) > 1 else 'was'} not idle"
     at = "" if evidence.ended_at_s is None else f" when the run ended at {evidence.ended_at_s:.0f} s"
     connected = evidence.connected_since_s is not None
     conditions = "" if connected else f", not fully connected ({evidence.network_at_end or 'conditions not on record'})"

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 
 from harness.archive.exports import Export
-from harness.archive.record import BlockHolders, FaultRecord, LeastHeld, Loss, Survival
+from harness.archive.run_record import BlockHolders, FaultRecord, LeastHeld, Loss, Survival
 from harness.archive.traces import Held, Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import agents

@@ -19,7 +19,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.figures import figures
 from harness.checker.judgement import Judgement
 from harness.checker.records.doubt import in_doubt
-from harness.scenario.verdicts import JUDGED
+from harness.scenario.verdict_names import JUDGED
 
 CHECKS = {
     "1": distributed.check,
@@ -35,7 +35,7 @@ BESIDE: dict[str, Callable[[Evidence], Judgement]] = {
     "records": records.check,
     "liveness": liveness.check,
 }
-"""Judgements that are not of the thesis, by their keys: see `harness.scenario.verdicts`."""
+"""Judgements that are not of the thesis, by their keys: see `harness.scenario.verdict_names`."""
 
 
 @dataclass(frozen=True)

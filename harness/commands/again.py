@@ -11,12 +11,12 @@ from rich.text import Text
 from typer.core import TyperCommand
 from typer.exceptions import TyperException
 
-from harness.bisection import CannotBeTriedError, Outcome, Workshop, differences, subject_of
-from harness.bisection.code import ROOT, interrupted_by_sigterm
-from harness.bisection.outcome import read
 from harness.commands.terminal import complain, print_json
 from harness.errors import HarnessError, InterruptedRunError, MachineError
-from ucp.files import write_atomically
+from harness.field.bisection import CannotBeTriedError, Outcome, Workshop, differences, subject_of
+from harness.field.bisection.code_state import ROOT, interrupted_by_sigterm
+from harness.field.bisection.outcome import read
+from ucp.agent_files import write_atomically
 
 AS_IT_WAS, CHANGED, CANNOT_BE_TRIED, STOP = 0, 1, 125, 128
 """Exit statuses as `git bisect run` takes them; from 128 on it stops."""

@@ -8,9 +8,9 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from harness.bisection import Found, Workshop, bisect, subject_of
-from harness.bisection.code import interrupted_by_sigterm
 from harness.commands.terminal import print_json
+from harness.field.bisection import Found, Workshop, bisect, subject_of
+from harness.field.bisection.code_state import interrupted_by_sigterm
 
 NOT_FOUND = 1
 FILES_SHOWN = 12

@@ -21,7 +21,7 @@ def opener_of(bundle: Path | None) -> "Opener | None":
     if bundle is None:
         return None
     try:
-        from harness.keyring import KeysError
+        from harness.play.keyring import KeysError
         from ucp.secure.bundle import load_bundle
         from ucp.secure.keyfile import KeyFileError
         from ucp.secure.opening import Opener

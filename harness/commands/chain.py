@@ -6,17 +6,17 @@ from typing import Annotated
 
 import typer
 
-from harness import logbook
 from harness.archive.archive import RunArchive
 from harness.commands.depot_key import DepotKey, depot_of
 from harness.commands.new_file import write_new
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST, ExportError
-from harness.logbook.flown import flown
-from harness.logbook.geojson import geojson
-from harness.logbook.kml import kml
-from harness.logbook.positions import Track, tracks
-from harness.logbook.text import document, lines
+from harness.report import logbook
+from harness.report.logbook.flown import flown
+from harness.report.logbook.geojson import geojson
+from harness.report.logbook.kml import kml
+from harness.report.logbook.logbook_text import document, lines
+from harness.report.logbook.positions import Track, tracks
 
 
 def chain_command(

@@ -11,7 +11,7 @@ from harness.archive.archive import RunArchive
 from harness.checker.survival import survival
 from harness.commands.terminal import complain, print_json, show_programs, show_result, show_survival
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST
-from harness.report.programs import programs
+from harness.report.agent_programs import programs
 
 
 def check_command(

@@ -5,7 +5,7 @@ from rich.console import Console
 
 def clean_command() -> None:
     """Remove the containers of runs on Docker that are over; those of a run that goes on, and all others, stay."""
-    from harness.play.containers.engine import Engine
+    from harness.play.containers.docker_engine import Engine
     from harness.play.containers.leftovers import clean
 
     engine = Engine.connect()

@@ -11,16 +11,16 @@ from rich.text import Text
 
 from harness.commands.new_file import refuse_existing, write_new
 from harness.commands.terminal import complain, print_json
-from harness.conformance.file import to_lines
-from harness.conformance.page import read_agents, to_html
-from harness.conformance.progress import progress
+from harness.conformance.conformance_page import read_agents, to_html
+from harness.conformance.conformance_run import Asked, conform
 from harness.conformance.results import TITLES, Results
-from harness.conformance.run import Asked, conform
-from harness.conformance.table import render, summary, to_junit
+from harness.conformance.results_table import render, summary, to_junit
+from harness.conformance.run_progress import progress
+from harness.conformance.vector_file import to_lines
 from harness.conformance.vectors import generate
 from harness.errors import HarnessError, MachineError
-from harness.play.program import located
-from harness.run.sweep import terminated_is_interrupted
+from harness.play.command_line import located
+from harness.run.parallel import terminated_is_interrupted
 from ucp.agent import HANDLERS
 
 
@@ -30,7 +30,8 @@ class ConformanceRequestError(HarnessError):
 
 def conformance_command(
     command: Annotated[
-        list[str] | None, typer.Argument(metavar="-- COMMAND...", help="The agent, as ucp/CONTRACT.md starts it.")
+        list[str] | None,
+        typer.Argument(metavar="-- COMMAND...", help="The agent, as ucp/contract/CONTRACT.md starts it."),
     ] = None,
     only: Annotated[
         str | None, typer.Option(metavar="ALG", help="One Algorithm: 13, or receive_request_next_in_sequence.")

@@ -12,18 +12,18 @@ from harness.archive.directory import claim
 from harness.commands.depot_key import DepotKey, depot_of
 from harness.commands.new_file import refuse_existing, write_new
 from harness.commands.terminal import complain, print_lines
-from harness.depot import outputs
-from harness.depot.came_home import came_home
-from harness.depot.consolidation import Consolidation, consolidate
-from harness.depot.lines import Reconciled
-from harness.depot.words import in_words
 from harness.errors import ExportError
-from harness.logbook.geojson import geojson
-from harness.logbook.kml import kml
-from harness.logbook.positions import Track
+from harness.field.depot import record_outputs
+from harness.field.depot.collected_exports import came_home
+from harness.field.depot.consolidation import Consolidation, consolidate
+from harness.field.depot.record_lines import Reconciled
+from harness.field.depot.record_text import in_words
+from harness.report.logbook.geojson import geojson
+from harness.report.logbook.kml import kml
+from harness.report.logbook.positions import Track
 
 if TYPE_CHECKING:
-    from harness.depot.reconcile import Reconciliation
+    from harness.field.depot.depot_reconcile import Reconciliation
 
 FINDING = 1
 MOST_TOLD = 20
@@ -66,7 +66,7 @@ def consolidate_command(
     print_lines(in_words(record, reconciled, opened=depot_key is not None))
     print_lines(_written(record, reconciled, out, kml_file, geojson_file, csv_file))
     if html_file is not None:
-        from harness.depot.page import draw
+        from harness.field.depot.page import draw
 
         write_new(html_file, [draw(record, reconciliation)])
         print_lines([str(html_file)])
@@ -80,7 +80,7 @@ def consolidate_command(
 
 
 def _reconcile(record: Consolidation, directory: Path) -> "Reconciliation":
-    from harness.depot.reconcile import reconcile, write  # what plays a swarm takes its time to import
+    from harness.field.depot.depot_reconcile import reconcile, write  # what plays a swarm takes its time to import
 
     claim(directory)
     with Console(stderr=True).status("reconciling", spinner="line") as status:
@@ -99,15 +99,15 @@ def _written(
 ) -> Iterator[str]:
     """Write what is asked for; the name of each file."""
     if out is not None:
-        write_new(out, outputs.lines(record, reconciled))
+        write_new(out, record_outputs.lines(record, reconciled))
         yield str(out)
     if reconciled is not None and out is not None:
         yield f"{out.with_suffix('.reconciled')}: the exports of {len(reconciled.vehicles)} vehicles, reconciled"
     if csv_file is not None:
-        write_new(csv_file, [outputs.table(record)])
+        write_new(csv_file, [record_outputs.table(record)])
         yield str(csv_file)
     if kml_file is not None or geojson_file is not None:
-        yield from _maps(outputs.tracks(record), {kml_file: kml, geojson_file: _geojson})
+        yield from _maps(record_outputs.tracks(record), {kml_file: kml, geojson_file: _geojson})
 
 
 def _maps(tracks: list[Track], forms: dict[Path | None, Callable[[Iterable[Track]], str]]) -> Iterator[str]:

@@ -8,13 +8,13 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from harness import checker, coverage
+from harness import checker
 from harness.archive.archive import RunArchive
 from harness.commands.terminal import complain, print_json
-from harness.coverage import Reached
 from harness.errors import WRONG_REQUEST, RunDirectoryError
-from harness.prove import Bounds
-from harness.prove.bounds import EVENT_FILLS_BLOCK
+from harness.proof import Bounds, coverage
+from harness.proof.bounds import EVENT_FILLS_BLOCK
+from harness.proof.coverage import Reached
 from ucp.settings import Settings
 
 OF_BLOCKS = {*EVENT_FILLS_BLOCK, "max_event_bytes"}

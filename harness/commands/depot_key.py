@@ -23,7 +23,7 @@ def depot_of(path: Path | None) -> "Depot | None":
     if path is None:
         return None
     try:
-        from harness.keyring.home import load_depot_key
+        from harness.play.keyring.key_directory import load_depot_key
     except ModuleNotFoundError:
         raise MachineError("--depot-key takes a further package: `pip install ucp-harness[secure]`") from None
     return load_depot_key(path)

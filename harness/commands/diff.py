@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.text import Text
 
 from harness.commands.terminal import complain, print_json
-from harness.difference import AgentDifference, Difference, Parting, Step, compare
-from harness.report.programs import in_sentence
+from harness.report.agent_programs import in_sentence
+from harness.report.difference import AgentDifference, Difference, Parting, Step, compare
 
 DIFFERENT = 1
 VALUE_CHARACTERS = 60

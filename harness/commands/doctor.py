@@ -9,9 +9,9 @@ from rich.text import Text
 
 from harness.commands.terminal import print_json
 from harness.errors import CANNOT_HERE, VIOLATED
-from harness.machine import calibration
-from harness.machine.doctor import examine
-from harness.machine.kernel import Kernel, run_inside
+from harness.play.machine import calibration
+from harness.play.machine.capabilities import examine
+from harness.play.machine.uml_kernel import Kernel, run_inside
 
 
 def doctor_command(

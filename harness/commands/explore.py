@@ -7,12 +7,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from harness import explore
-from harness.archive.played import scenario_of
-from harness.archive.runs import RUNS
+from harness.archive.playable import scenario_of
+from harness.archive.run_listing import RUNS
 from harness.commands.terminal import complain, print_json
-from harness.run.sweep import cores
+from harness.run.parallel import cores
 from harness.scenario import Scenario
+from harness.sweep import explore
 
 SEEDS = 1000
 _DURATION = re.compile(r"(\d{1,9}(?:\.\d{1,6})?)(s|m|h|)")
@@ -102,7 +102,7 @@ def _hunt(
     jobs: int | None,
     as_json: bool,
 ) -> None:
-    from harness.explore import guided  # pages take long to import
+    from harness.sweep.explore import guided  # pages take long to import
 
     request, own_seed = _asked(scenario, secured)
     directory = corpus or RUNS / _directory_name(request.name)

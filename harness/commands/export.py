@@ -11,7 +11,7 @@ from harness.commands.depot_key import DepotKey, depot_of
 from harness.commands.new_file import newly, refuse_existing
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
-from harness.export import Recording
+from harness.report.export import Recording
 
 Write = Callable[[Recording, Path, Callable[[float], None]], int]
 
@@ -55,18 +55,18 @@ def export_command(
 
 
 def _mcap() -> Write:
-    from harness.export.mcap import write_mcap
+    from harness.report.export.mcap_file import write_mcap
 
     return write_mcap
 
 
 def _perfetto() -> Write:
-    from harness.export.perfetto import write_perfetto
+    from harness.report.export.perfetto_file import write_perfetto
 
     return write_perfetto
 
 
 def _rosbag() -> Write:
-    from harness.export.rosbag import write_rosbag
+    from harness.report.export.rosbag_file import write_rosbag
 
     return write_rosbag

@@ -12,8 +12,8 @@ from harness.errors import MachineError
 from harness.scenario.load import parse
 
 try:
-    from harness.keyring.home import Home, KeysError, write_revocation
-    from harness.keyring.inspection import in_words, inspect
+    from harness.play.keyring.inspection import in_words, inspect
+    from harness.play.keyring.key_directory import Home, KeysError, write_revocation
     from ucp.secure.bundle import DEFAULT_EPOCH_S, MAX_EPOCH_S
 except ModuleNotFoundError:
     raise MachineError("keys take a further package: `pip install ucp-harness[secure]`") from None

@@ -5,15 +5,15 @@ from typing import Annotated
 
 import typer
 
-from harness import matrix
 from harness.archive.directory import default_path
 from harness.backend_names import BackendName
 from harness.commands.terminal import complain, end_sweep, print_lines
-from harness.matrix import nights as nights_of_matrix
-from harness.matrix import outputs, results, summary, table
-from harness.matrix.baseline import load_baseline
-from harness.matrix.run import compared, on_cluster, on_cores
-from harness.run.sweep import cores
+from harness.run.parallel import cores
+from harness.sweep import matrix
+from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table, results_file
+from harness.sweep.matrix import nights as nights_of_matrix
+from harness.sweep.matrix.baseline import load_baseline
+from harness.sweep.matrix.matrix_run import compared, on_cluster, on_cores
 
 
 def matrix_command(
@@ -54,7 +54,7 @@ def matrix_command(
         spread = on_cores(request, jobs or cores(), shown=True)
     else:
         spread = on_cluster(request, scheduler, shown=True)
-    with results.opened(directory, request) as ended:
+    with results_file.opened(directory, request) as ended:
         finished = matrix.run_matrix(request, ended, spread, covers=coverage)
     if baseline is not None:
         finished = compared(finished, baseline, str(against))
@@ -64,9 +64,9 @@ def matrix_command(
         earlier = nights_of_matrix.read(kept, request)
         if earlier.left_out:
             complain(f"{earlier.said_left_out}; {earlier.left_out[0]}")
-    outputs.write(finished, directory, earlier)
+    matrix_outputs.write(finished, directory, earlier)
     if finished.record.outcome == "interrupted":
         complain(f"the same command with --out {directory} goes on from here")
     if finished.record.tried is not None and not as_json:
-        print_lines(summary.tried_in_words(finished.record.tried))
-    end_sweep(finished.record, None if as_json else table.render(finished.record), directory / "report.html")
+        print_lines(matrix_summary.tried_in_words(finished.record.tried))
+    end_sweep(finished.record, None if as_json else matrix_table.render(finished.record), directory / "report.html")

@@ -11,9 +11,9 @@ import typer
 
 from harness.commands.roster import roster_of
 from harness.commands.terminal import complain, print_json, print_lines
-from harness.depot.mission_files import MissionFileError, Plan, write
-from harness.depot.same_mission import compare
 from harness.errors import WRONG_REQUEST, MachineError
+from harness.field.depot.mission_comparison import compare
+from harness.field.depot.mission_files import MissionFileError, Plan, write
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import parse
 from harness.scenario.quirks import in_words
@@ -21,7 +21,7 @@ from ucp.messages import PORT
 from ucp.sealed import seal_to
 
 if TYPE_CHECKING:
-    from harness.keyring.home import Home
+    from harness.play.keyring.key_directory import Home
 
 DIFFERENT = 1
 
@@ -131,7 +131,7 @@ def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenar
 
 def _home(directory: Path) -> "Home":
     try:
-        from harness.keyring.home import Home
+        from harness.play.keyring.key_directory import Home
     except ModuleNotFoundError:
         raise MachineError("keys take a further package: `pip install ucp-harness[secure]`") from None
     return Home(directory)

@@ -8,19 +8,19 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from harness.archive.packets import packets_text
+from harness.archive.packets.air_names import Names, runs_of
+from harness.archive.packets.block_story import in_order, story
+from harness.archive.packets.capture_files import Captures, capture_files, read_captures
+from harness.archive.packets.exchanges import Exchanges
+from harness.archive.packets.loss_table import count_losses, matrix
+from harness.archive.packets.packets_document import document
+from harness.archive.packets.packets_text import Paint, Wording
+from harness.archive.packets.selection import Selection
+from harness.archive.packets.transmissions import join
 from harness.commands.bundle import BundleOption, opener_of
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST
-from harness.packets import text
-from harness.packets.document import document
-from harness.packets.exchanges import Exchanges
-from harness.packets.files import Captures, capture_files, read_captures
-from harness.packets.losses import count_losses, matrix
-from harness.packets.names import Names, runs_of
-from harness.packets.selection import Selection
-from harness.packets.story import in_order, story
-from harness.packets.text import Paint, Wording
-from harness.packets.transmissions import join
 
 
 def packets_command(
@@ -69,14 +69,14 @@ def _told(
         )
         return
     wording = Wording(names, _paint())
-    yield text.head(captures)
+    yield packets_text.head(captures)
     if chapters is not None:
-        yield from text.life(chapters, exchanges, wording)
+        yield from packets_text.life(chapters, exchanges, wording)
         return
-    yield from text.lines(shown, exchanges, wording, selection.receiver)
+    yield from packets_text.lines(shown, exchanges, wording, selection.receiver)
     if lost:
         yield from matrix(count_losses(selected))
-    yield from text.tail(captures, selected)
+    yield from packets_text.tail(captures, selected)
 
 
 def _paint() -> Paint:

@@ -8,11 +8,11 @@ import typer
 import yaml
 from rich.console import Console
 
-from harness import prove, specification
+from harness import proof as prove
 from harness.commands.terminal import Watcher, complain, print_json
 from harness.errors import INTERRUPTED
-from harness.prove import Bounds, BoundsError, Limits, Progress
-from harness.run.sweep import cores, terminated_is_interrupted
+from harness.proof import Bounds, BoundsError, Limits, Progress, specification
+from harness.run.parallel import cores, terminated_is_interrupted
 
 GIGABYTE = 1e9
 TIMERS = ("duration", "any")

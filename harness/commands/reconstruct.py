@@ -10,7 +10,7 @@ from harness.commands.bundle import BundleOption, opener_of
 from harness.commands.depot_key import DepotKey, depot_of
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, RunDirectoryError
-from harness.field.homecoming import sort_out
+from harness.field.ingest import sort_out
 from harness.field.reconstruct import reconstruct, write
 
 

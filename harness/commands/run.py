@@ -11,22 +11,22 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from harness.archive.directory import default_path
-from harness.archive.played import scenario_of
-from harness.archive.record import CapturedFrames
+from harness.archive.playable import scenario_of
+from harness.archive.run_record import CapturedFrames
 from harness.backend_names import BackendName
 from harness.commands.terminal import complain, show_programs, show_result, show_rogue, show_survival
 from harness.commands.watch import PORT, show_address
 from harness.errors import HarnessError, ScenarioError
-from harness.machine.kernel import OUT, Kernel, run_inside
 from harness.play import progress
 from harness.play.backends import BACKENDS
 from harness.play.interventions import Interventions
-from harness.report.capture import gaps
+from harness.play.machine.uml_kernel import OUT, Kernel, run_inside
+from harness.report.capture_gaps import gaps
+from harness.report.live.server_process import beside
 from harness.run.run import Run, run
 from harness.scenario import Scenario
 from harness.scenario.load import explain
 from harness.scenario.quirks import in_words
-from harness.watch.beside import beside
 
 
 class Vehicles(StrEnum):

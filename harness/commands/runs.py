@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from harness.archive.record import RunRecord
-from harness.archive.runs import RUNS, PastRun, past_runs
+from harness.archive.run_listing import RUNS, PastRun, past_runs
+from harness.archive.run_record import RunRecord
 from harness.commands.terminal import MARKS, STYLES, complain, print_json
 from harness.errors import RunDirectoryError
-from harness.scenario.verdicts import BAD_IN_WORDS, Kind, kind_of
+from harness.scenario.verdict_names import BAD_IN_WORDS, Kind, kind_of
 
 
 def runs_command(

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from harness import scale
 from harness.archive.directory import claim, default_path
 from harness.commands.terminal import end_sweep
-from harness.run.sweep import cores
-from harness.scale import model, outputs, table
+from harness.run.parallel import cores
+from harness.sweep import scale
+from harness.sweep.scale import model, outputs, table
 
 
 def scale_command(

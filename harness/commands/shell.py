@@ -9,8 +9,8 @@ import typer
 
 from harness.commands.terminal import complain
 from harness.errors import MachineError, RunDirectoryError
-from harness.machine.kernel import enter, runs_inside
-from harness.machine.running import running, way_into
+from harness.play.machine.running_runs import running, way_into
+from harness.play.machine.uml_kernel import enter, runs_inside
 
 
 def shell_command(

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from harness.errors import RunDirectoryError, ScenarioError
-from harness.play.by_hand import ask_run
-from harness.scenario.write import in_a_line
-from harness.stories.sentences import VERBS, Course
+from harness.play.request_socket import ask_run
+from harness.report.stories.sentences import VERBS, Course
+from harness.scenario.scenario_file import in_a_line
 
 _TIME: list[tuple[re.Pattern[str], str, str | None]] = [
     (re.compile("pause"), "pause", None),

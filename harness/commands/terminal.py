@@ -15,14 +15,14 @@ from rich.table import Table
 from rich.text import Text
 
 from harness import checker
-from harness.archive.record import RogueInjection, RunRecord, Survival
+from harness.archive.run_record import RogueInjection, RunRecord, Survival
 from harness.checker import injections, survival
-from harness.report import programs
-from harness.scenario.verdicts import CHARACTERISTICS, Kind
+from harness.report import agent_programs
+from harness.scenario.verdict_names import CHARACTERISTICS, Kind
 
 if TYPE_CHECKING:
-    from harness.matrix.record import MatrixRecord
-    from harness.scale.record import ScaleRecord
+    from harness.sweep.matrix.matrix_record import MatrixRecord
+    from harness.sweep.scale.record import ScaleRecord
 
 STYLES: dict[Kind, str] = {"good": "green", "bad": "bold red", "unknown": "yellow"}
 MARKS: dict[Kind, str] = {"good": "✔", "bad": "✘", "unknown": "-"}
@@ -49,8 +49,8 @@ def show_result(console: Console, result: checker.Result) -> None:
 
 
 def show_programs(console: Console, record: RunRecord) -> None:
-    if ran := programs.programs(record):
-        console.print(Text(programs.in_sentence(ran), style="dim"), soft_wrap=True)
+    if ran := agent_programs.programs(record):
+        console.print(Text(agent_programs.in_sentence(ran), style="dim"), soft_wrap=True)
 
 
 def show_survival(console: Console, survived: Survival) -> None:

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from harness import specification
 from harness.commands.terminal import Watcher, complain, print_json, print_lines
+from harness.proof import specification
 from harness.scenario import load_scenario
 
 

@@ -12,10 +12,10 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from harness.watch.beside import require_packages
+from harness.report.live.server_process import require_packages
 
 if TYPE_CHECKING:
-    from harness.watch.feed import Feed
+    from harness.report.live.feed import Feed
 
 PORT = typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0 is a free one.")
 
@@ -29,7 +29,7 @@ def watch_command(
     Ctrl-C ends it.
     """
     require_packages()
-    from harness.watch.feed import Feed
+    from harness.report.live.feed import Feed
 
     feed = Feed(run)
     with closing(feed):
@@ -40,9 +40,9 @@ def watch_command(
 
 
 async def _show(feed: "Feed", run: Path, port: int) -> None:
-    from harness.watch.projector import tell_film
-    from harness.watch.server import Server
-    from harness.watch.story import Story
+    from harness.report.live.change_log import Story
+    from harness.report.live.projector import tell_film
+    from harness.report.live.server import Server
 
     with closing(Story()) as story:
         async with Server(story, run, live=False).open(port) as address:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from harness.conformance.model import AGENT, OLD_US, PEERS, YOUNG_US, Action, Command, Expire, Model
+from harness.conformance.reference_model import AGENT, OLD_US, PEERS, YOUNG_US, Action, Command, Expire, Model
 from ucp.block import Block, next_chain_hash
 from ucp.messages import (
     BlockAddRequest,

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from harness.conformance.alphabet import INPUTS, TIMER
-from harness.conformance.model import Run
-from harness.conformance.seen import Seen
-from harness.conformance.states import Pair
+from harness.conformance.observation import Seen
+from harness.conformance.reference_model import Run
+from harness.conformance.state_space import Pair
 from harness.conformance.suite import Failure, Tally
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT
 from ucp.handler import LocalEvent

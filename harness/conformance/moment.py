@@ -3,7 +3,7 @@
 from collections import deque
 from typing import Any
 
-from harness.conformance.model import Model
+from harness.conformance.reference_model import Model
 
 CONTAINERS = frozenset((bytearray, set, list, deque, dict))
 

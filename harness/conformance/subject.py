@@ -5,9 +5,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
 from harness.conformance.alphabet import INPUTS, TIMER, Input
-from harness.conformance.model import Model
-from harness.conformance.seen import Exchange, Seen
-from harness.conformance.states import Variant, pair_of, state_of
+from harness.conformance.observation import Exchange, Seen
+from harness.conformance.reference_model import Model
+from harness.conformance.state_space import Variant, pair_of, state_of
 
 
 class Subject(ABC):

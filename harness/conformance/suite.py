@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Any
 
-from harness.conformance.air import AgentEndedError, NoAgentError, UnsupportedError
 from harness.conformance.alphabet import INPUTS
-from harness.conformance.model import Model, Run
-from harness.conformance.seen import Exchange, Seen
-from harness.conformance.states import COUNTING, Pair, Variant, advance, in_short, is_unchanged, walk
+from harness.conformance.observation import Exchange, Seen
+from harness.conformance.reference_model import Model, Run
+from harness.conformance.state_space import COUNTING, Pair, Variant, advance, in_short, is_unchanged, walk
 from harness.conformance.subject import Start
 from harness.conformance.tours import Map, Suspicion, Tour
+from harness.conformance.udp_lab import AgentEndedError, NoAgentError, UnsupportedError
 from harness.conformance.vectors import Vectors
 
 SIDE_BY_SIDE = 24

@@ -12,9 +12,9 @@ from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 
 from harness.conformance.alphabet import INPUTS, TIMER
-from harness.conformance.model import Model
-from harness.conformance.seen import Seen
-from harness.conformance.states import Pair, State, Step, Variant, pair_of, state_of
+from harness.conformance.observation import Seen
+from harness.conformance.reference_model import Model
+from harness.conformance.state_space import Pair, State, Step, Variant, pair_of, state_of
 from harness.conformance.subject import Subject
 
 TIMER_COSTS = 10.0

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
-from harness.conformance.model import Outcome
-from harness.conformance.states import VARIANTS, Pair, Step, Variant, explore, in_short
+from harness.conformance.reference_model import Outcome
+from harness.conformance.state_space import VARIANTS, Pair, Step, Variant, explore, in_short
 
 
 @dataclass(frozen=True)

@@ -27,13 +27,13 @@ from pydantic import ValidationError
 
 from harness.errors import ScenarioError
 from harness.play import mission
-from harness.play.growing import GrowingTimeline
-from harness.play.keys import refuse_revocations
+from harness.play.growing_timeline import GrowingTimeline
 from harness.play.mission import Swarm
 from harness.play.pace import NEXT_RUN, Pace
+from harness.play.vehicle_keys import refuse_revocations
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, timeline_of
-from harness.scenario.states import changed
+from harness.scenario.network_states import changed
 from harness.scenario.timeline import TimelineEntry
 
 MOST_WAITING = 100

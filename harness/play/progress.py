@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from harness.play.control import Status
+from harness.play.agent_control import Status
 
 LINE_EVERY_S = 10.0
 

@@ -66,14 +66,14 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_cmdline_main(config: pytest.Config) -> int | None:
     if config.getoption("--ucp-kernel") == "host":
         return None
-    from harness.pytest_plugin.kernel import session_inside
+    from harness.pytest_plugin.kernel_option import session_inside
 
     return session_inside(config)
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     if file_path.suffix == ".story":
-        from harness.stories.text import is_story
+        from harness.report.stories.story_file import is_story
 
         if not is_story(file_path):
             return None

@@ -8,7 +8,7 @@ from harness.archive.block_names import name_blocks
 from harness.checker import Result
 from harness.checker.judgement import Finding, Judgement
 from harness.errors import ScenarioError
-from harness.scenario.verdicts import BESIDE, Verdict, kind_of
+from harness.scenario.verdict_names import BESIDE, Verdict, kind_of
 
 EVIDENCE_SHOWN = 5
 

@@ -11,10 +11,10 @@ from harness.errors import ScenarioError
 from harness.play.progress import Silent
 from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.findings import Findings
+from harness.pytest_plugin.judged_run import Trial, one_sentence
 from harness.pytest_plugin.options import Options
 from harness.pytest_plugin.stash import TRIAL
 from harness.pytest_plugin.swarm_in_test import SwarmInTest
-from harness.pytest_plugin.trial import Trial, one_sentence
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import parse

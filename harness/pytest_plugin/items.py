@@ -11,9 +11,9 @@ from harness.backend_names import BackendName
 from harness.errors import HarnessError
 from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.fixtures import play
+from harness.pytest_plugin.judged_run import Trial, one_sentence
 from harness.pytest_plugin.options import Options
 from harness.pytest_plugin.stash import TRIAL
-from harness.pytest_plugin.trial import Trial, one_sentence
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.expect import Expect
 

@@ -72,7 +72,7 @@ class Options:
     def refuse(self, backend: BackendName) -> None:
         """Raises MachineError, with the reason, for a backend that cannot play where the command line wants it to."""
         if self.in_uml:
-            from harness.pytest_plugin.kernel import refuse_outside
+            from harness.pytest_plugin.kernel_option import refuse_outside
 
             refuse_outside(backend)
 

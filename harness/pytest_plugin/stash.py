@@ -7,6 +7,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from harness.pytest_plugin.trial import Trial
+    from harness.pytest_plugin.judged_run import Trial
 
 TRIAL: pytest.StashKey[Trial] = pytest.StashKey()

@@ -14,12 +14,12 @@ from harness.errors import HarnessError, ScenarioError
 from harness.play.backends import in_virtual_time
 from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.fixtures import play
+from harness.pytest_plugin.judged_run import Trial, one_sentence
 from harness.pytest_plugin.options import Options
 from harness.pytest_plugin.stash import TRIAL
-from harness.pytest_plugin.trial import Trial, one_sentence
+from harness.report.stories.narration import Telling
+from harness.report.stories.story_file import Story, read_story
 from harness.scenario.expect import Expect
-from harness.stories.telling import Telling
-from harness.stories.text import Story, read_story
 
 CONTEXT_LINES = 3
 
@@ -73,7 +73,7 @@ class StoryItem(pytest.Item):
             )
 
     def _skip_what_needs_virtual_time(self) -> None:
-        from harness.play.process.preflight import refuse_what_needs_virtual_time
+        from harness.play.process.process_preflight import refuse_what_needs_virtual_time
 
         try:
             refuse_what_needs_virtual_time(self._story.scenario)

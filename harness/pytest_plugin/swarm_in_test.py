@@ -207,8 +207,8 @@ class SwarmInTest:
     ) -> int:
         """Let the mission go on until an agent runs this handler, with this branch; the agent's ID.
 
-        What was told last may have it run at once. Names are those of traces (ucp/HANDLERS.md). Raises AssertionError
-        if nobody runs it within `limit_s`.
+        What was told last may have it run at once. Names are those of traces (ucp/contract/HANDLERS.md). Raises
+        AssertionError if nobody runs it within `limit_s`.
         """
         __tracebackhide__ = True
         if not 0 <= limit_s < math.inf:

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
-from harness.present import words
+from harness.present import text as words
 from harness.present.colours import Ink
 from harness.report.chain_tree import Node, chain_tree, holders, marks, ranges
 from harness.report.chain_tree_layout import (

@@ -1,10 +1,10 @@
 """What the page and report.md both say of a run: what was asked, how it ended, and its figures."""
 
 from harness.archive.exports import Exports
-from harness.archive.record import RunRecord
+from harness.archive.run_record import RunRecord
 from harness.play.backends import in_virtual_time
-from harness.present import words
-from harness.report.programs import programs
+from harness.present import text
+from harness.report.agent_programs import programs
 from harness.scenario.quirks import in_words
 from sitl.vehicle import VehicleType
 
@@ -41,19 +41,19 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
     agents = len({*record.known_agents, *exports.by_agent})
     parts.append("1 agent" if agents == 1 else f"{agents} agents")
     if scenario is not None:
-        parts.append(f"{words.duration(scenario.duration_s)} mission")
+        parts.append(f"{text.duration(scenario.duration_s)} mission")
         if isinstance(scenario.network.loss, float):
-            parts.append(f"{words.percent(scenario.network.loss)} loss")
+            parts.append(f"{text.percent(scenario.network.loss)} loss")
         parts += in_words(scenario.quirks)
         if not in_virtual_time(record.backend):
-            parts.append(f"speedup {words.value(scenario.speedup)}")
+            parts.append(f"speedup {text.value(scenario.speedup)}")
     played = {"seed": record.seed, "backend": record.backend, "engine": record.engine}
     parts += [f"{key} {value}" for key, value in played.items() if value is not None]  # to be typed again, so no groups
     parts += [program.in_words for program in programs(record)]
     if record.wall_s is not None:
-        parts.append(f"{words.duration(record.wall_s)} wall time")
+        parts.append(f"{text.duration(record.wall_s)} wall time")
     if record.started_at:
-        parts.append(f"started {words.started(record.started_at)}")
+        parts.append(f"started {text.started(record.started_at)}")
     return parts
 
 
@@ -71,4 +71,4 @@ def outcome(record: RunRecord) -> tuple[str, str] | None:
 
 def figures(record: RunRecord) -> list[tuple[str, str]]:
     """Labels and values."""
-    return [(FIGURES.get(key, words.label(key)), words.value(figure)) for key, figure in record.figures.items()]
+    return [(FIGURES.get(key, text.label(key)), text.value(figure)) for key, figure in record.figures.items()]

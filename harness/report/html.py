@@ -12,7 +12,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from harness.present import words
+from harness.present import text as words
 
 _HERE = Path(__file__).parent
 PAGE_STYLE = (_HERE / "page.css").read_text(encoding="utf-8")

@@ -7,7 +7,7 @@ from markupsafe import Markup
 
 from harness.archive.connectivity import QUALITY_LIMITS, Connectivity, quality
 from harness.archive.tracks import Tracks
-from harness.present import words
+from harness.present import text
 from harness.present.colours import Ink
 from harness.report import map_svg
 from harness.report.map_geometry import Extent, extent
@@ -124,7 +124,7 @@ def _moment(
     losses = {pair: network.loss(pair, at_s) for pair in links if pair[0] in seen and pair[1] in seen}
     if lossy := _in_words(losses.values()):
         state += f", {lossy}"
-    at = words.duration(round(at_s, 1))
+    at = text.duration(round(at_s, 1))
     picture = map_svg.draw_moment(
         seen,
         lost,
@@ -164,7 +164,7 @@ def _in_words(losses: Collection[float]) -> str:
     least, most = min(losses, default=0.0), max(losses, default=0.0)
     if not quality(most):
         return ""
-    low, high = words.percent(least), words.percent(most)
+    low, high = text.percent(least), text.percent(most)
     return f"links lose {high}" if low == high else f"links lose {low} to {high}"
 
 
@@ -175,7 +175,7 @@ def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> li
     entries = [
         (
             map_svg.sample(f"q{which}"),
-            f"link that loses {words.percent(limits[which])} to {words.percent(limits[which + 1])}",
+            f"link that loses {text.percent(limits[which])} to {text.percent(limits[which + 1])}",
         )
         for which in range(1, len(QUALITY_LIMITS))
         if f" q{which}" in drawn

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from harness.archive.connectivity import quality
 from harness.archive.tracks import Fix
-from harness.present import words
+from harness.present import text as words
 from harness.present.colours import Ink
 from harness.present.svg import FONT, n
 from harness.report.map_geometry import Extent, Point, Projection, thinned

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.present import words
+from harness.present import text as words
 from harness.present.svg import linear_axis
 from harness.report.timeline_plot import short
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.archive.record import FaultRecord
 from harness.archive.replication import Replication
-from harness.present import words
+from harness.archive.run_record import FaultRecord
+from harness.present import text
 from harness.present.svg import n
 from harness.report.timeline_plot import Shade, plot, seconds, shaded, short
 
@@ -82,9 +82,9 @@ def _chart(
         if until_s > moment.at_s
     ]
     base = Markup('<path class="base" d="M0 {}H{}"/>').format(n(HEIGHT - _BOTTOM), short(end_s))
-    scale = Markup('<text class="scale" x="4" y="11">{}</text>').format(words.value(highest))
-    at_end = ", ".join(f"{what} {words.value(figure(moments[-1]))}" for what, figure in figures)
-    description = f"{name} along mission time, at most {words.value(highest)}; at the end {at_end}"
+    scale = Markup('<text class="scale" x="4" y="11">{}</text>').format(text.value(highest))
+    at_end = ", ".join(f"{what} {text.value(figure(moments[-1]))}" for what, figure in figures)
+    description = f"{name} along mission time, at most {text.value(highest)}; at the end {at_end}"
     return Chart(
         name,
         [
@@ -114,5 +114,5 @@ def _steps(moments: Sequence[Replication], figure: Figure, per_px: float, end_s:
 
 
 def _tip(moment: Replication, figures: Sequence[tuple[str, Figure]], name: str) -> str:
-    values = ", ".join(f"{what} {words.value(figure(moment))}" for what, figure in figures)
+    values = ", ".join(f"{what} {text.value(figure(moment))}" for what, figure in figures)
     return f"from {seconds(moment.at_s)}: {name}: {values}"

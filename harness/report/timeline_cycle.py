@@ -4,8 +4,8 @@ from math import ceil
 
 from markupsafe import Markup
 
-from harness.archive.record import Cycle
-from harness.checker.cycles import findings, in_words
+from harness.archive.run_record import Cycle
+from harness.checker.recurring_cycles import findings, in_words
 from harness.report.timeline_charts import Chart
 from harness.report.timeline_plot import pin, plot, short
 

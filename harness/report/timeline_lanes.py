@@ -14,7 +14,7 @@ from typing import TypeVar
 from markupsafe import Markup
 
 from harness.archive.history import CUT_SHORT, Commit, History, Phase, Reconcile, Tie, Vote
-from harness.archive.record import FaultRecord
+from harness.archive.run_record import FaultRecord
 from harness.present.svg import n
 from harness.report.timeline_plot import Shade, pin, plot, seconds, shaded, short, told
 from harness.scenario.faults import KINDS

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.archive.record import FaultRecord
+from harness.archive.run_record import FaultRecord
 from harness.present.svg import linear_axis, n
 
 TICK_HEIGHT = 22

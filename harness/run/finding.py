@@ -11,7 +11,7 @@ from harness.gc_pause import gc_paused
 from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.scenario.verdicts import CHARACTERISTICS
+from harness.scenario.verdict_names import CHARACTERISTICS
 
 EVIDENCE_SHOWN = 5
 

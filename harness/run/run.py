@@ -15,7 +15,7 @@ from typing import Any
 from harness import checker, report
 from harness.archive.archive import RunArchive
 from harness.archive.directory import RunDirectory
-from harness.archive.record import RogueInjection, RunRecord, Survival
+from harness.archive.run_record import RogueInjection, RunRecord, Survival
 from harness.backend_names import BackendName
 from harness.checker.injections import account
 from harness.checker.survival import survival
@@ -24,14 +24,14 @@ from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, 
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
-from harness.play.by_hand import listening
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import Progress
-from harness.run.replay import REPLAY_FILE, replay_of
+from harness.play.request_socket import listening
+from harness.run.replay_file import REPLAY_FILE, replay_of
 from harness.scenario import Scenario
 from netem import uml
-from ucp.files import write_atomically
+from ucp.agent_files import write_atomically
 
 PACKAGES = ("ucp-harness", "pymavlink")
 

@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from harness import checker
 from harness.archive.exports import Export, ExportMaker
-from harness.archive.record import JudgedRecord
+from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
 from harness.checker.evidence import InjectedDatagram, RogueTraffic
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
-from harness.play.simulation.backend import Simulation
 from harness.play.simulation.foreign.failure import AgentFailedError
-from harness.play.simulation.lives import Incarnation
-from harness.play.simulation.on_disk import header
+from harness.play.simulation.incarnations import Incarnation
+from harness.play.simulation.run_files import header
+from harness.play.simulation.simulation import Simulation
 from harness.play.simulation.virtual_time import VirtualTime
 from harness.scenario import Scenario
 from netem.radio import Place
 from ucp.trace import SCHEMA, Entry, in_base64
 
 if TYPE_CHECKING:
-    from ucp.secure.agent import SecuredAgent
+    from ucp.secure.secured_agent import SecuredAgent
 
 Result = TypeVar("Result")
 
@@ -67,7 +67,7 @@ def simulate_in_memory(
         evidence = memory.evidence(simulation)
     result = checker.check(evidence)
     if (records := simulation.records()) and (again or result.bad):
-        from harness.play.simulation.foreign.again import Again
+        from harness.play.simulation.foreign.determinism import Again
 
         with closing(Again(patient=again)) as second:
             for record in records:

@@ -9,14 +9,14 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from harness.scenario.model import VehicleKey
+from harness.scenario.strict_model import VehicleKey
 from ucp.block import MAX_AGENT_ID
-from ucp.shown import shown
+from ucp.short_value import shown
 
 MAX_WORDS = 100
 
 Command = Annotated[list[str], Field(min_length=1, max_length=MAX_WORDS)]
-"""A program that follows ucp/CONTRACT.md, and its arguments; the mission file's name is added."""
+"""A program that follows ucp/contract/CONTRACT.md, and its arguments; the mission file's name is added."""
 
 
 def _commands(asked: Any) -> Any:

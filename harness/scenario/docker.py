@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from harness.scenario.model import Model
+from harness.scenario.strict_model import Model
 
 MIN_MEMORY_MIB = 6
 """Docker refuses a container that may use less."""

@@ -21,8 +21,8 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from harness.backend_names import BackendName
-from harness.scenario.model import Model, VehicleId, VehicleKey
-from harness.scenario.verdicts import (
+from harness.scenario.strict_model import Model, VehicleId, VehicleKey
+from harness.scenario.verdict_names import (
     BESIDE,
     CHARACTERISTICS,
     CharacteristicVerdict,
@@ -32,7 +32,7 @@ from harness.scenario.verdicts import (
     kind_of,
 )
 from ucp.agent import HANDLERS
-from ucp.shown import shown
+from ucp.short_value import shown
 
 FigureName = Literal[
     "agents",

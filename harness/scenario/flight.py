@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from harness.scenario.model import Model, VehicleId
+from harness.scenario.strict_model import Model, VehicleId
 from sitl.plan import MAX_LEGS, By, GoTo, Land, Loiter, Plan, TakeOff
 from sitl.plan import Leg as PlannedLeg
 

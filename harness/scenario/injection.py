@@ -20,7 +20,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from harness.scenario.fates import MessageName
-from harness.scenario.model import Instant, Model, Seconds, VehicleId
+from harness.scenario.strict_model import Instant, Model, Seconds, VehicleId
 
 InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie"]
 INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie")

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from harness.errors import ScenarioError
 from harness.scenario import library
 from harness.scenario.scenario import Scenario
-from ucp.shown import shown, shown_key
+from ucp.short_value import shown, shown_key
 
 MAX_PROBLEM = 200
 """More of what is wrong with a file is not shown."""

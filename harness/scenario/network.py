@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
-from harness.scenario.model import MAX_AGENTS, Model, Probability, VehicleId, VehicleKey
-from harness.scenario.radio import RadioModel
+from harness.scenario.radio_model import RadioModel
+from harness.scenario.strict_model import MAX_AGENTS, Model, Probability, VehicleId, VehicleKey
 from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
 from netem.errors import ConditionsError
 from netem.link import MAX_DELAY_S, MAX_LIMIT

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
-from harness.scenario.model import Model, VehicleId
+from harness.scenario.strict_model import Model, VehicleId
 from ucp.quirks import QUIRKS, Quirks, check_quirk
 
 

@@ -8,23 +8,23 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator, model_validator
 
 from harness.scenario.agent_command import AgentCommand
-from harness.scenario.datagrams import ScriptedDatagram
 from harness.scenario.docker import Docker
-from harness.scenario.events import Events
+from harness.scenario.event_source import Events
 from harness.scenario.expect import Expect
 from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.flight import Flight
-from harness.scenario.model import MAX_AGENTS, Data, Model, Seconds, VehicleKey
 from harness.scenario.network import NetworkModel
+from harness.scenario.network_states import Step, refuse_ambiguity, steps
 from harness.scenario.numbered import Lateness
 from harness.scenario.quirks import AskedQuirks, OfSome, of_agent
 from harness.scenario.quirks import check as check_quirks
 from harness.scenario.schedule import NEEDED, Schedule
 from harness.scenario.security import Security
 from harness.scenario.stagger import Stagger, staggered
-from harness.scenario.states import Step, refuse_ambiguity, steps
+from harness.scenario.stray_datagrams import ScriptedDatagram
+from harness.scenario.strict_model import MAX_AGENTS, Data, Model, Seconds, VehicleKey
 from harness.scenario.timeline import TimelineEntry
 from harness.scenario.vehicles import Vehicles
 from netem.conditions import NetworkConditions
@@ -37,7 +37,7 @@ from ucp.events import EVENT_HEADER_BYTES
 from ucp.quirks import Quirks, in_force
 from ucp.sealed import SEAL_BYTES
 from ucp.settings import Settings
-from ucp.shown import shown
+from ucp.short_value import shown
 
 MAX_DURATION_S = 31 * 86400
 """No mission is longer: a run in virtual time would take hours and all memory."""
@@ -90,7 +90,7 @@ class Scenario(Model):
     flight: Annotated[list[Flight], Field(max_length=MAX_AGENTS)] = []
     """Where vehicles fly; those that no plan names take off and stay."""
     agent_command: AgentCommand = None
-    """Any program that follows ucp/CONTRACT.md, with its arguments: for all agents, or by agent for some."""
+    """Any program that follows ucp/contract/CONTRACT.md, with its arguments: for all agents, or by agent for some."""
     docker: Docker = Docker()
     """What containers are made from, and may use."""
     settings: Settings = Settings()

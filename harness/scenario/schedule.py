@@ -19,8 +19,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from harness.scenario.model import Instant, Model, Probability, Seconds, VehicleId
 from harness.scenario.network import DelaySeconds, Disturbance, NetworkLayer, NetworkValues, Where, laid_over, of_whom
+from harness.scenario.strict_model import Instant, Model, Probability, Seconds, VehicleId
 
 MAX_STEPS = 10_000
 """More changes than this are a mistake, or another scenario."""

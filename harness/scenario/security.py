@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from harness.scenario.model import Model, VehicleId
+from harness.scenario.strict_model import Model, VehicleId
 
 
 class Security(Model):

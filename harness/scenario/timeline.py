@@ -17,8 +17,8 @@ from harness.scenario.injection import (
     Lie,
     Replay,
 )
-from harness.scenario.model import Instant, Seconds
 from harness.scenario.network import Disturbance
+from harness.scenario.strict_model import Instant, Seconds
 
 NETWORK_KEYS = ("loss", "partition", "heal", "network")
 """Keys of an entry that change the network."""

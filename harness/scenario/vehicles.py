@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
 
-from harness.scenario.model import Model, VehicleKey
-from sitl import parameters, places
+from harness.scenario.strict_model import Model, VehicleKey
+from sitl import parameters, start_places
 from sitl.airframes import NOT_FLOWN, type_of
-from sitl.places import Offset
 from sitl.setup import Debugger, Setup
+from sitl.start_places import Offset
 from sitl.vehicle import SPACING_M, Home, VehicleError, VehicleType, home_in_field
 
 VehicleKind = Literal["ardupilot", "embedded", "none"]
@@ -42,7 +42,7 @@ def _read(read: Callable[[str, Path], Any], written_out: Any) -> BeforeValidator
 
 
 def _named(name: str, beside: Path) -> list[float]:
-    home = places.named(name, beside, os.environ)
+    home = start_places.named(name, beside, os.environ)
     return [home.lat_deg, home.lon_deg, home.alt_m, home.heading_deg]
 
 
@@ -85,8 +85,8 @@ Pairs = dict[str, float]
 Parameters = Annotated[Pairs, AfterValidator(_sound), _read(lambda name, beside: parameters.read(beside / name), Pairs)]
 """Pairs, or a file of them."""
 
-Offsets = dict[Annotated[int, Field(ge=0, le=places.MAX_INSTANCE)], Offset]
-Swarm = Annotated[Offsets, _read(lambda name, beside: places.swarm(beside / name), Offsets)]
+Offsets = dict[Annotated[int, Field(ge=0, le=start_places.MAX_INSTANCE)], Offset]
+Swarm = Annotated[Offsets, _read(lambda name, beside: start_places.swarm(beside / name), Offsets)]
 """By instance, from 0; or a file of them."""
 
 Frame = Annotated[str, Field(pattern=r"^[A-Za-z0-9+][A-Za-z0-9_.+-]{0,63}$"), AfterValidator(_flown_here)]

@@ -10,15 +10,15 @@ from typing import Any
 from pydantic import BaseModel
 
 from harness.archive.exports import Export
-from harness.archive.record import RunRecord
-from harness.depot.lines import ConsolidatedLine
-from harness.depot.manifest import Manifest
-from harness.field.adapters.record import ImportRecord
-from harness.field.replay.document import ReplayDocument
-from harness.matrix import MatrixRecord
-from harness.packets.document import PacketsRecord
-from harness.scale import ScaleRecord
+from harness.archive.packets.packets_document import PacketsRecord
+from harness.archive.run_record import RunRecord
+from harness.field.adapters.import_record import ImportRecord
+from harness.field.depot.manifest import Manifest
+from harness.field.depot.record_lines import ConsolidatedLine
+from harness.field.replay.replay_document import ReplayDocument
 from harness.scenario import Scenario
+from harness.sweep.matrix import MatrixRecord
+from harness.sweep.scale import ScaleRecord
 
 DIRECTORY = Path(__file__).parent
 MODELS: dict[str, type[BaseModel]] = {

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from harness.play.containers import ownership
-from harness.play.containers.engine import DEFAULT_HOST, Engine
+from harness.play.containers.docker_engine import DEFAULT_HOST, Engine
 from harness.play.containers.images import HOST_IMAGE, from_host, idle_command
 
 

@@ -4,10 +4,10 @@ from functools import cache
 
 import pytest
 
+from docs.generate.wrong_agents.trials_page import NOTHING, PAGE, findings_of, first_found, row, rows_of
+from docs.generate.wrong_agents.wrong_trial import MISSIONS, Trial, judged, play
 from harness.checker import Result
 from harness.checker.judgement import Finding, Judgement
-from harness.wrong_agents.page import NOTHING, PAGE, findings_of, first_found, row, rows_of
-from harness.wrong_agents.trial import MISSIONS, Trial, judged, play
 from ucp.quirks import QUIRKS
 
 ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
@@ -24,7 +24,7 @@ def cells(quirk: str) -> list[str]:
 
 
 def test_every_quirk_has_a_row_and_every_row_a_quirk() -> None:
-    assert list(ROWS) == list(QUIRKS), "write it again: python -m harness.wrong_agents.page"
+    assert list(ROWS) == list(QUIRKS), "write it again: python -m docs.generate.wrong_agents.trials_page"
 
 
 def test_nothing_goes_unnoticed() -> None:

@@ -18,7 +18,7 @@ from typing import Any, get_args
 import pytest
 
 from harness.errors import MachineError
-from harness.play.process.preflight import refuse_what_this_machine_cannot
+from harness.play.process.process_preflight import refuse_what_this_machine_cannot
 from harness.scenario import Scenario
 from netem.conditions import NetworkConditions
 from netem.errors import EngineError

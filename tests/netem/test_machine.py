@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from netem import namespaces
-from netem.doctor import examine
 from netem.lab import Lab, LabUnavailable
+from netem.lab_doctor import examine
 from tests.machine import unavailable
 
 REPOSITORY = Path(__file__).parents[2]
@@ -83,7 +83,7 @@ _EXPECT_REFUSAL = """
     import asyncio
     from pathlib import Path
     from netem.lab import Lab, LabUnavailable
-    from netem.doctor import examine
+    from netem.lab_doctor import examine
 
     try:
         asyncio.run(Lab.open([1, 2], log=Path("lab.log")))
@@ -115,7 +115,7 @@ def test_where_user_namespaces_are_forbidden_the_refusal_says_so_and_what_to_do(
 _INTERPRETER_OUT_OF_REACH = """
     import asyncio, sys
     from pathlib import Path
-    from netem.doctor import examine
+    from netem.lab_doctor import examine
     from netem.lab import Lab, LabUnavailable
 
     program = Path("program")

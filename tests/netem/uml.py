@@ -34,7 +34,7 @@ _OF_NETEM = (
     "tests/netem/test_measure.py::test_real_packets_fare_as_asked",
     "tests/netem/test_measure.py::test_a_network_that_loses_more_than_asked_is_found",
     "tests/netem/test_measure.py::test_a_network_that_delays_longer_than_asked_is_found",
-    "tests/harness/test_netem_run.py",
+    "tests/harness/play/test_netem_run.py",
 )
 _TESTS = ("-q", "-k", "not nftables", *_OF_NETEM)
 

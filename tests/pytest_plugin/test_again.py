@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.archive.played import scenario_of
+from harness.archive.playable import scenario_of
 from harness.errors import HarnessError
 from tests.harness.command import harness
 from tests.pytest_plugin.inner import run

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from harness.errors import ScenarioError
-from harness.stories.text import read_story
+from harness.report.stories.story_file import read_story
 from tests.harness.unsupported import refusing_to_start
 from tests.pytest_plugin.inner import no_internals, run, run_directories
 

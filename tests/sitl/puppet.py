@@ -9,8 +9,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from sitl.autopilot import Autopilot
-from sitl.channel import Channel
 from sitl.pilot import Pilot
+from sitl.serial_channel import Channel
 from sitl.vehicle import VehicleType
 from tests.sitl.flying import HOME
 

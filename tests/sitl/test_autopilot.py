@@ -8,7 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.kinematics import Point
-from sitl.mission import on_earth
+from sitl.mission_upload import on_earth
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
 from sitl.plane import LOITER_RADIUS_M
 from sitl.vehicle import VehicleType

@@ -13,8 +13,8 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
 import sitl.autopilot
-import sitl.mission
 import sitl.mission_inbox
+import sitl.mission_upload
 import sitl.pilot
 from sitl.modes import MODES
 from sitl.pilot import Pilot
@@ -222,7 +222,7 @@ def test_a_mission_that_is_acknowledged_and_forgotten_is_uploaded_again(tmp_path
 
 
 def test_a_request_that_is_lost_begins_the_upload_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sitl.mission, "RESEND_S", 0.1)
+    monkeypatch.setattr(sitl.mission_upload, "RESEND_S", 0.1)
     lost: list[bytes] = []
 
     def strings(puppet: Puppet) -> None:

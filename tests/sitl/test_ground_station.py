@@ -15,8 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 import sitl.ground_station
 from sitl.address import Address, connected
-from sitl.frames import FrameSplitter
 from sitl.ground_station import GroundStation
+from sitl.mavlink_frames import FrameSplitter
 from sitl.operator import MOST_COMMANDS, CommandLog
 from sitl.vehicle import VehicleError
 from tests.sitl.flying import DEADLINE_S

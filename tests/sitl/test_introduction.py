@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.parameters import ParameterError
-from sitl.state import Version
+from sitl.vehicle_state import Version
 from tests.sitl.puppet import message_id, on_strings
 
 

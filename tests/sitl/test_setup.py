@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sitl import parameters, places
+from sitl import parameters, start_places
 from sitl.airframes import airframe, type_of
 from sitl.ardupilot import ArduPilot
 from sitl.embedded import Embedded
@@ -84,16 +84,19 @@ def test_a_parameter_that_is_not_known_is_named_with_the_nearest() -> None:
 def test_named_locations_are_looked_for_beside_the_scenario_then_where_the_user_keeps_them(tmp_path: Path) -> None:
     mine = written(tmp_path / "config" / "ardupilot" / "locations.txt", "#N=x\nAVC=40.07,-105.2,1583.7,366 # field\n")
     environ = {"XDG_CONFIG_DIR": str(mine.parents[1])}
-    assert places.named("AVC", tmp_path, environ).heading_deg == 6
+    assert start_places.named("AVC", tmp_path, environ).heading_deg == 6
     written(tmp_path / "locations.txt", "AVC=1,2,3,4\n")
-    assert places.named("AVC", tmp_path, environ).lat_deg == 1
+    assert start_places.named("AVC", tmp_path, environ).lat_deg == 1
     with pytest.raises(VehicleError, match=r"no such location in .*: did you mean AVC\?"):
-        places.named("AVD", tmp_path, environ)
+        start_places.named("AVD", tmp_path, environ)
     with pytest.raises(VehicleError, match="no file of named locations: looked for"):
-        places.named("AVC", tmp_path / "none", {"HOME": "/nowhere"})
+        start_places.named("AVC", tmp_path / "none", {"HOME": "/nowhere"})
     tree = tmp_path / "ardupilot"
     written(tree / "Tools" / "autotest" / "locations.txt", "CMAC=-35.3,149.1,584,353\n")
-    assert places.named("CMAC", None, {"HOME": "/nowhere", "ARDUPILOT_SITL": str(tree / "build/sitl/bin")}).alt_m == 584
+    assert (
+        start_places.named("CMAC", None, {"HOME": "/nowhere", "ARDUPILOT_SITL": str(tree / "build/sitl/bin")}).alt_m
+        == 584
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,19 +110,19 @@ def test_named_locations_are_looked_for_beside_the_scenario_then_where_the_user_
 def test_a_location_that_is_none_is_refused_with_its_line(text: str, problem: str, tmp_path: Path) -> None:
     written(tmp_path / "locations.txt", text)
     with pytest.raises(VehicleError, match=problem):
-        places.named("AVC", tmp_path, {})
+        start_places.named("AVC", tmp_path, {})
 
 
 def test_a_swarm_is_laid_out_by_instance(tmp_path: Path) -> None:
     path = written(tmp_path / "swarm.txt", "#instance=East,North,Up,Heading\n1=20,30,4,90\n2=-20,0,0\n1=9,9,9,9\n")
-    offsets = places.swarm(path)
+    offsets = start_places.swarm(path)
     assert offsets.keys() == {1, 2}
     home = offsets[1].of(HOME)
     assert HOME.metres_to(home.lat_deg, home.lon_deg, home.alt_m) == pytest.approx((30, 20, 4))
     assert home.heading_deg == 90 and offsets[2].of(HOME).heading_deg == HOME.heading_deg
     for text, problem in (("x=1,2,3\n", "is no instance"), ("1=1,2\n", "is not EAST,NORTH"), ("#\n", "has no offsets")):
         with pytest.raises(VehicleError, match=problem):
-            places.swarm(written(tmp_path / "swarm.txt", text))
+            start_places.swarm(written(tmp_path / "swarm.txt", text))
 
 
 @pytest.mark.parametrize(

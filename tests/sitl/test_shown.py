@@ -4,9 +4,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.channel import Channel
 from sitl.plan import GoTo, Plan, TakeOff
-from sitl.shown import REFUSAL, ShownVehicle
+from sitl.serial_channel import Channel
+from sitl.shown_vehicle import REFUSAL, ShownVehicle
 from sitl.track import track
 from tests.sitl.flying import HOME
 

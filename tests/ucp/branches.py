@@ -21,14 +21,14 @@ from ucp.handler import EventHandler
 Branch = tuple[str, str]
 """(handler, branch)"""
 
-PAGE = Path(ucp.__path__[0]) / "BRANCHES.md"
+PAGE = Path(ucp.__path__[0]) / "contract" / "BRANCHES.md"
 
 INTRODUCTION = """\
 # The branches of the event handlers, and their tests
 
 A handler ends in one of the branches that it declares; a trace names the handler and the branch of each of its runs.
-Here is each branch of Algorithms 1-20, with the tests in [tests/ucp](../tests/ucp) that take it and pin what it does.
-A test that does not take its branches fails, and a branch without a test fails `make test`.
+Here is each branch of Algorithms 1-20, with the tests in [tests/ucp](../../tests/ucp) that take it and pin what it
+does. A test that does not take its branches fails, and a branch without a test fails `make test`.
 
 This page is written by `python -m tests.ucp.branches`.
 
@@ -42,8 +42,8 @@ TABLE = """\
 OF_WRONG_AGENTS = """
 ## Of wrong agents
 
-An agent with [quirks](quirks) has wrong handlers in the place of some of these. Besides their branches they take two:
-"ignored by quirk", where `ignore_commit` strikes, and "crashed by quirk", where a handler ended by an exception.
+An agent with [quirks](../quirks) has wrong handlers in the place of some of these. Besides their branches they take
+two: "ignored by quirk", where `ignore_commit` strikes, and "crashed by quirk", where a handler ended by an exception.
 """
 
 WHEN: dict[str, dict[str, str]] = {

@@ -1,4 +1,5 @@
-"""The agent in C, `ucp/examples/ucp_agent.c`: what any agent has to do, and what only a program in C can get wrong."""
+"""The agent in C, `ucp/contract/examples/ucp_agent.c`: what any agent has to do, and what only a program in C can get
+wrong."""
 
 import json
 import os
@@ -12,8 +13,8 @@ from typing import Any
 import pytest
 
 import ucp
-from harness.conformance.file import to_lines
-from harness.conformance.states import VARIANTS, explore
+from harness.conformance.state_space import VARIANTS, explore
+from harness.conformance.vector_file import to_lines
 from harness.conformance.vectors import Vectors
 from harness.play.progress import Silent
 from harness.run.run import run
@@ -21,10 +22,10 @@ from harness.run.simulate import simulate
 from tests.harness.command import harness, write_scenario
 from tests.harness.virtual import scenario
 from tests.machine import do_without
-from ucp.vectors import INDEX
-from ucp.vectors.replay import Player, play
+from ucp.contract.vectors import INDEX
+from ucp.contract.vectors.replay import Player, play
 
-SOURCE = Path(ucp.__path__[0]) / "examples" / "ucp_agent.c"
+SOURCE = Path(ucp.__path__[0]) / "contract" / "examples" / "ucp_agent.c"
 VECTORS = INDEX.parent.parent
 ABOUT: dict[str, dict[str, Any]] = json.loads(INDEX.read_text(encoding="ascii"))
 TRANSCRIPTS = {*ABOUT}

@@ -16,20 +16,20 @@ import pytest
 from jsonschema import Draft202012Validator
 
 import ucp
-from harness.play.process.mission_file import mission_file
+from harness.play.process.agent_mission import mission_file
 from harness.scenario import Scenario
 from tests.ucp.test_node import AgentUnderTest, mission
-from ucp import schemas, vectors
 from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER
+from ucp.contract import schemas, vectors
+from ucp.contract.schemas.control_schema import MAY_BE_MISSING, REQUESTS, STATUS
+from ucp.contract.schemas.trace_schema import DROPS, OPERATIONS, SECURED_DROPS
+from ucp.contract.vectors.replay import differences
 from ucp.features import FEATURES, needed
 from ucp.messages import RequestForBlock, encode
-from ucp.schemas.control import MAY_BE_MISSING, REQUESTS, STATUS
-from ucp.schemas.trace import DROPS, OPERATIONS, SECURED_DROPS
 from ucp.sealed import seal_to
 from ucp.settings import Settings
-from ucp.vectors.replay import differences
 
-PAGE = (Path(ucp.__path__[0]) / "CONTRACT.md").read_text(encoding="utf-8")
+PAGE = (Path(ucp.__path__[0]) / "contract" / "CONTRACT.md").read_text(encoding="utf-8")
 TRANSCRIPTS = sorted(vectors.MISSIONS.glob("*.jsonl"))
 
 Document = dict[str, Any]
@@ -48,13 +48,13 @@ def fits(name: str, document: object) -> bool:
 
 @pytest.mark.parametrize("name", schemas.DOCUMENTS)
 def test_a_schema_is_up_to_date(name: str) -> None:
-    assert json.loads(schemas.path(name).read_text()) == schemas.generate(name), "run `python -m ucp.schemas`"
+    assert json.loads(schemas.path(name).read_text()) == schemas.generate(name), "run `python -m ucp.contract.schemas`"
 
 
 def test_the_vectors_are_up_to_date_to_the_byte() -> None:
     texts = vectors.texts()
     for path, text in texts.items():
-        assert path.read_text(encoding="ascii") == text, "run `python -m ucp.vectors`"
+        assert path.read_text(encoding="ascii") == text, "run `python -m ucp.contract.vectors`"
     assert {*texts} == {*vectors.DIRECTORY.glob("*.json"), *vectors.MISSIONS.iterdir()}
 
 
@@ -264,7 +264,7 @@ def test_the_missions_take_every_branch_of_every_handler() -> None:
 
 def replayed(command: list[str]) -> tuple[int, str]:
     played = subprocess.run(
-        [sys.executable, "-m", "ucp.vectors.replay", *command], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "ucp.contract.vectors.replay", *command], capture_output=True, text=True, check=False
     )
     return played.returncode, played.stdout + played.stderr
 

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 import ucp
+from docs.generate.handlers import PAGE, page
 from harness.archive.traces import Trace
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, Agent
 from ucp.core import Core
-from ucp.diagram import PAGE, page
 from ucp.handler import EventHandler, LocalEvent
 from ucp.messages import Message, RequestForBlock
 from ucp.settings import Settings
@@ -137,7 +137,7 @@ def test_each_message_and_timer_has_a_handler_and_somebody_who_sends_or_starts_i
 
 
 def test_the_diagram_is_of_the_handlers_that_there_are() -> None:
-    assert PAGE.read_text() == page(), "write it again: python -m ucp.diagram"
+    assert PAGE.read_text() == page(), "write it again: python -m docs.generate.handlers"
 
 
 def test_what_handlers_do_to_the_state_no_driver_is_offered() -> None:

@@ -19,9 +19,9 @@ import pytest
 
 from harness.archive.exports import read_export
 from harness.archive.traces import read_trace
-from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError
+from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
+from ucp.agent_files import TraceFile
 from ucp.block import Block, InceptionBlock, next_chain_hash
-from ucp.files import TraceFile
 from ucp.messages import BlockAddRequest, CommitBlock, RequestForBlock, decode, encode
 from ucp.mission import parse_mission
 from ucp.node import Node
@@ -30,7 +30,18 @@ from ucp.store import Store
 DEADLINE_S = 10.0
 NEEDED = {
     *("agent", "block", "chain", "clock", "commit", "control", "core", "dataclass", "events", "export", "features"),
-    *("files", "handler", "loop", "messages", "mission", "reconcile", "request", "settings", "shown", "state"),
+    *(
+        "agent_files",
+        "handler",
+        "loop",
+        "messages",
+        "mission",
+        "reconcile",
+        "request",
+        "settings",
+        "short_value",
+        "state",
+    ),
     *("sealed", "status", "store", "timers", "trace", "wire"),
 }
 """The modules of `ucp` that every agent loads."""
@@ -395,7 +406,7 @@ def test_a_full_disk_fails_the_export_keeps_the_old_one_and_the_agent_lives(tmp_
 import json, pathlib, subprocess, sys, time
 sys.path.insert(0, sys.argv[2])
 from tests.ucp.test_node import AgentUnderTest, mission
-from harness.play.control import AgentRefusedError
+from harness.play.agent_control import AgentRefusedError
 disk = pathlib.Path(sys.argv[1])
 subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], check=True)
 agent = AgentUnderTest(disk, mission(events={"source": "random", "mean_s": 1.0}))

@@ -17,6 +17,7 @@ from scapy.utils import RawPcapWriter
 from tests.machine import require_tshark
 from tests.ucp.secure.swarm import session
 from ucp.block import BLOCK_FIELDS, Block
+from ucp.contract.wireshark import DISSECTOR
 from ucp.events import EVENT_FIELDS, LoggableEvent, decode_events
 from ucp.messages import (
     HEADER,
@@ -38,7 +39,6 @@ from ucp.messages import (
 )
 from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, read_clear
 from ucp.secure.revocation import Revocation
-from ucp.wireshark import DISSECTOR
 
 TIMEOUT_S = 120.0
 A, B = bytes(range(32)), bytes(range(200, 232))

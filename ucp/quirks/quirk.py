@@ -23,7 +23,7 @@ from typing import Any
 from ucp.core import Core
 from ucp.handler import EventHandler, LocalEvent
 from ucp.messages import Message
-from ucp.shown import shown
+from ucp.short_value import shown
 
 Handler = Callable[..., str]
 """What runs otherwise: a handler, given the core and its input."""

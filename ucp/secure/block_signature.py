@@ -4,8 +4,8 @@ Ed25519 (RFC 8032) over a domain tag, the mission's ID and BD (eq. 3.5): nothing
 another mission, passes for it.
 """
 
-from ucp.secure.datagrams import Signer
-from ucp.secure.suite import Signed
+from ucp.secure.crypto_suite import Signed
+from ucp.secure.sealed_datagrams import Signer
 
 _TAG = b"UCP block\0"
 

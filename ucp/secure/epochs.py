@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 
 from ucp.secure.bundle import LAST_EPOCH, Bundle
-from ucp.secure.suite import SenderKeys, next_epoch_secret
+from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
 
 AHEAD = 8
 """Epochs that others may be ahead of one's own clock: 80 minutes, if an epoch has 600 s."""

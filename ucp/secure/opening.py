@@ -6,9 +6,9 @@ see all of it; what is not authentic is told here, too.
 
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle
-from ucp.secure.datagrams import Opened, decrypted, domain_of, understood
+from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret, verify
 from ucp.secure.envelope import REVOCATION, read_clear
-from ucp.secure.suite import SenderKeys, next_epoch_secret, verify
+from ucp.secure.sealed_datagrams import Opened, decrypted, domain_of, understood
 
 EPOCHS_AHEAD = 4096
 """How far the secrets are made that no clock asks for: four weeks, if an epoch has 600 s."""

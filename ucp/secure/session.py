@@ -12,7 +12,6 @@ from collections.abc import Callable
 
 from ucp.messages import TYPE_CODES, MalformedDatagramError, Message
 from ucp.secure.bundle import Bundle
-from ucp.secure.datagrams import ARITHMETIC, NOTHING_ASKED, Arithmetic, Opened, Request, domain_of
 from ucp.secure.envelope import (
     LAST_SEQUENCE,
     REQUEST,
@@ -25,6 +24,7 @@ from ucp.secure.envelope import (
     Clear,
 )
 from ucp.secure.epochs import Epochs
+from ucp.secure.sealed_datagrams import ARITHMETIC, NOTHING_ASKED, Arithmetic, Opened, Request, domain_of
 from ucp.secure.window import ReplayWindow
 
 

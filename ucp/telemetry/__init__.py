@@ -41,6 +41,7 @@ charged or changed. A vehicle that does not know its percentage has no levels; i
 
 from ucp.events import DEFAULT_LOG, EventKind
 from ucp.telemetry.connection import VehicleConnection
+from ucp.telemetry.event_text import describe
 from ucp.telemetry.records import (
     ARMED,
     BATTERY,
@@ -56,7 +57,6 @@ from ucp.telemetry.records import (
     position_of,
 )
 from ucp.telemetry.translator import TelemetryEvents
-from ucp.telemetry.words import describe
 
 __all__ = [
     "ARMED",

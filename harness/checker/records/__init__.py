@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.records import (
-    air,
     algorithms,
-    at_export,
-    completed,
-    conditions,
+    captures_vs_traces,
+    completed_blocks,
+    conditions_vs_network,
     counters,
+    export_vs_trace,
     headers,
-    messages,
-    within,
+    heard_vs_sent,
+    trace_consistency,
 )
 from harness.checker.records.contradiction import Contradiction
 
@@ -28,14 +28,14 @@ NAME = "every record"
 COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     headers.compare,
     algorithms.compare,
-    within.compare,
+    trace_consistency.compare,
     counters.compare,
-    at_export.compare,
-    completed.compare,
-    messages.compare,
-    conditions.compare,
-    air.compare_counters,
-    air.compare_captures,
+    export_vs_trace.compare,
+    completed_blocks.compare,
+    heard_vs_sent.compare,
+    conditions_vs_network.compare,
+    captures_vs_traces.compare_counters,
+    captures_vs_traces.compare_captures,
 )
 
 

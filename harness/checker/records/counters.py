@@ -4,12 +4,12 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterator
 
-from harness.archive.record import AgentRecord, HandlerRuns
+from harness.archive.run_record import AgentRecord, HandlerRuns
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
-from harness.checker.records.clocks import in_virtual_time, slack_s
+from harness.checker.records.clock_tolerance import in_virtual_time, slack_s
 from harness.checker.records.contradiction import Contradiction, of_agent
-from harness.checker.replay import Life
+from harness.checker.trace_replay import Life
 from ucp.messages import Datagram, datagram_bytes
 from ucp.secure.envelope import ADDED_BYTES
 from ucp.trace import Commanded, Dropped, Recorded

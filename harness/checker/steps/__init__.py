@@ -15,8 +15,8 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
-from harness.checker.steps.header import CheckedHeader, ImpossibleHeaderError, checked
-from harness.checker.steps.inputs import Blocks, decoded
+from harness.checker.steps.recorded_inputs import Blocks, decoded
+from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from ucp.agent import HANDLERS, ON_MESSAGE, why_not_handled
 from ucp.messages import MalformedDatagramError
 from ucp.trace import Commanded, Dropped

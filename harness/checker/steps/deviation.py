@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from harness.checker.steps.inputs import decoded
+from harness.checker.steps.recorded_inputs import decoded
 from ucp.agent import HANDLERS
 from ucp.messages import MalformedDatagramError
 from ucp.trace import HandlerRun, Sent, Tally

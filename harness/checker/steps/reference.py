@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from harness.checker.steps.inputs import Blocks, NotOnRecordError, decoded
+from harness.checker.steps.recorded_inputs import Blocks, NotOnRecordError, decoded
 from ucp.agent import HANDLERS
 from ucp.block import HASH_BYTES, Block
 from ucp.core import Core

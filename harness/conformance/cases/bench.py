@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.conformance.air import AgentEndedError, Air, Ear, Process
-from harness.conformance.mission import NO_KEYS
-from harness.conformance.model import AGENT, EVENT_ID, INITIAL_DATA
-from harness.conformance.states import VARIANTS
+from harness.conformance.reference_model import AGENT, EVENT_ID, INITIAL_DATA
+from harness.conformance.state_space import VARIANTS
+from harness.conformance.subject_mission import NO_KEYS
+from harness.conformance.udp_lab import AgentEndedError, Air, Ear, Process
 from ucp.block import InceptionBlock
 from ucp.clock import MICROSECONDS
 from ucp.messages import ChainContainQuery, ChainContainResponse, MalformedDatagramError, Message, decode, encode

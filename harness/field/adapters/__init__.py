@@ -1,11 +1,11 @@
 """Records of other implementations, brought into the house's formats: by an adapter that knows them.
 
 adapter.py          what an adapter is, and what it yields
-comma_separated.py  CSV, one record in a row
-rosbag.py, bags.py  ROS bags of version 1 and 2
-loading.py          a user's own adapter, by its name
-bring_in.py         reads sources, each by the adapter that knows it
-write.py, record.py what comes of it: traces, exports, captures, and import.json
+csv_adapter.py  CSV, one record in a row
+rosbag_adapter.py, bags.py  ROS bags of version 1 and 2
+adapter_loading.py          a user's own adapter, by its name
+importing.py         reads sources, each by the adapter that knows it
+written_records.py, import_record.py what comes of it: traces, exports, captures, and import.json
 """
 
 from harness.field.adapters.adapter import (
@@ -17,7 +17,7 @@ from harness.field.adapters.adapter import (
     TraceLine,
     Unusable,
 )
-from harness.field.adapters.bring_in import bring_in
+from harness.field.adapters.importing import bring_in
 
 __all__ = [
     "Adapter",

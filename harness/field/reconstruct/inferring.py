@@ -11,9 +11,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from harness.checker.steps.header import CheckedHeader
-from harness.field.reconstruct.elsewhere import Captured, Seen, seconds_of
-from harness.field.reconstruct.inputs import Asked, Booted, Heard, Input, Logged, TimerEnded, What
+from harness.checker.steps.trace_header import CheckedHeader
+from harness.field.reconstruct.agent_inputs import Asked, Booted, Heard, Input, Logged, TimerEnded, What
+from harness.field.reconstruct.other_records import Captured, Seen, seconds_of
 from harness.play.simulation.air import NEVER
 from ucp.agent import Agent
 from ucp.events import LoggableEvent

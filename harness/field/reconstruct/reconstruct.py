@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 from harness.archive.exports import Export
 from harness.checker.judgement import agents
 from harness.errors import FieldError
-from harness.field.homecoming import Flight
-from harness.field.reconstruct.alone import Alone
+from harness.field.ingest import Flight
 from harness.field.reconstruct.comparing import FirstDifference, first_difference
-from harness.field.reconstruct.elsewhere import Elsewhere
+from harness.field.reconstruct.known_mission import NOTHING, told
+from harness.field.reconstruct.other_records import Elsewhere
 from harness.field.reconstruct.rehearsal import Rehearsal
-from harness.field.reconstruct.script import scenario_of
+from harness.field.reconstruct.single_agent import Alone
 from harness.field.reconstruct.timetable import Timetable, timetable
-from harness.field.reconstruct.told import NOTHING, told
+from harness.field.reconstruct.timetable_script import scenario_of
 from harness.run.simulate import InMemory, Simulated, simulate_in_memory
 from harness.scenario.load import parse
-from harness.scenario.write import Document
+from harness.scenario.scenario_file import Document
 from ucp.clock import MICROSECONDS
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from random import Random
 
-from harness.checker.steps.header import CheckedHeader
-from harness.checker.steps.inputs import decoded
-from harness.field.reconstruct.inputs import Asked, Booted, Heard, Input, Logged, TimerEnded
+from harness.checker.steps.recorded_inputs import decoded
+from harness.checker.steps.trace_header import CheckedHeader
+from harness.field.reconstruct.agent_inputs import Asked, Booted, Heard, Input, Logged, TimerEnded
 from harness.play.simulation.late_timers import LateTimers, Running
 from ucp.agent import Agent, why_not_handled
 from ucp.block import next_chain_hash

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
-from harness.field.reconstruct.clocks import FASTEST, SLOWEST, Delivery, Line, estimate
-from harness.field.reconstruct.inputs import Booted, Heard
+from harness.field.reconstruct.agent_inputs import Booted, Heard
+from harness.field.reconstruct.clock_offsets import FASTEST, SLOWEST, Delivery, Line, estimate
 from harness.field.reconstruct.rehearsal import Played, Rehearsal, Started
 
 APART_S = 2e-5

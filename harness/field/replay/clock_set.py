@@ -7,8 +7,8 @@ jumps by the same with most others, it was this agent's clock that was set, and 
 from functools import cached_property
 from statistics import median
 
-from harness.field.replay.exchanges import Exchanges
-from harness.field.replay.record import Record
+from harness.field.replay.agent_record import Record
+from harness.field.replay.peer_messages import Exchanges
 
 WITHIN = 200
 """So many lines before and after are looked at."""

@@ -11,9 +11,9 @@ from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
 from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
-from harness.field.replay.blocks import RecordedBlocks
+from harness.field.replay.agent_record import Entry, Record
 from harness.field.replay.clock_set import ClockSet
-from harness.field.replay.record import Entry, Record
+from harness.field.replay.known_blocks import RecordedBlocks
 from harness.field.replay.resumption import Resumption
 from ucp.agent import ON_TIMER
 from ucp.state import AgentState

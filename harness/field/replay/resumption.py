@@ -11,9 +11,9 @@ from itertools import islice
 
 from harness.archive.traces import Trace
 from harness.checker.steps.follower import Follower
-from harness.checker.steps.inputs import NotOnRecordError, event_of
-from harness.field.replay.blocks import RecordedBlocks
-from harness.field.replay.record import Entry, Record
+from harness.checker.steps.recorded_inputs import NotOnRecordError, event_of
+from harness.field.replay.agent_record import Entry, Record
+from harness.field.replay.known_blocks import RecordedBlocks
 from ucp.block import HASH_BYTES, Block, InceptionBlock, next_chain_hash
 from ucp.events import MalformedEventsError
 from ucp.trace import HandlerRun

@@ -14,15 +14,15 @@ import yaml
 from harness.archive.directory import PUBLIC_KEYS_FILE
 from harness.errors import RunDirectoryError, ScenarioError
 from harness.play.containers import images, ownership
-from harness.play.containers.backend import Containers
+from harness.play.containers.container_backend import Containers
+from harness.play.containers.container_preflight import refuse_debuggers_that_are_not_in_the_image
 from harness.play.containers.images import Image
-from harness.play.containers.preflight import refuse_debuggers_that_are_not_in_the_image
-from harness.play.keys import FRESH, FRESH_BYTES, MissionKeys, keys_of
-from harness.play.process.mission_file import mission_file
+from harness.play.process.agent_mission import mission_file
+from harness.play.vehicle_keys import FRESH, FRESH_BYTES, MissionKeys, keys_of
 from harness.scenario import Scenario
 from netem import addresses
 from sitl.vehicle import VehicleKind
-from ucp.files import write_json_atomically
+from ucp.agent_files import write_json_atomically
 
 INSIDE = "/ucp"
 """Where the directory beside the compose file is in every container."""

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 
 import docker.errors
 
-from harness.play.containers.engine import Engine
+from harness.play.containers.docker_engine import Engine
 from netem.lab import in_words
 
 STDOUT, STDERR = 1, 2

@@ -22,7 +22,7 @@ from pathlib import Path
 import docker.errors
 
 from harness.play.containers import ownership
-from harness.play.containers.engine import DockerError, Engine
+from harness.play.containers.docker_engine import DockerError, Engine
 from harness.scenario import Scenario
 
 HOST_IMAGE = "ucp-harness-host:empty"

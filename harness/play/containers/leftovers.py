@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import docker.errors
 
 from harness.play.containers import ownership
-from harness.play.containers.engine import DockerError, Engine
+from harness.play.containers.docker_engine import DockerError, Engine
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Gives the agents of a compose file their start, all the same one: `python start.py DIRECTORY`.
 
 Runs in a container of its own, so it is a file by itself. The control sockets in the directory tell which agents there
-are to be; each gets the command `start` (see ucp/CONTRACT.md) once all of them answer.
+are to be; each gets the command `start` (see ucp/contract/CONTRACT.md) once all of them answer.
 """
 
 import json

@@ -6,8 +6,8 @@ from typing import Any
 
 from harness.archive.directory import RunDirectory
 from harness.errors import ScenarioError
-from harness.play.process.lab import MissionLab
-from harness.play.process.vehicle import VehicleProcess
+from harness.play.process.run_lab import MissionLab
+from harness.play.process.vehicle_process import VehicleProcess
 from harness.play.process.watchers import Watchers
 from harness.scenario import Scenario
 from netem.radio import Place

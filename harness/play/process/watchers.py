@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
 from harness.errors import HarnessError, InterruptedRunError
-from harness.play.process.agent import AgentFailedError
+from harness.play.process.agent_process import AgentFailedError
 
 T = TypeVar("T")
 

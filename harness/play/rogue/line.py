@@ -7,7 +7,7 @@ from ucp.secure.envelope import NAMES, read_clear
 from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
-"""The number of the injection of a datagram that the scenario itself has (`harness.scenario.datagrams`)."""
+"""The number of the injection of a datagram that the scenario itself has (`harness.scenario.stray_datagrams`)."""
 
 
 def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:

@@ -38,8 +38,8 @@ from ucp.secure.envelope import NAMES, REQUEST_OF, read_clear
 from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
-    from harness.play.rogue.captured import CapturedKeys
-    from ucp.secure.datagrams import Request
+    from harness.play.rogue.captured_bundle import CapturedKeys
+    from ucp.secure.sealed_datagrams import Request
 
 REMEMBERED = 10_000
 """Datagrams that it keeps to replay."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
-from harness.play.simulation.lives import Incarnation
+from harness.play.simulation.incarnations import Incarnation
 from netem.radio import Place
 from ucp.trace import Entry
 

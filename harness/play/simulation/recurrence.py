@@ -9,7 +9,7 @@ message surely arrives, or never does, and besides
 - has arrived, and the answers to it, before the next timer of anybody ends, and has only been answered or tallied:
   then nothing depends on when it came.
 
-Only then the recurrence is a proof. Other cycles show in the traces (`harness.checker.cycles`).
+Only then the recurrence is a proof. Other cycles show in the traces (`harness.checker.recurring_cycles`).
 
 One state is kept and compared with all that follow, then a later one with twice as many (Brent's algorithm), so that a
 swarm that goes on for days takes no more memory than one that goes on for minutes.
@@ -111,7 +111,7 @@ class Recurrence:
         self._as_timers_left_it = _what_messages_may_change(swarm)
 
     def cycle(self, swarm: Sequence[Waiting]) -> dict[str, Any]:
-        """The cycle that the last look has found; `harness.archive.record.Cycle`."""
+        """The cycle that the last look has found; `harness.archive.run_record.Cycle`."""
         agents = {agent.state.agent_id for agent in swarm}
         went_on = {step["agent_id"] for step in self._steps}
         return {

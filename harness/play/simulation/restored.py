@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from harness.play.simulation.agents import Stored
-from harness.play.simulation.backend import Simulation
 from harness.play.simulation.recorder import Recorder
+from harness.play.simulation.simulated_agent import Stored
+from harness.play.simulation.simulation import Simulation
 from harness.scenario import Scenario
 from ucp.store import StoredState
 

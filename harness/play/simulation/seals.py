@@ -4,7 +4,7 @@ import base64
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from harness.scenario.events import ScriptedEvent
+from harness.scenario.event_source import ScriptedEvent
 from ucp.events import MalformedEventsError, decode_events
 from ucp.sealed import SEAL_BYTES
 

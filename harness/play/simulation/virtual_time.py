@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING
 from harness.archive.directory import RunDirectory
 from harness.errors import InterruptedRunError, MachineError, ScenarioError
 from harness.play.backend import Backend
-from harness.play.ground_station import refuse_what_no_ground_station_sees
+from harness.play.ground_station_check import refuse_what_no_ground_station_sees
 from harness.play.pace import Pace
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
-from harness.play.simulation.backend import Simulation, no_vehicles
 from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
-from harness.play.simulation.on_disk import OnDisk
+from harness.play.simulation.run_files import OnDisk
+from harness.play.simulation.simulation import Simulation, no_vehicles
 from harness.scenario import Scenario
 from harness.scenario.faults import VehicleFault
 
 if TYPE_CHECKING:
     from harness.play.simulation.captured_air import VirtualCapture
-    from harness.play.simulation.foreign.programs import Programs
-    from harness.play.simulation.on_station import TracksOnStation
+    from harness.play.simulation.foreign.program_pool import Programs
+    from harness.play.simulation.station_tracks import TracksOnStation
 
 
 class VirtualTime(Backend):
@@ -125,7 +125,7 @@ def _of_real_vehicles(scenario: Scenario) -> list[str]:
 
 
 async def _open_station(simulation: Simulation) -> "TracksOnStation":
-    from harness.play.simulation.on_station import TracksOnStation  # draws in MAVLink
+    from harness.play.simulation.station_tracks import TracksOnStation  # draws in MAVLink
 
     return await TracksOnStation.open(simulation.scenario, simulation.tracks, simulation.now)
 
@@ -143,7 +143,7 @@ def _export(simulation: Simulation, files: OnDisk) -> None:
 
 async def _compare_again(simulation: Simulation, breathe: Callable[[Simulation], Awaitable[None]]) -> None:
     """Play the lives of agents that are not ours again, to see whether they are the same twice."""
-    from harness.play.simulation.foreign.again import Again, NotTheSameError
+    from harness.play.simulation.foreign.determinism import Again, NotTheSameError
 
     simulation.enter("the same again")
     with closing(Again(patient=True)) as again:
@@ -163,7 +163,7 @@ def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["Programs | 
     if not scenario.foreign:
         yield None
         return
-    from harness.play.simulation.foreign.programs import Programs
+    from harness.play.simulation.foreign.program_pool import Programs
 
     with closing(Programs(rundir.agents)) as programs:
         yield programs

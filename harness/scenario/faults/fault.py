@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from pydantic import Field
 
-from harness.scenario.model import VehicleId
+from harness.scenario.strict_model import VehicleId
 from harness.scenario.vehicles import Vehicles
 from sitl.circumstances import Circumstance
 

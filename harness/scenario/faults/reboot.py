@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from harness.scenario.faults.fault import ARROW, DIAMOND, PAUSED, REBOOTING, RUNNING, Disk, Fault, Lives
-from harness.scenario.model import Seconds
+from harness.scenario.strict_model import Seconds
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from harness.scenario.faults.fault import KILLED, PAUSED, REBOOTING, RUNNING, SWITCHED_OFF, Fault, Lives
-from harness.scenario.model import VehicleId
+from harness.scenario.strict_model import VehicleId
 
 Hearers = Annotated[list[VehicleId], Field(min_length=1)]
 

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 from pydantic import ValidationError
 
-from harness.play.control import AgentControl, AgentRefusedError, AgentSilentError, Status
+from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError, Status
 from tests.fuzz.finding import require, sound
 from ucp.agent import Agent
 from ucp.status import status_of

@@ -12,10 +12,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from harness.errors import ScenarioError
-from harness.play.by_hand import SOCKET, ask_run, listening
-from harness.play.control import connect
+from harness.play.agent_control import connect
 from harness.play.interventions import Interventions
-from harness.play.simulation.backend import Simulation
+from harness.play.request_socket import SOCKET, ask_run, listening
+from harness.play.simulation.simulation import Simulation
 from harness.run.simulate import InMemory, simulate
 from harness.scenario import Scenario
 from harness.scenario.injection import INJECTIONS

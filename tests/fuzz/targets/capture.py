@@ -5,16 +5,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from harness.archive.packets import packets_text
+from harness.archive.packets.air_names import Names
+from harness.archive.packets.capture_files import read_captures
+from harness.archive.packets.exchanges import Exchanges
+from harness.archive.packets.loss_table import count_losses
+from harness.archive.packets.packets_document import document
+from harness.archive.packets.packets_text import Wording
+from harness.archive.packets.pcap import OUTBOUND, CaptureFile, Frame
+from harness.archive.packets.transmissions import join
 from harness.errors import HarnessError
-from harness.packets import text
-from harness.packets.document import document
-from harness.packets.exchanges import Exchanges
-from harness.packets.files import read_captures
-from harness.packets.losses import count_losses
-from harness.packets.names import Names
-from harness.packets.pcap import OUTBOUND, CaptureFile, Frame
-from harness.packets.text import Wording
-from harness.packets.transmissions import join
 from netem.pcapng import PcapngFile, header
 from tests.fuzz.finding import require, sound
 from tests.fuzz.targets.home import came_home, sound_run
@@ -57,9 +57,9 @@ def _show(paths: list[Path]) -> None:
         sound(sentence)
     transmissions = join(captures)
     exchanges, names = Exchanges(transmissions), Names(transmissions, [])
-    list(text.lines(transmissions, exchanges, Wording(names, str), None))
-    text.head(captures)
-    list(text.tail(captures, transmissions))
+    list(packets_text.lines(transmissions, exchanges, Wording(names, str), None))
+    packets_text.head(captures)
+    list(packets_text.tail(captures, transmissions))
     list(document(captures, count_losses(transmissions), transmissions, exchanges, names))
 
 

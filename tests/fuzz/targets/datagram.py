@@ -6,9 +6,9 @@ from pathlib import Path
 from scapy.config import conf
 from scapy.packet import Raw
 
-from harness.packets.datagram import NotUcpError, unwrap
-from harness.packets.pcap import CaptureFile
-from harness.packets.summary import summarize
+from harness.archive.packets.datagram import NotUcpError, unwrap
+from harness.archive.packets.message_summary import summarize
+from harness.archive.packets.pcap import CaptureFile
 from tests.fuzz.finding import require
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import MAX_DATAGRAM_BYTES, MalformedDatagramError, datagram_bytes, decode

@@ -5,13 +5,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.depot.came_home import came_home
-from harness.depot.consolidation import consolidate
-from harness.depot.mission_files import Plan, write
-from harness.depot.outputs import lines, table, tracks
-from harness.depot.same_mission import compare
-from harness.depot.words import in_words
 from harness.errors import HarnessError
+from harness.field.depot.collected_exports import came_home
+from harness.field.depot.consolidation import consolidate
+from harness.field.depot.mission_comparison import compare
+from harness.field.depot.mission_files import Plan, write
+from harness.field.depot.record_outputs import lines, table, tracks
+from harness.field.depot.record_text import in_words
 from tests.fuzz.finding import sound
 from tests.fuzz.targets.home import sound_run
 from tests.harness.virtual import scenario

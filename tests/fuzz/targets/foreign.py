@@ -12,8 +12,8 @@ from unittest.mock import patch
 
 from harness import checker
 from harness.errors import HarnessError
-from harness.play.simulation.foreign import foreigners, programs
-from harness.play.simulation.foreign.program import Program
+from harness.play.simulation.foreign import foreigners, program_pool
+from harness.play.simulation.foreign.virtual_program import Program
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.fuzz.finding import require, sound
@@ -86,7 +86,7 @@ def run(data: bytes) -> None:
 def _play(replaced: dict[int, bytes]) -> list[bytes]:
     """The good answers."""
     ours = type("Replaced", (_Ours,), {"answers": [], "replaced": replaced})
-    with patch.object(programs, "Program", ours), patch.object(foreigners, "SHARED", programs.Programs()):
+    with patch.object(program_pool, "Program", ours), patch.object(foreigners, "SHARED", program_pool.Programs()):
         try:
             played = simulate(SCENARIO, 1, tracing=True)
         except HarnessError as error:

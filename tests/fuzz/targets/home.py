@@ -11,14 +11,14 @@ from tempfile import TemporaryDirectory
 
 from harness import checker
 from harness.archive.archive import RunArchive
-from harness.archive.record import RogueInjection
+from harness.archive.run_record import RogueInjection
 from harness.archive.trace_lines import read_lines
 from harness.errors import HarnessError
 from harness.field.adapters import bring_in
-from harness.field.adapters.comma_separated import CommaSeparated
-from harness.field.adapters.record import FILE, ImportRecord
-from harness.field.adapters.rosbag import RosBag
-from harness.field.homecoming import Homecoming, sort_out
+from harness.field.adapters.csv_adapter import CommaSeparated
+from harness.field.adapters.import_record import FILE, ImportRecord
+from harness.field.adapters.rosbag_adapter import RosBag
+from harness.field.ingest import Homecoming, sort_out
 from harness.field.replay import Player, open_record
 from tests.fuzz.finding import require, sound
 from tests.harness.field.flights import flown

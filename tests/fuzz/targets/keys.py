@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.keyring.home import Home, KeysError, load_depot_key
-from harness.keyring.inspection import in_words, inspect
+from harness.play.keyring.inspection import in_words, inspect
+from harness.play.keyring.key_directory import Home, KeysError, load_depot_key
 from tests.fuzz.finding import require, sound
 from ucp.secure.bundle import load_bundle, write_bundle
 from ucp.secure.keyfile import KeyFileError

@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from harness.archive.traces import HEADER
-from harness.checker.steps.header import checked
-from harness.play.process.mission_file import mission_file
+from harness.checker.steps.trace_header import checked
+from harness.play.process.agent_mission import mission_file
 from tests.fuzz.finding import require, sound
 from tests.harness.virtual import scenario
 from ucp.agent import Agent

@@ -13,7 +13,7 @@ from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.scenario.library import FOLDER
 from harness.scenario.load import load_scenario, parse
-from harness.scenario.write import ORDER, to_yaml
+from harness.scenario.scenario_file import ORDER, to_yaml
 from tests.fuzz.finding import require, sound
 
 MOST_AGENTS = 4

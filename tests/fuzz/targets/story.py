@@ -5,7 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness.errors import HarnessError
-from harness.stories.text import is_story, read_story
+from harness.report.stories.story_file import is_story, read_story
 from tests.fuzz.finding import require, sound
 
 STORIES = Path(__file__).parents[2] / "stories"

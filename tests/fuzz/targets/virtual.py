@@ -12,7 +12,7 @@ from typing import Any
 
 from harness.archive.exports import export_of
 from harness.archive.traces import Header, parsed
-from harness.play.process.mission_file import mission_file
+from harness.play.process.agent_mission import mission_file
 from tests.fuzz.finding import FailedError, require, sound
 from tests.harness.virtual import scenario
 from ucp.block import Block, InceptionBlock, next_chain_hash

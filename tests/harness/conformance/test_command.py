@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from harness.conformance.air import AgentEndedError, NoAgentError
-from harness.conformance.run import Asked, conform
-from harness.conformance.states import VARIANTS, explore
-from harness.conformance.table import to_junit
+from docs.generate.wrong_agents import quirky
+from harness.conformance.conformance_run import Asked, conform
+from harness.conformance.results_table import to_junit
+from harness.conformance.state_space import VARIANTS, explore
+from harness.conformance.udp_lab import AgentEndedError, NoAgentError
 from harness.conformance.vectors import Vectors
-from harness.conformance.virtual import Program
-from harness.wrong_agents import quirky
+from harness.conformance.virtual_subject import Program
 from tests.harness.command import harness, processes, sentences
 
 OURS = (sys.executable, "-P", "-m", "ucp.node")
@@ -123,7 +123,7 @@ def test_where_its_start_is_cancelled_nothing_of_it_is_left(tmp_path: Path) -> N
 def test_a_program_that_closes_its_standard_output_and_goes_on_is_told(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("harness.conformance.virtual.GRACE_S", 0.1)
+    monkeypatch.setattr("harness.conformance.virtual_subject.GRACE_S", 0.1)
 
     async def ask() -> None:
         program = await Program.start(("sh", "-c", "exec >&-; sleep 1000"), tmp_path / "errors.log")

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from harness.conformance.air import Air
+from docs.generate.wrong_agents import quirky
 from harness.conformance.alphabet import INPUTS, LOG
-from harness.conformance.over_udp import BESIDE_OTHERS, OverUdp
+from harness.conformance.conformance_run import Asked, conform
+from harness.conformance.observation import Seen
 from harness.conformance.results import Results
-from harness.conformance.run import Asked, conform
-from harness.conformance.seen import Seen
-from harness.conformance.states import VARIANTS, explore
-from harness.conformance.table import to_junit
+from harness.conformance.results_table import to_junit
+from harness.conformance.state_space import VARIANTS, explore
+from harness.conformance.udp_lab import Air
+from harness.conformance.udp_subject import BESIDE_OTHERS, OverUdp
 from harness.conformance.vectors import Vectors
-from harness.wrong_agents import quirky
 
 pytestmark = pytest.mark.lab
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.conformance.page import AgentsFileError, read_agents, to_html
+from harness.conformance.conformance_page import AgentsFileError, read_agents, to_html
 from harness.conformance.results import Case, Results, Row
 
 

@@ -5,14 +5,14 @@ import sys
 import pytest
 import yaml
 
+from docs.generate.wrong_agents import quirky
 from harness.conformance.alphabet import LOG, TIMER
-from harness.conformance.lines import Writer
-from harness.conformance.model import AGENT
-from harness.conformance.scenario import scenario_of
-from harness.conformance.states import VARIANTS
+from harness.conformance.failure_scenario import scenario_of
+from harness.conformance.reference_model import AGENT
+from harness.conformance.state_space import VARIANTS
+from harness.conformance.virtual_lines import Writer
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.wrong_agents import quirky
 
 WAYS = [
     (LOG, LOG, TIMER, TIMER, "Chain Hash Successor Query about the inception block"),

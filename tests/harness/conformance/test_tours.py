@@ -4,8 +4,8 @@ import asyncio
 import time
 
 from harness.conformance.alphabet import Input
-from harness.conformance.seen import Exchange, Seen
-from harness.conformance.states import VARIANTS, Variant, advance, explore, pair_of, state_of
+from harness.conformance.observation import Exchange, Seen
+from harness.conformance.state_space import VARIANTS, Variant, advance, explore, pair_of, state_of
 from harness.conformance.subject import Subject
 from harness.conformance.suite import Suite
 from harness.conformance.tours import Map

@@ -5,11 +5,11 @@ from random import Random
 
 import pytest
 
+from docs.generate.wrong_agents.conformance_page import ALIKE, PAGE
+from docs.generate.wrong_agents.trials_page import rows_of
 from harness.conformance.alphabet import INPUTS, LOG, TIMER
-from harness.conformance.model import Model
-from harness.conformance.states import STEP_S, VARIANTS
-from harness.wrong_agents.conformance import ALIKE, PAGE
-from harness.wrong_agents.page import rows_of
+from harness.conformance.reference_model import Model
+from harness.conformance.state_space import STEP_S, VARIANTS
 from ucp.quirks import QUIRKS, wrong_handlers
 
 WAY = (LOG, "vote no", "vote no", TIMER, LOG, "vote yes", "vote no", LOG, TIMER, LOG, "vote no", TIMER, TIMER)

@@ -12,8 +12,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from harness.packets.datagram import NotUcpError, unwrap
-from harness.packets.pcap import OUTBOUND, CaptureFile
+from harness.archive.packets.datagram import NotUcpError, unwrap
+from harness.archive.packets.pcap import OUTBOUND, CaptureFile
 
 EPOCH_NS = 1_790_000_000_000_000_000
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from harness.archive.packets.capture_files import capture_files, read_captures
 from harness.errors import FieldError
 from harness.field.adapters import bring_in
-from harness.field.adapters.comma_separated import CommaSeparated
-from harness.field.adapters.loading import load_adapter
-from harness.packets.files import capture_files, read_captures
+from harness.field.adapters.adapter_loading import load_adapter
+from harness.field.adapters.csv_adapter import CommaSeparated
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
 

@@ -1,14 +1,14 @@
 """The table of wrong agents at the desk is whole, and its rows say what replay said."""
 
-from harness.wrong_agents.at_the_desk import PAGE, AtTheDesk, Named, row
-from harness.wrong_agents.page import rows_of
+from docs.generate.wrong_agents.at_the_desk import PAGE, AtTheDesk, Named, row
+from docs.generate.wrong_agents.trials_page import rows_of
 from ucp.quirks import QUIRKS
 
 ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
 
 
 def test_every_quirk_has_a_row() -> None:
-    assert list(ROWS) == list(QUIRKS), "write it again: python -m harness.wrong_agents.at_the_desk"
+    assert list(ROWS) == list(QUIRKS), "write it again: python -m docs.generate.wrong_agents.at_the_desk"
 
 
 def test_no_wrong_agent_passes_for_a_right_one() -> None:

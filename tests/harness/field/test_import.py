@@ -11,14 +11,14 @@ import pytest
 
 from harness import checker
 from harness.archive.archive import RunArchive
+from harness.archive.packets.capture_files import capture_files, read_captures
 from harness.archive.traces import read_trace
 from harness.errors import FieldError, MachineError
 from harness.field.adapters import bring_in
-from harness.field.adapters.comma_separated import CommaSeparated
-from harness.field.adapters.record import ImportRecord
-from harness.field.adapters.rosbag import RosBag
-from harness.field.homecoming import sort_out
-from harness.packets.files import capture_files, read_captures
+from harness.field.adapters.csv_adapter import CommaSeparated
+from harness.field.adapters.import_record import ImportRecord
+from harness.field.adapters.rosbag_adapter import RosBag
+from harness.field.ingest import sort_out
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
 from tests.harness.field.recordings import of_run, write_bag1, write_bag2, write_csv

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from harness.errors import FieldError
-from harness.field.homecoming import sort_out
+from harness.field.ingest import sort_out
 from harness.field.reconstruct import Reconstruction, reconstruct, write
 from harness.run.simulate import simulate
 from harness.scenario import load_scenario

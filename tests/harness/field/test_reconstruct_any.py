@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harness.field.homecoming import sort_out
+from harness.field.ingest import sort_out
 from harness.field.reconstruct import reconstruct
 from tests.harness.field.flights import flown
 

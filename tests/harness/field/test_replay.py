@@ -15,9 +15,9 @@ from harness.checker import steps
 from harness.errors import FieldError
 from harness.field.replay import Player, open_record
 from harness.field.replay import player as player_module
-from harness.field.replay.names import Names
-from harness.field.replay.places import next_place, place
-from harness.field.replay.source import source_of
+from harness.field.replay.breakpoints import next_place, place
+from harness.field.replay.handler_source import source_of
+from harness.field.replay.replay_names import Names
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.field.flights import flown, trace_of
 from ucp.agent import HANDLERS

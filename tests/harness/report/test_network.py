@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.connectivity import read_connectivity
-from harness.archive.record import RunRecord
-from harness.report.network import ground_station, happened, strip
+from harness.archive.run_record import RunRecord
+from harness.report.network_section import ground_station, happened, strip
 
 
 def drawn(path: Path, *lines: dict[str, Any]) -> list[str]:

@@ -16,11 +16,11 @@ from harness.archive.archive import RunArchive
 from harness.archive.history import Commit, History, Phase, Reconcile, Tie, Vote
 from harness.archive.replication import Replication
 from harness.play.progress import Silent
-from harness.report import timeline, timeline_charts, timeline_lanes, write_report
+from harness.report import timeline_charts, timeline_lanes, timeline_section, write_report
 from harness.run.run import run
+from tests.harness.play.test_recurrence import in_step
 from tests.harness.report.runs import write_run
 from tests.harness.report.test_page import HOSTILE, Reader
-from tests.harness.test_recurrence import in_step
 from tests.harness.virtual import scenario
 
 AGENTS = range(1, 6)
@@ -162,7 +162,7 @@ def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> No
 
 @pytest.mark.parametrize(
     ("module", "limit", "said"),
-    [(archive, "LARGE_BYTES", "traces are too large"), (timeline, "MAX_ARROWS", "too many for a page")],
+    [(archive, "LARGE_BYTES", "traces are too large"), (timeline_section, "MAX_ARROWS", "too many for a page")],
 )
 def test_messages_above_a_limit_are_left_out_and_that_is_said(
     troubled: Path, monkeypatch: pytest.MonkeyPatch, module: Any, limit: str, said: str

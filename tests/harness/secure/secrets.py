@@ -5,10 +5,10 @@ import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from harness.keyring.home import Home
+from harness.play.keyring.key_directory import Home
 from ucp.messages import MalformedDatagramError
+from ucp.secure.crypto_suite import KEY_BYTES, NONCE_BYTES, expand, next_epoch_secret
 from ucp.secure.envelope import CLEAR, MAGIC, VERSION, read_clear
-from ucp.secure.suite import KEY_BYTES, NONCE_BYTES, expand, next_epoch_secret
 
 _SENDER = b"UCP sender\0"
 _CLEAR_START = MAGIC + bytes([VERSION])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.keyring.home import Home
+from harness.play.keyring.key_directory import Home
 from tests.harness.command import harness
 from tests.harness.secure.secrets import left_in, secrets, told
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from harness.errors import ScenarioError
-from harness.keyring.home import Home, write_revocation
+from harness.play.keyring.key_directory import Home, write_revocation
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.harness.command import harness

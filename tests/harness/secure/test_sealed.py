@@ -10,7 +10,7 @@ import pytest
 from harness.archive.exports import SUFFIX, Export
 from harness.archive.traces import HANDLER_RUN, Header, Trace
 from harness.checker import Evidence, steps
-from harness.keyring.home import Home
+from harness.play.keyring.key_directory import Home
 from tests.harness.command import harness
 from tests.ucp.air import Air
 from ucp.agent import Agent

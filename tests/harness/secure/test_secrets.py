@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from harness.keyring.home import Home
+from harness.play.keyring.key_directory import Home
 from tests.harness.command import harness
 from tests.harness.secure.secrets import boots_in, forms, left_in, secrets, told
 

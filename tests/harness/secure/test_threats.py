@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.threats import ROWS, Row, table
+from docs.generate.threats import ROWS, Row, table
 
 PAGE = (Path(__file__).parents[3] / "docs/security.md").read_text(encoding="utf-8")
 

@@ -1,8 +1,8 @@
 """Secured agents without an air: what one sends is handed to the others by the test."""
 
 from ucp.events import LoggableEvent
-from ucp.secure.agent import SecuredAgent, boot_of
 from ucp.secure.bundle import Bundle, KeySet
+from ucp.secure.secured_agent import SecuredAgent, boot_of
 from ucp.secure.session import Session
 
 ROSTER = (1, 2, 3)

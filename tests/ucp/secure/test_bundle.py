@@ -11,9 +11,9 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from ucp.secure.block_signature import claim_of_block, sign_block
 from ucp.secure.bundle import KeySet, load_bundle, load_public, write_bundle, write_public
+from ucp.secure.crypto_suite import verify
 from ucp.secure.keyfile import MAX_FILE_BYTES, KeyFileError
 from ucp.secure.revocation import Revocation, RevocationError
-from ucp.secure.suite import verify
 
 KEYS = KeySet.derived(b"a seed".ljust(32), (1, 7, 28), seals=True)
 BUNDLE = KEYS.bundle(7)

@@ -15,11 +15,11 @@ from tests.ucp.datagrams import all_messages
 from tests.ucp.secure.swarm import KEYS, session
 from ucp.messages import ChainContainQuery, Message, encode
 from ucp.scapy import UCP, Revocation, Sealed, SecuredUCP, message_of, opened
-from ucp.secure.agent import boot_of
 from ucp.secure.bundle import KeySet
 from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, MalformedDatagramError, read_clear
 from ucp.secure.opening import EPOCHS_AHEAD, Opener
 from ucp.secure.revocation import Revocation as Signed
+from ucp.secure.secured_agent import boot_of
 from ucp.secure.session import Session
 
 

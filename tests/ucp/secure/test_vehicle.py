@@ -17,9 +17,9 @@ from ucp.export import export_chain
 from ucp.mission import Mission, MissionError, parse_mission
 from ucp.secure.block_signature import claim_of_block
 from ucp.secure.bundle import bundle_name, load_bundle, write_bundle
+from ucp.secure.crypto_suite import verify
 from ucp.secure.revocation import Revocation
-from ucp.secure.suite import verify
-from ucp.secure.vehicle import secured_agent
+from ucp.secure.secured_vehicle import secured_agent
 from ucp.store import SecuredState, Store
 
 

@@ -2,13 +2,13 @@
 
 An index is not asked for, nor `metadata.yaml`: a bag whose recorder was killed, or whose vehicle lost power, has none.
 What is behind a damaged place is used. Sizes that a file claims are believed up to a bound. What the messages mean is
-for the package rosbags to say (harness.field.adapters.rosbag).
+for the package rosbags to say (harness.field.adapters.rosbag_adapter).
 
-found.py      what is found in a bag: messages, and places that cannot be read
+bag_message.py      what is found in a bag: messages, and places that cannot be read
 version_1.py  version 1
-mcap.py       version 2 in MCAP
+mcap_bag.py       version 2 in MCAP
 sqlite.py     version 2 in SQLite
-packed.py     what is packed in any of them
+decompression.py     what is packed in any of them
 """
 
 import mmap
@@ -18,12 +18,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from harness.archive.opened import Opened
-from harness.field.adapters.bags import mcap, sqlite, version_1
-from harness.field.adapters.bags.found import MAX_FILE_BYTES, Broken, Found, Item
-from harness.field.adapters.bags.packed import ZSTD_MAGIC, unpacked_file
+from harness.archive.bounded_file import Opened
+from harness.field.adapters.bags import mcap_bag, sqlite, version_1
+from harness.field.adapters.bags.bag_message import MAX_FILE_BYTES, Broken, Found, Item
+from harness.field.adapters.bags.decompression import ZSTD_MAGIC, unpacked_file
 
-MAGICS = (version_1.MAGIC, mcap.MAGIC, sqlite.MAGIC, ZSTD_MAGIC)
+MAGICS = (version_1.MAGIC, mcap_bag.MAGIC, sqlite.MAGIC, ZSTD_MAGIC)
 """What a bag begins with."""
 
 
@@ -63,9 +63,9 @@ def _items(path: Path, scratch: Path) -> Iterator[Item]:
     magic = _magic(path)
     if magic == sqlite.MAGIC:
         yield from sqlite.items(path, scratch)
-    elif magic in (version_1.MAGIC, mcap.MAGIC):
+    elif magic in (version_1.MAGIC, mcap_bag.MAGIC):
         with path.open("rb") as bag, mmap.mmap(bag.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            yield from (version_1 if magic == version_1.MAGIC else mcap).items(content)
+            yield from (version_1 if magic == version_1.MAGIC else mcap_bag).items(content)
     else:
         yield Broken("it is no ROS bag")
     if trouble:

@@ -7,7 +7,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from harness.field.adapters.bags.found import MAX_CHUNK_BYTES, MAX_FILE_BYTES, MAX_MESSAGE_BYTES, Broken, Found, Item
+from harness.field.adapters.bags.bag_message import (
+    MAX_CHUNK_BYTES,
+    MAX_FILE_BYTES,
+    MAX_MESSAGE_BYTES,
+    Broken,
+    Found,
+    Item,
+)
 
 MAGIC = b"SQLite format 3\0"
 JOURNAL = "-wal"

@@ -4,8 +4,16 @@ import re
 import struct
 from collections.abc import Iterator
 
-from harness.field.adapters.bags.found import MAX_CHUNK_BYTES, MAX_RECORDS, MAX_TRIES, Broken, Buffer, Item, Topics
-from harness.field.adapters.bags.packed import unpacked
+from harness.field.adapters.bags.bag_message import (
+    MAX_CHUNK_BYTES,
+    MAX_RECORDS,
+    MAX_TRIES,
+    Broken,
+    Buffer,
+    Item,
+    Topics,
+)
+from harness.field.adapters.bags.decompression import unpacked
 
 MAGIC = b"#ROSBAG V2.0\n"
 _U32, _TIME = struct.Struct("<I"), struct.Struct("<II")

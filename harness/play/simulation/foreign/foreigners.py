@@ -6,17 +6,17 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from harness.errors import MachineError, ScenarioError
-from harness.play.process.agent import agent_command, reboots_with_disk
-from harness.play.process.mission_file import mission_file
-from harness.play.simulation.agents import Stored, VirtualAgent
-from harness.play.simulation.foreign.agent import ForeignAgent, LifeRecord
-from harness.play.simulation.foreign.program import Program
-from harness.play.simulation.foreign.programs import SHARED, Programs
+from harness.play.process.agent_mission import mission_file
+from harness.play.process.agent_process import agent_command, reboots_with_disk
+from harness.play.simulation.foreign.foreign_agent import ForeignAgent, LifeRecord
+from harness.play.simulation.foreign.program_pool import SHARED, Programs
+from harness.play.simulation.foreign.virtual_program import Program
+from harness.play.simulation.simulated_agent import Stored, VirtualAgent
 from harness.scenario import Scenario
 from netem import addresses
 
 if TYPE_CHECKING:
-    from harness.play.simulation.secured import Keys
+    from harness.play.simulation.secured_agents import Keys
 
 MAX_RECORD_BYTES = 128 * 1024 * 1024
 """Of all that agents are given and answer in a mission, so much is kept, to be given to them again."""
@@ -87,7 +87,7 @@ class Foreigners:
         make: Callable[..., ForeignAgent] = ForeignAgent
         handed = None
         if self._keys is not None:
-            from harness.play.simulation.foreign.secured import SecuredForeignAgent  # needs the extra `secure`
+            from harness.play.simulation.foreign.foreign_secured import SecuredForeignAgent  # needs the extra `secure`
 
             make = partial(SecuredForeignAgent, self._keys.mission.bundles[agent_id])
             handed = self._keys.handed(agent_id, life, born_at)

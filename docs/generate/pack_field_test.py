@@ -1,0 +1,59 @@
+"""Plays scenarios/field_test_2020.yaml, breaks what came home as field data is broken, and packs it.
+
+    python docs/generate/pack_field_test.py docs/field_test_2020.tar.xz
+
+The same scenario and seed give the same logs, to the last byte, for as long as runs in virtual time stay as they are.
+"""
+
+import gzip
+import io
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+
+from harness.play.progress import Silent
+from harness.run.run import run
+from harness.scenario import Scenario, load_scenario
+
+SCENARIO = Path(__file__).parents[2] / "scenarios/field_test_2020.yaml"
+SEED = 76
+HOVER_TEST = {"name": "Hover test in the morning", "agents": [10, 28, 32, 118, 120, 122], "duration_s": 120}
+NOTES = "Camp Roberts, 2nd UCP test. Wind 250/8. 122 landed first, batteries swapped at 14:40.\n"
+
+
+def broken() -> dict[str, bytes]:
+    """What was copied from six vehicles, by file name."""
+    with tempfile.TemporaryDirectory() as scratch:
+        flight = _flown(load_scenario(SCENARIO), Path(scratch) / "flight")
+        before = _flown(Scenario.model_validate(HOVER_TEST), Path(scratch) / "before")
+    del flight["122.chain.json"]
+    whole = flight.pop("28.trace.jsonl")
+    flight["28.trace.jsonl.gz"] = gzip.compress(whole, mtime=0)
+    flight["32.trace.jsonl"] = flight["32.trace.jsonl"][:-100_000]
+    flight["118.trace.jsonl"] = before["118.trace.jsonl"] + flight["118.trace.jsonl"]
+    flight["backup/120.trace.jsonl"] = flight["120.trace.jsonl"]
+    sector = flight["10.trace.jsonl"].index(b"\n", 900_000) + 1000
+    flight["10.trace.jsonl"] = flight["10.trace.jsonl"][:sector] + bytes(512) + flight["10.trace.jsonl"][sector + 512 :]
+    return {**flight, "notes.txt": NOTES.encode(), "camera/DSC_0042.JPG": b"\xff\xd8\xff\xe0" + bytes(range(256)) * 16}
+
+
+def _flown(scenario: Scenario, directory: Path) -> dict[str, bytes]:
+    run(scenario, SEED, directory, Silent(), "sim")
+    files = (path for kind in ("*.trace.jsonl", "*.chain.json") for path in (directory / "agents").glob(kind))
+    return {path.name: path.read_bytes() for path in files}
+
+
+def packed(files: dict[str, bytes]) -> bytes:
+    """An archive of them, in the directory `logs`."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:xz", format=tarfile.USTAR_FORMAT) as archive:
+        for name, content in sorted(files.items()):
+            member = tarfile.TarInfo(f"logs/{name}")
+            member.size = len(content)
+            archive.addfile(member, io.BytesIO(content))
+    return buffer.getvalue()
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_bytes(packed(broken()))

@@ -1,0 +1,124 @@
+"""`python -m docs.generate.wrong_agents.at_the_desk [QUIRK ...]`: wrong agents as processes, their records taken to
+`replay`.
+
+Rows for these quirks, or for all, are put into ../../wrong-agents-field.md; the words around them are written by hand.
+"""
+
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from textwrap import shorten
+
+from docs.generate.matrix_thesis import put_between_markers
+from docs.generate.wrong_agents.quirky import PROBABILITY
+from docs.generate.wrong_agents.trials_page import rows_of
+from harness.archive.exports import agents_directory
+from harness.archive.traces import SUFFIX
+from harness.field.replay import Player, open_record
+from harness.field.replay.replay_names import Names
+from harness.play.progress import Silent
+from harness.run.parallel import Failed, sweep
+from harness.run.run import run
+from harness.scenario import load_scenario
+from ucp.agent import HANDLERS
+from ucp.agent_files import write_atomically
+from ucp.quirks import QUIRKS
+
+PAGE = Path(__file__).parents[2] / "wrong-agents-field.md"
+MISSION = Path(__file__).parent / "desk.yaml"
+JOBS = 2
+MOST_RUNS = 8
+"""If no record of the first differs: a mistake may need what has not happened there."""
+SHOWN = 160
+HEADER = (
+    "| quirk | Algorithm | named first | rightly | minutes | runs | what `replay` says of it |\n"
+    "|---|--:|---|--:|--:|--:|---|\n"
+)
+
+
+@dataclass(frozen=True)
+class Named:
+    """The first difference of a record; `handler` is None if it is no handler's."""
+
+    t: float
+    handler: str | None
+    difference: str
+
+
+@dataclass(frozen=True)
+class AtTheDesk:
+    """What `replay` made of the records of the last of `runs`: the first difference of each that has one."""
+
+    runs: int
+    records: int
+    named: tuple[Named, ...]
+
+
+def at_the_desk(quirk: str) -> AtTheDesk:
+    """Fly until any record differs, `MOST_RUNS` times at most."""
+    value = PROBABILITY if QUIRKS[quirk].chance else True
+    scenario = load_scenario(MISSION).model_copy(update={"quirks": {quirk: value}})
+    records, named = 0, list[Named]()
+    for seed in range(1, MOST_RUNS + 1):
+        with TemporaryDirectory(prefix="ucp-desk-") as name:
+            brought_home = Path(name) / "home"
+            brought_home.mkdir()
+            run_directory = run(scenario, seed, Path(name) / "run", Silent(), "process").directory
+            for trace in agents_directory(run_directory).glob(f"*{SUFFIX}"):
+                shutil.copy(trace, brought_home)
+            traces = sorted(brought_home.iterdir())
+            records, named = len(traces), list(_first_differences(traces))
+        if named:
+            break
+    return AtTheDesk(seed, records, tuple(named))
+
+
+def _first_differences(traces: Sequence[Path]) -> Iterator[Named]:
+    for trace in traces:
+        record = open_record(trace)
+        first = Player(record).to_end().first
+        if first is not None:
+            yield Named(first.t, first.handler, first.difference(Names(record).of))
+
+
+def row(quirk: str, brought: AtTheDesk) -> str:
+    """A line of the table."""
+    about = QUIRKS[quirk]
+    first = min(brought.named, key=lambda named: named.t, default=None)
+    cells = [f"`{quirk}`", ", ".join(map(str, about.algorithms))]
+    if first is None:
+        cells += ["no difference", "\u2013", "\u2013", str(brought.runs), "it did not come to it"]
+    else:
+        rightly = sum(_is_of(named.handler, quirk) for named in brought.named)
+        cells += [
+            f"`{first.handler}`",
+            f"{rightly} of {len(brought.named)}",
+            f"{first.t / 60:.1f}",
+            str(brought.runs),
+            shorten(first.difference, SHOWN, placeholder=" …").replace("|", "\\|"),
+        ]
+    return f"| {' | '.join(cells)} |\n"
+
+
+def _is_of(handler: str | None, quirk: str) -> bool:
+    return handler in HANDLERS and HANDLERS[handler].algorithm in QUIRKS[quirk].algorithms
+
+
+def main(names: Sequence[str]) -> None:
+    """Fly these quirks, or all if none is named; the rows of the others stay as they are."""
+    with sweep(list(names or QUIRKS), at_the_desk, JOBS, what="quirks", in_order=False) as outcomes:
+        for quirk, brought in outcomes:
+            if isinstance(brought, Failed):
+                sys.stderr.write(f"{quirk}: {brought.reason}\n")
+                continue
+            page = PAGE.read_text(encoding="utf-8")
+            rows = rows_of(page) | {quirk: row(quirk, brought)}
+            table = HEADER + "".join(rows[name] for name in QUIRKS if name in rows)
+            write_atomically(PAGE, put_between_markers(page, table))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,54 @@
+"""A wrong agent as a program: `python -m docs.generate.wrong_agents.quirky QUIRK MISSION_FILE`, or `QUIRK --virtual`.
+
+It is `python -m ucp.node` whose every mission asks for this quirk.
+"""
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from ucp import node, virtual
+from ucp.quirks import QUIRKS
+
+PROBABILITY = 0.2
+"""Of a quirk that strikes by chance."""
+
+
+def wrong(mission: dict[str, Any], quirk: str) -> dict[str, Any]:
+    """The mission, in which the agent is asked for the quirk."""
+    quirks = {**mission.get("quirks", {}), quirk: PROBABILITY if QUIRKS[quirk].chance else True}
+    features = list(dict.fromkeys([*mission.get("features", []), "quirks"]))
+    return {**mission, "quirks": quirks, "features": features}
+
+
+class _Lines:
+    """Standard input of an agent in virtual time, whose missions are made wrong."""
+
+    def __init__(self, quirk: str) -> None:
+        self._quirk = quirk
+
+    def readline(self, limit: int) -> bytes:
+        line = sys.stdin.buffer.readline(limit)
+        given = json.loads(line) if line else {}
+        if "mission" in given:
+            return json.dumps({**given, "mission": wrong(given["mission"], self._quirk)}).encode() + b"\n"
+        return line
+
+    def __iter__(self) -> Iterator[bytes]:
+        return iter(lambda: self.readline(virtual.MAX_LINE_BYTES), b"")
+
+
+def main(arguments: Sequence[str]) -> int:
+    quirk, mission_file = arguments
+    if mission_file == "--virtual":
+        virtual.serve(_Lines(quirk), sys.stdout.buffer)  # type: ignore[arg-type]  # all that it does is read lines
+        return 0
+    path = Path(mission_file)
+    path.write_text(json.dumps(wrong(json.loads(path.read_text(encoding="utf-8")), quirk)), encoding="utf-8")
+    return node.main([str(path)])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,59 @@
+"""One run of a swarm in virtual time, all of whose agents have one quirk, judged as any run is."""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from docs.generate.wrong_agents.quirky import PROBABILITY
+from harness.checker import Result
+from harness.checker.judgement import Judgement
+from harness.run.simulate import simulate
+from harness.scenario import Scenario, load_scenario
+from ucp.quirks import QUIRKS
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+MISSIONS = (
+    SCENARIOS / "loss_15.yaml",
+    SCENARIOS / "loss_25.yaml",
+    SCENARIOS / "partition_heal.yaml",
+    Path(__file__).parent / "busy.yaml",
+)
+"""Seed 1 plays the first, seed 2 the second, and so on, round and round."""
+
+_MOMENT = re.compile(r"\bt=(\d+(?:\.\d+)?) s")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """`bad`: numbers and keys of the judgements that are, with the mission second of their first piece of evidence.
+
+    The second is None where the evidence has no time. `named` is the handler that the step judge names first.
+    """
+
+    bad: dict[str, float | None]
+    named: str | None
+
+
+@cache
+def mission(seed: int) -> Scenario:
+    return load_scenario(MISSIONS[(seed - 1) % len(MISSIONS)])
+
+
+def play(quirk: str | None, seed: int) -> Trial:
+    """A run with this quirk; None plays the right agent."""
+    value = {quirk: PROBABILITY if QUIRKS[quirk].chance else True} if quirk else {}
+    return judged(simulate(mission(seed).model_copy(update={"quirks": value}), seed, tracing=True).result)
+
+
+def judged(result: Result) -> Trial:
+    deviations = result.beside["steps"].evidence
+    return Trial(
+        {key: first_s(result.judgements[key]) for key in result.bad}, deviations[0].handler if deviations else None
+    )
+
+
+def first_s(judgement: Judgement) -> float | None:
+    """The mission second of the earliest piece of evidence; None if no piece has one."""
+    moments = [float(moment) for finding in judgement.evidence for moment in _MOMENT.findall(finding.detail)[:1]]
+    return min(moments, default=None)

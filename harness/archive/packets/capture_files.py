@@ -1,0 +1,94 @@
+"""Finds captures and reads them together: those of one mission, on one clock."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from harness.archive.packets.capture_reader import Capture, Datagram
+from harness.errors import CaptureError, RunDirectoryError
+
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
+
+DIRECTORY = "capture"
+"""Of a run directory."""
+SUFFIXES = (".pcapng", ".pcap")
+
+
+class Clock(NamedTuple):
+    """Mission seconds: `epoch_ns` is second 0. `of_run` is false where no capture says so: then it is the first packet.
+
+    Captures from the field are as far apart as their vehicles' clocks.
+    """
+
+    epoch_ns: int
+    speedup: float
+    of_run: bool
+
+    def seconds(self, time_ns: int) -> float:
+        return (time_ns - self.epoch_ns) / 1e9 * self.speedup
+
+
+class Captures(NamedTuple):
+    """`errors` has a sentence for each file that could not be used."""
+
+    used: list[Capture]
+    datagrams: list[Datagram]
+    clock: Clock
+    errors: list[str]
+
+    @property
+    def problems(self) -> list[str]:
+        """A sentence for each thing that was wrong with a file that could be used."""
+        return [problem for capture in self.used for problem in capture.problems]
+
+
+def capture_files(paths: Iterable[Path]) -> list[Path]:
+    """The captures in run directories, in directories of captures, and those that are named themselves; each once.
+
+    Raises RunDirectoryError if a path does not exist, or a directory holds none.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inner = path / DIRECTORY
+            captures = [file for file in (inner if inner.is_dir() else path).iterdir() if file.suffix in SUFFIXES]
+            if not captures:
+                raise RunDirectoryError(f"{path}: holds no captures (*.pcapng): `ucp-harness run --capture` makes them")
+            files += sorted(captures, key=lambda file: (len(file.name), file.name))
+        elif path.exists():
+            files.append(path)
+        else:
+            raise RunDirectoryError(f"{path}: does not exist; give a run directory or captures (*.pcapng, *.pcap)")
+    return list({file.resolve(): file for file in files}.values())
+
+
+def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Captures:
+    """All captures of the mission of the first that names one; captures from the field may be of any.
+
+    `opener` opens what a secured mission sealed.
+    """
+    used: list[Capture] = []
+    errors: list[str] = []
+    datagrams: dict[bytes, Datagram] = {}
+    clock: Clock | None = None
+    for number, path in enumerate(paths):
+        capture = Capture(number, path)
+        try:
+            capture.read(datagrams, opener=opener)
+        except CaptureError as error:
+            errors.append(str(error))
+            continue
+        if capture.about is not None:
+            own = Clock(capture.about.epoch_us * 1000, capture.about.speedup, True)
+            if clock not in (None, own):
+                errors.append(f"{path}: of another run than the captures before it; look at each run by itself")
+                continue
+            clock = own
+        used.append(capture)
+    whose = {capture.vehicle for capture in used if capture.about}
+    for capture in used:
+        if not capture.about and capture.vehicle in whose:
+            capture.vehicle = None  # it speaks in the name of another
+    first_ns = min((capture.began_ns for capture in used if capture.began_ns is not None), default=0)
+    return Captures(used, list(datagrams.values()), clock or Clock(first_ns, 1.0, False), errors)

@@ -1,0 +1,190 @@
+"""Reads one capture, a listening point: what it saw of each datagram goes to those that it shares with the others.
+
+A vehicle's capture says whose it is in a comment (`ucp-harness run --capture`). One from the field is that of the
+vehicle whose datagrams leave it, else of the one in its name, `7.pcap`, else of no vehicle: a point that only listens.
+"""
+
+import hashlib
+from array import array
+from collections import Counter
+from collections.abc import Iterable
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import BaseModel, Field, ValidationError
+
+from harness.archive.exports import AgentId
+from harness.archive.packets.datagram import NotUcpError, unwrap
+from harness.archive.packets.message_summary import MessageSummary, summarize
+from harness.archive.packets.pcap import INBOUND, OUTBOUND, CaptureFile, Frame
+from ucp.block import MAX_AGENT_ID
+from ucp.messages import TYPE_CODES, MalformedDatagramError, decode
+from ucp.secure.envelope import REVOCATION, VERSION, read_clear
+
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
+
+SECURED = bytes([VERSION])
+NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
+_LAST_NS = 2**63 - 1
+
+Name = int | str
+"""Who listened: a vehicle's ID, or the name of a point that is no vehicle's."""
+
+
+class About(BaseModel):
+    """What a run's capture says of itself, as JSON in the comment of its section; `epoch_us` is mission second 0."""
+
+    ucp_harness: Literal[1]
+    vehicle: AgentId
+    epoch_us: Annotated[int, Field(ge=0, lt=2**63, strict=True)]
+    speedup: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Datagram:
+    """One datagram's bytes, wherever and how often they were seen: `seen` has a time in ns and a place by turns.
+
+    A place is the number of the capture and the frame's direction, in one number.
+    """
+
+    __slots__ = ("seen", "sender", "sequence", "summary")
+
+    def __init__(self, sender: int, sequence: int, summary: MessageSummary) -> None:
+        self.sender = sender
+        self.sequence = sequence
+        self.summary = summary
+        self.seen = array("q")
+
+    def sightings(self) -> Iterable[tuple[int, int, int]]:
+        """(time in ns, number of the capture, direction)."""
+        seen = self.seen
+        return ((seen[i], seen[i + 1] >> 2, seen[i + 1] & 3) for i in range(0, len(seen), 2))
+
+
+class Capture:
+    """One file, as read. It listened from `began_ns` to `ended_ns`; None if nothing says so.
+
+    `sees_itself`: it shows what leaves its vehicle, and not only what reaches it.
+    """
+
+    def __init__(self, number: int, path: Path) -> None:
+        self.number = number
+        self.path = path
+        self.about: About | None = None
+        self.vehicle: int | None = None
+        self.began_ns: int | None = None
+        self.ended_ns: int | None = None
+        self.sees_itself = False
+        self.frames = 0
+        self.dropped: int | None = None
+        self.not_ucp: Counter[str] = Counter()
+        self.malformed: Counter[str] = Counter()
+        self.problems: list[str] = []
+
+    @property
+    def name(self) -> Name:
+        return self.path.stem if self.vehicle is None else self.vehicle
+
+    def listening(self, time_ns: int) -> bool:
+        return self.began_ns is not None and self.ended_ns is not None and self.began_ns <= time_ns <= self.ended_ns
+
+    def read(
+        self, datagrams: dict[bytes, Datagram], most_frames: int | None = None, opener: "Opener | None" = None
+    ) -> None:
+        """Add what the file saw, or its first frames, to `datagrams`; what is sealed `opener` opens.
+
+        Raises CaptureError if it is no capture.
+        """
+        file = CaptureFile(self.path)
+        first_ns, last_ns = _LAST_NS, -1
+        sent_by: Counter[int] = Counter()
+        senders: set[int] = set()  # of datagrams whose direction the file does not say
+        frames = iter(file)
+        for frame in islice(frames, most_frames):
+            self.frames += 1
+            if not 0 <= frame.time_ns <= _LAST_NS:
+                self.not_ucp["at an impossible time"] += 1
+                continue
+            first_ns, last_ns = min(first_ns, frame.time_ns), max(last_ns, frame.time_ns)
+            try:
+                datagram, direction = _datagram(frame, datagrams, opener)
+            except NotUcpError as not_ucp:
+                self.not_ucp[not_ucp.reason] += 1
+            except MalformedDatagramError as malformed:
+                self.malformed[malformed.reason] += 1
+            else:
+                datagram.seen.append(frame.time_ns)
+                datagram.seen.append(self.number << 2 | direction)
+                if direction == OUTBOUND:
+                    sent_by[datagram.sender] += 1
+                elif not direction:
+                    senders.add(datagram.sender)
+        self.frames += sum(1 for _ in frames)
+        self._understand(file, sent_by)
+        self.sees_itself = self.about is not None or bool(sent_by) or self.vehicle in senders
+        epoch_ns = self.about.epoch_us * 1000 if self.about else first_ns
+        began_ns = min(first_ns, epoch_ns) if file.started_ns is None else file.started_ns
+        ended_ns = last_ns if file.ended_ns is None else max(last_ns, file.ended_ns)
+        if began_ns <= ended_ns:
+            self.began_ns, self.ended_ns = began_ns, ended_ns
+
+    def _understand(self, file: CaptureFile, sent_by: Counter[int]) -> None:
+        self.dropped = file.dropped
+        self.about = self._read_comment(file.comment)
+        if self.about:
+            self.vehicle = self.about.vehicle
+        elif sent_by:
+            self.vehicle = sent_by.most_common(1)[0][0]
+        elif self.path.stem.isdecimal() and 1 <= int(self.path.stem[:6]) <= MAX_AGENT_ID:
+            self.vehicle = int(self.path.stem)
+        if file.trouble:
+            self.problems.append(f"{self.path}: {file.trouble}")
+        if self.dropped:
+            self.problems.append(
+                f"{self.path}: frames that the capture itself missed, and that look like losses: {self.dropped}"
+            )
+        if cut := self.not_ucp["cut short by the capture"]:
+            self.problems.append(
+                f"{self.path}: frames that were cut short, and look like losses: {cut}; capture with -s 0"
+            )
+
+    def _read_comment(self, comment: bytes | None) -> About | None:
+        if comment is None or b'"ucp_harness"' not in comment:
+            return None
+        try:
+            return About.model_validate_json(comment)
+        except ValidationError:
+            self.problems.append(
+                f"{self.path}: its comment is damaged or of a newer version: read as one from the field"
+            )
+            return None
+
+    def direction(self, sender: int, direction: int) -> int:
+        """Of a datagram, where the file does not say: what names the vehicle itself as its sender leaves it."""
+        return direction or (OUTBOUND if sender == self.vehicle else INBOUND)
+
+
+def _plain(payload: bytes) -> Datagram:
+    sender, sequence, message = decode(payload)
+    return Datagram(sender, sequence, summarize(message))
+
+
+def _secured(payload: bytes, opener: "Opener | None") -> Datagram:
+    """Of what is sealed, who says it, when, and which message it is, are in the clear."""
+    clear = read_clear(payload)
+    if clear.type == REVOCATION:
+        raise NotUcpError("a revocation of keys")
+    if opener is not None:
+        sender, sequence, message = opener.open(payload).said
+        return Datagram(sender, sequence, summarize(message))
+    return Datagram(clear.sender, clear.sequence, MessageSummary(NAMES[clear.type], None, None))
+
+
+def _datagram(frame: Frame, datagrams: dict[bytes, Datagram], opener: "Opener | None") -> tuple[Datagram, int]:
+    payload, direction = unwrap(frame)
+    key = hashlib.blake2b(payload, digest_size=16).digest()
+    datagram = datagrams.get(key)
+    if datagram is None:
+        datagram = datagrams[key] = _secured(payload, opener) if payload[2:3] == SECURED else _plain(payload)
+    return datagram, direction

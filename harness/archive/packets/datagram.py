@@ -1,0 +1,93 @@
+"""From a frame to the UCP datagram in it: Ethernet and what tcpdump writes instead, IPv4, UDP.
+
+A frame that was damaged on its way is told by its checksums, as the receiver's kernel does, which drops it. A UDP
+checksum that holds no more than the sum of the addresses is one that the sender's kernel leaves to its network card,
+and in a private network there is none: that is a sound frame.
+
+Agents of a run listen on one port. In the field they may on another: what begins like a UCP message is taken for one.
+"""
+
+import struct
+
+from harness.archive.packets.pcap import OUTBOUND, Frame
+from ucp.messages import MAGIC, PORT
+
+_ETHERNET, _RAW_IP, _COOKED, _IPV4, _COOKED_2 = 1, 101, 113, 228, 276
+_ETHERTYPE_IPV4, _ETHERTYPES_VLAN = 0x0800, (0x8100, 0x88A8)
+_ETHERTYPES = {0x0806: "ARP", 0x86DD: "IPv6", 0x888E: "EAPOL"}
+_PROTOCOLS = {1: "ICMP", 2: "IGMP", 6: "TCP"}
+_UDP = 17
+_OUTGOING = 4
+"""The packet type of tcpdump's cooked headers for what the host itself sent."""
+_ENDS = struct.Struct("!4H")
+
+
+class NotUcpError(ValueError):
+    """There is no sound UCP datagram in this frame. `reason` is one of a few words, for counting."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+def unwrap(frame: Frame) -> tuple[bytes, int]:
+    """(UDP payload, direction). Raises NotUcpError for a frame that carries none, or that was cut or damaged."""
+    ethertype, packet, direction = _network_layer(frame)
+    if ethertype != _ETHERTYPE_IPV4:
+        raise NotUcpError(_ETHERTYPES.get(ethertype, "neither IPv4 nor IPv6"))
+    if len(packet) < 20 or packet[0] >> 4 != 4:
+        raise NotUcpError("damaged")
+    header = 4 * (packet[0] & 15)
+    total = int.from_bytes(packet[2:4], "big")
+    if header < 20 or total < header:
+        raise NotUcpError("damaged")
+    if total > len(packet):
+        raise NotUcpError("cut short by the capture" if frame.length > len(frame.data) else "damaged")
+    if _sum(packet[:header]):
+        raise NotUcpError("damaged")
+    if packet[9] != _UDP:
+        raise NotUcpError(_PROTOCOLS.get(packet[9], "another protocol on IPv4"))
+    if int.from_bytes(packet[6:8], "big") & 0x3FFF:
+        raise NotUcpError("IP fragment")
+    return _udp(packet[12:20], packet[header:total]), direction
+
+
+def _network_layer(frame: Frame) -> tuple[int, bytes, int]:
+    """(Ethertype, packet, direction)."""
+    data, link_type, direction = frame.data, frame.link_type, frame.direction
+    if link_type == _ETHERNET:
+        start = 14
+        ethertype = int.from_bytes(data[12:14], "big")
+        while ethertype in _ETHERTYPES_VLAN:
+            ethertype = int.from_bytes(data[start + 2 : start + 4], "big")
+            start += 4
+        return ethertype, data[start:], direction
+    if link_type in (_RAW_IP, _IPV4):
+        return (_ETHERTYPE_IPV4 if data[:1] < b"\x60" else 0x86DD), data, direction
+    if link_type == _COOKED and len(data) >= 16:
+        outgoing, ethertype, start = int.from_bytes(data[:2], "big"), int.from_bytes(data[14:16], "big"), 16
+    elif link_type == _COOKED_2 and len(data) >= 20:
+        outgoing, ethertype, start = data[10], int.from_bytes(data[:2], "big"), 20
+    else:
+        raise NotUcpError("of another kind of link")
+    return ethertype, data[start:], OUTBOUND if outgoing == _OUTGOING else direction
+
+
+def _udp(addresses: bytes, segment: bytes) -> bytes:
+    if len(segment) < 8:
+        raise NotUcpError("damaged")
+    _, port, length, checksum = _ENDS.unpack_from(segment)
+    payload = segment[8:length]
+    if port != PORT and payload[:2] != MAGIC:
+        raise NotUcpError("UDP to other ports")
+    if not 8 <= length <= len(segment):
+        raise NotUcpError("damaged")
+    pseudo_header = addresses + bytes([0, _UDP]) + segment[4:6]
+    if checksum and _sum(pseudo_header + segment[:length]) and _sum(pseudo_header) != checksum % 0xFFFF:
+        raise NotUcpError("damaged")
+    return payload
+
+
+def _sum(data: bytes) -> int:
+    """The Internet checksum's sum of 16-bit words (RFC 1071), 0 if it fits: in ones' complement a remainder."""
+    return int.from_bytes(data + b"\0" if len(data) % 2 else data, "big") % 0xFFFF

@@ -1,0 +1,80 @@
+"""Which response answers which request, and what became of each request at each vehicle.
+
+Responses are broadcast and do not name the asker. But an agent answers what reaches it at once or never, and in order:
+so, from the last response back to the first, each answers the last request on its subject that reached the responder
+before it, and that no later response answers.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
+
+from harness.archive.packets.capture_reader import Name
+from harness.archive.packets.transmissions import Transmission
+
+Outcome = Literal["answered", "response lost", "request lost", "no answer"]
+Subject = tuple[str, bytes | None]
+_Asked = tuple[float, int]
+"""When, and the number of the request."""
+
+
+class Answer(NamedTuple):
+    """What came of a request at one vehicle: `response` is its first answer, if it gave one.
+
+    It is "answered" unless the response is known to be lost to the asker.
+    """
+
+    by: int
+    outcome: Outcome
+    response: Transmission | None = None
+
+
+class Exchanges:
+    def __init__(self, transmissions: Sequence[Transmission]) -> None:
+        self._responses: dict[int, list[Transmission]] = {}
+        for request, response in sorted(_match(transmissions), key=lambda pair: pair[1].number):
+            self._responses.setdefault(request.number, []).append(response)
+
+    def responses(self, request: Transmission) -> Sequence[Transmission]:
+        """In the order of sending."""
+        return self._responses.get(request.number, ())
+
+    def answers(self, request: Transmission) -> list[Answer]:
+        """What came of a request at each vehicle that it reached or should have reached."""
+        first: dict[int, Transmission] = {}
+        for response in self.responses(request):
+            first.setdefault(response.sender, response)
+        answers = [
+            Answer(name, "response lost" if request.sender in response.lost_by else "answered", response)
+            for name, response in first.items()
+        ]
+        silent = {name for name in request.reached if name != request.sender} - first.keys()
+        answers += [Answer(name, "no answer") for name in silent if isinstance(name, int)]
+        answers += [
+            Answer(name, "request lost") for name in request.lost_by if isinstance(name, int) and name not in first
+        ]
+        return sorted(answers)
+
+
+def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission, Transmission]]:
+    """(request, response). A forged response is nobody's answer."""
+    asked: dict[Subject, list[_Asked]] = {}
+    reached: dict[tuple[Name, Subject], list[_Asked]] = {}
+    sent: dict[tuple[Name, Subject], list[Transmission]] = {}
+    for transmission in transmissions:
+        if subject := transmission.summary.asks:
+            asked.setdefault(subject, []).append((transmission.at_s, transmission.number))
+            for reception in transmission.received:
+                arrivals = [(reception.at_s, transmission.number)] * reception.copies
+                arrivals[-1] = reception.last_s, transmission.number
+                reached.setdefault((reception.by, subject), []).extend(arrivals)
+        elif (subject := transmission.summary.answers) and transmission.origin != "forged":
+            sent.setdefault((transmission.sender, subject), []).append(transmission)
+    for (name, subject), responses in sent.items():
+        # Where it is not known what reached the responder, all that others asked may have.
+        others = (what for what in asked.get(subject, ()) if transmissions[what[1]].sender != name)
+        waiting = sorted(reached.get((name, subject)) or others)
+        for response in reversed(responses):
+            while waiting and waiting[-1][0] > response.at_s:
+                waiting.pop()
+            if waiting:
+                yield transmissions[waiting.pop()[1]], response

@@ -1,0 +1,167 @@
+"""What `ucp-harness packets --json` prints, schema `ucp-packets/1`. Keys are added, never removed or renamed."""
+
+import json
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.archive.packets.air_names import Names
+from harness.archive.packets.capture_files import Captures, Clock
+from harness.archive.packets.capture_reader import Capture, Name
+from harness.archive.packets.exchanges import Exchanges, Outcome
+from harness.archive.packets.loss_table import Pair
+from harness.archive.packets.transmissions import Origin, Transmission
+
+SCHEMA = "ucp-packets/1"
+
+_WhoListened = Annotated[Name, Field(description="A vehicle's ID, or the name of a point that is no vehicle's.")]
+
+
+class CaptureRecord(BaseModel):
+    """One file. It listened from `began_s` to `ended_s`, null if it saw nothing, and missed `dropped` frames."""
+
+    file: str
+    vehicle: int | None
+    began_s: float | None
+    ended_s: float | None
+    frames: int
+    dropped: int | None
+    not_ucp: dict[str, int]
+    malformed: dict[str, int]
+    problems: list[str]
+
+
+class PairRecord(BaseModel):
+    """Of `sent` datagrams that the receiver should have heard, `lost` never reached it."""
+
+    sender: int
+    receiver: _WhoListened
+    sent: int
+    lost: int
+
+
+class ReceptionRecord(BaseModel):
+    """`copies` reached a listener, the last at `last_s`."""
+
+    by: _WhoListened
+    at_s: float
+    copies: int
+    last_s: float
+
+
+class AnswerRecord(BaseModel):
+    """What came of a request at vehicle `by`: its answer, if it gave one, and the number of the datagram."""
+
+    by: int
+    outcome: Outcome
+    answer: str | None
+    response: int | None
+
+
+class DatagramRecord(BaseModel):
+    """A datagram, sent once. `number` counts in the order of sending; `answers` is null for what is no request.
+
+    `origin` is captured (seen leaving its sender), inferred (its sender was not captured then: `at_s` is when it first
+    reached somebody) or forged (not sent by the agent that it names). `lost_by` listened and did not receive it;
+    `not_listening` had no capture running.
+    """
+
+    number: int
+    at_s: float
+    sender: int
+    sequence: int
+    message: str
+    block: str | None
+    block_hash: str | None
+    chain_hash: str | None
+    answer: str | None
+    origin: Origin
+    seen_leaving: _WhoListened | None
+    received: list[ReceptionRecord]
+    lost_by: list[_WhoListened]
+    not_listening: list[_WhoListened]
+    answers: list[AnswerRecord] | None
+
+
+class PacketsRecord(BaseModel):
+    """Times are mission seconds; second 0 is `epoch_us`, the first packet if `captures` are not of a run."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    schema_: Annotated[Literal["ucp-packets/1"], Field(alias="schema")] = "ucp-packets/1"
+    epoch_us: int
+    speedup: float
+    of_run: bool
+    captures: list[CaptureRecord]
+    losses: list[PairRecord]
+    errors: list[str]
+    datagrams: list[DatagramRecord]
+
+
+def document(
+    captures: Captures, pairs: Iterable[Pair], shown: Iterable[Transmission], exchanges: Exchanges, names: Names
+) -> Iterator[str]:
+    """The lines of one JSON document, each datagram a line."""
+    clock = captures.clock
+    record = PacketsRecord(
+        epoch_us=clock.epoch_ns // 1000,
+        speedup=clock.speedup,
+        of_run=clock.of_run,
+        captures=[_capture(capture, clock) for capture in captures.used],
+        losses=[PairRecord(**pair._asdict()) for pair in pairs],
+        errors=captures.errors,
+        datagrams=[],
+    )
+    whole = record.model_dump(mode="json", by_alias=True)
+    del whole["datagrams"]
+    yield json.dumps(whole)[:-1] + ', "datagrams": ['
+    separator = ""
+    for transmission in shown:
+        yield separator + _datagram(transmission, exchanges, names).model_dump_json()
+        separator = ","
+    yield "]}"
+
+
+def _capture(capture: Capture, clock: Clock) -> CaptureRecord:
+    return CaptureRecord(
+        file=str(capture.path),
+        vehicle=capture.vehicle,
+        began_s=None if capture.began_ns is None else clock.seconds(capture.began_ns),
+        ended_s=None if capture.ended_ns is None else clock.seconds(capture.ended_ns),
+        frames=capture.frames,
+        dropped=capture.dropped,
+        not_ucp=dict(capture.not_ucp),
+        malformed=dict(capture.malformed),
+        problems=capture.problems,
+    )
+
+
+def _datagram(transmission: Transmission, exchanges: Exchanges, names: Names) -> DatagramRecord:
+    summary = transmission.summary
+    answers = [
+        AnswerRecord(
+            by=answer.by,
+            outcome=answer.outcome,
+            answer=answer.response.summary.answer if answer.response else None,
+            response=answer.response.number if answer.response else None,
+        )
+        for answer in exchanges.answers(transmission)
+    ]
+    return DatagramRecord(
+        number=transmission.number,
+        at_s=transmission.at_s,
+        sender=transmission.sender,
+        sequence=transmission.sequence,
+        message=summary.message,
+        block=None if summary.block_hash is None else names.known(summary.block_hash),
+        block_hash=None if summary.block_hash is None else summary.block_hash.hex(),
+        chain_hash=None if summary.chain_hash is None else summary.chain_hash.hex(),
+        answer=summary.answer,
+        origin=transmission.origin,
+        seen_leaving=transmission.seen_leaving,
+        received=[ReceptionRecord(**reception._asdict()) for reception in transmission.received],
+        lost_by=list(transmission.lost_by),
+        not_listening=list(transmission.absent),
+        answers=answers if summary.asks else None,
+    )

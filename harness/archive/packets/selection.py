@@ -1,0 +1,47 @@
+"""Which transmissions somebody wants to see."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from harness.archive.packets.capture_files import Captures
+from harness.archive.packets.transmissions import Transmission
+from harness.errors import CaptureError
+from ucp.messages import TYPE_CODES
+
+MESSAGES = [message.NAME for message in TYPE_CODES]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """None selects all; `message` is a message's name, in any case. Raises CaptureError for what there cannot be."""
+
+    sender: int | None = None
+    receiver: int | None = None
+    message: str | None = None
+    between_s: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.message is not None and self.message.lower() not in map(str.lower, MESSAGES):
+            raise CaptureError(f"--message {self.message}: there is no such message; there are {', '.join(MESSAGES)}")
+        if self.between_s is not None and not self.between_s[0] <= self.between_s[1]:
+            raise CaptureError("--between {:g} {:g}: the first second is not before the last".format(*self.between_s))
+
+    def of(self, transmissions: Iterable[Transmission], captures: Captures) -> Iterator[Transmission]:
+        """Those that fit; with a receiver, only as far as they concern it. Raises CaptureError if it has no capture."""
+        vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
+        if self.receiver is not None and self.receiver not in vehicles:
+            known = f"captures are of {', '.join(map(str, vehicles))}" if vehicles else "nor of any other vehicle"
+            raise CaptureError(f"--to {self.receiver}: there is no capture of that vehicle; {known}")
+        for transmission in transmissions:
+            if self._fits(transmission):
+                if self.receiver is None:
+                    yield transmission
+                elif self.receiver in (towards := transmission.towards(self.receiver)).reached or towards.lost_by:
+                    yield towards
+
+    def _fits(self, transmission: Transmission) -> bool:
+        return (
+            (self.sender is None or transmission.sender == self.sender)
+            and (self.message is None or transmission.summary.message.lower() == self.message.lower())
+            and (self.between_s is None or self.between_s[0] <= transmission.at_s <= self.between_s[1])
+        )

@@ -1,0 +1,133 @@
+"""What was sent, and who received it: the sightings of all captures, put together.
+
+A datagram is known by its bytes. An agent that starts anew may send the very same again, so each sighting elsewhere
+belongs to the last time before it that the datagram was sent. Where a capture of its sender was listening and did not
+see it leave, somebody else sent it.
+"""
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Literal, NamedTuple
+
+from harness.archive.packets.capture_files import Captures, Clock
+from harness.archive.packets.capture_reader import Capture, Datagram, Name
+from harness.archive.packets.message_summary import MessageSummary
+from harness.archive.packets.pcap import OUTBOUND
+
+Origin = Literal["captured", "inferred", "forged"]
+"""Seen leaving its sender; or its sender was not captured then, and `at_s` is when it first reached somebody; or not
+sent by the agent that it names."""
+
+
+class Reception(NamedTuple):
+    """`copies` reached a listener, the last at `last_s`; mission seconds."""
+
+    by: Name
+    at_s: float
+    copies: int = 1
+    last_s: float = 0.0
+
+
+class Transmission(NamedTuple):
+    """A datagram sent once, at mission second `at_s`; `number` counts from 0 in the order of sending.
+
+    `seen_leaving` is the listener whose capture saw it leave. `lost_by` listened and did not receive it; `absent` were
+    not listening then, or no longer, so that nobody knows.
+    """
+
+    number: int
+    at_s: float
+    sender: int
+    sequence: int
+    summary: MessageSummary
+    origin: Origin
+    seen_leaving: Name | None
+    received: tuple[Reception, ...]
+    lost_by: tuple[Name, ...]
+    absent: tuple[Name, ...]
+
+    @property
+    def reached(self) -> list[Name]:
+        return [reception.by for reception in self.received]
+
+    def towards(self, receiver: Name) -> "Transmission":
+        """The same, as far as it concerns one receiver."""
+        return self._replace(
+            received=tuple(reception for reception in self.received if reception.by == receiver),
+            lost_by=tuple(name for name in self.lost_by if name == receiver),
+            absent=tuple(name for name in self.absent if name == receiver),
+        )
+
+
+class _Listeners:
+    """Who listened, and when. A listener may have left several captures."""
+
+    def __init__(self, captures: Iterable[Capture]) -> None:
+        self._of: dict[Name, list[Capture]] = {}
+        for capture in captures:
+            self._of.setdefault(capture.name, []).append(capture)
+        self.names = sorted(self._of, key=lambda name: (isinstance(name, str), name))
+
+    def listening(self, name: Name, time_ns: int) -> bool:
+        return any(capture.listening(time_ns) for capture in self._of.get(name, ()))
+
+    def would_have_seen_leave(self, sender: Name, time_ns: int) -> bool:
+        """Not if its captures show only what reaches it, or missed frames."""
+        captures = self._of.get(sender, ())
+        sound = any(capture.sees_itself for capture in captures) and not any(capture.dropped for capture in captures)
+        return sound and self.listening(sender, time_ns)
+
+
+def join(captures: Captures) -> list[Transmission]:
+    """All transmissions, in the order of sending."""
+    by_number = {capture.number: capture for capture in captures.used}
+    listeners = _Listeners(captures.used)
+    transmissions = [
+        transmission
+        for datagram in captures.datagrams
+        for transmission in _of(datagram, by_number, listeners, captures.clock)
+    ]
+    transmissions.sort(key=lambda transmission: (transmission.at_s, transmission.sender, transmission.sequence))
+    return [transmission._replace(number=number) for number, transmission in enumerate(transmissions)]
+
+
+def _of(
+    datagram: Datagram, captures: Mapping[int, Capture], listeners: _Listeners, clock: Clock
+) -> Iterator[Transmission]:
+    left: list[tuple[int, Name]] = []
+    arrived: list[tuple[int, Name]] = []
+    for time_ns, number, direction in sorted(datagram.sightings()):
+        if capture := captures.get(number):
+            leaving = capture.direction(datagram.sender, direction) == OUTBOUND
+            (left if leaving else arrived).append((time_ns, capture.name))
+    times = [time_ns for time_ns, _ in left or arrived[:1]]
+    arrivals: list[dict[Name, list[int]]] = [{} for _ in times]
+    for time_ns, name in arrived:
+        arrivals[max(0, bisect_right(times, time_ns) - 1)].setdefault(name, []).append(time_ns)
+    for index, (time_ns, reached) in enumerate(zip(times, arrivals, strict=True)):
+        seen_leaving = left[index][1] if left else None
+        missing = [
+            name for name in listeners.names if name not in reached and name not in (datagram.sender, seen_leaving)
+        ]
+        yield Transmission(
+            number=0,
+            at_s=clock.seconds(time_ns),
+            sender=datagram.sender,
+            sequence=datagram.sequence,
+            summary=datagram.summary,
+            origin=_origin(datagram.sender, seen_leaving, listeners.would_have_seen_leave(datagram.sender, time_ns)),
+            seen_leaving=seen_leaving,
+            received=tuple(
+                Reception(name, clock.seconds(reached[name][0]), len(reached[name]), clock.seconds(reached[name][-1]))
+                for name in listeners.names
+                if name in reached
+            ),
+            lost_by=tuple(name for name in missing if listeners.listening(name, time_ns)),
+            absent=tuple(name for name in missing if not listeners.listening(name, time_ns)),
+        )
+
+
+def _origin(sender: int, seen_leaving: Name | None, would_have_been_seen: bool) -> Origin:
+    if seen_leaving == sender:
+        return "captured"
+    return "forged" if seen_leaving is not None or would_have_been_seen else "inferred"

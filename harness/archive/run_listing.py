@@ -1,0 +1,40 @@
+"""The runs in a folder, the newest first."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from heapq import nlargest
+from pathlib import Path
+
+from harness.archive.exports import RUN_FILE
+from harness.archive.record_file import read_record
+from harness.archive.run_record import RunRecord
+from harness.errors import RunDirectoryError
+
+RUNS = Path("runs")
+"""Where runs are that were given no directory."""
+
+
+@dataclass(frozen=True)
+class PastRun:
+    """A run directory, and what can be read of its record; `problem` is a sentence if nothing can."""
+
+    path: Path
+    record: RunRecord
+    problem: str | None
+
+    @property
+    def report(self) -> Path:
+        return self.path / "report.html"
+
+
+def past_runs(folder: Path, most: int) -> Iterator[PastRun]:
+    """So many of the newest, by when their records were written last. Raises RunDirectoryError if it is no folder."""
+    try:
+        written = [(path.stat().st_mtime_ns, path) for path in folder.glob(f"*/{RUN_FILE}")]
+    except OSError as error:
+        raise RunDirectoryError(f"{folder} cannot be read: {error.strerror}") from None
+    if not folder.is_dir():
+        raise RunDirectoryError(f"{folder} is not there: `ucp-harness run` makes it, or name the folder of your runs")
+    for _, path in nlargest(most, written):
+        file = read_record(path)
+        yield PastRun(path.parent, file.record, str(file.error) if file.error else None)

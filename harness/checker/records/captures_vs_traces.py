@@ -1,0 +1,106 @@
+"""What crossed the air against the traces: captures of every vehicle, and what the kernel counted on the way.
+
+A message is in its agent's trace before it is sent, and an agent that was killed in between has not sent it.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+
+from harness.archive.packets.capture_files import Captures
+from harness.archive.packets.pcap import INBOUND, OUTBOUND
+from harness.checker.evidence import Evidence
+from harness.checker.judgement import times
+from harness.checker.records.clock_tolerance import slack_s
+from harness.checker.records.contradiction import Contradiction, of_agent
+
+COUNTS_DATAGRAMS = "nftables"
+"""The engine whose counters are of what was broadcast; others also count what they doubled."""
+
+Datagrams = Counter[tuple[object, object]]
+"""How often which sender's sequence number was seen."""
+
+
+def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
+    """A whole capture has what its vehicle's trace says was sent and handled, and nothing else of that vehicle."""
+    captures = evidence.captures
+    if captures is None:
+        return
+    left, reached = _seen(captures)
+    for capture in captures.used:
+        agent_id = capture.vehicle
+        trace = evidence.traces.get(agent_id) if agent_id is not None else None
+        if agent_id is None or trace is None or trace.problem or capture.about is None:
+            continue
+        if capture.dropped != 0 or capture.problems:
+            continue  # only a whole capture can be held against anything
+        sent: Datagrams = Counter((agent_id, message.seq) for run in trace.runs for message in run.sent)
+        unsent = sum((sent - left[agent_id]).values()) - _not_sent(evidence, agent_id)
+        if unsent > 0:
+            detail = (
+                f"{times(unsent)} its trace says that it sent a message, which its vehicle's capture did not see leave"
+            )
+            yield of_agent(agent_id, detail, "1")
+        if untold := sum((left[agent_id] - sent).values()):
+            detail = f"{times(untold)} its vehicle's capture saw a message leave that its trace does not tell of"
+            yield of_agent(agent_id, detail, "1", short=True)
+        heard = {(run.trigger.get("from"), run.trigger["seq"]) for run in trace.runs if "seq" in run.trigger}
+        if unheard := len(heard - reached[agent_id].keys()):
+            detail = f"{times(unheard)} it handled a message that its vehicle's capture did not see arrive"
+            yield of_agent(agent_id, detail, "1")
+
+
+def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams]]:
+    """What left each vehicle and what reached it."""
+    left: dict[int, Datagrams] = defaultdict(Counter)
+    reached: dict[int, Datagrams] = defaultdict(Counter)
+    by_number = {capture.number: capture for capture in captures.used}
+    for datagram in captures.datagrams:
+        for _, place, seen in datagram.sightings():
+            capture = by_number.get(place)
+            if capture is None or capture.vehicle is None:
+                continue
+            direction = capture.direction(datagram.sender, seen)
+            if direction == OUTBOUND and datagram.sender == capture.vehicle:
+                left[capture.vehicle][datagram.sender, datagram.sequence] += 1
+            elif direction == INBOUND:
+                reached[capture.vehicle][datagram.sender, datagram.sequence] += 1
+    return left, reached
+
+
+def _not_sent(evidence: Evidence, agent_id: int) -> int:
+    """How many messages of its trace an agent may not have sent: the radio refused them, or it was killed before."""
+    recorded = evidence.recorded(agent_id)
+    lives = evidence.lives[agent_id]
+    killed = lives if recorded is None or recorded.outcome != "exported" else lives[:-1]
+    last = sum(len(run.sent) for life in killed for run in life.runs if run.t == life.runs[-1].t)
+    return last + ((recorded.send_failures or 0) if recorded else 0)
+
+
+def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
+    """As many datagrams were on their way to each vehicle as the others sent, and as many got there as it handled."""
+    record = evidence.record
+    if record is None or record.engine != COUNTS_DATAGRAMS or record.mission_s is None:
+        return
+    if set(record.roster) - set(evidence.traces):
+        return  # nobody knows how much the others sent
+    sent = {agent_id: _sent_by(evidence, agent_id, record.mission_s) for agent_id in evidence.traces}
+    for agent_id, trace in evidence.traces.items():
+        counted = record.counters.receivers.get(str(agent_id)) if record.counters else None
+        if counted is None or counted.passed is None or counted.lost is None or counted.cut is None:
+            continue
+        by = record.mission_s - slack_s(trace)
+        heard = sum("seq" in run.trigger for run in trace.runs if run.t < by)
+        if heard > counted.passed:
+            detail = f"it handled {heard} messages, and the kernel let {counted.passed} through to its vehicle"
+            yield of_agent(agent_id, detail, "1")
+        on_the_way = sum(messages for sender, messages in sent.items() if sender != agent_id)
+        if on_the_way > (told_of := counted.passed + counted.lost + counted.cut):
+            detail = f"the others sent {on_the_way} messages, and on the way to its vehicle the kernel counted "
+            yield of_agent(agent_id, f"{detail}{told_of}", "1")
+
+
+def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:
+    """How many messages an agent has sent, at least, when the kernel's counters were read."""
+    trace = evidence.traces[agent_id]
+    by = mission_s - slack_s(trace)
+    return sum(len(run.sent) for run in trace.runs if run.t < by) - _not_sent(evidence, agent_id)

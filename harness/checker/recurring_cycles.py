@@ -1,0 +1,262 @@
+"""What agents that never finish go round in: as virtual time has shown it, or as it shows in their traces.
+
+A trace shows a cycle where it ends in the same handler runs several times in a row, each time with the same chain and
+as many blocks aside; and a standstill where an agent that is not idle has run nothing for longer than its timers take.
+Agents that only have a lot left to do are in neither: their chains change.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from harness.archive.run_record import Cycle, CycleStep, CycleWait
+from harness.archive.traces import Trace
+from harness.checker.judgement import MAX_EVIDENCE, Finding, agents
+from harness.checker.waiting import ALL_TIMERS, longest
+from ucp.trace import HandlerRun
+
+if TYPE_CHECKING:
+    from harness.checker.evidence import Evidence
+
+SEVERAL = 5
+"""So often in a row is no coincidence."""
+LAST_RUNS = 20_000
+"""In so many handler runs of an agent, its last, a cycle is looked for."""
+COUNTED = {
+    "receive_phase_1_response": ("yes", "no"),
+    "receive_response_next_in_sequence": ("new candidate", "counted"),
+}
+"""Handler of an answer in a reconcile -> the branches in which the answer counts."""
+ALREADY = "already in progress"
+"""Branch of Algorithm 7 in an agent that reconciles as it is."""
+REFUSED = ("receive_vote_add_block", "no")
+ASKS = ("reconcile_phase_1", "reconcile_phase_2")
+MAX_NAMED = 10
+PERIOD_TOLERANCE_S = 0.01
+SHORTEST_PAUSE_S = 0.05
+"""What follows sooner follows at once, for people."""
+
+
+def cycle_of(evidence: "Evidence") -> Cycle | None:
+    """What agents go round in, some of which are not idle at the end; None if that is not shown."""
+    busy = evidence.busy
+    if not busy:
+        return None
+    recorded = evidence.record.cycle if evidence.record else None
+    if recorded is not None and not recorded.proven:
+        recorded = None  # that was found in the traces, where it must be found again
+    if recorded is not None and recorded.period_s is None:
+        return recorded.model_copy(update={"since_s": _last_ran_s(evidence, recorded)})
+    traced = _in_traces(evidence, busy, times=2 if recorded else SEVERAL)
+    if recorded is None or traced is None or recorded.period_s is None or traced.period_s is None:
+        return recorded or traced
+    if abs(traced.period_s - recorded.period_s) > PERIOD_TOLERANCE_S:
+        return recorded
+    return recorded.model_copy(
+        update={"since_s": traced.since_s, "periods": traced.periods, "steps": traced.steps, "waits": traced.waits}
+    )
+
+
+def _last_ran_s(evidence: "Evidence", standstill: Cycle) -> float:
+    """When the last of the agents that hang ran anything of its own."""
+    traces = [evidence.traces.get(agent_id) for agent_id in standstill.agents]
+    ran_at = [runs[-1].t for trace in traces if trace is not None and (runs := _own_runs(trace))]
+    return max(ran_at) if len(ran_at) == len(traces) else standstill.since_s
+
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """One agent's part: its runs, once round, since when it goes round, and how often it has."""
+
+    runs: list[HandlerRun]
+    since_s: float
+    period_s: float
+    times: int
+
+
+def _in_traces(evidence: "Evidence", busy: Sequence[int], times: int) -> Cycle | None:
+    rounds: dict[int, _Round] = {}
+    since_s, ended_at_s, connected_s = 0.0, evidence.ended_at_s, evidence.connected_since_s
+    if ended_at_s is None or connected_s is None:
+        return None
+    for agent_id, trace in evidence.traces.items():
+        runs = _own_runs(trace)
+        is_busy, going_round = agent_id in busy, _round(runs, times)
+        quiet_s = ended_at_s - runs[-1].t if runs else 0.0
+        if not runs or (not is_busy and (going_round is None or quiet_s > going_round.period_s)):
+            since_s = max(since_s, trace.chain_changed_at())
+        elif is_busy and quiet_s > longest(trace, ALL_TIMERS):
+            since_s = max(since_s, runs[-1].t)
+        elif going_round is not None:  # also one that happens to be idle at the end: others have it reconcile
+            rounds[agent_id] = going_round
+            since_s = max(since_s, going_round.since_s)
+        else:
+            return None
+    if not set(busy) <= set(evidence.traces):
+        return None
+    if rounds.keys().isdisjoint(busy):
+        return Cycle(since_s=since_s, agents=list(busy))
+    period_s = max(each.period_s for each in rounds.values())
+    from_s = max(since_s, connected_s)
+    seen = min(min(each.times, int((each.runs[-1].t - from_s) / each.period_s) + 1) for each in rounds.values())
+    if seen < times:
+        return None
+    begin_s = min(each.runs[0].t for each in rounds.values())
+    return Cycle(
+        since_s=round(since_s, 3),
+        period_s=round(period_s, 3),
+        periods=seen,
+        agents=sorted({*busy, *rounds}),
+        steps=sorted(
+            (
+                CycleStep(agent_id=agent_id, after_s=round(run.t - begin_s, 3), handler=run.handler, branch=run.branch)
+                for agent_id, each in rounds.items()
+                for run in each.runs
+            ),
+            key=lambda step: step.after_s,
+        ),
+        waits=list(_waits(evidence, rounds, period_s)),
+    )
+
+
+def _own_runs(trace: Trace) -> list[HandlerRun]:
+    """The last runs with which the agent went on or that changed something, in its last life."""
+    start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
+    runs = (run for run in trace.runs[start:] if "message" not in run.trigger or run.changes)
+    return [run for run in runs if run.branch != ALREADY]
+
+
+def _round(runs: Sequence[HandlerRun], times: int) -> _Round | None:
+    """The shortest round in which `runs` end so many times in a row."""
+    keys = [_key(run) for run in reversed(runs)]
+    for length, matching in enumerate(_matches(keys)):
+        if length and length + matching >= times * length:
+            going_round = length + matching
+            period_s = runs[-1].t - runs[-1 - length].t
+            if period_s > 0:
+                return _Round(list(runs[-length:]), runs[-going_round].t, period_s, going_round // length)
+    return None
+
+
+def _key(run: HandlerRun) -> tuple[object, ...]:
+    state = run.state
+    return run.handler, run.branch, state.top, state.chain, state.deque, state.stack, state.reconciling
+
+
+def _matches(keys: Sequence[object]) -> list[int]:
+    """For each place how many keys from there on are those from the first on (the Z-function)."""
+    matching = [0] * len(keys)
+    left = right = 0
+    for place in range(1, len(keys)):
+        length = min(right - place, matching[place - left]) if place < right else 0
+        while place + length < len(keys) and keys[length] == keys[place + length]:
+            length += 1
+        matching[place] = length
+        if place + length > right:
+            left, right = place, place + length
+    return matching
+
+
+def _waits(evidence: "Evidence", rounds: dict[int, _Round], period_s: float) -> Iterator[CycleWait]:
+    """Whom each agent asks in its reconciles without ever counting an answer, and who refuses it, in the last round."""
+    for agent_id, each in rounds.items():
+        heard, refused_by = set[int](), set[int]()
+        for run in reversed(evidence.traces[agent_id].runs):
+            if run.t < each.runs[-1].t - period_s:
+                break
+            if run.branch in COUNTED.get(run.handler, ()):
+                heard.add(int(run.trigger["from"]))
+            elif (run.handler, run.branch) == REFUSED:
+                refused_by.add(int(run.trigger["from"]))
+        asks = any(run.handler in ASKS for run in each.runs)
+        silent = set(evidence.exports) - heard - {agent_id} if asks else set()
+        if silent or refused_by:
+            yield CycleWait(agent_id=agent_id, for_agents=sorted(silent), refused_by=sorted(refused_by))
+
+
+# In words
+
+
+def in_short(cycle: Cycle) -> str:
+    """Who never finishes, and since when."""
+    many = len(cycle.agents) > 1
+    goes = f"go{'' if many else 'es'} round in circles" if cycle.period_s is not None else f"hang{'' if many else 's'}"
+    return f"{named(cycle.agents)} {goes} since {cycle.since_s:.0f} s"
+
+
+def in_words(cycle: Cycle) -> str:
+    """Who goes round since when, what shows it, and who waits for whom."""
+    if cycle.period_s is None:
+        return f"{in_short(cycle)}: not idle, and no timer runs that would end that"
+    every = f"every {cycle.period_s:.4g} s"
+    shown = (
+        f"the global state recurs {every}, and nothing is left to chance"
+        if cycle.proven
+        else f"the same handler runs follow each other {every}, {cycle.periods} times in a row"
+    )
+    return "; ".join([f"{in_short(cycle)}: {shown}", *_waits_in_words(cycle.waits)])
+
+
+def _waits_in_words(waits: Sequence[CycleWait]) -> Iterator[str]:
+    silent = {wait.agent_id: tuple(wait.for_agents) for wait in waits if wait.for_agents}
+    refused_by = {wait.agent_id: tuple(wait.refused_by) for wait in waits if wait.refused_by}
+    if _each_other(silent):
+        yield f"{named(silent)} ask each other in vain, for whoever reconciles answers nobody"
+    else:
+        for peers, alike in _alike(silent):
+            yield f"{named(alike)} ask{'s' if len(alike) == 1 else ''} {named(peers)} in vain"
+    if _each_other(refused_by):
+        yield f"{named(refused_by)} refuse each other's blocks"
+    else:
+        for peers, alike in _alike(refused_by):
+            yield f"{named(peers)} refuse{'s' if len(peers) == 1 else ''} the blocks of {named(alike)}"
+
+
+def _each_other(peers: Mapping[int, tuple[int, ...]]) -> bool:
+    return len(peers) > 1 and all(set(whom) == set(peers) - {agent_id} for agent_id, whom in peers.items())
+
+
+def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ...], list[int]]]:
+    """Peers, and the agents that all have these."""
+    alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
+    for agent_id, whom in peers.items():
+        alike[whom].append(agent_id)
+    yield from alike.items()
+
+
+def named(ids: Collection[int]) -> str:
+    """Which agents, or how many if that would be a long list."""
+    return agents(tuple(ids)) if len(ids) <= MAX_NAMED else f"{len(ids)} agents"
+
+
+def findings(cycle: Cycle) -> list[Finding]:
+    """What agents run in one round; of those that run the same the first stands for all."""
+    alike: dict[str, list[int]] = defaultdict(list)
+    for agent_id in cycle.agents:
+        alike[_round_in_words(cycle, agent_id)].append(agent_id)
+    return [
+        Finding(first, f"{f'as {named(others)}, ' if others else ''}{runs}")
+        for runs, (first, *others) in list(alike.items())[:MAX_EVIDENCE]
+    ]
+
+
+def _round_in_words(cycle: Cycle, agent_id: int) -> str:
+    """From what follows the longest pause on, so that those that do the same one after another are told alike."""
+    steps = [step for step in cycle.steps if step.agent_id == agent_id]
+    if not steps or cycle.period_s is None:
+        return f"not idle, and has done nothing since {cycle.since_s:.0f} s"
+    before = [steps[-1].after_s - cycle.period_s, *(step.after_s for step in steps[:-1])]
+    pauses = [step.after_s - at_s for step, at_s in zip(steps, before, strict=True)]
+    first = pauses.index(max(pauses))
+    words = "runs "
+    for number in range(first, first + len(steps)):
+        step, pause_s = steps[number % len(steps)], pauses[number % len(steps)]
+        if number > first:
+            words += f", {_pause(pause_s)} later " if pause_s >= SHORTEST_PAUSE_S else ", "
+        words += step.handler + (f" ({step.branch})" if step.branch else "")
+    return f"{words}; {_pause(pauses[first])} later it begins anew"
+
+
+def _pause(pause_s: float) -> str:
+    return f"{pause_s:.0f} s" if pause_s >= 2 else f"{pause_s:.1f} s"

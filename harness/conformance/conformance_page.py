@@ -1,0 +1,96 @@
+"""Agents x Algorithms as a page, for a project with many implementations; in one file that loads nothing."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from harness.conformance.results import BESIDE, TITLES, Results, Row
+from harness.conformance.results_table import headline
+from harness.errors import HarnessError
+from harness.report import html
+
+_TEMPLATE = Path(__file__).with_name("page.html.j2")
+_STYLE = """
+td.holds { color: var(--good, #1a7f37); } td.violated { color: var(--bad, #cf222e); font-weight: 600; }
+td { font-variant-numeric: tabular-nums; text-align: center; } th[scope=row] { text-align: left; }
+"""
+MOST_BYTES = 256 * 1024
+MOST_AGENTS = 50
+FAILURES_SHOWN = 20
+
+
+class AgentsFileError(HarnessError):
+    """The file of agents cannot be used."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What came of an agent's cases of one Algorithm, and the word of it for the style sheet."""
+
+    text: str
+    kind: str
+
+
+def read_agents(path: Path) -> dict[str, list[str]]:
+    """Name -> command, from YAML. Raises AgentsFileError."""
+    form = "`name: [program, argument, ...]` for each agent"
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise AgentsFileError(f"{path} is larger than {MOST_BYTES} bytes: it has to be {form}")
+        document: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AgentsFileError(f"{path} cannot be read: {error.strerror}") from None
+    except (yaml.YAMLError, ValueError, RecursionError):
+        raise AgentsFileError(f"{path} is not YAML: it has to be {form}") from None
+    right = isinstance(document, dict) and all(
+        isinstance(name, str)
+        and isinstance(command, list)
+        and command
+        and all(isinstance(word, str) and "\0" not in word for word in command)
+        for name, command in document.items()
+    )
+    if not right or not 0 < len(document) <= MOST_AGENTS:
+        raise AgentsFileError(f"{path} has to be {form}, of 1 to {MOST_AGENTS} agents")
+    return {name: list(command) for name, command in document.items()}
+
+
+def to_html(results: Mapping[str, Results | str]) -> str:
+    """The page. Of an agent that could not be tested there is a sentence instead of results."""
+    tested = {name: result for name, result in results.items() if isinstance(result, Results)}
+    rows = {name: {row.algorithm: row for row in result.rows()} for name, result in tested.items()}
+    numbers = [number for number in (*sorted(TITLES), BESIDE) if any(number in each for each in rows.values())]
+    failed = sum(len(result.failures) for result in tested.values())
+    return html.render(
+        _TEMPLATE,
+        styles=[html.PAGE_STYLE + _STYLE],
+        headline=(f"{failed} failed", "violated") if failed else (f"{len(tested)} agents, none fails", "holds"),
+        names=list(results),
+        table=[
+            (Row(number).title, [_cell(rows.get(name, {}).get(number), name in tested) for name in results])
+            for number in numbers
+        ],
+        notes=[(name, _notes(result)) for name, result in results.items()],
+    )
+
+
+def _cell(row: Row | None, tested: bool) -> Cell:
+    if row is None:
+        return Cell("\u2013" if tested else "not tested", "")
+    if row.failed:
+        return Cell(f"{row.failed} failed, {row.passed} passed", "violated")
+    if row.passed:
+        left = f", {row.not_tried} not tried" if row.not_tried else ""
+        return Cell(f"{row.passed} passed{left}", "holds")
+    return Cell("not applicable" if row.not_applicable else "not tried", "")
+
+
+def _notes(result: Results | str) -> Sequence[str]:
+    if isinstance(result, str):
+        return [result]
+    failures = [headline(case) for case in result.failures[:FAILURES_SHOWN]]
+    if len(result.failures) > FAILURES_SHOWN:
+        failures.append(f"and {len(result.failures) - FAILURES_SHOWN} more")
+    return [" ".join(result.command), *result.notes, *failures]

@@ -1,0 +1,150 @@
+"""A whole run over UDP: the vectors by tours, then what is suspected alone; and what is to be kept of each failure."""
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from harness.conformance import udp_subject
+from harness.conformance import virtual_subject as virtual
+from harness.conformance.blame import Evidence
+from harness.conformance.handwritten import by_hand
+from harness.conformance.kept_failures import keep
+from harness.conformance.results import Case, Results, Row
+from harness.conformance.suite import (
+    ALONE_AT_ONCE,
+    FAILURES_OF_A_KIND,
+    MOST_SUSPICIONS,
+    SIDE_BY_SIDE,
+    Failure,
+    Suite,
+    Tally,
+)
+from harness.conformance.udp_lab import Air
+from harness.conformance.vectors import Vectors, generate
+
+IN_VIRTUAL_TIME = 2
+"""Processes of the agent there."""
+LIMIT_S = 600.0
+"""Of the tours, in wall time; what has not been seen by then is not tried. A quiet machine needs a sixth of it."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be tested: `only` names one Algorithm, `keep` is where failures are written to."""
+
+    command: tuple[str, ...]
+    only: str | None
+    keep: Path | None
+    virtual: bool = False
+    by_hand: bool = True
+    enough: int = MOST_SUSPICIONS
+    limit_s: float = LIMIT_S
+
+
+def conform(
+    asked: Asked, place: Path, told: Callable[[int, int], None], generated: Sequence[Vectors] | None = None
+) -> Results:
+    """Raises MachineError, NoAgentError. `told` is called with how many vectors have passed, of how many.
+
+    `generated` are other vectors than all that `asked` is about.
+    """
+    results = Results(asked.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
+    began = time.monotonic()
+    try:
+        chosen = generate(asked.only) if generated is None else generated
+        total = sum(len(vectors.wanted) for vectors in chosen)
+        asyncio.run(_run(asked, place, chosen, lambda count: told(count, total), results))
+    except KeyboardInterrupt:
+        results.interrupted = True
+    results.cases = _kept(results.cases, asked)
+    results.wall_s = time.monotonic() - began
+    return results
+
+
+async def _run(
+    asked: Asked, place: Path, generated: Sequence[Vectors], told: Callable[[int], None], results: Results
+) -> None:
+    until = time.monotonic() + asked.limit_s
+    if asked.virtual:
+        start, programs = virtual.starting(asked.command, place / "errors.log")
+        try:
+            await _play(Suite(start, generated, told, side_by_side=IN_VIRTUAL_TIME), until, asked, results)
+        finally:
+            for program in programs:
+                await program.close()
+        return
+    async with Air(place, asked.command, SIDE_BY_SIDE + ALONE_AT_ONCE) as air:
+        start = udp_subject.starting(air)
+        await _play(
+            Suite(start, generated, told, side_by_side=SIDE_BY_SIDE, enough=asked.enough), until, asked, results
+        )
+        if asked.by_hand:
+            results.cases += await by_hand(air, asked.only)
+
+
+async def _play(suite: Suite, until: float, asked: Asked, results: Results) -> None:
+    try:
+        await suite.run(until)
+    finally:
+        _conclude(suite.tallies, asked, results)
+
+
+def _conclude(tallies: Sequence[Tally], asked: Asked, results: Results) -> None:
+    evidence = Evidence(tallies)
+    for tally in tallies:
+        failed = {failure.seen.pair for failure in tally.failures}
+        for pair, step in tally.vectors.wanted.items():
+            algorithm = step.outcome.algorithm
+            row = results.counted.setdefault(algorithm, Row(algorithm))
+            if pair in tally.passed:
+                row.passed += 1
+            elif tally.unsupported is not None:
+                row.not_applicable += 1
+            elif pair not in failed:
+                row.not_tried += 1
+        if tally.unsupported is not None:
+            features = ", ".join(tally.vectors.variant.features) or "the base"
+            results.notes.append(f"not supported: {features}: {tally.unsupported}")
+        results.cases += [_case(failure, evidence) for failure in tally.failures]
+        if tally.set_aside:
+            results.notes.append(
+                f"{tally.set_aside} vectors were set aside: the branches that they take had failed "
+                f"{FAILURES_OF_A_KIND} times"
+            )
+
+
+def _case(failure: Failure, evidence: Evidence) -> Case:
+    blamed = evidence.blame(failure)
+    seen = failure.seen
+    return Case(
+        f"{seen.before.text}; {seen.given}",
+        blamed.algorithm,
+        "failed",
+        blamed.handler,
+        blamed.branch,
+        seen.wrong[0],
+        failure.variant,
+        failure.way,
+        seen.expected,
+        seen.came,
+        seen.wrong,
+        failure.exchanges,
+    )
+
+
+def _kept(cases: Sequence[Case], asked: Asked) -> list[Case]:
+    """Each failure with its directory, if any is asked for."""
+    if asked.keep is None:
+        return list(cases)
+    numbered = []
+    for number, case in enumerate(cases, 1):
+        if case.verdict == "failed":
+            place = asked.keep / f"{number:02d}-{case.handler or 'program'}"
+            keep(case, asked.command, place)
+            numbered.append(replace(case, directory=str(place)))
+        else:
+            numbered.append(case)
+    return numbered

@@ -1,0 +1,73 @@
+"""What bags pack: chunks, single messages, and whole files. Nothing is unpacked beyond a bound."""
+
+import bz2
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from harness.archive.bounded_file import Opened
+from harness.field.adapters.bags.bag_message import MAX_CHUNK_BYTES, MAX_FILE_BYTES, MAX_MESSAGE_BYTES
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_AT_ONCE = 1024 * 1024
+_STEP_BYTES = 16 * 1024
+"""So much is lost of what is packed, at most, before a damaged place."""
+
+
+def unpacked(compression: str, data: bytes, most_bytes: int = MAX_CHUNK_BYTES) -> tuple[bytes, str]:
+    """The content as far as it can be unpacked, and why there is no more of it, if it is not whole."""
+    if compression in ("", "none"):
+        return data, ""
+    unpacker = _unpacker(compression)
+    if unpacker is None:
+        return b"", f"a part of it is packed by {compression[:20]!r}, which no bag is"
+    content = bytearray()
+    for start in range(0, len(data), _STEP_BYTES):
+        try:
+            content += unpacker.decompress(data[start : start + _STEP_BYTES], max(most_bytes - len(content), 0))
+        except Exception as error:  # each of the three has errors of its own
+            return bytes(content), f"what {compression} packed is damaged: {str(error)[:100]}"
+        if unpacker.eof:
+            return bytes(content), ""
+        if len(content) >= most_bytes:
+            return bytes(content), f"what is beyond {most_bytes // 1024 // 1024} MiB of a part of it is not read"
+    return bytes(content), f"what {compression} packed breaks off"
+
+
+def message_data(data: bytes) -> bytes:
+    """The message, which version 2 may have packed by itself. Raises ValueError."""
+    if not data.startswith(ZSTD_MAGIC):
+        return data
+    content, trouble = unpacked("zstd", data, MAX_MESSAGE_BYTES)
+    if trouble:
+        raise ValueError(trouble)
+    return content
+
+
+def unpacked_file(path: Path, copy: Path) -> str:
+    """Unpack what zstd packed; why it is not whole, if so."""
+    unpacker: Any = _unpacker("zstd")
+    written = 0
+    with Opened(path, MAX_FILE_BYTES) as file, copy.open("wb") as unpacked_copy:
+        while written < MAX_FILE_BYTES and not unpacker.eof:
+            part = file.read(_AT_ONCE) if unpacker.needs_input else b""
+            if unpacker.needs_input and not part:
+                return "what zstd packed breaks off"
+            try:
+                written += unpacked_copy.write(unpacker.decompress(part, _AT_ONCE))
+            except Exception as error:  # its own, and not everywhere of one class
+                return f"what zstd packed is damaged: {str(error)[:100]}"
+    return "" if unpacker.eof else f"what is beyond {MAX_FILE_BYTES // 1024 // 1024} MiB is not read"
+
+
+def _unpacker(compression: str) -> Any:
+    if compression == "bz2":
+        return bz2.BZ2Decompressor()
+    if compression == "lz4":
+        return import_module("lz4.frame").LZ4FrameDecompressor()
+    if compression == "zstd":
+        try:
+            return import_module("compression.zstd").ZstdDecompressor()
+        except ImportError:  # before Python 3.14; it comes with rosbags
+            return import_module("backports.zstd").ZstdDecompressor()
+    return None

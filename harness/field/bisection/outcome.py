@@ -1,0 +1,162 @@
+"""What came of playing a subject once, and in what two outcomes differ."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import Export
+from harness.checker import Result
+from harness.errors import RunDirectoryError
+from harness.scenario.verdict_names import BAD_IN_WORDS, kind_of
+
+MAX_OUTCOME_BYTES = 64 * 1024 * 1024
+TOLD = 8
+"""More differences of two outcomes nobody reads."""
+OF_CHANCE = ("2", "5", "6", "liveness")
+"""Judgements that depend on how far processes had come when they were stopped."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class Difference(_Model):
+    """Where a core does other than a record."""
+
+    line: int
+    handler: str | None
+    detail: str
+
+
+class OfAgent(_Model):
+    """What one agent came to.
+
+    chain: the names of its blocks, the oldest first; top: its top chain hash; deviates: the handler in which it first
+    did other than the algorithms say, "" if that is none of the protocol's. Of a record: what a core does otherwise.
+    None where nothing of that is compared.
+    """
+
+    chain: list[str] | None = None
+    top: str | None = None
+    deviates: str | None = None
+    differences: list[Difference] | None = None
+
+
+class Outcome(_Model):
+    """`crashed` is where the code under test raised an exception that ended all of it."""
+
+    schema_: Literal["ucp-outcome/1"] = "ucp-outcome/1"
+    subject: str
+    agents: dict[int, OfAgent] = {}
+    verdicts: dict[str, str] = {}
+    crashed: str | None = None
+
+    @property
+    def of_records(self) -> bool:
+        return any(of.differences is not None for of in self.agents.values())
+
+    def as_recorded(self) -> "Outcome":
+        """What it would be of a core that does all that is in the records, and nothing else."""
+        return self.model_copy(update={"agents": {agent: OfAgent(differences=[]) for agent in self.agents}})
+
+    @property
+    def sentence(self) -> str:
+        """In a line."""
+        if self.crashed:
+            return f"it crashes: {self.crashed}"
+        bad = [key for key, verdict in self.verdicts.items() if kind_of(verdict) == "bad"]
+        wrong = [f"agent {agent} in {of.deviates or 'no handler'}" for agent, of in self.agents.items() if of.deviates]
+        chains = {of.top: of.chain for of in self.agents.values() if of.chain is not None}
+        parts = [f"{len(chains)} distinct chain{'s' if len(chains) != 1 else ''}"] if chains else []
+        for agent, of in self.agents.items():
+            if of.differences:
+                parts.append(f"agent {agent}: {len(of.differences)} differences, the first at line {_first(of)}")
+            elif of.differences is not None:
+                parts.append(f"agent {agent}: as recorded")
+        return "; ".join([*parts, *(BAD_IN_WORDS.get(key, key) for key in bad), *wrong]) or "nothing differs"
+
+
+def _first(of: OfAgent) -> str:
+    first = (of.differences or [])[0]
+    return f"{first.line}{f', in {first.handler}' if first.handler else ''}"
+
+
+def of_run(subject: str, result: Result, exports: dict[int, Export], *, exact: bool) -> Outcome:
+    """Of a run that has been judged; where chance plays a part chains and what depends on the moment are left out."""
+    names = name_blocks(exports)
+    first: dict[int, str] = {}
+    for finding in result.beside["steps"].evidence:
+        first.setdefault(finding.agent_id, finding.handler or "")
+    agents = {}
+    for agent, export in sorted(exports.items()):
+        chain = [names.get(block, block[:12]) for block in export.chain_of_block_hashes] if exact else None
+        top = export.top_chain_hash if exact else None
+        agents[agent] = OfAgent(chain=chain, top=top, deviates=first.get(agent))
+    judged = result.judgements.items()
+    verdicts: dict[str, str] = {key: judgement.verdict for key, judgement in judged if exact or key not in OF_CHANCE}
+    return Outcome(subject=subject, agents=agents, verdicts=verdicts)
+
+
+def differences(before: Outcome, after: Outcome) -> list[str]:
+    """A sentence for each thing in which they differ; none if they are the same."""
+    return list(_differences(before, after))
+
+
+def _differences(before: Outcome, after: Outcome) -> Iterator[str]:
+    if before.crashed != after.crashed:
+        yield f"it crashes: {after.crashed}" if after.crashed else f"it no longer crashes ({before.crashed})"
+        return
+    for key in {**before.verdicts, **after.verdicts}:
+        if (was := before.verdicts.get(key)) != (now := after.verdicts.get(key)):
+            what = f"characteristic {key}" if key.isdecimal() else key
+            yield f"{what}: {now or 'not judged'}, and was {was or 'not judged'}"
+    for agent in sorted({*before.agents, *after.agents}):
+        was_of, now_of = before.agents.get(agent, OfAgent()), after.agents.get(agent, OfAgent())
+        yield from (f"agent {agent}: {words}" for words in _of_agent(was_of, now_of))
+
+
+def _of_agent(was: OfAgent, now: OfAgent) -> Iterator[str]:
+    if was.deviates != now.deviates:
+        words = {None: "nowhere", "": "in no known handler"}
+        yield (
+            f"it deviates first {words.get(now.deviates, f'in {now.deviates}')}, "
+            f"and did {words.get(was.deviates, f'in {was.deviates}')}"
+        )
+    if was.top != now.top:
+        old, new = was.chain or [], now.chain or []
+        shared = next((place for place, pair in enumerate(zip(old, new, strict=False)) if pair[0] != pair[1]), None)
+        if shared is None:
+            shared = min(len(old), len(new))
+        yield (
+            f"its chain has {len(new)} blocks, and had {len(old)}; block {shared + 1} is "
+            f"{_at(new, shared)}, and was {_at(old, shared)}"
+        )
+    if was.differences != now.differences:
+        old_differences, new_differences = was.differences or [], now.differences or []
+        known = {(each.line, each.handler, each.detail) for each in old_differences}
+        new_ones = [each for each in new_differences if (each.line, each.handler, each.detail) not in known]
+        if new_ones:
+            first = new_ones[0]
+            yield f"line {first.line}{f', {first.handler}' if first.handler else ''}: {first.detail}"
+        else:
+            gone = len(old_differences) - len(new_differences)
+            yield f"{gone} differences from the record are no longer there"
+
+
+def _at(chain: list[str], place: int) -> str:
+    return chain[place] if place < len(chain) else "not there"
+
+
+def read(path: Path) -> Outcome:
+    """An outcome that was kept. Raises RunDirectoryError."""
+    try:
+        if path.stat().st_size > MAX_OUTCOME_BYTES:
+            raise RunDirectoryError(f"{path}: larger than {MAX_OUTCOME_BYTES} bytes, which no outcome is")
+        return Outcome.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise RunDirectoryError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValidationError, RecursionError):
+        raise RunDirectoryError(f"{path}: not an outcome; `ucp-harness again ... --out` writes one") from None

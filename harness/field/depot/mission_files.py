@@ -1,0 +1,151 @@
+"""Makes the mission files of a roster, one for each vehicle, with the inception block that all of them share.
+
+They are what a run gives its agents (`harness.play.process.agent_mission`), but for what a flight has otherwise: time
+passes as it does, no mistake is asked for, every vehicle has an address of its own choosing, and keeps a store, so that
+a brown-out loses nothing. Each is read by the agent's own reader before it is written.
+"""
+
+import ipaddress
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from harness.errors import HarnessError, MachineError, RunDirectoryError
+from harness.field.depot.manifest import FILE, Manifest, ManifestInception, fingerprint
+from harness.play.process.agent_mission import NO_QUIRKS, mission_file
+from harness.scenario import Scenario
+from netem.addresses import BROADCAST, address
+from ucp.agent_files import write_json_atomically
+from ucp.block import MAX_EVENT_DATA_BYTES, hash_digest
+from ucp.features import needed
+from ucp.messages import PORT
+from ucp.mission import MAX_INITIAL_DATA_BYTES, Mission, MissionError, parse_mission
+from ucp.sealed import SEAL_BYTES, sealed_to
+
+SUFFIX = ".mission.json"
+
+
+class MissionFileError(HarnessError):
+    """What was asked for makes no mission that an agent reads."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A mission before it is written. `settings` and `events` are laid over the scenario's, key by key.
+
+    A vehicle's address is its place in `subnet`, its ID counted from the first, or what `addresses` says; without a
+    subnet it is that of a run's network (`netem.addresses`). `broadcast` goes with it if it is None.
+    `secured`: each vehicle has its bundle of keys beside its mission file.
+    """
+
+    scenario: Scenario
+    initial_data: bytes
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    events: Mapping[str, Any] = field(default_factory=dict)
+    subnet: ipaddress.IPv4Network | None = None
+    addresses: Mapping[int, str] = field(default_factory=dict)
+    broadcast: str | None = None
+    port: int = PORT
+    secured: bool = False
+
+    def documents(self) -> dict[int, dict[str, Any]]:
+        """The mission file of each agent. Raises MissionFileError."""
+        if len(self.initial_data) > MAX_INITIAL_DATA_BYTES:
+            raise MissionFileError(
+                f"the initial data is {len(self.initial_data)} bytes: at most {MAX_INITIAL_DATA_BYTES} are possible"
+            )
+        strangers = sorted(self.addresses.keys() - {*self.scenario.roster})
+        if strangers:
+            raise MissionFileError(f"`--address` names vehicle {strangers[0]}, which is not on the roster")
+        documents = {agent_id: self._document(agent_id) for agent_id in self.scenario.roster}
+        vehicles: dict[str, int] = {}
+        for agent_id, document in documents.items():
+            its_address = document["network"]["address"]
+            other = vehicles.setdefault(its_address, agent_id)
+            if other != agent_id:
+                raise MissionFileError(f"vehicles {other} and {agent_id} would both have the address {its_address}")
+        return documents
+
+    def _document(self, agent_id: int) -> dict[str, Any]:
+        document = mission_file(
+            agent_id,
+            self.scenario,
+            int.from_bytes(hash_digest(self.initial_data)[:8], "big"),
+            self.initial_data,
+            address=self._address(agent_id),
+            broadcast=self.broadcast or (str(self.subnet.broadcast_address) if self.subnet else BROADCAST),
+            with_vehicle=True,
+            store=f"{agent_id}.store",
+        )
+        document |= {"quirks": dict(NO_QUIRKS), "speedup": 1.0}
+        document["network"]["port"] = self.port
+        if self.secured:
+            document["security"] = {"bundle": f"{agent_id}.bundle.json"}
+        if sealed_to(self.initial_data) is not None:
+            document["settings"]["max_block_bytes"] = MAX_EVENT_DATA_BYTES - SEAL_BYTES
+        document["settings"].update(self.settings)
+        document["events"].update(self.events)
+        document["features"] = needed(document)
+        try:
+            parse_mission(document)
+        except MissionError as error:
+            raise MissionFileError(f"agent {agent_id}: {error}") from None
+        return document
+
+    def _address(self, agent_id: int) -> str:
+        if agent_id in self.addresses:
+            return self.addresses[agent_id]
+        if self.subnet is None:
+            return address(agent_id)
+        if not 0 < agent_id < self.subnet.num_addresses - 1:
+            raise MissionFileError(
+                f"vehicle {agent_id} has no place in {self.subnet}: choose a wider `--subnet`, or give "
+                f"`--address {agent_id}=...`"
+            )
+        return str(self.subnet[agent_id])
+
+
+def write(plan: Plan, directory: Path, *, overwrite: bool = False) -> list[Path]:
+    """Write the mission files and the manifest; which files those are, the manifest last.
+
+    Raises MissionFileError, RunDirectoryError if a file is there already and may not be overwritten, or if the
+    directory has mission files of others, and MachineError if the disk refuses.
+    """
+    documents = {f"{agent_id}{SUFFIX}": document for agent_id, document in plan.documents().items()}
+    missions = {name: parse_mission(document) for name, document in documents.items()}
+    files = {**documents, FILE: manifest(plan.scenario.name, missions).to_json()}
+    _refuse(directory, list(files), overwrite)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for name, document in files.items():
+            write_json_atomically(directory / name, document)
+    except OSError as error:
+        raise MachineError(f"{directory} cannot be written: {error.strerror}; choose another --out") from None
+    return [directory / name for name in files]
+
+
+def manifest(name: str, missions: Mapping[str, Mission]) -> Manifest:
+    """What these mission files, by their names, have in common; there is one at least."""
+    first = next(iter(missions.values()))
+    return Manifest(
+        name=name,
+        roster=sorted(first.roster),
+        inception=ManifestInception.of(first.initial_data),
+        settings_sha256=fingerprint(first.settings),
+        broadcast=first.network.broadcast,
+        port=first.network.port,
+        files={mission.agent_id: file for file, mission in missions.items()},
+    )
+
+
+def _refuse(directory: Path, names: Sequence[str], overwrite: bool) -> None:
+    there = [name for name in names if (directory / name).exists()]
+    if there and not overwrite:
+        raise RunDirectoryError(f"{directory / there[0]} exists: choose another --out, or allow it by --overwrite")
+    stale = sorted(path.name for path in directory.glob(f"*{SUFFIX}") if path.name not in names)
+    if stale:
+        raise RunDirectoryError(
+            f"{directory / stale[0]} is of another mission, for its agent is not on this roster: move it away first, "
+            "or choose another --out"
+        )

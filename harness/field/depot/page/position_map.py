@@ -1,0 +1,170 @@
+"""Where it was logged: each vehicle's positions as a line in its colour, and its other events where it last was.
+
+What was with one vehicle only is ringed: the next loss would have taken it. Where blocks of a vehicle were lost, its
+line is dotted from the last position before to the first one after.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from markupsafe import Markup
+
+from harness.archive.tracks import Fix
+from harness.present import text
+from harness.present.colours import Ink
+from harness.present.svg import FONT, n
+from harness.report.logbook.positions import Entry, Track, Whereabouts
+from harness.report.map_geometry import Point, Projection, extent, thinned
+from harness.report.map_svg import end_mark, frame, start_mark
+from harness.report.map_tags import tags
+from ucp.telemetry import describe
+
+METRES_PER_DEGREE = 111_195.0
+"""Of latitude, on a sphere of 6,371 km."""
+FARTHEST_M = 1e6
+MAX_POINTS = 20_000
+MAX_FIXES = 50_000
+MAX_EVENTS = 2_000
+_LEFT, _TOP, _RIGHT, _BOTTOM = 62, 14, 14, 62
+_WIDTH, _HEIGHT = 900, 560
+
+
+@dataclass(frozen=True)
+class Map:
+    """The drawing, and sentences on what is not on it."""
+
+    drawing: Markup
+    notes: list[str]
+
+
+def draw(
+    tracks: Sequence[Track], rare: Iterable[str], lost: Mapping[int, Sequence[int]], ink: Mapping[int, Ink]
+) -> Map:
+    """`rare` are the names of blocks that one vehicle alone holds; `lost` the ordinals of an agent's lost blocks.
+
+    There is a position at least.
+    """
+    field = _Field(tracks)
+    ways = {track.agent_id: [field.fix(at_us, position) for at_us, position in track.fixes] for track in tracks}
+    far = field.far
+    land = extent([fix for way in ways.values() for fix in way])
+    to_px = Projection(land, _LEFT, _TOP, _WIDTH, _HEIGHT)
+    alone = set(rare)
+    logged = [event for track in tracks for event in _logged(track, alone)]
+    shown = sorted(logged[:: -(-len(logged) // MAX_EVENTS) or 1], key=lambda event: event[0])  # the rare ones on top
+    drawing = Markup(
+        '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
+        ' aria-labelledby="map-title map-desc" font-family="{font}" font-size="12">'
+        '<title id="map-title">Map of what was logged</title><desc id="map-desc">{desc}</desc>\n'
+        "{frame}\n{ways}\n{marks}\n{ends}</svg>\n"
+    ).format(
+        w=n(_LEFT + to_px.width + _RIGHT),
+        h=n(_TOP + to_px.height + _BOTTOM),
+        font=FONT,
+        desc=f"Positions of {len(tracks)} vehicles, {land.width_m:.0f} m from west to east.",
+        frame=frame(to_px),
+        ways=_ways(tracks, ways, lost, to_px, ink),
+        marks=Markup("").join(
+            _mark(to_px(field.fix(entry.event.timestamp_us, entry.position)), entry, rare, ink[agent_id])
+            for rare, agent_id, entry in shown
+            if entry.position is not None
+        ),
+        ends=_ends(ways, to_px, ink),
+    )
+    notes = [] if len(shown) == len(logged) else [f"Of {len(logged)} events the map has {len(shown)}."]
+    if far:
+        notes.append(f"{far} positions more than {FARTHEST_M / 1000:.0f} km away are at the edge.")
+    return Map(drawing, notes)
+
+
+class _Field:
+    """Metres north and east of the middle of all positions."""
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        positions = [position for track in tracks for _, position in track.fixes]
+        self._lat = sorted(position.lat_e7 for position in positions)[len(positions) // 2] / 1e7
+        self._lon = sorted(position.lon_e7 for position in positions)[len(positions) // 2] / 1e7
+        self._east = METRES_PER_DEGREE * max(0.01, math.cos(math.radians(self._lat)))
+        self._first_us = min(at_us for track in tracks for at_us, _ in track.fixes)
+        self.far = 0
+
+    def fix(self, at_us: int, position: Whereabouts) -> Fix:
+        north_m = (position.lat_e7 / 1e7 - self._lat) * METRES_PER_DEGREE
+        east_m = ((position.lon_e7 / 1e7 - self._lon + 180) % 360 - 180) * self._east
+        self.far += max(abs(north_m), abs(east_m)) > FARTHEST_M
+        at_s = (at_us - self._first_us) / 1e6
+        return Fix(at_s, *(max(-FARTHEST_M, min(FARTHEST_M, metres)) for metres in (north_m, east_m)))
+
+
+def _ways(
+    tracks: Sequence[Track],
+    ways: Mapping[int, Sequence[Fix]],
+    lost: Mapping[int, Sequence[int]],
+    to_px: Projection,
+    ink: Mapping[int, Ink],
+) -> Markup:
+    pieces = [(track, gap, piece) for track in tracks for gap, piece in _pieces(track, ways[track.agent_id], lost)]
+    every = sum(map(len, ways.values())) // MAX_FIXES + 1  # thinning looks at each point many times
+    lines = thinned([[to_px(fix) for fix in (*piece[:-1:every], piece[-1])] for _, _, piece in pieces], MAX_POINTS)
+    drawn = []
+    for (track, gap, _), line in zip(pieces, lines, strict=True):
+        path = "M" + "L".join(f"{n(x)} {n(y)}" for x, y in line)
+        tip = f"vehicle {track.agent_id}" + (": here blocks of it were lost" if gap else "")
+        colours = ink[track.agent_id]
+        drawn.append(
+            Markup(
+                '<g class="{}"><title>{}</title><path class="edge" d="{p}" stroke="{}"/><path d="{p}" stroke="{}"/></g>'
+            ).format("track gap" if gap else "track", tip, colours.stroke, colours.fill, p=path)
+        )
+    return Markup("\n").join(drawn)
+
+
+def _pieces(
+    track: Track, way: Sequence[Fix], lost: Mapping[int, Sequence[int]]
+) -> Iterable[tuple[bool, Sequence[Fix]]]:
+    """The way, cut where blocks were lost between two positions; whether it is such a gap."""
+    missing = lost.get(track.agent_id, ())
+    ordinals = [_ordinal(entry.block) for entry in track.entries if entry.is_position]
+    begin = 0
+    for at, (before, after) in enumerate(pairwise(ordinals), 1):
+        if before and after and any(before < ordinal < after for ordinal in missing):
+            yield False, way[begin:at]
+            yield True, way[at - 1 : at + 1]
+            begin = at
+    yield False, way[begin:]
+
+
+def _ordinal(name: str) -> int | None:
+    ordinal = name.partition(".")[2]
+    return int(ordinal) if ordinal.isdecimal() else None
+
+
+def _logged(track: Track, alone: set[str]) -> Iterable[tuple[bool, int, Entry]]:
+    """Each event but positions, and positions that one vehicle alone has: whether it is one of these, and whose."""
+    for entry in track.entries:
+        rare = entry.block in alone
+        if entry.position is not None and (rare or not entry.is_position):
+            yield rare, track.agent_id, entry
+
+
+def _mark(place: Point, entry: Entry, rare: bool, ink: Ink) -> Markup:
+    tip = [
+        describe(entry.event.event_id, entry.event.data),
+        text.moment(entry.event.timestamp_us),
+        f"block {entry.block}" + (", with one vehicle only" if rare else ""),
+    ]
+    return Markup('<circle class="{}" cx="{}" cy="{}" r="{}" fill="{}"><title>{}</title></circle>').format(
+        "logged rare" if rare else "logged", n(place[0]), n(place[1]), 3 if rare else 2.5, ink.fill, "\n".join(tip)
+    )
+
+
+def _ends(ways: Mapping[int, Sequence[Fix]], to_px: Projection, ink: Mapping[int, Ink]) -> Markup:
+    parts = []
+    for agent_id, way in ways.items():
+        colours = ink[agent_id]
+        first, last = f"first position of vehicle {agent_id}", f"last position of vehicle {agent_id}"
+        parts.append(start_mark(to_px(way[0]), first, colours.fill, colours.stroke))
+        parts.append(end_mark(to_px(way[-1]), last, colours.fill, colours.stroke))
+    return Markup("").join(parts) + tags([(agent_id, to_px(way[-1])) for agent_id, way in ways.items()], [], to_px, ink)

@@ -1,0 +1,69 @@
+"""What an agent is told before it starts: its mission file (`ucp-mission/1`, see ucp/contract/CONTRACT.md)."""
+
+import base64
+from typing import Any
+
+from harness.play.seeds import agent_seed
+from harness.scenario import Scenario
+from harness.scenario.event_source import Events
+from sitl.vehicle import AGENT_PORT
+from ucp.features import CONTRACT, needed
+from ucp.messages import PORT
+from ucp.mission import SCHEMA
+
+NO_QUIRKS = {"ignore_commit": 0.0, "crash_on_tie": False, "early_phase3_expiry": False, "stale_chain_hash": False}
+"""The quirks that a mission file always has; the others are there if they are asked for."""
+
+
+def mission_file(
+    agent_id: int,
+    scenario: Scenario,
+    seed: int,
+    initial_data: bytes,
+    *,
+    address: str,
+    broadcast: str,
+    with_vehicle: bool,
+    life: int = 1,
+    epoch_us: int | None = None,
+    store: str | None = None,
+    bundle: str | None = None,
+) -> dict[str, Any]:
+    """`seed` is the run's; an agent has one of its own in each `life`. With `epoch_us` it joins a mission under way.
+
+    `bundle` is the file with its keys, in a secured mission.
+    """
+    events = scenario.events
+    document = {
+        "schema": SCHEMA,
+        "contract": CONTRACT,
+        "features": [],
+        "agent_id": agent_id,
+        "roster": list(scenario.roster),
+        "initial_data": base64.b64encode(initial_data).decode("ascii"),
+        "network": {"address": address, "broadcast": broadcast, "port": PORT},
+        "events": {
+            "source": _source(events, with_vehicle),
+            "mean_s": events.mean_s,
+            "position_interval_s": events.position_interval_s,
+            "log": list(events.log),
+            "vehicle_host": "127.0.0.1",
+            "vehicle_port": AGENT_PORT,
+        },
+        "settings": scenario.settings_of(agent_id).told(),
+        "quirks": {**NO_QUIRKS, **scenario.quirks_of(agent_id)},
+        "seed": agent_seed(seed, agent_id, life),
+        "speedup": scenario.speedup,
+        "epoch_us": epoch_us,
+        "store": store,
+    }
+    if bundle is not None:
+        document["security"] = {"bundle": bundle}
+    return document | {"features": needed(document)}
+
+
+def _source(events: Events, with_vehicle: bool) -> str:
+    """Scripted events come by the command `log`, and those of no vehicle from the agent itself."""
+    if events.source == "scripted":
+        return "none"
+    return events.source if with_vehicle else "random"

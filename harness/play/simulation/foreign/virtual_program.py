@@ -1,0 +1,230 @@
+"""A program that plays agents in virtual time, as a process: a line in, a line out (ucp/contract/CONTRACT.md,
+`--virtual`).
+
+It dies with the thread that started it, hears no Ctrl-C of ours, and is given no longer than a few seconds of wall time
+for an answer.
+"""
+
+import os
+import select
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from ctypes import CDLL
+from pathlib import Path
+from typing import IO
+
+from harness.archive.exports import MAX_EXPORT_BYTES
+from harness.play.last_output import LOOKED_AT_BYTES, last_words, last_words_in
+from harness.play.simulation.foreign.failure import Outcome
+
+START_LIMIT_S = 30.0
+ANSWER_LIMIT_S = 10.0
+"""Wall time after which a program that does not answer counts as hung; the first answer comes after its start."""
+MAX_ANSWER_BYTES = MAX_EXPORT_BYTES
+CHUNK_BYTES = 64 * 1024
+MOMENT_S = 1.0
+
+_PR_SET_PDEATHSIG = 1
+_LIBC = CDLL(None)
+
+
+class NoAnswerError(Exception):
+    """A program ended, hung, or said what is no line: what it did, in words that follow "agent 3"."""
+
+    def __init__(self, outcome: Outcome, what: str, status: int | None = None) -> None:
+        super().__init__(what)
+        self.outcome: Outcome = outcome
+        self.status = status
+        """Its exit status, if it ended by itself."""
+
+
+class Program:
+    """`command` with `--virtual`, started. What it says on standard error goes to `log`, or is kept for a while.
+
+    Raises OSError if it cannot be started.
+    """
+
+    def __init__(self, command: Sequence[str], log: Path | None = None) -> None:
+        self.command = tuple(command)
+        self.log = log
+        self.owes_an_answer = False
+        self._answered = False
+        self._said = b""
+        self._errors: IO[bytes] = log.open("ab") if log is not None else _passing_file()
+        try:
+            self._process = subprocess.Popen(
+                [*command, "--virtual"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                bufsize=0,
+                cwd=tempfile.gettempdir(),
+                process_group=0,
+                preexec_fn=_die_with_parent,
+            )
+        except BaseException:
+            self._errors.close()
+            raise
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._in, self._out = self._process.stdin.fileno(), self._process.stdout.fileno()
+        os.set_blocking(self._in, False)
+        self._readable = select.poll()
+        self._readable.register(self._out, select.POLLIN)
+
+    @property
+    def is_new(self) -> bool:
+        """Whether it has answered nothing yet."""
+        return not self._answered
+
+    @property
+    def runs(self) -> bool:
+        return self._process.poll() is None
+
+    def tell(self, line: bytes) -> None:
+        """Write a line. Raises NoAnswerError."""
+        if self._said:
+            raise NoAnswerError("crashed", f"wrote what nobody asked for: {_shown(self._said)}")
+        self.owes_an_answer = True
+        try:
+            written = os.write(self._in, line)
+        except BlockingIOError:
+            written = 0
+        except BrokenPipeError:
+            raise self._ended() from None
+        if written < len(line):
+            self._write(memoryview(line)[written:])
+
+    def answer(self) -> bytes:
+        """The next line that it says, with its end. Raises NoAnswerError."""
+        limit_s = ANSWER_LIMIT_S if self._answered else START_LIMIT_S
+        if not self._said:
+            if not self._readable.poll(limit_s * 1000):
+                raise _hung(limit_s)
+            self._said = os.read(self._out, CHUNK_BYTES)
+            if not self._said:
+                raise self._ended()
+        end = self._said.find(b"\n") + 1
+        line = self._said[:end] if end else self._long_line(limit_s)
+        self._said = self._said[len(line) :]
+        self._answered, self.owes_an_answer = True, False
+        return line
+
+    def _long_line(self, limit_s: float) -> bytes:
+        """A line that comes in pieces."""
+        deadline = time.monotonic() + limit_s
+        pieces = [self._said]
+        length = len(self._said)
+        while b"\n" not in pieces[-1]:
+            if length > MAX_ANSWER_BYTES:
+                raise NoAnswerError("crashed", f"answers with a line of more than {MAX_ANSWER_BYTES >> 20} MiB")
+            left_s = deadline - time.monotonic()
+            if left_s <= 0 or not self._readable.poll(left_s * 1000):
+                raise _hung(limit_s)
+            pieces.append(os.read(self._out, CHUNK_BYTES))
+            length += len(pieces[-1])
+            if not pieces[-1]:
+                raise self._ended()
+        self._said = b"".join(pieces)
+        return self._said[: self._said.find(b"\n") + 1]
+
+    def _write(self, left: memoryview) -> None:
+        """Write what does not fit into the pipe, and hear what it says meanwhile."""
+        deadline = time.monotonic() + ANSWER_LIMIT_S
+        ready = select.poll()
+        ready.register(self._in, select.POLLOUT)
+        ready.register(self._out, select.POLLIN)
+        while left:
+            left_s = deadline - time.monotonic()
+            events = dict(ready.poll(max(0.0, left_s) * 1000))
+            if not events:
+                raise NoAnswerError("hung", f"did not read what it was given within {ANSWER_LIMIT_S:g} s")
+            if self._out in events:
+                heard = os.read(self._out, CHUNK_BYTES)
+                self._said += heard
+                if not heard or len(self._said) > MAX_ANSWER_BYTES:
+                    raise self._ended() if not heard else NoAnswerError("crashed", "writes without an end")
+            if self._in in events:
+                with suppress(BlockingIOError):
+                    try:
+                        left = left[os.write(self._in, left) :]
+                    except BrokenPipeError:
+                        raise self._ended() from None
+
+    def _ended(self) -> NoAnswerError:
+        try:
+            status = self._process.wait(MOMENT_S)
+        except subprocess.TimeoutExpired:
+            return NoAnswerError("crashed", "closed its standard input or output and did not end")
+        if status < 0:
+            return NoAnswerError("crashed", f"was ended by {signal.Signals(-status).name}")
+        return NoAnswerError("crashed", f"ended by itself with status {status}", status)
+
+    def where_it_logs(self) -> str:
+        """Where its log is, or what it said last, as the end of a sentence."""
+        if self.log is not None:
+            return f"; its log is {self.log}"
+        words = self.last_words()
+        return f"; it said: {words}" if words else ""
+
+    def last_words(self) -> str:
+        """What it said last on standard error; empty if nothing."""
+        if self.log is not None:
+            return last_words_in(self.log)
+        size = self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, size - LOOKED_AT_BYTES))
+        return last_words(self._errors.read().decode("utf-8", "replace"))
+
+    def forget_words(self) -> None:
+        """What it said on standard error in a mission that is over, if nobody keeps it."""
+        if self.log is None:
+            self._errors.seek(0)
+            self._errors.truncate()
+
+    def close_input(self) -> None:
+        """Tell it to end."""
+        with suppress(OSError):
+            assert self._process.stdin is not None
+            self._process.stdin.close()
+
+    def end(self, within_s: float = 0.0) -> None:
+        """Have it ended, in whatever state it is; after `within_s` by SIGKILL."""
+        self.close_input()
+        try:
+            self._process.wait(within_s)
+        except subprocess.TimeoutExpired:
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)  # a script, and what it has started
+            self._process.wait()
+        self.let_go()
+
+    def close(self) -> None:
+        """Have it ended, now."""
+        self.end()
+
+    def let_go(self) -> None:
+        """Close what belongs to it here. It goes on."""
+        self.close_input()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        self._errors.close()
+
+
+def _hung(limit_s: float) -> NoAnswerError:
+    return NoAnswerError("hung", f"did not answer within {limit_s:g} s (with a whole line, flushed)")
+
+
+def _passing_file() -> IO[bytes]:
+    return tempfile.TemporaryFile()  # whoever asks for it closes it
+
+
+def _die_with_parent() -> None:
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _shown(said: bytes) -> str:
+    text = said.split(b"\n")[0].decode(errors="replace")
+    return repr(text[:60] + ("..." if len(text) > 60 else ""))

@@ -1,0 +1,95 @@
+"""The real gate of secured missions: agents behind keys, and what is sealed by whoever has a vehicle's bundle.
+
+Nothing is said here about what gets through: `ucp.secure` opens each datagram, and hands it on or drops it.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from harness.errors import MachineError
+from harness.play.rogue.lies import made_block
+from ucp.agent import Agent
+from ucp.messages import CARRY_A_BLOCK, Message
+
+if TYPE_CHECKING:
+    from ucp.secure.session import Session
+
+BOOT = b"in a proof".ljust(16, b"\0")
+CAPTORS_BOOT = b"later than that".ljust(16, b"\0")
+"""The captor says to have begun after all others, so that the vehicle itself is not heard any more."""
+
+
+class Gate:
+    """The keys of `roster`; those of vehicle `captured` are in the hands of somebody. Raises MachineError."""
+
+    def __init__(self, roster: Iterable[int], captured: int) -> None:
+        try:
+            from ucp.secure.bundle import KeySet
+        except ModuleNotFoundError:
+            raise MachineError(
+                "--captured needs the package cryptography, which comes with the extra `secure`: install that"
+            ) from None
+        self._keys = KeySet.derived(b"the keys of a proof".ljust(32), roster)
+        self._roster = tuple(roster)
+        self._captured = captured
+        self._sequence = 0
+        self._mouths: dict[int, Session] = {}
+        """By the sender in whose name it speaks."""
+
+    def agent(self, agent_id: int, *arguments: Any, revoked: bool = False, **options: Any) -> Agent:
+        """An agent behind keys; all other arguments are Agent's. If `revoked` it knows that the vehicle's keys are."""
+        from ucp.secure.secured_agent import SecuredAgent
+        from ucp.secure.session import Session
+
+        agent = SecuredAgent(Session(self._keys.bundle(agent_id), BOOT), agent_id, *arguments, **options)
+        if revoked:
+            agent.revoke(self._revocation(), 0.0)
+        return agent
+
+    def sealed(self, message: Message, now: float, *, sender: int | None = None, genuine: bool = False) -> bytes:
+        """A new datagram that says this, in the captured vehicle's name or in that of `sender`.
+
+        A block in it is signed by its maker if it is `genuine`, as whoever heard it has its signature; else with the
+        only key that there is. An answer names a question that nobody has heard of: of those no newer one is known.
+        """
+        from ucp.secure.block_signature import sign_block
+        from ucp.secure.sealed_datagrams import Request
+        from ucp.secure.session import Session
+
+        self._sequence += 1
+        sender = sender or self._captured
+        if sender not in self._mouths:
+            bundle = replace(self._keys.bundle(self._captured), agent_id=sender)
+            self._mouths[sender] = Session(bundle, CAPTORS_BOOT)
+        session = self._mouths[sender]
+        session.epochs.look_at(now)
+        signature = None
+        if type(message) in CARRY_A_BLOCK:
+            block = message.block  # type: ignore[union-attr]
+            signer = self._key(block.agent_id if genuine else self._captured)
+            signature = sign_block(signer, session.mission, block.block_data())
+        request = Request(self._captured, CAPTORS_BOOT, self._sequence)
+        return session.seal(self._sequence, message, request, signature, 0)
+
+    def forged(self, message: Message, receiver: int, now: float) -> Iterator[bytes]:
+        """The same in the name of another, and with a block in the receiver's own name: its keys are nobody's."""
+        another = next((member for member in self._roster if member not in (receiver, self._captured)), None)
+        if another is not None:
+            yield self.sealed(message, now, sender=another)
+        if type(message) in CARRY_A_BLOCK:
+            others = made_block(receiver, message.block.timestamp_us)  # type: ignore[union-attr]
+            yield self.sealed(replace(message, block=others), now)  # type: ignore[arg-type]
+
+    def _key(self, agent_id: int) -> Any:
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+        return Ed25519PrivateKey.from_private_bytes(self._keys.vehicles[agent_id])
+
+    def _revocation(self) -> bytes:
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+        from ucp.secure.revocation import Revocation
+
+        signer = Ed25519PrivateKey.from_private_bytes(self._keys.authority)
+        return Revocation.signed(signer, self._keys.public.mission, 1, [self._captured]).encode()

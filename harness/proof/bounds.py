@@ -1,0 +1,159 @@
+"""Within which bounds everything is looked at."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from harness.errors import HarnessError
+from harness.scenario.stagger import Stagger, Staggered, staggered
+from ucp.quirks import check_quirk
+from ucp.settings import MAX_TIMER_S, Settings
+from ucp.short_value import shown
+
+Network = Literal["lossless", "lossy", "any"]
+FAULTS = ("reboot", "death", "duplicate")
+MAX_AGENTS = 9
+MAX_BLOCKS = 9
+MAX_LIES = 9
+MAX_COINCIDENCES = 9
+MAX_LOSSES = 9
+EVENT_FILLS_BLOCK = {"max_block_bytes": 267}
+"""An event completes a block."""
+
+
+class BoundsError(HarnessError):
+    """These are no bounds within which anything can be looked at."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """`agents` that complete `blocks` blocks in all; each of `faults` but "duplicate" happens once at most.
+
+    `timers_any`: a timer may end whenever it runs, however long it should. `coincidences`: so many moments, at most,
+    are the same by chance, beside those whose distance is fixed, as one began by the other. `reduced`: states that
+    behave alike are one. `steps`: each step of the agents is held against that of right ones, too. `stagger`: agents'
+    timers differ, as a scenario's `stagger` says. `captured`: somebody has this agent's keys, and after a moment of his
+    choice speaks in its name: `lies` messages, each heard by any of the agents, or any number in the network "any".
+    `clocks_any`: of two blocks any may be the older, whoever completed them when: each time that it is asked. `losses`:
+    so many times, at most, somebody loses a message that would have made a difference to him. `crossing`: agents
+    may act at once, so that their messages cross; if not, all that comes of one act is heard before the next.
+    """
+
+    agents: int = 2
+    blocks: int = 2
+    network: Network = "lossy"
+    faults: tuple[str, ...] = ()
+    timers_any: bool = False
+    coincidences: int | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    quirks: Mapping[str, bool | float] = field(default_factory=dict)
+    reduced: bool = True
+    steps: bool = False
+    stagger: Stagger = field(default_factory=dict)
+    captured: int | None = None
+    lies: int = 1
+    clocks_any: bool = False
+    losses: int | None = None
+    crossing: bool = True
+
+    def __post_init__(self) -> None:
+        for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):
+            if not 1 <= count <= most:
+                raise BoundsError(f"--{name} must be 1..{most}, not {count}")
+        if self.network not in get_args(Network):
+            raise BoundsError(f"--network must be one of {', '.join(get_args(Network))}, not {self.network!r}")
+        for fault in self.faults:
+            if fault not in FAULTS:
+                raise BoundsError(f"--faults must be some of {', '.join(FAULTS)}, not {fault!r}")
+        self._check_captured()
+        self._check_time()
+        if self.losses is not None and not 0 <= self.losses <= MAX_LOSSES:
+            raise BoundsError(f"--losses must be 0..{MAX_LOSSES}, not {self.losses}")
+        if self.losses is not None and self.network != "lossy":
+            raise BoundsError("--losses is for --network lossy, where messages are lost")
+        if not self.crossing and self.network == "any":
+            raise BoundsError("--no-crossing is not for --network any, where a message takes as long as it likes")
+        if self.stagger and self.network == "any":
+            raise BoundsError("--stagger is not for --network any, where each agent is looked at by itself")
+        for name, step_s in self.stagger.items():
+            if name not in get_args(Staggered) or type(step_s) not in (int, float) or not 0 <= step_s <= MAX_TIMER_S:
+                known = ", ".join(get_args(Staggered))
+                raise BoundsError(f"--stagger must be seconds for one of {known}, not {name}={shown(step_s)}")
+        names = [field.name for field in dataclasses.fields(Settings)]
+        for name in self.settings:
+            if name not in names:
+                raise BoundsError(f"--settings {name} is unknown: there are {', '.join(names)}")
+        try:
+            self.agent_settings(self.agents)
+            for name, value in self.quirks.items():
+                check_quirk(name, value)
+        except (TypeError, ValueError) as error:
+            raise BoundsError(f"{error}") from None
+
+    def _check_captured(self) -> None:
+        if self.captured is None:
+            return
+        if not (self.agents > 1 and 1 <= self.captured <= self.agents):
+            raise BoundsError(f"--captured must be one of 2 or more agents, not {self.captured} of {self.agents}")
+        if not 0 <= self.lies <= MAX_LIES:
+            raise BoundsError(f"--lies must be 0..{MAX_LIES}, not {self.lies}")
+        if self.quirks or "death" in self.faults:
+            raise BoundsError("--captured is for right agents that stay: leave out --quirk and the fault death")
+
+    def _check_time(self) -> None:
+        if self.coincidences is not None and not 0 <= self.coincidences <= MAX_COINCIDENCES:
+            raise BoundsError(f"--coincidences must be 0..{MAX_COINCIDENCES}, not {self.coincidences}")
+        for option, given in (("--coincidences", self.coincidences is not None), ("--clocks any", self.clocks_any)):
+            if given and (self.timers_any or self.network == "any"):
+                raise BoundsError(f"{option} is not for --timers any, nor for --network any")
+        if self.clocks_any and (self.quirks or self.captured is not None):
+            raise BoundsError("--clocks any is for right agents: leave out --quirk and --captured")
+
+    @property
+    def nameless(self) -> bool:
+        """Whether it makes no difference which ID an agent has: to itself it is the first then.
+
+        Not where each is looked at by itself, against all that the others say by their IDs.
+        """
+        return self.reduced and self.captured is None and self.network != "any"
+
+    @property
+    def alike(self) -> bool:
+        """Whether it makes no difference who is who."""
+        return self.nameless and not self.stagger
+
+    @property
+    def blocks_alike(self) -> bool:
+        """Whether it makes no difference which block is which."""
+        return self.nameless and self.clocks_any
+
+    @property
+    def settles(self) -> bool:
+        """Whether all answers to a question have come, or are lost, when the instant of the question is over."""
+        return self.reduced and self.captured is None
+
+    def agent_settings(self, agent_id: int = 1) -> Settings:
+        return staggered(Settings(**{**EVENT_FILLS_BLOCK, **self.settings}), self.stagger, agent_id - 1)
+
+    def in_words(self) -> str:
+        parts = [
+            f"{self.agents} agent{'s' if self.agents > 1 else ''}",
+            f"{self.blocks} block{'s' if self.blocks > 1 else ''}",
+            f"network {self.network}",
+        ]
+        if self.captured is not None:
+            lies = "as many lies as it likes" if self.network == "any" else f"{self.lies} lie{'s' * (self.lies != 1)}"
+            parts.append(f"agent {self.captured} captured, {lies}")
+        parts += [f"faults {', '.join(self.faults)}"] if self.faults else []
+        parts += [] if self.crossing else ["nothing crosses"]
+        parts += ["timers in any order"] if self.timers_any else []
+        if self.coincidences is not None:
+            parts += [f"{self.coincidences or 'no'} coincidence{'s' * (self.coincidences != 1)}"]
+        parts += ["any block the older"] if self.clocks_any else []
+        if self.losses is not None:
+            parts += [f"{self.losses or 'no'} loss{'es' * (self.losses != 1)}"]
+        parts += [f"{name} {value}" for name, value in self.settings.items()]
+        parts += [f"stagger {name} {step_s}" for name, step_s in self.stagger.items()]
+        parts += [f"quirk {name}" for name in self.quirks]
+        return ", ".join(parts)

@@ -1,0 +1,1 @@
+"""The graph of a proof: all global states within the bounds, explored breadth first on all cores."""

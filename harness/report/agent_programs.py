@@ -1,0 +1,54 @@
+"""Who ran what, where not all agents were the harness's own."""
+
+import shlex
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from harness.archive.run_record import AgentRecord, RunRecord
+from harness.report.chain_tree import ranges
+from harness.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Program:
+    """What these agents ran: `command` as the scenario has it, None for the harness's own.
+
+    `version` is what the agents said of themselves, None if they said nothing.
+    """
+
+    agents: tuple[int, ...]
+    command: tuple[str, ...] | None
+    version: str | None
+
+    @property
+    def in_words(self) -> str:
+        """ "agent 2 ran ./my_agent --fast (1.4)", "agents 1, 3 ran the harness's own"."""
+        program = "the harness's own" if self.command is None else shlex.join(self.command)
+        of_version = "" if self.version is None else f" ({self.version})"
+        return f"agent{'s' * (len(self.agents) > 1)} {', '.join(ranges([*self.agents]))} ran {program}{of_version}"
+
+    def to_json(self) -> dict[str, Any]:
+        return {"agents": self.agents, "command": self.command, "version": self.version}
+
+
+def programs(record: RunRecord) -> list[Program]:
+    """In the order of their first agents; none where all agents are the harness's own, or nothing is known of them."""
+    return [] if record.scenario is None else asked_for(record.scenario, record.agents)
+
+
+def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[Program]:
+    """The same of a scenario; `agents` is what is on record of them."""
+    if not scenario.foreign:
+        return []
+    alike: dict[tuple[tuple[str, ...] | None, str | None], list[int]] = {}
+    for agent_id in scenario.roster:
+        command, agent = scenario.command_of(agent_id), agents.get(str(agent_id))
+        ran = tuple(command) if command else None, agent.version if agent else None
+        alike.setdefault(ran, []).append(agent_id)
+    return [Program(tuple(alike_agents), command, version) for (command, version), alike_agents in alike.items()]
+
+
+def in_sentence(ran: Iterable[Program]) -> str:
+    return "; ".join(program.in_words for program in ran)

@@ -1,0 +1,176 @@
+"""Comparing two run directories."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, Literal
+
+from harness.archive.archive import RunArchive
+from harness.archive.exports import RUN_FILE
+from harness.errors import RunDirectoryError
+from harness.report.agent_programs import Program, programs
+from harness.report.chain_tree import ranges
+from harness.report.difference.differing_keys import KeyDifference, differing_keys
+from harness.report.difference.step_difference import Step, completed_blocks, name
+
+
+@dataclass(frozen=True)
+class Parting:
+    """Where the traces of an agent part: at the handler run of this number; None where a trace has ended before."""
+
+    number: int
+    a: Step | None
+    b: Step | None
+
+    @property
+    def at_s(self) -> float:
+        """The earlier of both, in mission seconds."""
+        return min(step.t for step in (self.a, self.b) if step is not None)
+
+
+@dataclass(frozen=True)
+class ChainParting:
+    """Where the exported chains of an agent part: the names of the block in this place, which counts from 1.
+
+    None where a chain has ended before; that of an agent without an export has no block.
+    """
+
+    place: int
+    a: str | None
+    b: str | None
+
+
+@dataclass(frozen=True)
+class AgentDifference:
+    run: Parting | None
+    chain: ChainParting | None
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What tells two runs apart.
+
+    keys: of the scenario, and `seed`.
+    agents: every agent of the roster; both None for one that does the same in both.
+    handler_runs: how many were the same, of all agents, each counted up to where it parts.
+    programs: who ran what in either run, where not all agents were the harness's own.
+    exact: the traces are the same to the last byte of each handler run.
+    errors: a sentence for each export that could not be used, and for each run without an end.
+    """
+
+    keys: list[KeyDifference]
+    programs: dict[Literal["a", "b"], list[Program]]
+    agents: dict[int, AgentDifference]
+    handler_runs: int
+    exact: bool
+    errors: list[str]
+
+    @property
+    def first(self) -> int | None:
+        """The agent that parts first in mission time, the lowest ID of several; None if no trace parts."""
+        at_s = {
+            agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None
+        }
+        return min(at_s, key=lambda agent_id: (at_s[agent_id], agent_id), default=None)
+
+    @property
+    def verdict(self) -> str:
+        """`identical`, `same but for times`, or `differ`; keys that differ make no difference by themselves."""
+        if any(difference.run or difference.chain for difference in self.agents.values()):
+            return "differ"
+        return "identical" if self.exact else "same but for times"
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "verdict": self.verdict,
+            "keys": [asdict(key) for key in self.keys],
+            "programs": {run: [program.to_json() for program in ran] for run, ran in self.programs.items()},
+            "first": self.first,
+            "handler_runs": self.handler_runs,
+            "agents": {str(agent_id): asdict(difference) for agent_id, difference in self.agents.items()},
+            "errors": self.errors,
+        }
+
+
+def compare(a: Path, b: Path) -> Difference:
+    """Raises RunDirectoryError if the two cannot be compared: no run directory, no trace, another roster or backend."""
+    run_a, run_b = _Run(a), _Run(b)
+    _refuse_what_cannot_be_compared(run_a, run_b)
+    agents: dict[int, AgentDifference] = {}
+    handler_runs, exact = 0, True
+    for agent_id in run_a.roster:
+        same, to_the_byte, parting = _compare_traces(run_a, run_b, agent_id)
+        handler_runs, exact = handler_runs + same, exact and to_the_byte
+        agents[agent_id] = AgentDifference(parting, _compare_chains(run_a.chain(agent_id), run_b.chain(agent_id)))
+    keys = [*differing_keys(run_a.asked(), run_b.asked())]
+    ran: dict[Literal["a", "b"], list[Program]] = {"a": programs(run_a.record), "b": programs(run_b.record)}
+    return Difference(keys, ran, agents, handler_runs, exact, [*run_a.problems(), *run_b.problems()])
+
+
+class _Run:
+    """One run directory."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.archive = RunArchive(path)
+        self.record = self.archive.record
+        if not self.archive.recorded:
+            missing = RunDirectoryError(f"{path}: there is no {RUN_FILE}; is this a run directory?")
+            raise self.archive.record_error or missing
+        self.roster: Sequence[int] = sorted({*self.record.roster})
+        self.exports = self.archive.exports
+        self.names: Mapping[str, str] = {
+            block: known
+            for agent_id in self.roster
+            for block, known in completed_blocks(self.archive.trace_lines(agent_id), agent_id).items()
+        }
+
+    def chain(self, agent_id: int) -> list[str]:
+        export = self.exports.by_agent.get(agent_id)
+        return [name(block, self.names) for block in export.chain_of_block_hashes] if export else []
+
+    def problems(self) -> Iterator[str]:
+        if self.record.outcome == "running":
+            yield f"{self.path}: the run has not recorded its end, and is compared up to there"
+        yield from self.archive.record_problems
+        yield from self.exports.errors
+
+    def asked(self) -> dict[str, Any]:
+        """What the run was to play, as JSON."""
+        scenario = self.record.scenario
+        return {"seed": self.record.seed, **(scenario.model_dump(mode="json", by_alias=True) if scenario else {})}
+
+
+def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
+    for run in (a, b):
+        if not run.roster:
+            raise RunDirectoryError(f"{run.path / RUN_FILE}: it names no agents: play the run again")
+    if a.roster != b.roster:
+        roster_a, roster_b = (", ".join(ranges([*run.roster])) for run in (a, b))
+        raise RunDirectoryError(f"A has agents {roster_a}, and B has {roster_b}: compare runs of the same agents")
+    if a.record.backend != b.record.backend:
+        raise RunDirectoryError(
+            "one run was in virtual time, whose traces leave out messages that change nothing, and one was not: "
+            "compare runs of the same backend"
+        )
+
+
+def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, Parting | None]:
+    """How many handler runs are the same, whether to the last byte, and where the traces part."""
+    same, exact = 0, True
+    for line_a, line_b in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):
+        if line_a is None or line_b is None or (line_a.life, line_a.text) != (line_b.life, line_b.text):
+            exact = False
+            step_a, step_b = line_a and Step.of(line_a, a.names), line_b and Step.of(line_b, b.names)
+            if step_a != step_b:
+                return same, exact, Parting(same + 1, step_a, step_b)
+        same += 1
+    return same, exact, None
+
+
+def _compare_chains(a: list[str], b: list[str]) -> ChainParting | None:
+    for place, (block_a, block_b) in enumerate(zip_longest(a, b), 1):
+        if block_a != block_b:
+            return ChainParting(place, block_a, block_b)
+    return None

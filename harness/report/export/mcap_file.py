@@ -1,0 +1,133 @@
+"""A run as MCAP: one file that Foxglove, Lichtblick and PlotJuggler open without a plug-in.
+
+Where there is a schema of Foxglove's own for something it is used, in protobuf: a position is a LocationFix (for maps)
+and a FrameTransform (for the 3D view), links and vehicles are a SceneUpdate, every line of a log is a Log. All else are
+the JSON topics of `topics`. run.json and the chain exports are attached as they are.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
+from harness.errors import MachineError
+from harness.report.export.exported_run import Recording
+from harness.report.export.links import FIELD, vehicle_frame
+from harness.report.export.samples import LossesChanged, Position, Said, Telemetry
+from harness.report.export.topics import Topics
+
+try:
+    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+    from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+    from foxglove_schemas_protobuf.Log_pb2 import Log
+    from mcap.well_known import MessageEncoding, SchemaEncoding
+    from mcap.writer import Writer
+    from mcap_protobuf.schema import register_schema
+
+    from harness.report.export.scene import Scene, colours_of
+except ImportError:
+    raise MachineError("writing MCAP takes further packages: `pip install ucp-harness[export]`") from None
+
+_LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
+_SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO, Log.INFO, Log.DEBUG)
+"""Of MAV_SEVERITY, from emergency to debug."""
+
+
+def write_mcap(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+    """How many messages were written into a new file. `progress` is told the mission second, now and then.
+
+    Raises OSError.
+    """
+    with path.open("xb") as file:
+        return _write(recording, _Writer(file), progress)
+
+
+def _write(recording: Recording, writer: "_Writer", progress: Callable[[float], None]) -> int:
+    colours = colours_of(recording.agents)
+    topics, scene = Topics(recording), Scene(recording.archive.record, colours)
+    for sample in recording.samples():
+        at_ns = sample.at_ns
+        match sample:
+            case Position():
+                writer.position(sample, colours[sample.vehicle])
+                for update in scene.moved(sample):
+                    writer.message("/scene", at_ns, update)
+            case LossesChanged(losses=losses):
+                scene.links.losses |= losses
+            case Said(level=level, source=source, text=text):
+                writer.log(at_ns, _LEVELS[level], source, text)
+            case Telemetry(vehicle=vehicle, message=message) if message.get_type() == "STATUSTEXT":
+                severity = _SEVERITIES[min(message.severity, len(_SEVERITIES) - 1)]
+                writer.log(at_ns, severity, f"vehicle {vehicle}", message.text)
+        for topic, name, told in topics.of(sample):
+            writer.json(topic, at_ns, name, topics.schemas[name], told)
+        if writer.messages % 1024 == 0:
+            progress(recording.time.mission_s(at_ns))
+    end_ns = recording.time.at(recording.end_s)
+    for problem in recording.problems:
+        writer.log(end_ns, Log.WARNING, "export", problem)
+    writer.attach(recording)
+    writer.finish()
+    return writer.messages
+
+
+class _Writer:
+    """An MCAP file, of which channels are there from their first message on."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._writer = Writer(file)
+        self._writer.start(profile="", library="ucp-harness")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self.messages = 0
+
+    def position(self, position: Position, colour: Any) -> None:
+        """On the map, and in the 3D view."""
+        frame = vehicle_frame(position.vehicle)
+        transform = FrameTransform(parent_frame_id=FIELD, child_frame_id=frame)
+        transform.timestamp.FromNanoseconds(position.at_ns)
+        transform.translation.x, transform.translation.y, transform.translation.z = position.metres
+        transform.rotation.w = 1.0
+        self.message("/tf", position.at_ns, transform)
+        if position.place is not None:
+            lat_deg, lon_deg, alt_m = position.place
+            fix = LocationFix(frame_id=frame, latitude=lat_deg, longitude=lon_deg, altitude=alt_m, color=colour)
+            fix.timestamp.FromNanoseconds(position.at_ns)
+            self.message(f"/vehicles/{position.vehicle}/location", position.at_ns, fix)
+
+    def log(self, at_ns: int, level: Any, name: str, text: str) -> None:
+        line = Log(level=level, name=name, message=text)
+        line.timestamp.FromNanoseconds(at_ns)
+        self.message("/log", at_ns, line)
+
+    def message(self, topic: str, at_ns: int, message: Any) -> None:
+        """A message in protobuf."""
+        if topic not in self._channels:
+            name = message.DESCRIPTOR.full_name
+            if name not in self._schemas:
+                self._schemas[name] = register_schema(self._writer, type(message))
+            self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.Protobuf, self._schemas[name])
+        self._add(topic, at_ns, message.SerializeToString())
+
+    def json(self, topic: str, at_ns: int, name: str, schema: dict[str, Any], told: dict[str, Any]) -> None:
+        if topic not in self._channels:
+            if name not in self._schemas:
+                data = json.dumps({"title": name, **schema}).encode()
+                self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.JSONSchema, data)
+            self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.JSON, self._schemas[name])
+        self._add(topic, at_ns, json.dumps(told, separators=(",", ":"), allow_nan=False).encode())
+
+    def _add(self, topic: str, at_ns: int, data: bytes) -> None:
+        self._writer.add_message(self._channels[topic], log_time=at_ns, data=data, publish_time=at_ns)
+        self.messages += 1
+
+    def attach(self, recording: Recording) -> None:
+        """The record and the exports, if they can be read: what is wrong with them is told already."""
+        begin_ns = recording.time.at(0.0)
+        for path in (recording.directory / RUN_FILE, *export_paths(recording.directory)):
+            if path.is_file() and path.stat().st_size <= MAX_EXPORT_BYTES:
+                self._writer.add_attachment(begin_ns, begin_ns, path.name, "application/json", path.read_bytes())
+
+    def finish(self) -> None:
+        self._writer.finish()

@@ -1,0 +1,245 @@
+"""A run as a trace for https://ui.perfetto.dev: what every agent did when, and an arrow for each message.
+
+Each agent has a group of tracks: its votes, its reconciles with their phases, its handler runs, and as counters what it
+holds. An arrow goes from the handler run that sent a message to each that it triggered. The swarm has counters of
+losses and chains, and a track of what was done to it and what was said.
+
+It is Perfetto's own protobuf, not Chrome's JSON, whose arrows only find slices that last: a handler run is an instant.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from heapq import merge
+from itertools import count
+from operator import itemgetter
+from pathlib import Path
+from typing import IO, Any
+
+from harness.archive.history import Message
+from harness.errors import MachineError
+from harness.report.export.exported_run import Recording
+from harness.report.export.samples import NetworkChanged, Position, Said, Sample, Spread, Step
+from ucp.trace import HandlerRun
+
+try:
+    from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import (
+        BUILTIN_CLOCK_BOOTTIME,
+        BUILTIN_CLOCK_REALTIME,
+        TracePacket,
+        TrackDescriptor,
+        TrackEvent,
+    )
+    from perfetto.trace_builder.proto_builder import StreamingTraceProtoBuilder
+except ImportError:
+    raise MachineError("writing Perfetto traces takes a further package: `pip install ucp-harness[export]`") from None
+
+SWARM = "swarm"
+MAX_TEXT = 500
+"""More of a line of a log is not shown."""
+_LARGEST = 2**63 - 1
+_SEQUENCE = 1
+
+Event = tuple[int, int, Any]
+"""Time, 1 for what a message triggered and else 0, and the packet: what was sent comes before what was received."""
+
+
+def write_perfetto(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+    """How many events were written into a new file. `progress` is told the mission second, now and then.
+
+    Raises OSError.
+    """
+    with path.open("xb") as file:
+        return _write(recording, file, progress)
+
+
+def _write(recording: Recording, file: IO[bytes], progress: Callable[[float], None]) -> int:
+    trace = _Trace(recording)
+    builder = StreamingTraceProtoBuilder(file)
+    if recording.time.epoch_ns:
+        builder.write_packet(trace.clocks())
+    events = 0
+    streams = [trace.of_samples(), *(trace.votes(agent) for agent in recording.agents)]
+    streams += [trace.reconciles(agent) for agent in recording.agents]
+    for at_ns, _, packet in merge(*streams, key=itemgetter(0, 1)):
+        for descriptor in trace.new_tracks():
+            builder.write_packet(descriptor)
+        builder.write_packet(packet)
+        events += 1
+        if events % 1024 == 0:
+            progress(recording.time.mission_s(at_ns))
+    return events
+
+
+class _Arrows:
+    """The numbers of arrows: one for each message and each agent that received it."""
+
+    def __init__(self, messages: Iterable[Message]) -> None:
+        numbers = count(1)
+        self._from: dict[tuple[int, int, float], list[int]] = {}
+        self._to: dict[tuple[int, int, int, float], int] = {}
+        self.backwards = 0
+        """Receipts that are earlier than what was sent, by the agents' clocks: no arrow goes back in time."""
+        for message in messages:
+            for receiver, at_s in message.receipts:
+                if at_s < message.at_s:
+                    self.backwards += 1
+                    continue
+                number = self._to[message.sender, message.seq, receiver, at_s] = next(numbers)
+                self._from.setdefault((message.sender, message.seq, message.at_s), []).append(number)
+
+    def leaving(self, agent: int, run: HandlerRun) -> Iterator[int]:
+        for sent in run.sent:
+            yield from self._from.pop((agent, sent.seq, run.t), ())
+
+    def arriving(self, agent: int, run: HandlerRun) -> int | None:
+        sender, seq = run.trigger.get("from"), run.trigger.get("seq")
+        return self._to.pop((sender, seq, agent, run.t), None) if sender is not None else None  # type: ignore[arg-type]
+
+
+class _Trace:
+    """Makes packets of what happened, and of tracks when they are first used."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._arrows = _Arrows(recording.history.messages or ())
+        if self._arrows.backwards:
+            recording.add_problem(
+                f"{self._arrows.backwards} messages were received before they were sent, by the agents' clocks: "
+                "they have no arrow"
+            )
+        self._uuids = count(1)
+        self._tracks: dict[tuple[str, str], int] = {}
+        self._new: list[Any] = []
+        self._counters: dict[tuple[str, str], float] = {}
+        for rank, group in enumerate((SWARM, *map(_agent, recording.agents))):
+            self._track(group, rank=rank)
+
+    def clocks(self) -> Any:
+        """Says that times are wall time."""
+        packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)
+        for clock in (BUILTIN_CLOCK_BOOTTIME, BUILTIN_CLOCK_REALTIME):
+            packet.clock_snapshot.clocks.add(clock_id=clock, timestamp=self._recording.time.epoch_ns)
+        return packet
+
+    def new_tracks(self) -> Iterator[Any]:
+        """Descriptions of the tracks that are used for the first time."""
+        new, self._new = self._new, []
+        yield from new
+
+    def of_samples(self) -> Iterator[Event]:
+        for sample in self._recording.samples():
+            yield from self._of(sample)
+
+    def _of(self, sample: Sample) -> Iterator[Event]:
+        at_ns = sample.at_ns
+        match sample:
+            case Step(agent=agent, run=run):
+                yield self._step(at_ns, agent, run)
+                held = {"chain": run.state.chain, "deque": run.state.deque, "stack": run.state.stack}
+                for name, blocks in held.items():
+                    yield from self._count(at_ns, _agent(agent), f"{name} (blocks)", blocks)
+            case Position(vehicle=vehicle, metres=metres):
+                yield from self._count(at_ns, _agent(vehicle), "altitude (m)", metres[2])
+            case NetworkChanged():
+                yield from self._count(at_ns, SWARM, "mean loss (%)", 100 * sample.mean_loss)
+                yield from self._count(at_ns, SWARM, "worst loss (%)", 100 * sample.worst_loss)
+                yield from self._count(at_ns, SWARM, "groups that hear each other", len(sample.groups))
+            case Spread(replication=replication):
+                yield from self._count(at_ns, SWARM, "longest chain (blocks)", replication.longest_chain)
+                yield from self._count(at_ns, SWARM, "mutual chain (blocks)", replication.mutual_chain)
+                yield from self._count(at_ns, SWARM, "distinct chains", replication.distinct_chains)
+            case Said(source=source, text=text):
+                packet = self._packet(at_ns, SWARM, source, TrackEvent.TYPE_INSTANT, text[:MAX_TEXT])
+                yield at_ns, 0, packet
+
+    def _step(self, at_ns: int, agent: int, run: HandlerRun) -> Event:
+        packet = self._packet(at_ns, _agent(agent), "handlers", TrackEvent.TYPE_INSTANT, run.handler)
+        event = packet.track_event
+        event.flow_ids.extend(self._arrows.leaving(agent, run))
+        if (arrow := self._arrows.arriving(agent, run)) is not None:
+            event.terminating_flow_ids.append(arrow)
+        trigger = next(iter(run.trigger.items()), ("", ""))
+        _annotate(event, "trigger", f"{trigger[0]}: {trigger[1]}")
+        _annotate(event, "branch", run.branch)
+        block = self._recording.block
+        told = {
+            "changes": [f"{operation} {block(block_hash)}" for operation, block_hash in run.changes],
+            "sent": [sent.message + (f" of {block(sent.block)}" if sent.block else "") for sent in run.sent],
+        }
+        for name, parts in told.items():
+            if parts:
+                _annotate(event, name, ", ".join(parts))
+        return at_ns, int("message" in run.trigger), packet
+
+    def votes(self, agent: int) -> Iterator[Event]:
+        for vote in self._recording.history.votes:
+            if vote.agent == agent:
+                name = f"vote on {self._recording.block(vote.block)}" if vote.block else "vote"
+                yield self._begin(agent, "votes", vote.start_s, name, outcome=vote.outcome)
+                yield self._end(agent, "votes", vote.end_s)
+
+    def reconciles(self, agent: int) -> Iterator[Event]:
+        for reconcile in self._recording.history.reconciles:
+            if reconcile.agent == agent:
+                done = "done" if reconcile.done else "cut short"
+                name = f"reconcile: {reconcile.reason}"
+                yield self._begin(agent, "reconciles", reconcile.start_s, name, outcome=done)
+                for phase in reconcile.phases:
+                    yield self._begin(agent, "reconciles", phase.start_s, phase.name, rounds=str(phase.rounds))
+                    yield self._end(agent, "reconciles", phase.end_s)
+                yield self._end(agent, "reconciles", reconcile.end_s)
+
+    def _begin(self, agent: int, track: str, at_s: float, name: str, **told: str) -> Event:
+        at_ns = self._recording.time.at(at_s, agent)
+        packet = self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_BEGIN, name)
+        for key, value in told.items():
+            _annotate(packet.track_event, key, value)
+        return at_ns, 0, packet
+
+    def _end(self, agent: int, track: str, at_s: float) -> Event:
+        at_ns = self._recording.time.at(at_s, agent)
+        return at_ns, 0, self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_END)
+
+    def _count(self, at_ns: int, group: str, name: str, value: float) -> Iterator[Event]:
+        """If it is another than before."""
+        if self._counters.get((group, name)) != value and abs(value) <= _LARGEST:
+            self._counters[group, name] = value
+            packet = self._packet(at_ns, group, name, TrackEvent.TYPE_COUNTER)
+            packet.track_event.double_counter_value = value
+            yield at_ns, 1, packet
+
+    def _packet(self, at_ns: int, group: str, track: str, kind: Any, name: str = "") -> Any:
+        packet = TracePacket(timestamp=at_ns, trusted_packet_sequence_id=_SEQUENCE)
+        packet.track_event.type = kind
+        packet.track_event.track_uuid = self._track(group, track, counter=kind == TrackEvent.TYPE_COUNTER)
+        if name:
+            packet.track_event.name = name
+        return packet
+
+    def _track(self, group: str, name: str = "", *, rank: int = 0, counter: bool = False) -> int:
+        """The track of that name in a group, or the group's own."""
+        if (group, name) not in self._tracks:
+            uuid = self._tracks[group, name] = next(self._uuids)
+            packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)
+            track = packet.track_descriptor
+            track.uuid, track.name = uuid, name or group
+            if name:
+                track.parent_uuid = self._tracks[group, ""]
+                track.sibling_order_rank = _ORDER.index(name) if name in _ORDER else len(_ORDER)
+            else:
+                track.sibling_order_rank = rank
+                track.child_ordering = TrackDescriptor.EXPLICIT
+            if counter:
+                track.counter.SetInParent()
+            self._new.append(packet)
+        return self._tracks[group, name]
+
+
+_ORDER = ("votes", "reconciles", "handlers")
+
+
+def _agent(agent: int) -> str:
+    return f"agent {agent}"
+
+
+def _annotate(event: Any, name: str, value: str) -> None:
+    event.debug_annotations.add(name=name, string_value=value)

@@ -1,0 +1,237 @@
+"""A run as a bag of ROS 2, for its tools (ros2 bag, RViz, rqt, PlotJuggler), made without ROS.
+
+Positions, transforms, links and logs are messages that every ROS installation knows. The agents' traces and exports are
+on the topics that the adapter for bags reads (`harness.field.adapters.rosbag_adapter`): `ucp-harness import` makes a
+run directory of the bag again. Storage is SQLite, which every ROS 2 from Humble on opens.
+"""
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from heapq import merge
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, Literal
+
+from harness.archive.history import LATEST_S
+from harness.archive.traces import Gap, Header
+from harness.errors import MachineError
+from harness.report.export.exported_run import Recording
+from harness.report.export.links import FIELD, Line, Links, vehicle_frame
+from harness.report.export.samples import (
+    LossesChanged,
+    Metres,
+    NetworkChanged,
+    Position,
+    Said,
+    Sample,
+    Step,
+    Telemetry,
+)
+
+try:
+    import numpy
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+except ImportError:
+    raise MachineError("writing ROS bags takes a further package: `pip install ucp-harness[export]`") from None
+
+Timed = tuple[int, str, Any]
+"""Time, topic, and message."""
+
+METADATA_VERSION: Literal[8] = 8
+"""Of the bag: Humble and all later ones read it."""
+LEVELS = {"info": 20, "warning": 30, "error": 40}
+"""rcl_interfaces/Log: INFO, WARN, ERROR."""
+_LARGEST = 2**32 - 1
+_STORE = get_typestore(Stores.ROS2_HUMBLE)
+_NS = 1_000_000_000
+
+
+def write_rosbag(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+    """How many messages were written into a new directory. `progress` is told the mission second, now and then.
+
+    Raises OSError, and MachineError where the disk refuses.
+    """
+    try:
+        return _write(recording, path, progress)
+    except sqlite3.Error as error:
+        raise MachineError(f"{path} cannot be written: {error}") from None
+
+
+def _write(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+    bag = _Messages(recording)
+    written = 0
+    with Writer(path, version=METADATA_VERSION, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        channels: dict[str, Any] = {}
+        for at_ns, topic, message in bag.all():
+            name = message.__msgtype__
+            if topic not in channels:
+                channels[topic] = writer.add_connection(topic, name, typestore=_STORE)
+            writer.write(channels[topic], at_ns, _STORE.serialize_cdr(message, name))
+            written += 1
+            if written % 1024 == 0:
+                progress(recording.time.mission_s(at_ns))
+    return written
+
+
+class _Messages:
+    """What happened, as messages of ROS."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._links = Links()
+        self._counts: dict[str, float] = {}
+
+    def all(self) -> Iterator[Timed]:
+        """In order of time."""
+        traces = [self._trace(agent) for agent in self._recording.archive.traces]
+        yield from merge(self._of_samples(), *traces, key=itemgetter(0))
+        end_ns = self._recording.time.at(self._recording.end_s)
+        for agent, export in self._recording.archive.exports.by_agent.items():
+            yield (
+                end_ns,
+                f"/ucp/{agent}/chain",
+                _made("std_msgs/msg/String", data=export.model_dump_json(by_alias=True)),
+            )
+        for problem in self._recording.problems:
+            yield end_ns, "/rosout", _log(end_ns, LEVELS["warning"], "export", problem)
+
+    def _trace(self, agent: int) -> Iterator[Timed]:
+        """Its lines, as they were written."""
+        time = self._recording.time
+        at_ns = time.at(0.0, agent)
+        for entry in self._recording.archive.traces[agent].entries():
+            if not isinstance(entry, Gap | Header) and 0 <= entry.t <= LATEST_S:
+                at_ns = time.at(entry.t, agent)
+            if not isinstance(entry, Gap):
+                yield at_ns, f"/ucp/{agent}/trace", _made("std_msgs/msg/String", data=entry.to_line().rstrip("\n"))
+
+    def _of_samples(self) -> Iterator[Timed]:
+        for sample in self._recording.samples():
+            for topic, message in self._of(sample):
+                yield sample.at_ns, topic, message
+
+    def _of(self, sample: Sample) -> Iterator[tuple[str, Any]]:
+        at_ns = sample.at_ns
+        match sample:
+            case Position(vehicle=vehicle):
+                if (lines := self._links.moved(sample)) is not None:
+                    yield "/links", _markers(at_ns, lines)
+                yield "/tf", _transform(sample)
+                if sample.place is not None:
+                    yield f"/vehicle_{vehicle}/fix", _fix(sample)
+            case LossesChanged(losses=losses):
+                self._links.losses |= losses
+            case NetworkChanged(mean_loss=mean, worst_loss=worst):
+                yield from self._count("/network/mean_loss", "Float64", mean)
+                yield from self._count("/network/worst_loss", "Float64", worst)
+            case Step(agent=agent, run=run):
+                held = {"chain": run.state.chain, "deque": run.state.deque, "stack": run.state.stack}
+                for name, blocks in held.items():
+                    yield from self._count(f"/agent_{agent}/{name}", "UInt32", min(max(blocks, 0), _LARGEST))
+            case Said(level=level, source=source, text=text):
+                yield "/rosout", _log(at_ns, LEVELS[level], source, text)
+            case Telemetry(vehicle=vehicle, message=message):
+                yield f"/vehicle_{vehicle}/mavlink", _bytes(bytes(message.get_msgbuf()))
+
+    def _count(self, topic: str, kind: str, value: float) -> Iterator[tuple[str, Any]]:
+        """If it is another than before."""
+        if self._counts.get(topic) != value:
+            self._counts[topic] = value
+            yield topic, _made(f"std_msgs/msg/{kind}", data=value)
+
+
+def _made(name: str, /, **fields: Any) -> Any:
+    """A message of this type."""
+    return _STORE.types[name](**fields)
+
+
+def _stamp(at_ns: int) -> Any:
+    return _made("builtin_interfaces/msg/Time", sec=at_ns // _NS, nanosec=at_ns % _NS)
+
+
+def _header(at_ns: int, frame: str) -> Any:
+    return _made("std_msgs/msg/Header", stamp=_stamp(at_ns), frame_id=frame)
+
+
+def _log(at_ns: int, level: int, name: str, text: str) -> Any:
+    return _made(
+        "rcl_interfaces/msg/Log",
+        stamp=_stamp(at_ns),
+        level=level,
+        name=name,
+        msg=text,
+        file="",
+        function="",
+        line=0,
+    )
+
+
+def _bytes(data: bytes) -> Any:
+    layout = _made("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    return _made("std_msgs/msg/UInt8MultiArray", layout=layout, data=numpy.frombuffer(data, numpy.uint8))
+
+
+def _fix(position: Position) -> Any:
+    assert position.place is not None
+    lat_deg, lon_deg, alt_m = position.place
+    return _made(
+        "sensor_msgs/msg/NavSatFix",
+        header=_header(position.at_ns, vehicle_frame(position.vehicle)),
+        status=_made("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+        latitude=lat_deg,
+        longitude=lon_deg,
+        altitude=alt_m,
+        position_covariance=numpy.zeros(9),
+        position_covariance_type=0,
+    )
+
+
+def _vector(kind: str, metres: Metres) -> Any:
+    return _made(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", metres, strict=True)))
+
+
+def _quaternion() -> Any:
+    return _made("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+
+
+def _transform(position: Position) -> Any:
+    transform = _made(
+        "geometry_msgs/msg/TransformStamped",
+        header=_header(position.at_ns, FIELD),
+        child_frame_id=vehicle_frame(position.vehicle),
+        transform=_made(
+            "geometry_msgs/msg/Transform", translation=_vector("Vector3", position.metres), rotation=_quaternion()
+        ),
+    )
+    return _made("tf2_msgs/msg/TFMessage", transforms=[transform])
+
+
+def _markers(at_ns: int, lines: list[Line]) -> Any:
+    """One list of lines; RViz takes none that is empty, so that without any link the old one is deleted."""
+    marker: Any = _STORE.types["visualization_msgs/msg/Marker"]
+    none = (0.0, 0.0, 0.0)
+    made = marker(
+        header=_header(at_ns, FIELD),
+        ns="links",
+        id=0,
+        type=marker.LINE_LIST,
+        action=marker.ADD if lines else marker.DELETE,
+        pose=_made("geometry_msgs/msg/Pose", position=_vector("Point", none), orientation=_quaternion()),
+        scale=_vector("Vector3", (1.0, 0.0, 0.0)),
+        color=_made("std_msgs/msg/ColorRGBA", r=0.0, g=1.0, b=0.0, a=1.0),
+        lifetime=_made("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        frame_locked=False,
+        points=[_vector("Point", end) for line in lines for end in (line.low, line.high)],
+        colors=[_made("std_msgs/msg/ColorRGBA", **line.colour) for line in lines for _ in range(2)],
+        texture_resource="",
+        texture=_made(
+            "sensor_msgs/msg/CompressedImage", header=_header(at_ns, FIELD), format="", data=numpy.zeros(0, numpy.uint8)
+        ),
+        uv_coordinates=[],
+        text="",
+        mesh_resource="",
+        mesh_file=_made("visualization_msgs/msg/MeshFile", filename="", data=numpy.zeros(0, numpy.uint8)),
+        mesh_use_embedded_materials=False,
+    )
+    return _made("visualization_msgs/msg/MarkerArray", markers=[made])

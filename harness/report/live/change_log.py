@@ -1,0 +1,63 @@
+"""All that a feed has told, for any number of readers: each reads on from where it is, in its own time.
+
+It lies in a file that has no name, so memory is bounded whatever a run is; and who reads slowly holds up nobody.
+"""
+
+import json
+import os
+import tempfile
+from collections.abc import Iterable
+from functools import partial
+
+from harness.report.live.agent_course import Change
+
+MAX_BYTES = 512 * 1024 * 1024
+CHUNK_BYTES = 256 * 1024
+FAR_BEHIND_BYTES = 4 * 1024 * 1024
+"""Who has so much left to read while a run goes on is given what is needed to follow, and no more."""
+_LEFT_OUT = (b'["m"', b'["p"', b'["t"', b'["d"')
+
+_encode = partial(json.dumps, separators=(",", ":"), check_circular=False)
+
+
+class Story:
+    """Changes, a line each. `size` is in bytes."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115
+        self.size = 0
+        self._full = False
+
+    def tell(self, changes: Iterable[Change]) -> None:
+        """Raises OSError if the disk is full."""
+        lines = "".join([_encode(change) + "\n" for change in changes]).encode()
+        if self._full or not lines:
+            return
+        if self.size + len(lines) > MAX_BYTES:
+            self._full = True
+            note = f"there is more than {MAX_BYTES >> 20} MiB to tell: what follows is left out"
+            lines = (_encode(["note", note]) + "\n").encode()
+        self._file.write(lines)
+        self._file.flush()
+        self.size += len(lines)
+
+    def read(self, start: int, *, may_skip: bool = False) -> tuple[int, str]:
+        """Whole lines from `start` on, some at a time, and where they end; none at the end.
+
+        A reader that may skip and is far behind is not given messages and places.
+        """
+        skips = may_skip and self.size - start > FAR_BEHIND_BYTES
+        data = self._pread(start, FAR_BEHIND_BYTES if skips else CHUNK_BYTES)
+        while b"\n" not in data and start + len(data) < self.size:
+            data += self._pread(start + len(data), CHUNK_BYTES)
+        whole = data[: data.rfind(b"\n") + 1]
+        end = start + len(whole)
+        if skips:
+            whole = b"".join(line for line in whole.splitlines(keepends=True) if not line.startswith(_LEFT_OUT))
+        return end, whole.decode()
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _pread(self, start: int, most: int) -> bytes:
+        return os.pread(self._file.fileno(), min(most, self.size - start), start)

@@ -1,0 +1,221 @@
+"""A run directory as one stream of changes, whether the run goes on or is over.
+
+A change is a list: its kind, its mission second, and more. Blocks go by KEY_LENGTH digits of their hashes.
+
+| kind | after the mission second |
+|---|---|
+| `p` | vehicle -> metres north, east and up |
+| `n` | a change of network or agents: what, detail, agents, their state, [low, high, loss there, loss back] of each
+        pair that changed, the parts that the swarm is in, if they changed, and whether somebody asked for it by hand |
+| `b` | a block was completed: key, agent, ordinal |
+| `c` | an agent's blocks moved: agent, [operation, key] of each, top chain hash, how it came to a block |
+| `z` | an agent's life ended, and another begins with nothing: agent |
+| `s` | what an agent is about: agent, word, detail |
+| `m` | a broadcast: agent, message, key or null, mask of who took it in (bit n is the nth of the roster), in hex |
+| `d` | an agent dropped a datagram: agent, reason |
+| `x` | what is against a characteristic at once: agent, number, key |
+| `t` | it is that late |
+| `all` | agents were given all that reached them: who did not take a message in has lost it |
+| `run`, `end`, `note` | no second, but a document: what the run is; how it ended; a sentence on what cannot be shown |
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from harness.archive.archive import RunArchive
+from harness.archive.exports import RUN_FILE, agents_directory
+from harness.archive.record_file import read_record
+from harness.archive.run_record import RunRecord
+from harness.errors import RunDirectoryError
+from harness.play.backends import in_virtual_time
+from harness.present.colours import inks
+from harness.report.live.agent_course import Change, Course, Heard, Sent
+from harness.report.live.surroundings import Around
+from harness.scenario.faults import ASKED_FOR, VehicleFault
+from harness.scenario.verdict_names import kind_of
+
+MAX_VEHICLES = 200
+"""Whose links a page can draw."""
+LINES_AT_ONCE = 500
+"""Of one file, before somebody else has a turn."""
+LOOKS_UNTIL_TOLD = 2
+"""A message is told so many looks after it was first seen: by then whoever took it in has said so."""
+
+
+@dataclass
+class _Broadcast:
+    """`message` is None while only receivers have told of it."""
+
+    mask: int
+    looks: int
+    t: float = 0.0
+    message: str | None = None
+    block: str | None = None
+
+
+class Feed:
+    """What happened in a run directory, look by look.
+
+    Raises RunDirectoryError if it is none, nothing in it can be shown, or more vehicles than fit on a page.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        archive = RunArchive(directory)
+        self._directory = directory
+        self._roster = archive.roster
+        if not self._roster:
+            raise RunDirectoryError(f"{directory}: it has neither {RUN_FILE} nor traces, so there is nothing to watch")
+        if len(self._roster) > MAX_VEHICLES:
+            raise RunDirectoryError(
+                f"{directory}: {len(self._roster)} vehicles flew, and the page shows at most {MAX_VEHICLES}: "
+                "`ucp-harness report` and `export` take them all"
+            )
+        agents = agents_directory(directory)
+        self._bit = {agent_id: 1 << number for number, agent_id in enumerate(self._roster)}
+        self._courses = [Course(agents, agent_id) for agent_id in self._roster]
+        self._around = Around(directory, self._roster)
+        self._on_the_air: dict[tuple[int, int], _Broadcast] = {}
+        self._looks = 0
+        self._told_s = 0.0
+        self._told_of: set[str] = set()
+        self._record = archive.record
+        self._all_heard = self._record.backend is not None and not in_virtual_time(self._record.backend)
+        self._record_stamp = self._stamp()
+
+    def first(self, *, live: bool) -> Change:
+        """What the run is, and whether it goes on."""
+        record, scenario = self._record, self._record.scenario
+        return [
+            "run",
+            {
+                "name": scenario.name if scenario else self._directory.name,
+                "directory": self._directory.name,
+                "roster": self._roster,
+                "types": [scenario.vehicles.type_of(agent) if scenario else "copter" for agent in self._roster],
+                "inks": [[ink.fill, ink.stroke, ink.text, ink.dashed] for ink in inks(self._roster).values()],
+                "duration_s": scenario.duration_s if scenario else None,
+                "speedup": scenario.speedup if scenario else None,
+                "backend": record.backend,
+                "seed": record.seed,
+                "live": live,
+                "all_heard": self._all_heard,
+                "flown": self._is_flown(),
+                "troubles": [[kind.what, kind.unless_told] for kind in ASKED_FOR if issubclass(kind, VehicleFault)],
+            },
+        ]
+
+    def _is_flown(self) -> bool:
+        """Whether the vehicles are programs, which something can befall."""
+        record, scenario = self._record, self._record.scenario
+        has_vehicles = scenario is not None and scenario.vehicles.kind != "none"
+        return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
+
+    def look(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
+        """What is new, up to a mission second; and whether there is more up to then, for which to look again."""
+        more = self._around.read(until_s, LINES_AT_ONCE)
+        for course in self._courses:
+            more |= course.read(until_s, LINES_AT_ONCE)
+        self._looks += not more  # who has more to tell may yet have taken in what was sent
+        changes = [*self._take(), *self._messages(told_now=False)]
+        changes.sort(key=lambda change: float(change[1]))
+        at_s = max(self._around.at_s, *(course.at_s for course in self._courses))
+        if at_s > self._told_s:
+            self._told_s = at_s
+            changes.append(["t", round(at_s, 3)])
+        if not self._all_heard and any(course.takes_in_all for course in self._courses):
+            self._all_heard = True
+            changes.append(["all", self._told_s])
+        return [*changes, *self._notes()], more
+
+    def last(self) -> list[Change]:
+        """What is left to say at the end, and how it ended."""
+        changes = [*self._take(), *self._messages(told_now=True)]
+        return [*changes, *self._notes(), ["end", self._ending()]]
+
+    @property
+    def next_s(self) -> float | None:
+        """When happened what nobody has looked at yet; None if all that was written by now was told."""
+        ahead = (self._around.next_s, *(course.next_s for course in self._courses))
+        return min((at_s for at_s in ahead if at_s is not None), default=None)
+
+    @property
+    def over(self) -> bool:
+        """Whether the run's record says how it ended, and what the verdict is."""
+        stamp = self._stamp()
+        if stamp != self._record_stamp:
+            self._record_stamp = stamp
+            self._record = read_record(self._directory / RUN_FILE).record
+        return self._record.outcome == "failed" or bool(self._record.characteristics)
+
+    def close(self) -> None:
+        self._around.close()
+        for course in self._courses:
+            course.close()
+
+    def _take(self) -> Iterator[Change]:
+        for changes in (self._around.changes, *(course.changes for course in self._courses)):
+            yield from changes
+            changes.clear()
+
+    def _messages(self, *, told_now: bool) -> Iterator[Change]:
+        """Those that whoever was to take them in has taken in by now."""
+        happened: list[tuple[float, int, int, Sent | Heard]] = []
+        for course in self._courses:
+            happened += [(sent.t, 0, course.agent_id, sent) for sent in course.sent]
+            happened += [(heard.t, 1, course.agent_id, heard) for heard in course.heard]
+            course.sent.clear()
+            course.heard.clear()
+        happened.sort(key=itemgetter(0, 1))
+        for _, _, agent_id, what in happened:
+            if isinstance(what, Heard):
+                key = what.sender, what.seq
+                if key not in self._on_the_air:
+                    self._on_the_air[key] = _Broadcast(0, self._looks)
+                self._on_the_air[key].mask |= self._bit[agent_id]
+                continue
+            key = agent_id, what.seq
+            before = self._on_the_air.get(key)
+            if before is not None and before.message is not None:
+                yield self._told(agent_id, before)  # its number is used again, in another life
+                before = None
+            mask = before.mask if before else 0
+            self._on_the_air[key] = _Broadcast(mask, self._looks, what.t, what.message, what.block)
+        old = self._looks if told_now else self._looks - LOOKS_UNTIL_TOLD
+        for key in [key for key, broadcast in self._on_the_air.items() if broadcast.looks <= old]:
+            broadcast = self._on_the_air.pop(key)
+            if broadcast.message is not None:
+                yield self._told(key[0], broadcast)
+
+    def _told(self, sender: int, broadcast: _Broadcast) -> Change:
+        return ["m", broadcast.t, sender, broadcast.message, broadcast.block, f"{broadcast.mask:x}"]
+
+    def _notes(self) -> Iterator[Change]:
+        """Sentences that were not said yet."""
+        damaged = (course.problem for course in self._courses)
+        for sentence in chain(self._around.problems, damaged):
+            if sentence is not None and sentence not in self._told_of:
+                self._told_of.add(sentence)
+                yield ["note", sentence]
+
+    def _ending(self) -> dict[str, Any]:
+        record = self._record if self.over else RunRecord()
+        return {
+            "outcome": record.outcome,
+            "detail": record.outcome_detail,
+            "judgements": [
+                [key, judgement.name, judgement.verdict, judgement.reason, kind_of(judgement.verdict)]
+                for key, judgement in record.judgements.items()
+            ],
+            "report": (self._directory / "report.html").is_file(),
+        }
+
+    def _stamp(self) -> tuple[int, int] | None:
+        try:
+            status = (self._directory / RUN_FILE).stat()
+        except OSError:
+            return None
+        return status.st_mtime_ns, status.st_ino

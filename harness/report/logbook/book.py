@@ -1,0 +1,77 @@
+"""Gathers exports, and what is known of where their events come from."""
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from harness.archive.archive import RunArchive
+from harness.archive.block_names import name_blocks
+from harness.archive.event_data import EventData
+from harness.archive.exports import SUFFIX, Export
+from harness.archive.run_record import AgentRecord, RunRecord
+from harness.errors import ExportError, RunDirectoryError
+from harness.play.backends import in_virtual_time
+
+if TYPE_CHECKING:
+    from ucp.secure.sealing import Depot
+
+
+@dataclass
+class Logbook:
+    """Exports by agent; `names` of their blocks; `errors`, a sentence for each file that could not be used.
+
+    `telemetry`: events are those of the source `mavlink`. Exports that came without a run are taken for such.
+    `absent`: a sentence for each agent of the mission that has no export here. `event_data` reads what blocks hold.
+    """
+
+    exports: dict[int, Export]
+    names: dict[str, str]
+    telemetry: bool = True
+    absent: dict[int, str] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+    event_data: EventData = field(default_factory=EventData)
+
+    def name(self, block_hash: str) -> str:
+        return self.names.get(block_hash, block_hash[:12])
+
+    def only(self, agent_id: int) -> "Logbook":
+        """The logbook with one agent's export; blocks keep their names. Raises ExportError if there is none."""
+        if agent_id in self.exports:
+            return replace(self, exports={agent_id: self.exports[agent_id]}, absent={})
+        known = (
+            f"exports here are of agents {', '.join(map(str, self.exports))}" if self.exports else "nor of any other"
+        )
+        raise ExportError(f"{self.absent.get(agent_id, f'there is no export of agent {agent_id}')}; {known}")
+
+
+def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
+    """The logbook of an archive; `depot` opens what is sealed.
+
+    Raises RunDirectoryError if it has no exports at all, ExportError if nothing here is sealed to this depot.
+    """
+    exports = archive.exports
+    if not exports.by_agent and not exports.errors:
+        why = f"holds no exports (*{SUFFIX}): no agent of this run left its chain"
+        raise RunDirectoryError(f"{archive.directory}: {why}")
+    record = archive.origin
+    absent = sorted({*record.roster} - {*exports.by_agent})
+    return Logbook(
+        exports.by_agent,
+        name_blocks(exports.by_agent),
+        telemetry=logged_telemetry(record),
+        absent={agent_id: _absent(agent_id, record.agents.get(str(agent_id))) for agent_id in absent},
+        errors=[*archive.record_problems, *exports.errors],
+        event_data=EventData.of(exports.by_agent.values(), depot),
+    )
+
+
+def logged_telemetry(record: RunRecord) -> bool:
+    """Events are random where no vehicle flies; those of exports that came without a run are taken for telemetry."""
+    asked = record.scenario
+    if asked is None:
+        return True
+    return asked.events.source == "mavlink" and asked.vehicles.kind != "none" and not in_virtual_time(record.backend)
+
+
+def _absent(agent_id: int, agent: AgentRecord | None) -> str:
+    why = f" ({agent.outcome})" if agent is not None and agent.outcome != "exported" else ""
+    return f"agent {agent_id} has no export here{why}"

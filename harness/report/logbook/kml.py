@@ -1,0 +1,66 @@
+"""Tracks as KML 2.2, with the gx:Track of Google's extension: what Google Earth plays over time."""
+
+from collections.abc import Iterable
+from xml.etree import ElementTree
+
+from harness.report.logbook.positions import Entry, Track, Whereabouts, coordinates, utc
+from ucp.telemetry import describe
+
+_KML, _GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
+ElementTree.register_namespace("", _KML)
+ElementTree.register_namespace("gx", _GX)
+
+
+def kml(tracks: Iterable[Track]) -> str:
+    """A document with a folder for each vehicle: its track, and a placemark with a time for every other event.
+
+    Altitudes are above mean sea level. An event is where the vehicle last was; one before the first position is left
+    out.
+    """
+    root = ElementTree.Element(f"{{{_KML}}}kml")
+    document = _add(root, "Document")
+    for track in tracks:
+        folder = _add(document, "Folder")
+        _add(folder, "name", f"vehicle {track.agent_id}")
+        _track(folder, track)
+        for entry in track.entries:
+            if not entry.is_position:
+                _placemark(folder, entry)
+    ElementTree.indent(root)
+    xml: bytes = ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True)
+    return xml.decode() + "\n"
+
+
+def _track(folder: ElementTree.Element, track: Track) -> None:
+    placemark = _add(folder, "Placemark")
+    _add(placemark, "name", f"track of vehicle {track.agent_id}")
+    line = ElementTree.SubElement(placemark, f"{{{_GX}}}Track")
+    _add(line, "altitudeMode", "absolute")
+    for timestamp_us, _ in track.fixes:
+        _add(line, "when", utc(timestamp_us))
+    for _, position in track.fixes:
+        coord = ElementTree.SubElement(line, f"{{{_GX}}}coord")
+        coord.text = _numbers(position, " ")
+
+
+def _placemark(folder: ElementTree.Element, entry: Entry) -> None:
+    if entry.position is None:
+        return
+    placemark = _add(folder, "Placemark")
+    _add(placemark, "name", describe(entry.event.event_id, entry.event.data))
+    _add(placemark, "description", f"block {entry.block}; the position is {entry.position_age_s:.0f} s older")
+    _add(_add(placemark, "TimeStamp"), "when", utc(entry.event.timestamp_us))
+    point = _add(placemark, "Point")
+    _add(point, "altitudeMode", "absolute")
+    _add(point, "coordinates", _numbers(entry.position, ","))
+
+
+def _numbers(position: Whereabouts, separator: str) -> str:
+    lon, lat, alt = coordinates(position)
+    return f"{lon:.7f}{separator}{lat:.7f}{separator}{alt:.3f}"
+
+
+def _add(parent: ElementTree.Element, tag: str, text: str | None = None) -> ElementTree.Element:
+    element = ElementTree.SubElement(parent, f"{{{_KML}}}{tag}")
+    element.text = text
+    return element

@@ -1,0 +1,102 @@
+"""Where the vehicles were: the logged positions of every vehicle in order of time, for maps.
+
+A vehicle's events are taken from wherever a copy of its blocks survived: from every chain, deque and reconcile stack of
+the logbook. A vehicle that was lost is on the map as far as others hold its blocks.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Protocol
+
+from harness.archive.exports import ExportedBlock
+from harness.report.logbook.book import Logbook
+from ucp.events import LoggableEvent, MalformedEventsError
+from ucp.telemetry import position_of
+
+LAST_TIMESTAMP_US = 253_402_300_799_999_999
+"""The end of the year 9999: a later time is nobody's, and no map can show it."""
+
+
+class Whereabouts(Protocol):
+    """A place, in 1e-7 degrees, and in millimetres above mean sea level."""
+
+    @property
+    def lat_e7(self) -> int: ...
+    @property
+    def lon_e7(self) -> int: ...
+    @property
+    def alt_mm(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One event in block `block`. `position` is its own, or the vehicle's last before it; None if there is none.
+
+    `position_age_s` is how much older than the event the position is.
+    """
+
+    block: str
+    event: LoggableEvent
+    is_position: bool
+    position: Whereabouts | None
+    position_age_s: float | None
+
+
+@dataclass(frozen=True)
+class Track:
+    """All events of one agent, oldest first; `fixes` are its positions, each with its timestamp in microseconds."""
+
+    agent_id: int
+    entries: list[Entry]
+    fixes: list[tuple[int, Whereabouts]]
+
+
+def tracks(logbook: Logbook) -> list[Track]:
+    """A track of each agent that logged positions, by agent ID; none if events are no telemetry."""
+    if not logbook.telemetry:
+        return []
+    blocks: dict[int, dict[tuple[int, str], ExportedBlock]] = {}
+    for export in logbook.exports.values():
+        for block in export.blocks():
+            blocks.setdefault(block.agent_id, {})[block.timestamp_us, block.event_data] = block
+    made = (track_of(agent_id, _events(logbook, blocks[agent_id].values())) for agent_id in sorted(blocks))
+    return [track for track in made if track.fixes]
+
+
+def coordinates(position: Whereabouts) -> tuple[float, float, float]:
+    """Longitude and latitude in degrees, altitude in metres above mean sea level."""
+    return position.lon_e7 / 1e7, position.lat_e7 / 1e7, position.alt_mm / 1e3
+
+
+def utc(timestamp_us: int) -> str:
+    """A timestamp up to the year 9999 as RFC 3339 has it, to the millisecond; virtual runs begin in 1970."""
+    at = datetime.fromtimestamp(timestamp_us // 1_000_000, UTC)
+    return f"{at:%Y-%m-%dT%H:%M:%S}.{timestamp_us // 1000 % 1000:03d}Z"
+
+
+def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[LoggableEvent, str]]:
+    """Events and the names of their blocks. A block that cannot be read has none."""
+    logged = []
+    for block in blocks:
+        try:
+            events = logbook.event_data.events(block)
+        except MalformedEventsError:
+            continue
+        name = logbook.name(block.block_hash)
+        logged += [(event, name) for event in events]
+    return logged
+
+
+def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Track:
+    """A track of events, with the names of their blocks, in whatever order; an impossible time is left out."""
+    track = Track(agent_id, [], [])
+    possible = [pair for pair in logged if pair[0].timestamp_us <= LAST_TIMESTAMP_US]
+    for event, block in sorted(possible, key=lambda pair: pair[0].timestamp_us):
+        own = position_of(event.event_id, event.data)
+        if own is not None:
+            track.fixes.append((event.timestamp_us, own))
+        at_us, position = track.fixes[-1] if track.fixes else (None, None)
+        age_s = None if at_us is None else (event.timestamp_us - at_us) / 1e6
+        track.entries.append(Entry(block, event, own is not None, position, age_s))
+    return track

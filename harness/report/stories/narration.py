@@ -1,0 +1,241 @@
+"""What agents did, as a story tells it: instant by instant, whatever in an instant is the cause before its effects.
+
+Who of those that are told the same is first, is chance on any real network. So agents are in the order of their IDs,
+what they do is by how far from its beginning it is: a timer ends, and it is asked; all who hear it answer; answers are
+counted. Whoever does the same for the same reason is told in one line.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from math import floor, inf, isfinite
+
+from harness.archive.history import in_time
+from harness.archive.traces import Trace
+from harness.report.stories.message_text import ANSWERS, told
+from harness.report.stories.story_file import Section
+from harness.report.stories.story_names import INCEPTION, LocalChain, Names
+from ucp.agent import HANDLERS
+from ucp.trace import HandlerRun, Sent
+
+INSTANT_S = 1.5
+"""Mission seconds in which what a message causes is of the instant in which it was sent, and a timer is as good as
+punctual: a machine is late now and then, and more so the faster it plays a mission."""
+
+
+@dataclass
+class Deed:
+    """What an agent did for one reason: a handler run that an input triggered, and those that it triggered locally."""
+
+    agent_id: int
+    position: int
+    """In the agent's trace."""
+    runs: list[HandlerRun]
+    cause: "Deed | None" = None
+    """Whose message it was, if it was one."""
+    reached: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
+    """Who heard of each message that it sent, by sequence number."""
+    at_s: float = 0.0
+    """When it, or what caused it, began, if everything had been punctual."""
+    distance: int = 0
+    """How many messages it is away from what began in this instant."""
+
+    @property
+    def instant(self) -> int:
+        return floor(self.at_s)
+
+    @property
+    def heard_from(self) -> int | None:
+        sender = self.runs[0].trigger.get("from")
+        return sender if isinstance(sender, int) else None
+
+    def message(self, sequence: int | str) -> Sent | None:
+        """What it sent under this number."""
+        return next((sent for run in self.runs for sent in run.sent if sent.seq == sequence), None)
+
+    @property
+    def does_something(self) -> bool:
+        """Whether it changed or sent anything."""
+        return len(self.runs) > 1 or any(run.changes or run.sent for run in self.runs)
+
+    @property
+    def is_answer_to_another(self) -> bool:
+        """Whether it is the receipt of an answer that somebody else had asked for, which everybody hears."""
+        if self.runs[0].trigger.get("message") not in ANSWERS or self.cause is None:
+            return False
+        asked_by = self.cause.heard_from
+        return asked_by is not None and asked_by != self.agent_id and not self.does_something
+
+
+class Telling:
+    """Of the traces of all agents on the roster."""
+
+    def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:
+        self._traces = traces
+        self._roster = roster
+        self._names = Names(traces)
+        self._deeds = sorted(
+            (deed for deed in _connected(traces) if not deed.is_answer_to_another),
+            key=lambda deed: (deed.instant, deed.distance, deed.agent_id, deed.heard_from or 0, deed.position),
+        )
+
+    def answer(self, section: Section, *, first: bool = False) -> list[str]:
+        """The lines of a section; the first has what came before it, too."""
+        from_s = 0 if first else section.from_s
+        deeds = [deed for deed in self._deeds if from_s <= deed.instant and _before(deed.instant, section.until_s)]
+        lines: list[str] = []
+        for instant, of_instant in groupby(deeds, key=lambda deed: deed.instant):
+            lines += [f"at {instant} s", *self._instant([*of_instant])]
+        return [*lines, *(self._chains(section.until_s) if section.shows_chains else [])]
+
+    def _instant(self, deeds: Sequence[Deed]) -> Iterator[str]:
+        """Whoever does the same at the same distance is told together."""
+        alike: dict[tuple[int, int, object], list[Deed]] = {}
+        for deed in deeds:
+            key = deed.distance, deed.agent_id, self._kind(deed)
+            if deed.does_something and any(other.does_something for other in alike.get(key, ())):
+                key = deed.distance, deed.agent_id, deed.position
+            alike.setdefault(key, []).append(deed)
+        together: dict[tuple[int, tuple[str, ...]], list[int]] = {}
+        for (distance, agent_id, _), alikes in alike.items():
+            together.setdefault((distance, tuple(self._lines(alikes))), []).append(agent_id)
+        for (_, lines), agents in together.items():
+            yield from (f"  {_listed(agents):<10}{line}" for line in lines)
+
+    def _kind(self, deed: Deed) -> object:
+        """What the deeds of one agent have in common that are told together: they are about the same answer.
+
+        Which of several comes first, and is the one that counts, is chance.
+        """
+        run = deed.runs[0]
+        if deed.cause is None or run.trigger.get("message") not in ANSWERS:
+            return deed.position
+        sent = deed.cause.message(run.trigger["seq"])
+        return run.handler, told(sent, self._names) if sent else run.branch
+
+    def _lines(self, alike: Sequence[Deed]) -> Iterator[str]:
+        """Algorithm, its name, and what came of it, of each handler run; of answers the branches as they were taken."""
+        heard_from = [deed.heard_from for deed in alike if deed.heard_from is not None]
+        in_order = sorted(alike, key=lambda deed: deed.position)
+        deed = next((deed for deed in in_order if deed.does_something), in_order[0])
+        branches = ", ".join(dict.fromkeys(deed.runs[0].branch for deed in in_order))
+        for number, run in enumerate(deed.runs):
+            handler = HANDLERS.get(run.handler)
+            title = handler.title.partition(" ")[2] if handler else run.handler
+            if number == 0 and heard_from:
+                title += f" from {_listed(heard_from)}"
+            rest = [branches if number == 0 else run.branch]
+            if run.changes:
+                rest.append(", ".join(self._change(operation, block) for operation, block in run.changes))
+            rest[-1] += "".join(f" -> {told(sent, self._names)}{self._missed(deed, sent)}" for sent in run.sent)
+            yield f" {run.algorithm:>2}  {title}: {'; '.join(rest)}"
+
+    def _change(self, operation: str, block: str) -> str:
+        name = self._names.block(block)
+        return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
+
+    def _missed(self, deed: Deed, sent: Sent) -> str:
+        """Of an answer it matters to whom it was given."""
+        meant = {deed.heard_from} if sent.message in ANSWERS else {*self._roster} - {deed.agent_id}
+        missed = sorted(agent for agent in meant - deed.reached[sent.seq] if agent is not None)
+        return f", not to {_listed(missed)}" if missed else ""
+
+    def _chains(self, until_s: int | None) -> list[str]:
+        """The chains as a tree, and with whom each ends."""
+        chains: dict[int, list[str]] = {}
+        for agent_id, trace in self._traces.items():
+            positions = {deed.position: deed.instant for deed in self._deeds if deed.agent_id == agent_id}
+            chain, instant = LocalChain(trace), 0
+            for position, run in enumerate(trace.runs):
+                instant = positions.get(position, instant)
+                if not _before(instant, until_s):
+                    break
+                if position in trace.starts:
+                    chain = LocalChain(trace)
+                chain.replay(run)
+            chains[agent_id] = self._names.of(chain.blocks)
+        if not chains:
+            return ["no chains: no agent has left a trace"]
+        return ["chains", *_tree({agent_id: [INCEPTION, *chain] for agent_id, chain in chains.items()}, "  ")]
+
+
+def _connected(traces: Mapping[int, Trace]) -> list[Deed]:
+    """All deeds, each with its cause."""
+    deeds = [deed for agent_id, trace in traces.items() for deed in _deeds(agent_id, trace)]
+    sent: dict[tuple[int, int], list[Deed]] = defaultdict(list)
+    for deed in deeds:
+        for run in deed.runs:
+            for message in run.sent:
+                sent[deed.agent_id, message.seq].append(deed)
+    due: dict[tuple[int, object], float] = {}
+    """When which timer of which agent should end."""
+    for deed in sorted(deeds, key=lambda deed: (deed.runs[0].t, deed.agent_id, deed.position)):
+        run = deed.runs[0]
+        timer_ends_s = due.get((deed.agent_id, run.trigger.get("timer")), -inf)
+        deed.at_s = timer_ends_s if run.t - timer_ends_s < INSTANT_S else run.t
+        if deed.heard_from is not None:
+            _hear(deed, sent)
+        for run in deed.runs:
+            due |= {
+                (deed.agent_id, timer): deed.at_s + lasts_s
+                for timer, lasts_s in (run.started or {}).items()
+                if isfinite(lasts_s)
+            }
+    return deeds
+
+
+def _hear(deed: Deed, sent: Mapping[tuple[int, int], Sequence[Deed]]) -> None:
+    """Find whose message it was that caused this."""
+    sender, run = deed.heard_from, deed.runs[0]
+    sequence = run.trigger.get("seq")
+    if sender is None or not isinstance(sequence, int):
+        return
+    earlier = [cause for cause in sent.get((sender, sequence), ()) if cause.runs[0].t < run.t]
+    if earlier:
+        cause = deed.cause = max(earlier, key=lambda cause: cause.runs[0].t)
+        cause.reached[sequence].add(deed.agent_id)
+        if run.t - cause.runs[0].t < INSTANT_S:
+            deed.at_s, deed.distance = cause.at_s, cause.distance + 1
+
+
+def _deeds(agent_id: int, trace: Trace) -> Iterator[Deed]:
+    """Local events run right after what triggered them."""
+    deed: Deed | None = None
+    for position, run in enumerate(trace.runs):
+        if not in_time(run):
+            continue
+        if "local" in run.trigger and deed is not None:
+            deed.runs.append(run)
+            continue
+        if deed is not None:
+            yield deed
+        deed = Deed(agent_id, position, [run])
+    if deed is not None:
+        yield deed
+
+
+def _tree(chains: Mapping[int, Sequence[str]], indent: str) -> Iterator[str]:
+    """A line for what all have in common, then, further in, one tree for each way on."""
+    common = 0
+    while all(len(chain) > common for chain in chains.values()) and (
+        len({chain[common] for chain in chains.values()}) == 1
+    ):
+        common += 1
+    ends = [agent_id for agent_id, chain in chains.items() if len(chain) == common]
+    blocks = next(iter(chains.values()))[:common]
+    yield f"{indent}{' '.join(blocks)}{f'  ({_listed(ends)})' if ends else ''}"
+    further: dict[str, dict[int, Sequence[str]]] = {}
+    for agent_id, chain in chains.items():
+        if len(chain) > common:
+            further.setdefault(chain[common], {})[agent_id] = chain[common:]
+    for branch in further.values():
+        yield from _tree(branch, indent + "  ")
+
+
+def _before(instant: int, until_s: int | None) -> bool:
+    return until_s is None or instant < until_s
+
+
+def _listed(agents: Sequence[int]) -> str:
+    return " ".join(map(str, agents))

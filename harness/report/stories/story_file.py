@@ -1,0 +1,184 @@
+"""A story's file: a scenario's keys, then sentences, each with the second at which it happens; below them, indented,
+what agents then do.
+
+    # Figure 3.8: what becomes of a vote.
+    agents: 3
+    1 s: 1 logs
+
+        at 1 s
+          1    1  Build Data Block: full; completes 1.1
+    ...
+    30 s: end
+
+What is indented is the answer, up to the next sentence that comes later: it is compared, and can be written anew.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from harness.errors import ScenarioError
+from harness.report.stories.sentences import Course
+from harness.scenario import Scenario
+from harness.scenario.load import parse, parse_yaml
+
+MAX_BYTES = 1024 * 1024
+MAX_LINES = 20_000
+_SENTENCE = re.compile(r"(\d{1,7}) s: +(\S.*)")
+_ENTRY = re.compile(r"(`?)(timeline|events\.script)\.(\d+)(?:\.|: )")
+INDENT = "    "
+DELAY_S = 0.02
+SPEEDUP = 10.0
+"""Of processes: a machine takes some milliseconds to change a network, and sentences may be a second apart."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """From `from_s` to `until_s` mission seconds, what is answered at the line numbered `line`, which counts from 0."""
+
+    line: int
+    from_s: int
+    until_s: int | None
+    shows_chains: bool
+
+
+@dataclass(frozen=True)
+class Story:
+    """`lines` are those of the file without the answers; each of `sections` comes after one of them."""
+
+    path: Path
+    text: str
+    lines: Sequence[str]
+    scenario: Scenario
+    sections: Sequence[Section]
+
+    @property
+    def in_virtual_time(self) -> Scenario:
+        """The scenario where messages take equally long, as in a real lab none overtakes another of the same sender."""
+        if self.scenario.network.delay:
+            return self.scenario
+        network = self.scenario.network.model_copy(update={"delay": DELAY_S})
+        return self.scenario.model_copy(update={"network": network})
+
+    def with_answers(self, answers: Sequence[Sequence[str]]) -> str:
+        """The file's text with these answers, one of each section."""
+        after = {section.line: answer for section, answer in zip(self.sections, answers, strict=True)}
+        lines: list[str] = []
+        for number, line in enumerate(self.lines):
+            if line or (lines and lines[-1]):  # one empty line is enough
+                lines.append(line)
+            if after.get(number):
+                lines += ["", *(f"{INDENT}{told}" for told in after[number]), ""]
+        while not lines[-1]:
+            lines.pop()
+        return "\n".join(lines) + "\n"
+
+
+def is_story(path: Path) -> bool:
+    """Whether any line of the file is a sentence: other tools have files of that suffix, too."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            return any(_SENTENCE.fullmatch(line.rstrip("\n")) for line in islice(file, MAX_LINES))
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def read_story(path: Path) -> Story:
+    """Raises ScenarioError: one sentence that names the file and the line."""
+    try:
+        if not path.is_file() or path.stat().st_size > MAX_BYTES:
+            raise ScenarioError(f"{path}: not a file, or larger than any story")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = "it is not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror
+        raise ScenarioError(f"{path}: cannot be read: {why}") from None
+    try:
+        return _parsed(path, text)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+
+
+def _parsed(path: Path, text: str) -> Story:
+    given = text.splitlines()
+    begins = next((number for number, line in enumerate(given) if _SENTENCE.fullmatch(line)), None)
+    if begins is None:
+        raise ScenarioError("there is no sentence in it, such as `1 s: 1 logs`")
+    while begins and given[begins - 1].startswith("#"):  # a remark on the first sentence
+        begins -= 1
+    lines, course = [*given[:begins], ""], Course()
+    told: list[tuple[int, int, bool]] = []  # line, second, whether chains are asked for
+    told_in: dict[str, list[int]] = {"events.script": [], "timeline": []}  # the line of each entry
+    for number, line in enumerate(given[begins:], begins + 1):
+        if line.startswith((" ", "\t")) or not line.strip():
+            continue
+        if line.startswith("#"):
+            lines += [*_gap(lines), line]
+            continue
+        sentence = _SENTENCE.fullmatch(line)
+        if sentence is None:
+            raise ScenarioError(f"line {number}: {line[:80]!r} is no sentence: those begin with their second, `12 s: `")
+        at_s, words = int(sentence[1]), sentence[2].rstrip()
+        if told and at_s < told[-1][1]:
+            raise ScenarioError(f"line {number}: {at_s} s is before {told[-1][1]} s, which was told already")
+        if course.ends_at_s is not None:
+            raise ScenarioError(f"line {number}: something is told after the end")
+        try:
+            course.tell(at_s, words)
+        except ScenarioError as error:
+            raise ScenarioError(f"line {number}: {error}") from None
+        for entries, of in zip((course.script, course.timeline), told_in.values(), strict=True):
+            of += [number] * (len(entries) - len(of))
+        lines.append(line)
+        told.append((len(lines) - 1, at_s, words in ("chains", "end")))
+    if course.ends_at_s is None:
+        raise ScenarioError("it has no end: the last sentence should be one such as `60 s: end`")
+    try:
+        scenario = _scenario(path, given[:begins], course)
+    except ScenarioError as error:
+        raise ScenarioError(_in_its_line(str(error), told_in)) from None
+    return Story(path, text, lines, scenario, _sections(told))
+
+
+def _in_its_line(problem: str, told_in: Mapping[str, Sequence[int]]) -> str:
+    """What is wrong with a scenario's entry, as that of the sentence which told it."""
+    entry = _ENTRY.match(problem)
+    return f"line {told_in[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
+
+
+def _gap(lines: Sequence[str]) -> list[str]:
+    """Remarks stand apart from the sentence before them."""
+    return [""] if _SENTENCE.fullmatch(lines[-1]) else []
+
+
+def _sections(told: Sequence[tuple[int, int, bool]]) -> list[Section]:
+    """Of sentences of one second the last is answered."""
+    last = {at_s: (line, any(chains for _, other_s, chains in told if other_s == at_s)) for line, at_s, _ in told}
+    seconds = [*last]
+    return [
+        Section(line, at_s, until_s, chains)
+        for (at_s, (line, chains)), until_s in zip(last.items(), [*seconds[1:], None], strict=True)
+    ]
+
+
+def _scenario(path: Path, header: Sequence[str], course: Course) -> Scenario:
+    try:
+        keys = parse_yaml("\n".join(header)) or {}
+    except ScenarioError as error:
+        raise ScenarioError(f"before its first sentence are a scenario's keys: {error}") from None
+    if not isinstance(keys, dict):
+        raise ScenarioError("before its first sentence are a scenario's keys, each with its value")
+    if taken := {"timeline", "duration_s", "events"} & keys.keys():
+        raise ScenarioError(f"`{min(taken)}` is what its sentences tell")
+    document: dict[str, Any] = {
+        "name": path.stem.replace("_", " "),
+        "vehicles": {"kind": "none"},
+        "speedup": SPEEDUP,
+        **keys,
+        "events": {"source": "scripted", "script": course.script},
+        "timeline": course.timeline,
+        "duration_s": course.ends_at_s,
+    }
+    return parse(document)

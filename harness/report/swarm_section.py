@@ -1,0 +1,154 @@
+"""Who flew, and what each agent and each block came to."""
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from harness.archive.archive import RunArchive
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import Export
+from harness.archive.run_record import AgentRecord, RunRecord
+from harness.present import text
+from harness.present.colours import Ink, inks
+from harness.report.agent_programs import programs
+from harness.report.chain_tree import holders, ranges
+
+IN_THE_RECORD_ONLY = {"binary_sha256", "parameters_file"}
+"""Of what run.json says of a vehicle."""
+MAX_GIVEN = 10
+"""More parameters that a vehicle was given are not shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlockRow:
+    name: str
+    ink: Ink
+    at: str
+    block_hash: str
+    held_by: str
+
+
+def agent_inks(archive: RunArchive) -> dict[int, Ink]:
+    exports = archive.exports.by_agent
+    makers = {block.agent_id for export in exports.values() for block in export.blocks()}
+    return inks({*archive.roster, *exports, *makers, *archive.traces})
+
+
+def missing(archive: RunArchive) -> list[str]:
+    """A sentence for all agents of the run without a usable export for the same reason."""
+    alike: dict[str, list[int]] = {}
+    for agent_id in archive.roster:
+        if agent_id not in archive.exports.by_agent:
+            alike.setdefault(_fate(archive.record.agents.get(str(agent_id))), []).append(agent_id)
+    return [f"{'agent' if len(ids) == 1 else 'agents'} {', '.join(ranges(ids))}{fate}" for fate, ids in alike.items()]
+
+
+def _fate(agent: AgentRecord | None) -> str:
+    if agent is None:
+        return ": no usable export"
+    if agent.outcome == "killed":
+        return ": killed, with all that was held there"
+    why = ", ".join(filter(None, (agent.outcome, agent.detail)))
+    return ": no usable export" + (f" ({why})" if why else "")
+
+
+BEFALLEN = "befallen"
+"""Of a vehicle's record."""
+
+
+def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
+    """Column labels, and a row (agent ID, ink, cells by column) for each agent and its vehicle."""
+    record, exports = archive.record, archive.exports.by_agent
+    mixed = bool(programs(record))
+    rows = []
+    columns: dict[str, None] = {}
+    for agent_id in sorted({*archive.roster, *exports}):
+        agent = record.agents.get(str(agent_id))
+        cells = _agent_cells(agent) if agent else {}
+        if mixed and agent:
+            cells |= {"program": shlex.join(agent.command or []) or None, "version": agent.version}
+        if export := exports.get(agent_id):
+            cells |= {
+                "idle": export.idle,
+                "completed": len(export.completed),
+                "in chain": len(export.chain),
+                "waiting": len(export.blocks_to_be_committed) + len(export.reconcile_stack),
+            }
+        for key, value in record.vehicles.get(str(agent_id), {}).items():
+            if key == BEFALLEN:
+                cells[key] = _befallen(value)
+                continue
+            if key in IN_THE_RECORD_ONLY:
+                continue
+            if key == "parameters_given" and isinstance(value, dict):
+                value = ", ".join(f"{name} {text.value(given)}" for name, given in list(value.items())[:MAX_GIVEN])
+            label = text.label(key)
+            cells[f"vehicle {label}" if label in cells or key == "detail" else label] = value
+        cells["detail"] = agent.detail if agent else None
+        rows.append((agent_id, ink[agent_id], cells))
+        columns |= dict.fromkeys(label for label, value in cells.items() if value is not None)
+    return {"columns": sorted(columns, key=lambda label: label == "detail"), "rows": rows}
+
+
+def _befallen(told: Any) -> str:
+    """ "lose_gps at 40 s, wind at 80 s: not simulated": what befell a vehicle, as it is on record."""
+    try:
+        return ", ".join(
+            f"{it['what']} at {it['at_s']:g} s{'' if it['parameters'] else ': not simulated'}" for it in told
+        )
+    except (KeyError, TypeError, ValueError):
+        return text.value(told)
+
+
+def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
+    kept = agent.model_dump(mode="json", exclude={"detail", "dropped", "command", "version"})
+    cells: dict[str, Any] = {text.label(key): value for key, value in kept.items()}
+    cells["completed before"] = len(agent.completed_before) or None
+    cells |= {"restarts": agent.restarts or None, "reboots": agent.reboots or None}
+    runs = [life.counted for life in agent.handler_runs if life is not None]
+    cells["handler runs"] = " + ".join(map(text.value, runs)) or None
+    if agent.dropped:
+        cells["dropped"] = ", ".join(f"{text.value(count)} {reason}" for reason, count in agent.dropped.items())
+    return cells
+
+
+def counts(exports: Mapping[int, Export], record: RunRecord) -> str | None:
+    """Where the blocks are that were completed and are in no chain, and whose those are that are in one all the same.
+
+    None if the blocks that were completed are those in the chains.
+    """
+    completed = {block for export in exports.values() for block in export.completed}
+    completed |= {block for agent in record.agents.values() for block in agent.completed_before}
+    in_chains = {block.block_hash for export in exports.values() for block in export.chain}
+    aside = {block.block_hash for export in exports.values() for block in export.blocks()} - in_chains
+    if completed == in_chains:
+        return None
+    parts = [f"of {len(completed)} completed blocks {_are(len(completed & in_chains))} in a chain"]
+    if waiting := len(completed & aside):
+        parts.append(f"{_are(waiting)} in a deque or on a reconcile stack")
+    if gone := len(completed - in_chains - aside):
+        parts.append(f"{_are(gone)} held by nobody whose export is here")
+    if strange := len((in_chains | aside) - completed):
+        parts.append(f"beside them {_are(strange)} held whose makers do not say here what they completed")
+    return "; ".join(parts).capitalize() + "."
+
+
+def _are(count: int) -> str:
+    return f"{count} is" if count == 1 else f"{count} are"
+
+
+def block_rows(exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> list[BlockRow]:
+    """Every block that is in a chain, oldest first."""
+    names, held_by = name_blocks(exports), holders(exports)
+    blocks = {block.block_hash: block for export in exports.values() for block in export.chain}
+    return [
+        BlockRow(
+            names[block.block_hash],
+            ink[block.agent_id],
+            text.moment(block.timestamp_us),
+            block.block_hash,
+            ", ".join(ranges(held_by[block.block_hash])),
+        )
+        for block in sorted(blocks.values(), key=lambda block: (block.timestamp_us, block.block_hash))
+    ]

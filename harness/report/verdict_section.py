@@ -1,0 +1,97 @@
+"""The six characteristics, and what is judged beside them, as the page says them: verdict, reason and evidence."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from harness.archive.run_record import CharacteristicRecord, FindingRecord, JudgementRecord, RunRecord
+from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS, JUDGED, kind_of
+
+STATEMENTS = {
+    "1": "The protocol is distributed, event driven and asynchronous.",
+    "2": "An idle agent has all blocks that it completed in its chain.",
+    "3": "No agent holds more than one copy of a block.",
+    "4": "Every block was made by an agent of the mission.",
+    "5": "Fully connected, all blocks come into all chains.",
+    "6": "Fully connected and reconciled, one uniform chain emerges.",
+    "steps": "Every agent did at every step what the 20 algorithms say.",
+    "records": "What two records tell about the same thing agrees.",
+    "liveness": "The swarm became idle once no more events came.",
+}
+ICONS = {"good": "✓", "bad": "✗", "unknown": "\u2013"}
+KINDS = {"good": "holds", "bad": "violated", "unknown": "unknown"}
+"""For the style sheet."""
+EVIDENCE_KEPT = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    key: str
+    number: str
+    """Empty for what is judged beside the characteristics."""
+    name: str
+    statement: str
+    verdict: str
+    icon: str
+    kind: str
+    """One word, for the style sheet."""
+    reason: str
+    evidence: list[dict[str, Any]]
+    """What is said of each piece of evidence, by label."""
+    evidence_left_out: int
+
+    @property
+    def is_bad(self) -> bool:
+        return self.kind == "violated"
+
+    @property
+    def topic(self) -> str:
+        """ "characteristic 6", "steps"."""
+        return f"characteristic {self.number}" if self.number else self.name
+
+    @property
+    def title(self) -> str:
+        """ "6. one uniform chain", "steps"."""
+        return f"{self.number}. {self.name}" if self.number else self.name
+
+
+def verdicts(record: RunRecord) -> list[Verdict]:
+    """All of a run that was judged, also on a characteristic whose verdict the record has not; none of another run."""
+    if not record.characteristics:
+        return []
+    judged = record.judgements
+    keys = sorted({*record.characteristics, *CHARACTERISTICS}, key=lambda key: (len(key), key))
+    return [_verdict(key, judged.get(key)) for key in [*keys, *(key for key in BESIDE if key in judged)]]
+
+
+def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None) -> Verdict:
+    kind, evidence = kind_of(judged.verdict) if judged else "unknown", judged.evidence if judged else []
+    return Verdict(
+        key=key,
+        number="" if key in BESIDE else key,
+        name=judged.name if judged else JUDGED[key],
+        statement=STATEMENTS.get(key, ""),
+        verdict=judged.verdict if judged else "not judged",
+        icon=ICONS[kind] if judged else "?",
+        kind=KINDS[kind],
+        reason=judged.reason if judged else "",
+        evidence=[_evidence(finding) for finding in evidence[:EVIDENCE_KEPT]],
+        evidence_left_out=max(0, len(evidence) - EVIDENCE_KEPT),
+    )
+
+
+def headline(verdicts: list[Verdict], *, completed: bool) -> tuple[str, str]:
+    """How it went, in a few words, and the kind of verdict that it amounts to: half a run is no success."""
+    characteristics = [verdict for verdict in verdicts if verdict.number]
+    violated, holding = (sum(verdict.kind == kind for verdict in characteristics) for kind in ("violated", "holds"))
+    beside = [f"{verdict.name}: {verdict.verdict}" for verdict in verdicts if not verdict.number and verdict.is_bad]
+    if violated:
+        return "; ".join([f"{violated} of {len(characteristics)} characteristics violated", *beside]), "violated"
+    if not verdicts:
+        return "not judged", "unknown"
+    words_for_it = "; ".join([f"none violated, {holding} of {len(characteristics)} hold", *beside])
+    return words_for_it, "violated" if beside else "holds" if completed and holding else "unknown"
+
+
+def _evidence(finding: FindingRecord) -> dict[str, Any]:
+    labels = {"agent_id": "agent", "block_hash": "hash"}
+    return {labels.get(key, key): value for key, value in finding.model_dump(exclude_none=True).items()}

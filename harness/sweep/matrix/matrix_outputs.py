@@ -1,0 +1,87 @@
+"""What a matrix leaves in its directory.
+
+matrix.json   all of it, schema `ucp-matrix/1`
+matrix.csv    one row a cell
+runs.csv      one row a run: loss, agents, backend, seed, figures, verdicts
+matrix.svg    the picture
+report.html   all of it for people, one file
+summary.md    table and findings in Markdown
+junit.xml     a test case a cell
+
+results.jsonl, from which all of it is made, is written while runs end (results_file.py); runs/ has the run
+directories that were kept of runs as processes, cells/ the scenarios with which any run can be played again.
+"""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness.errors import MachineError
+from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS, JUDGED
+from harness.sweep.matrix.cell import Cell, Run
+from harness.sweep.matrix.cell_scenarios import write_scenarios
+from harness.sweep.matrix.matrix_junit import to_junit
+from harness.sweep.matrix.matrix_metrics import METRICS
+from harness.sweep.matrix.matrix_picture import draw
+from harness.sweep.matrix.matrix_run import Finished
+from harness.sweep.matrix.matrix_summary import to_markdown
+from harness.sweep.matrix.nights import Nights
+from harness.sweep.matrix.report import to_html
+from ucp.agent_files import write_atomically, write_json_atomically
+
+
+def write(finished: Finished, directory: Path, nights: Nights | None = None) -> None:
+    """`nights` are for the trend. Raises MachineError if the disk refuses."""
+    record = finished.record
+    try:
+        write_json_atomically(directory / "matrix.json", record.to_json())
+        write_atomically(directory / "matrix.csv", to_csv(_cell_row(cell) for cell in record.cells))
+        write_atomically(directory / "runs.csv", to_csv(_run_rows(finished.runs)))
+        write_atomically(directory / "matrix.svg", draw(record))
+        write_scenarios(record.matrix, directory)
+        write_atomically(directory / "report.html", to_html(finished, directory, nights))
+        write_atomically(directory / "summary.md", to_markdown(record))
+        write_atomically(directory / "junit.xml", to_junit(record))
+    except OSError as error:
+        raise MachineError(f"{error.filename or directory} cannot be written: {error.strerror}") from None
+
+
+def _cell_row(cell: Cell) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        **cell.point._asdict(),
+        "runs": cell.runs,
+        "failed": cell.failed,
+        "unsupported": cell.unsupported,
+    }
+    for metric in METRICS:
+        estimate = cell.estimates[metric.name]
+        row |= {metric.name: estimate.mean, f"{metric.name}_low": estimate.low, f"{metric.name}_high": estimate.high}
+    return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in JUDGED}
+
+
+def _run_rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
+    figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
+    for run in runs:
+        yield {
+            **run.point._asdict(),
+            "seed": run.seed,
+            **{name: run.figures.get(name) for name in figures},
+            **{f"characteristic_{number}": run.verdicts.get(number) for number in CHARACTERISTICS},
+            **{key: run.verdicts.get(key) for key in BESIDE},
+            "failed": run.failed,
+            "unsupported": run.unsupported,
+        }
+
+
+def to_csv(rows: Iterable[dict[str, Any]]) -> str:
+    """Unknown is an empty field."""
+    file = io.StringIO()
+    writer: csv.DictWriter[str] | None = None
+    for row in rows:
+        if writer is None:
+            writer = csv.DictWriter(file, list(row), lineterminator="\n")
+            writer.writeheader()
+        writer.writerow(row)
+    return file.getvalue()

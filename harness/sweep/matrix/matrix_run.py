@@ -1,0 +1,104 @@
+"""The matrix's runs: each point with each seed, spread over cores or a cluster, and summed up."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+
+from harness.errors import InterruptedRunError, ScenarioError
+from harness.run.parallel import Failed, cores, sweep
+from harness.run.run import versions
+from harness.sweep.matrix.cell import Run, sum_up
+from harness.sweep.matrix.cell_play import Judge, Player, simulated
+from harness.sweep.matrix.cluster import cluster
+from harness.sweep.matrix.comparison import Comparison, compare
+from harness.sweep.matrix.matrix_coverage import Tally
+from harness.sweep.matrix.matrix_file import Matrix, Point, Task
+from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
+from harness.sweep.matrix.results_file import Results
+
+Outcomes = Iterator[tuple[Task, Run | Failed]]
+Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
+"""Hands out tasks, and brings their outcomes as they end."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A matrix that is over, also if it was interrupted: the runs that ended, by point and then seed as in the file."""
+
+    record: MatrixRecord
+    runs: list[Run]
+
+
+def on_cores(matrix: Matrix, jobs: int, *, shown: bool = False) -> Spread:
+    """So many runs at the same time; with processes among them, no more than there are cores."""
+    if matrix.needs_processes:
+        jobs = min(jobs, cores())
+    return partial(sweep, jobs=jobs, what="runs" if shown else None, in_order=False)
+
+
+def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
+    """On the workers of the Dask scheduler at `address`. Raises ScenarioError for processes."""
+    if matrix.needs_processes:
+        raise ScenarioError(
+            "--scheduler is for virtual time: runs as processes leave their directories here, so play them without it, "
+            "or with --backend sim"
+        )
+    return partial(cluster, address=address, what="runs" if shown else None)
+
+
+def run_matrix(
+    matrix: Matrix, results: Results, spread: Spread, judge: Judge = simulated, *, covers: bool = False
+) -> Finished:
+    """Play what `results` has not, add it there, and sum up all. Ctrl-C ends it early, with all that had ended.
+
+    Raises HarnessError if it cannot be played. `judge` plays what virtual time is asked for. `covers`: how much of the
+    protocol runs try is told, too.
+    """
+    started = time.monotonic()
+    play = Player(matrix, results.directory / "runs", judge, covers)
+    tasks = [task for task in matrix.tasks if task not in results.runs]
+    play.refuse(dict.fromkeys(task.point for task in tasks))
+    interrupted, tally = False, Tally() if covers else None
+    try:
+        with spread(tasks, play) as outcomes:
+            for task, run in outcomes:
+                results.add(_failed(task, run.reason) if isinstance(run, Failed) else run)
+                if tally is not None and isinstance(run, Run) and run.reached is not None:
+                    tally.add(task.point, run.reached)
+    except (KeyboardInterrupt, InterruptedRunError):
+        interrupted = True
+    runs = [results.runs[task] for task in matrix.tasks if task in results.runs]
+    by_point: dict[Point, list[Run]] = defaultdict(list)
+    for run in runs:
+        by_point[run.point].append(run)
+    record = MatrixRecord(
+        matrix=matrix,
+        backend=matrix.backend[0] if len(matrix.backend) == 1 else "several",
+        versions=versions(),
+        started_at=results.started_at,
+        wall_s=round(time.monotonic() - started, 1),
+        outcome="interrupted" if interrupted else "completed",
+        cells=[sum_up(point, its_runs) for point, its_runs in by_point.items()],
+        failed=[_without_result(run, run.failed) for run in runs if run.failed is not None],
+        unsupported=[_without_result(run, run.unsupported) for run in runs if run.unsupported is not None],
+        tried=None if tally is None else tally.tried(matrix, len(runs)),
+    )
+    return Finished(record, runs)
+
+
+def compared(finished: Finished, baseline: MatrixRecord, path: str) -> Finished:
+    """With what changed since the matrix of `baseline`, which is from `path`."""
+    changes = list(compare(baseline.cells, finished.record.cells))
+    comparison = Comparison(baseline=path, started_at=baseline.started_at, changes=changes)
+    return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
+
+
+def _without_result(run: Run, reason: str) -> RunWithoutResult:
+    return RunWithoutResult(**run.point._asdict(), seed=run.seed, reason=reason)
+
+
+def _failed(task: Task, reason: str) -> Run:
+    return Run(**task.point._asdict(), seed=task.seed, failed=reason)

@@ -1,0 +1,96 @@
+"""summary.md: the matrix in Markdown, for a job's summary on GitHub or a message to the team."""
+
+from collections.abc import Iterator
+
+from harness.present import text
+from harness.present.markdown import escaped, row
+from harness.report.agent_programs import asked_for, in_sentence
+from harness.sweep.matrix.cell import Cell
+from harness.sweep.matrix.matrix_coverage import Tried
+from harness.sweep.matrix.matrix_metrics import METRICS
+from harness.sweep.matrix.matrix_record import MatrixRecord
+from harness.sweep.matrix.matrix_table import (
+    axes,
+    explanation,
+    improvements,
+    say_finished,
+    say_interval,
+    say_mean,
+    troubles_of_all,
+    unjudged,
+    unsupported_of_all,
+    violated,
+)
+
+
+def to_markdown(record: MatrixRecord) -> str:
+    lines = [f"## {escaped(record.matrix.name)}", "", f"**{verdict(record)}**", "", *_table(record), ""]
+    lines += [explanation(record) + unjudged(record), ""]
+    if findings := [*troubles_of_all(record), *unsupported_of_all(record), *improvements(record)]:
+        lines += [*(f"- {escaped(sentence)}" for sentence in findings), ""]
+    if record.tried is not None:
+        lines += [*map(escaped, tried_in_words(record.tried)), ""]
+    if ran := in_sentence(asked_for(record.matrix.scenario_at(record.matrix.points[-1]))):
+        lines += [escaped(ran), ""]
+    versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
+    lines += [f"<sub>Begun {text.started(record.started_at)}; {versions}</sub>"]
+    return "\n".join(lines) + "\n"
+
+
+def tried_in_words(tried: Tried) -> Iterator[str]:
+    """How much of the protocol the runs have tried."""
+    every, branches = tried.all_cells, tried.all_cells["branches"]
+    yield (
+        f"Tried by {text.value(tried.runs)} runs: {text.value(every['local_states'])} local states, "
+        f"{text.value(every['pairs'])} pairs of one with an input, "
+        f"{branches['taken']} of {branches['exist']} branches of the handlers."
+    )
+    within = every["within"]
+    states, pairs = within["local_states"], within["pairs"]
+    yield (
+        f"Of what exists within {within['agents']} agents, {within['blocks']} blocks, network {within['network']}: "
+        f"{states['reached']} of {states['exist']} local states, {pairs['reached']} of {pairs['exist']} pairs."
+    )
+    if every["untold"]:
+        yield f"Not everything is known: {every['untold']}."
+
+
+def verdict(record: MatrixRecord) -> str:
+    """What a reader in a hurry wants to know."""
+    runs = sum(cell.runs for cell in record.cells)
+    parts = [f"{text.value(runs)} runs"]
+    if record.outcome == "interrupted":
+        parts[0] += f" of {text.value(record.runs_asked)}, interrupted"
+    bad = sum(map(violated, record.cells))
+    parts.append(f"{bad} violated a characteristic" if bad else "none violated a characteristic")
+    if record.failed:
+        parts.append(f"{len(record.failed)} failed")
+    if record.unsupported:
+        parts.append(f"{len(record.unsupported)} not supported")
+    if record.against:
+        worse = len(record.against.regressions)
+        which = f"{worse or 'no'} figure{'s' if worse > 1 else ''} worse"
+        parts.append(f"{which} than on {text.started(record.against.started_at)}")
+    return "; ".join(parts)
+
+
+def _table(record: MatrixRecord) -> Iterator[str]:
+    named = axes(record.matrix)
+    headers = [*named, "runs", *(metric.label for metric in METRICS), "finished", "violated", "failed"]
+    yield row(headers)
+    yield row(["--:"] * len(headers))
+    for cell in record.cells:
+        yield row([*(say(cell.point) for say in named.values()), str(cell.runs), *_figures(cell), *_bad(cell)])
+
+
+def _figures(cell: Cell) -> Iterator[str]:
+    for metric in METRICS:
+        estimate = cell.estimates[metric.name]
+        interval = say_interval(metric, estimate)
+        yield say_mean(metric, estimate) + (f"<br><sub>{interval}</sub>" if interval else "")
+
+
+def _bad(cell: Cell) -> Iterator[str]:
+    yield say_finished(cell)
+    for number in (violated(cell), cell.failed):
+        yield f"**{number}**" if number else "0"

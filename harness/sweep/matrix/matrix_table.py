@@ -1,0 +1,199 @@
+"""The matrix on the terminal: for each cell the means, and below them their 95 % intervals; then what went wrong."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from harness.present import text as words
+from harness.scenario.verdict_names import BAD_IN_WORDS, CHARACTERISTICS
+from harness.sweep.matrix.cell import Cell
+from harness.sweep.matrix.comparison import Change
+from harness.sweep.matrix.estimate import Estimate
+from harness.sweep.matrix.matrix_file import Matrix, Point
+from harness.sweep.matrix.matrix_metrics import BY_NAME, METRICS, Metric
+from harness.sweep.matrix.matrix_record import MatrixRecord
+
+NAMED = 5
+"""More runs of a cell than these are counted, not named; matrix.json names them all."""
+
+
+def render(record: MatrixRecord) -> RenderableType:
+    parts: list[RenderableType] = []
+    for cells in series(record):
+        if name := ", ".join(series_name(record.matrix, cells[0].point)):
+            parts.append(Text(name, style="bold"))
+        parts.append(_table(record, cells))
+    notes = (Text(note, style="red") for note in troubles_of_all(record))
+    lacking = (Text(note, style="yellow") for note in unsupported_of_all(record))
+    better = (Text(note, style="green") for note in improvements(record))
+    return Group(*parts, Text(explanation(record) + unjudged(record), style="dim"), *notes, *lacking, *better)
+
+
+def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
+    table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim")
+    liveness = ["fin-\nished"] if any(cell.finished.n for cell in cells) else []
+    for header in ("loss", "runs", *(metric.label for metric in METRICS), *liveness, "vio-\nlated"):
+        table.add_column(header.replace(" ", "\n", 1), justify="right", vertical="bottom", no_wrap=True)
+    for cell in cells:
+        estimates = [(metric, cell.estimates[metric.name]) for metric in METRICS]
+        means = (Text(say_mean(metric, estimate)) for metric, estimate in estimates)
+        finished = [_finished(cell)] if liveness else []
+        table.add_row(words.percent(cell.loss), str(cell.runs), *means, *finished, _violated(cell))
+        if len(record.matrix.seed_list) > 1:
+            table.add_row("", "", *(Text(say_interval(*pair), style="dim") for pair in estimates))
+    return table
+
+
+def series(record: MatrixRecord) -> list[list[Cell]]:
+    """The cells of each backend and number of agents, which differ by their loss alone."""
+    groups: dict[tuple[object, ...], list[Cell]] = {}
+    for cell in record.cells:
+        groups.setdefault((cell.backend, cell.agents), []).append(cell)
+    return list(groups.values())
+
+
+def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
+    """What tells the cells apart: the loss, and the axes that have several values. Each with its words for a point."""
+    named: dict[str, Callable[[Point], str]] = {"loss": lambda point: words.percent(point.loss)}
+    if len(matrix.agents or ()) > 1:
+        named["agents"] = lambda point: str(point.agents)
+    if len(matrix.backend) > 1:
+        named["backend"] = lambda point: point.backend
+    return named
+
+
+def name_of(matrix: Matrix, point: Point) -> str:
+    """A cell's name: 15 % loss; 15 % loss, 10 agents, process."""
+    return ", ".join([f"{words.percent(point.loss)} loss", *series_name(matrix, point)])
+
+
+def series_name(matrix: Matrix, point: Point) -> list[str]:
+    """What else than its loss tells a cell apart."""
+    named = axes(matrix)
+    return [
+        *([f"{point.agents} agents"] if "agents" in named else []),
+        *([point.backend] if "backend" in named else []),
+    ]
+
+
+def say(metric: Metric, estimate: Estimate) -> str:
+    """Mean and interval on one line."""
+    interval = say_interval(metric, estimate)
+    return f"{say_mean(metric, estimate)} ({interval})" if interval else say_mean(metric, estimate)
+
+
+def say_mean(metric: Metric, estimate: Estimate) -> str:
+    if estimate.mean is None:
+        return "\u2013"
+    return _number(estimate.mean) if metric.unit == "number" else f"{_number(100 * estimate.mean)}\u00a0%"
+
+
+def say_interval(metric: Metric, estimate: Estimate) -> str:
+    """The bounds of a share's interval, which is lopsided; of a mean's, what to add and to take off."""
+    if estimate.low is None or estimate.high is None:
+        return ""
+    if metric.unit == "share of runs":
+        return f"{100 * estimate.low:.0f}\u2013{100 * estimate.high:.0f}\u00a0%"
+    margin = (estimate.high - estimate.low) / 2
+    return f"\u00b1{_margin(margin)}" if metric.unit == "number" else f"\u00b1{_margin(100 * margin)}\u00a0%"
+
+
+def explanation(record: MatrixRecord) -> str:
+    """What the numbers are, in a sentence."""
+    seeds = len(record.matrix.seed_list)
+    if seeds == 1:
+        return "One run a cell, so there are no intervals."
+    return f"Means of {seeds} runs a cell, the same seeds in each, and their 95 % intervals."
+
+
+def unjudged(record: MatrixRecord) -> str:
+    """A sentence if there are characteristics that no run could judge."""
+    judged = {
+        number for cell in record.cells for number, counts in cell.verdicts.items() if set(counts) - {"not applicable"}
+    }
+    never = [number for number in CHARACTERISTICS if number not in judged]
+    if not never or not record.cells:
+        return ""
+    return f" Not applicable in any run: characteristic{'s' if len(never) > 1 else ''} {', '.join(never)}."
+
+
+def violated(cell: Cell) -> int:
+    """Runs that violated a characteristic, or what is judged beside them."""
+    return len({seed for seeds in cell.violated.values() for seed in seeds})
+
+
+def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
+    """A sentence for each thing that is wrong in a cell."""
+    for key, seeds in cell.violated.items():
+        which = ", ".join(map(str, seeds[:NAMED])) + (", \u2026" if len(seeds) > NAMED else "")
+        plural = "s" if len(seeds) > 1 else ""
+        yield f"{BAD_IN_WORDS[key]} in {len(seeds)} of {cell.runs} runs, seed{plural} {which}"
+    failed = [run for run in record.failed if run.point == cell.point]
+    for run in failed[:NAMED]:
+        yield f"seed {run.seed} failed: {run.reason}"
+    if len(failed) > NAMED:
+        yield f"{len(failed) - NAMED} more runs failed"
+    for change in record.against.regressions if record.against else ():
+        if change.point == cell.point:
+            yield _say_change(change)
+
+
+def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:
+    """What an agent lacks for runs of this cell: each sentence once."""
+    return dict.fromkeys(run.reason for run in record.unsupported if run.point == cell.point)
+
+
+def unsupported_of_all(record: MatrixRecord) -> Iterable[str]:
+    for cell in record.cells:
+        for sentence in unsupported(record, cell):
+            yield f"{name_of(record.matrix, cell.point)}: {sentence}"
+
+
+def troubles_of_all(record: MatrixRecord) -> Iterable[str]:
+    for cell in record.cells:
+        for sentence in troubles(record, cell):
+            yield f"{name_of(record.matrix, cell.point)}: {sentence}"
+
+
+def improvements(record: MatrixRecord) -> Iterable[str]:
+    for change in record.against.changes if record.against else ():
+        if not change.worse:
+            yield f"{name_of(record.matrix, change.point)}: {_say_change(change)}"
+
+
+def _say_change(change: Change) -> str:
+    metric = BY_NAME[change.metric]
+    became = "worse" if change.worse else "better"
+    return f"{metric.label} {became}: {say(metric, change.now)}, was {say(metric, change.before)}"
+
+
+def say_finished(cell: Cell) -> str:
+    """The share of runs whose swarm finished."""
+    share = cell.finished.mean
+    return "\u2013" if share is None else f"{round(100 * share)}\u00a0%"
+
+
+def _finished(cell: Cell) -> Text:
+    return Text(say_finished(cell), style="green" if cell.finished.mean in (None, 1.0) else "bold red")
+
+
+def _violated(cell: Cell) -> Text:
+    runs = violated(cell)
+    if cell.unsupported == cell.runs:
+        return Text("\u2013")
+    if cell.failed:
+        return Text(f"{runs} + {cell.failed}", style="bold red")
+    return Text(str(runs), style="bold red" if runs else "green")
+
+
+def _number(number: float) -> str:
+    """Three digits that mean something."""
+    digits = 2 if abs(number) < 10 else 1 if abs(number) < 100 else 0
+    text = f"{number:.{digits}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def _margin(number: float) -> str:
+    return f"{number:.2g}" if number < 99.5 else f"{number:.0f}"

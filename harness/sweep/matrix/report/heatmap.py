@@ -1,0 +1,140 @@
+"""A figure at each point of the matrix: a table of loss and numbers of agents for each backend.
+
+The shade grows with the figure. It has one hue, so that anybody sees it, and each cell says its number; a sign and
+words say what was violated, failed, or changed.
+"""
+
+from dataclasses import dataclass
+
+from harness.present import text as words
+from harness.present.colours import ramp
+from harness.sweep.matrix.cell import Cell
+from harness.sweep.matrix.estimate import Estimate
+from harness.sweep.matrix.matrix_file import Point
+from harness.sweep.matrix.matrix_record import MatrixRecord
+from harness.sweep.matrix.matrix_table import name_of, say, say_interval, say_mean, violated
+from harness.sweep.matrix.report.figure_menu import Figure
+
+SHADES = 11
+_LIGHT = ramp((236, 244, 250), (0, 78, 122), SHADES)
+_DARK = ramp((30, 41, 50), (120, 200, 245), SHADES)
+
+
+def _style(inks: list[tuple[int, str, str]]) -> str:
+    return "".join(f".shade-{step}{{background:{fill};color:{text}}}\n" for step, fill, text in inks)
+
+
+STYLE = (
+    _style([(step, ink.fill, ink.text) for step, ink in enumerate(_LIGHT)])
+    + "@media screen and (prefers-color-scheme: dark) {\n"
+    + _style([(step, ink.fill, ink.text) for step, ink in enumerate(_DARK)])
+    + "}\n"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """`kind` is bad or good, for the style sheet."""
+
+    sign: str
+    text: str
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """A cell; `shade` is None if the figure is not known there, and `href` if there are no runs to show."""
+
+    shade: int | None
+    mean: str
+    interval: str
+    marks: list[Mark]
+    in_words: str
+    href: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Of one backend: a row for each number of agents, a column for each loss."""
+
+    backend: str
+    losses: list[str]
+    rows: list[tuple[str, list[Tile]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Heatmap:
+    """`lowest` and `highest` are what the first and the last shade stand for."""
+
+    figure: Figure
+    lowest: str
+    highest: str
+    grids: list[Grid]
+
+
+def anchor(point: Point) -> str:
+    """Where in the page its runs are."""
+    return f"{point.file_name}-{point.backend}"
+
+
+def heatmap(record: MatrixRecord, figure: Figure) -> Heatmap:
+    cells = {cell.point: cell for cell in record.cells}
+    scale = _scale(figure, record)
+    points = record.matrix.points
+    grids = []
+    for backend in record.matrix.backend:
+        agents = list(dict.fromkeys(point.agents for point in points))
+        rows = []
+        for number in agents:
+            its_points = [Point(loss, number, backend) for loss in record.matrix.loss]
+            tiles = [_tile(record, figure, point, cells.get(point), scale) for point in its_points]
+            rows.append((f"{number} agents" if number > 1 else "1 agent", tiles))
+        grids.append(Grid(backend, [words.percent(loss) for loss in record.matrix.loss], rows))
+    lowest, highest = (say_mean(figure.metric, Estimate(n=1, mean=bound)) for bound in scale)
+    return Heatmap(figure, lowest, highest, grids)
+
+
+def _scale(figure: Figure, record: MatrixRecord) -> tuple[float, float]:
+    """Shares are shaded from 0 to 100 %, numbers from the lowest to the highest mean."""
+    if figure.metric.unit != "number":
+        return 0.0, 1.0
+    means = [mean for cell in record.cells if (mean := figure.of(cell).mean) is not None]
+    return min(means, default=0.0), max(means, default=0.0)
+
+
+def _tile(record: MatrixRecord, figure: Figure, point: Point, cell: Cell | None, scale: tuple[float, float]) -> Tile:
+    name = name_of(record.matrix, point)
+    if cell is None:
+        return Tile(None, "\u2013", "", [], f"{name}: no run has ended", None)
+    estimate, marks = figure.of(cell), _marks(record, figure, cell)
+    text = ", ".join([say(figure.metric, estimate), *(mark.text for mark in marks)])
+    return Tile(
+        None if estimate.mean is None else _shade(estimate.mean, *scale),
+        say_mean(figure.metric, estimate),
+        say_interval(figure.metric, estimate),
+        marks,
+        f"{name}: {figure.metric.label} {text}",
+        f"#{anchor(point)}",
+    )
+
+
+def _shade(mean: float, lowest: float, highest: float) -> int:
+    return round((SHADES - 1) * (mean - lowest) / (highest - lowest)) if highest > lowest else 0
+
+
+def _marks(record: MatrixRecord, figure: Figure, cell: Cell) -> list[Mark]:
+    marks = []
+    if number := violated(cell):
+        marks.append(Mark("\u2717", f"{number} violated", "bad"))
+    if cell.failed:
+        marks.append(Mark("!", f"{cell.failed} failed", "bad"))
+    if cell.unsupported:
+        marks.append(Mark("\u2013", f"{cell.unsupported} not supported", "good"))
+    for change in record.against.changes if record.against else ():
+        if change.point == cell.point and change.metric == figure.metric.name:
+            up = change.now.mean is not None and change.before.mean is not None and change.now.mean > change.before.mean
+            text, kind = ("worse", "bad") if change.worse else ("better", "good")
+            marks.append(Mark("\u25b2" if up else "\u25bc", text, kind))
+    if cell.runs < (asked := len(record.matrix.seed_list)):
+        marks.append(Mark("\u2026", f"{cell.runs} of {asked} runs", "good"))
+    return marks

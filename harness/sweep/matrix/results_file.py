@@ -1,0 +1,110 @@
+"""results.jsonl: each run of a matrix as soon as it has ended, so that an interrupted matrix can go on.
+
+The first line has the matrix as resolved; each further line one run. Lines are only ever appended.
+"""
+
+import contextlib
+import fcntl
+import json
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from pydantic import ValidationError
+
+from harness.archive.directory import claim
+from harness.errors import MachineError, RunDirectoryError
+from harness.sweep.matrix.cell import Run
+from harness.sweep.matrix.matrix_file import Matrix, Task
+from ucp.agent_files import write_atomically
+
+FILE = "results.jsonl"
+SCHEMA = "ucp-matrix-results/1"
+
+
+class Results:
+    """The runs that have ended, of which there is one for each task at most."""
+
+    def __init__(self, directory: Path, started_at: str, runs: dict[Task, Run], file: BinaryIO) -> None:
+        self.directory, self.started_at, self.runs = directory, started_at, runs
+        self._file = file
+
+    def add(self, run: Run) -> None:
+        """Write it down at once. Raises MachineError if the disk refuses."""
+        line = _line(run.model_dump(mode="json"))
+        try:
+            if self._file.write(line) < len(line):
+                raise OSError(None, "No space left on device")
+        except OSError as error:
+            raise MachineError(
+                f"{self.directory / FILE} cannot be written: {error.strerror}; what had ended is there, and the same "
+                f"command with --out {self.directory} goes on"
+            ) from None
+        self.runs[run.task] = run
+
+
+@contextlib.contextmanager
+def opened(directory: Path, matrix: Matrix) -> Iterator[Results]:
+    """What `directory` has of `matrix`: a new or empty one nothing yet.
+
+    Raises RunDirectoryError if it holds anything else, or another command works on it.
+    """
+    path = directory / FILE
+    with contextlib.ExitStack() as stack:
+        try:
+            if not path.exists():
+                claim(directory)
+                write_atomically(path, _line(_header(matrix)).decode("ascii"))
+            file = stack.enter_context(path.open("r+b", buffering=0))
+        except OSError as error:
+            raise RunDirectoryError(f"{path} cannot be written: {error.strerror}; choose another --out") from None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunDirectoryError(f"another command works on the matrix in {directory}: wait for its end") from None
+        content = file.read()
+        whole = content.rfind(b"\n") + 1  # half a last line is of a run that was broken off in mid-write
+        first, *lines = content[:whole].splitlines() or [b""]
+        started_at = _begun(first, matrix, directory)
+        file.truncate(whole)
+        file.seek(whole)
+        yield Results(directory, started_at, _read(lines, matrix, path), file)
+
+
+def _header(matrix: Matrix) -> dict[str, Any]:
+    now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    return {"schema": SCHEMA, "started_at": now, "matrix": matrix.model_dump(mode="json")}
+
+
+def _begun(line: bytes, matrix: Matrix, directory: Path) -> str:
+    """When the matrix in `directory` was begun, if it is this one."""
+    try:
+        header = json.loads(line)
+    except (ValueError, RecursionError):
+        header = None
+    if not isinstance(header, dict) or header.get("schema") != SCHEMA:
+        raise RunDirectoryError(f"{directory} is not empty: choose another --out, nothing is overwritten")
+    if header.get("matrix") != matrix.model_dump(mode="json"):
+        raise RunDirectoryError(f"{directory} holds the results of another matrix file: choose another --out")
+    return str(header.get("started_at"))
+
+
+def _read(lines: list[bytes], matrix: Matrix, path: Path) -> dict[Task, Run]:
+    asked = set(matrix.tasks)
+    runs: dict[Task, Run] = {}
+    for number, line in enumerate(lines, 2):
+        try:
+            run = Run.model_validate_json(line)
+        except ValidationError:
+            run = None
+        if run is None or run.task not in asked:
+            raise RunDirectoryError(
+                f"{path} line {number} is not a run of this matrix: remove the line to play it again"
+            )
+        runs.setdefault(run.task, run)
+    return runs
+
+
+def _line(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":")).encode("ascii") + b"\n"

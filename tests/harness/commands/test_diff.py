@@ -1,0 +1,226 @@
+"""`ucp-harness diff`: says where two runs part, and that two of the same seed do not."""
+
+import hashlib
+import json
+import re
+import shutil
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import RunDirectoryError
+from harness.play.progress import Silent
+from harness.report.difference import AgentDifference, ChainParting, KeyDifference, compare
+from harness.report.difference.differing_keys import differing_keys
+from harness.run.run import run
+from harness.scenario import load_scenario
+from tests.harness.command import harness, sentences
+from tests.harness.mission import edit, edit_lines
+from tests.harness.virtual import scenario
+
+LOST_LAST_COMMIT = Path(__file__).parents[3] / "scenarios" / "lost_last_commit.yaml"
+SAME = AgentDifference(None, None)
+
+
+def fly(out: Path, seed: int = 1, **keys: Any) -> Path:
+    """A run in virtual time; three agents for five minutes, unless told otherwise."""
+    run(scenario(**{"agents": 3, "duration_s": 300, **keys}), seed, out, Silent(), "sim")
+    return out
+
+
+@pytest.fixture
+def a(tmp_path: Path) -> Path:
+    return fly(tmp_path / "a", network={"loss": 0.2})
+
+
+@pytest.fixture
+def b(a: Path) -> Path:
+    """A copy, to be changed."""
+    return Path(shutil.copytree(a, a.with_name("b")))
+
+
+def trace(run_dir: Path, agent: int = 2) -> Path:
+    return run_dir / "agents" / f"{agent}.trace.jsonl"
+
+
+def test_the_same_seed_is_the_same_run(a: Path, tmp_path: Path) -> None:
+    again = fly(tmp_path / "again", network={"loss": 0.2})
+    done = harness("diff", a, again)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = sum(trace(a, agent).read_text().count("\n") - 1 for agent in (1, 2, 3))
+    assert done.stdout == f"identical to the last byte: {lines} handler runs of 3 agents, and their chains\n"
+
+
+def test_one_lost_commit_is_where_the_runs_part(tmp_path: Path) -> None:
+    lossy = load_scenario(LOST_LAST_COMMIT)
+    without, with_it = tmp_path / "a", tmp_path / "b"
+    run(lossy, 1, without, Silent(), "sim")
+    run(lossy.model_copy(update={"fates": []}), 1, with_it, Silent(), "sim")
+    found = compare(without, with_it)
+    assert (found.verdict, found.first) == ("differ", 2)
+    assert [(one.key, one.b) for one in found.keys] == [("fates", [])]
+    parted = found.agents.pop(2)
+    assert set(found.agents.values()) == {SAME}
+    assert parted.chain == ChainParting(4, None, "4.2")
+    assert parted.run is not None and parted.run.a is None and parted.run.b is not None
+    assert (parted.run.b.handler, parted.run.b.branch) == ("receive_commit_block", "committed")
+    assert parted.run.b.trigger["from"] == 4
+    assert ("chain+", "4.2") in parted.run.b.changes
+    assert 117 < parted.run.at_s < 130
+
+
+def test_runs_that_differ_are_status_1_with_keys_first_then_agents(a: Path, tmp_path: Path) -> None:
+    other = fly(tmp_path / "other", seed=2, network={"loss": 0.3})
+    done = harness("diff", a, other)
+    assert done.returncode == 1
+    lines = done.stdout.splitlines()
+    assert lines[:2] == ["seed: 1 in A, 2 in B", "network.loss: 0.2 in A, 0.3 in B"]
+    assert re.fullmatch(r"the runs part first at [\d.]+ s, with agent [123]", lines[2])
+    assert [line for line in lines if line.startswith("agent ")] == ["agent 1:", "agent 2:", "agent 3:"]
+    assert re.search(r"^    A  [\d.]+ s \(line \d+\): \w+, .+; .+$", done.stdout, re.MULTILINE)
+
+
+def test_as_json_it_says_the_same(a: Path, b: Path) -> None:
+    edit_lines(trace(b), lambda lines: lines[5].update(branch="another"))
+    done = harness("diff", a, b, "--json")
+    assert done.returncode == 1
+    found = json.loads(done.stdout)
+    assert (found["verdict"], found["first"], found["keys"]) == ("differ", 2, [])
+    assert found["agents"]["1"] == {"run": None, "chain": None}
+    parting = found["agents"]["2"]["run"]
+    assert (parting["number"], parting["a"]["line"], parting["b"]["branch"]) == (5, 6, "another")
+
+
+def test_other_times_and_other_hashes_of_the_same_blocks_are_no_difference(a: Path, b: Path) -> None:
+    """As between two runs of processes."""
+    for path in (b / "agents").glob("*.json*"):
+        text = re.sub(
+            r"\b[0-9a-f]{64}\b", lambda found: hashlib.sha256(found[0].encode()).hexdigest(), path.read_text()
+        )
+        path.write_text(re.sub(r'"t":([\d.]+)', lambda found: f'"t":{float(found[1]) + 0.25}', text))
+    done = harness("diff", a, b)
+    assert done.returncode == 0
+    assert re.fullmatch(
+        r"the same: \d+ handler runs of 3 agents, and their chains; what differs is not compared: .*\n", done.stdout
+    )
+
+
+def test_a_state_that_was_edited_is_not_called_a_time(a: Path, b: Path) -> None:
+    trace(b).write_text(trace(b).read_text().replace('"deque":0', '"deque":7', 1))
+    done = harness("diff", a, b)
+    assert done.returncode == 0
+    assert "what differs is not compared: times, hashes that cover them, tallies or states" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda step: step.update(handler="another"),
+        lambda step: step.update(branch="another"),
+        lambda step: step.update(trigger={"message": "Commit Block", "from": 1, "seq": 99}),
+        lambda step: step.update(sent=[{"message": "Commit Block", "seq": 1, "block": None}]),
+        lambda step: step.update(changes=[["stack+", "00" * 32]]),
+    ],
+    ids=["handler", "branch", "trigger", "sent", "changes"],
+)
+def test_what_an_agent_does_is_compared(a: Path, b: Path, change: Any) -> None:
+    edit_lines(trace(b), lambda lines: change(lines[3]))
+    found = compare(a, b)
+    assert found.first == 2
+    assert found.agents[2].run is not None and found.agents[2].run.number == 3
+    assert found.agents[1] == found.agents[3] == SAME
+
+
+def test_the_first_to_part_is_the_first_in_mission_time_in_either_run(a: Path, b: Path) -> None:
+    edit_lines(trace(b, 1), lambda lines: lines[9].update(branch="another"))
+    edit_lines(trace(b, 3), lambda lines: lines[9].update(branch="another", t=1.5))
+    found = compare(a, b)
+    assert found.first == 3
+    assert found.agents[3].run is not None and found.agents[3].run.at_s == 1.5
+
+
+def test_another_life_of_an_agent_is_a_difference_even_if_it_does_the_same(a: Path, b: Path) -> None:
+    lines = trace(b).read_text().splitlines(keepends=True)
+    trace(b).write_text("".join([*lines[:4], lines[0], *lines[4:]]))
+    found = compare(a, b)
+    assert found.first == 2
+    parting = found.agents[2].run
+    assert parting is not None and parting.a is not None and parting.b is not None
+    assert (parting.number, parting.a.life, parting.b.life, parting.b.line) == (4, 1, 2, 6)
+
+
+def test_half_a_last_line_is_what_a_killed_agent_leaves(a: Path, b: Path) -> None:
+    for run_dir in (a, b):
+        with trace(run_dir).open("a") as file:
+            file.write('{"t":' if run_dir is a else '{"t":12,"handler":"x')
+    assert compare(a, b).verdict == "identical"
+
+
+def test_keys_are_told_innermost_and_lists_of_another_length_whole() -> None:
+    one = {"network": {"loss": 0.1, "delay": 1}, "timeline": [{"at_s": 1}], "fates": [1], "name": "x"}
+    other = {"network": {"loss": 0.2, "delay": 1}, "timeline": [{"at_s": 2}], "fates": [], "name": "x", "more": True}
+    assert [*differing_keys(one, other)] == [
+        KeyDifference("network.loss", 0.1, 0.2),
+        KeyDifference("timeline.0.at_s", 1, 2),
+        KeyDifference("fates", [1], []),
+        KeyDifference("more", None, True),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda b: trace(b).unlink(), "2.trace.jsonl: cannot be read (No such file or directory), and runs are"),
+        (lambda b: trace(b).write_text(""), "2.trace.jsonl: it is empty"),
+        (lambda b: trace(b).write_text(trace(b).read_text() + "{}\n"), "is damaged, or of another version of traces"),
+        (lambda b: edit_lines(trace(b), lambda lines: lines[0].update(schema="ucp-trace/3")), "line 1 is damaged, or"),
+        (
+            lambda b: edit(b / "run.json", lambda it: it.update(roster=[1, 2])),
+            "A has agents 1\u20133, and B has 1, 2: compare runs of the same agents",
+        ),
+        (lambda b: edit(b / "run.json", lambda it: it.update(backend="process")), "compare runs of the same backend"),
+        (lambda b: edit(b / "run.json", lambda it: it.pop("roster")), "it names no agents"),
+        (lambda b: (b / "run.json").unlink(), "is this a run directory?"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(a: Path, b: Path, spoil: Any, sentence: str) -> None:
+    spoil(b)
+    with pytest.raises(RunDirectoryError, match=re.escape(sentence)):
+        compare(a, b)
+
+
+def test_a_refusal_is_status_2_with_one_sentence(a: Path, tmp_path: Path) -> None:
+    done = harness("diff", a, tmp_path / "nowhere")
+    assert (done.returncode, done.stdout, len(sentences(done.stderr))) == (2, "", 1)
+
+
+def test_an_export_that_cannot_be_read_is_told_and_counts_as_no_chain(a: Path, b: Path) -> None:
+    (b / "agents" / "2.chain.json").write_text("{")
+    done = harness("diff", a, b)
+    assert done.returncode == 1
+    assert re.search(r"^  block 1 of its chain is \d\.1 in A, not there in B$", done.stdout, re.MULTILINE)
+    assert "2.chain.json: truncated or damaged" in sentences(done.stderr)[0]
+
+
+def test_a_run_that_has_not_recorded_its_end_is_compared_and_that_is_said(a: Path, b: Path) -> None:
+    edit(b / "run.json", lambda record: record.update(outcome="running"))
+    done = harness("diff", a, b)
+    assert done.returncode == 0
+    assert sentences(done.stderr) == [f"{b}: the run has not recorded its end, and is compared up to there"]
+
+
+def test_long_traces_are_never_in_memory_as_a_whole(a: Path, b: Path) -> None:
+    for run_dir in (a, b):
+        header, *steps = trace(run_dir).read_text().splitlines(keepends=True)
+        trace(run_dir).write_text(header + "".join(step for step in steps if '"complete"' not in step) * 200)
+    with trace(b).open("a") as file:
+        file.write(trace(a).read_text().splitlines(keepends=True)[1])
+    size = trace(b).stat().st_size
+    tracemalloc.start()
+    found = compare(a, b)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found.agents[2].run is not None and found.agents[2].run.a is None
+    assert peak < size / 4

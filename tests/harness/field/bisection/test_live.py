@@ -1,0 +1,87 @@
+"""One agent's record, given to an agent as a process: a right one says what is in it, a wrong one is found."""
+
+import json
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.errors import FieldError
+from harness.field.bisection.live_replay import play_live, script_of
+from harness.field.bisection.scripted_peers import Lateness, what
+from harness.field.replay import open_record
+from tests.harness.command import harness
+from ucp.messages import ChainContainQuery, encode
+
+PYTHON = shlex.quote(sys.executable)
+RIGHT = f"{PYTHON} -P -m ucp.node"
+WRONG = """import json, sys
+from pathlib import Path
+from ucp.node import main
+
+path = Path(sys.argv[1])
+mission = json.loads(path.read_text())
+mission["quirks"]["disapprove_everything"] = True
+path.write_text(json.dumps(mission))
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("field")
+    scenario = path / "short.yaml"
+    short = {"name": "short", "agents": 4, "duration_s": 150, "network": {"loss": 0.3}, "settle": {"limit_s": 30}}
+    scenario.write_text(json.dumps({**short, "events": {"source": "random", "mean_s": 10}}))
+    harness("run", scenario, "--backend", "sim", "--seed", 3, "--out", path / "run")
+    shutil.copytree(path / "run/agents", path / "home")
+    return path / "home"
+
+
+@pytest.mark.lab
+@pytest.mark.whoever
+def test_a_right_agent_says_what_is_in_the_record_and_a_wrong_one_does_not(records: Path, tmp_path: Path) -> None:
+    options = ["--agent", 2, "--speedup", 10, "--agent-command"]
+    right = harness("again", records, *options, RIGHT)
+    assert right.returncode == 0, right.stdout + right.stderr
+    assert "agent 2: as recorded" in right.stdout
+    (tmp_path / "wrong.py").write_text(WRONG)
+    wrong = harness("again", records, *options, f"{PYTHON} -P {shlex.quote(str(tmp_path / 'wrong.py'))}")
+    assert wrong.returncode == 1, wrong.stdout + wrong.stderr
+    assert "approve False); the record sent Block Add Response" in wrong.stdout
+    none = harness("again", records, *options, "no-such-agent")
+    assert none.returncode == 125
+    ending = harness("again", records, *options, f"{PYTHON} -c 'raise SystemExit(3)'")
+    assert ending.returncode == 125 and "the agent ended with status 3" in ending.stderr
+
+
+def test_what_an_agent_asked_itself_is_answered_when_it_asks(records: Path) -> None:
+    script = script_of(open_record(records, 2))
+    answers = [given for given in script.datagrams if given.after is not None]
+    assert answers and all(given.asked_s < given.t < given.asked_s + 6 for given in answers)
+    assert {question for _, question in script.questions} >= {given.after for given in answers}
+    assert script.expected == sorted(script.expected, key=lambda said: said.line)
+
+
+def test_a_record_in_words_that_nobody_knows_is_not_played(records: Path, tmp_path: Path) -> None:
+    (tmp_path / "2.trace.jsonl").write_text((records / "2.trace.jsonl").read_text().replace("vote_timer_", "poll_"))
+    with pytest.raises(FieldError, match=r"unknown handler name 'poll_expiration', so nobody knows what is to be"):
+        play_live(open_record(tmp_path, 2), ["no-such-agent"], tmp_path, speedup=1.0)
+
+
+def test_whoever_is_late_is_heard_late_for_as_long_as_it_reconciles() -> None:
+    lateness = Lateness(0.1)
+    assert lateness.at(5.0) == 0.0
+    lateness.asks(10.5, [2.0, 10.0])
+    assert lateness.at(14.0) == pytest.approx(0.6)
+    assert lateness.at(17.0) == 0.0
+    lateness.asks(30.0, [])
+    assert lateness.at(31.0) == 0.0
+
+
+def test_the_same_question_is_the_same_with_another_number() -> None:
+    question = ChainContainQuery(bytes(32))
+    assert what(encode(1, 5, question)) == what(encode(1, 6, question)) == what(encode(2, 5, question))
+    assert what(encode(1, 5, question)) != what(encode(1, 5, ChainContainQuery(bytes(31) + b"x")))

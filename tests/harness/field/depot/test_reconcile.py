@@ -1,0 +1,127 @@
+"""The final reconcile of what came home, by the protocol, without vehicles."""
+
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.archive.exports import Export
+from harness.field.depot.consolidation import Consolidation
+from harness.field.depot.depot_reconcile import reconcile
+from harness.field.depot.record_outputs import lines
+from harness.run.simulate import simulate
+from tests.harness.field.depot.exports import brought, document, made, write_exports
+from tests.harness.field.depot.test_consolidate import read
+from tests.harness.virtual import scenario
+
+RUNS = 25
+
+
+def flown(seed: int) -> dict[int, Export]:
+    """What the agents of a random run hold at its end: with loss, a partition, deaths, brown-outs, settled or not."""
+    lots = random.Random(seed)
+    count = lots.randint(2, 7)
+    agents = sorted(lots.sample(range(1, 300), count))
+    at_s = iter(sorted(lots.sample(range(20, 540), 5)))
+    timeline: list[dict[str, Any]] = [
+        {"at_s": next(at_s), "partition": [lots.sample(agents, lots.randint(1, count - 1))]}
+    ]
+    if lots.random() < 0.5:
+        timeline.append({"at_s": next(at_s), "heal": True})
+    if count > 2 and lots.random() < 0.5:
+        timeline.append({"at_s": next(at_s), "kill": [agents[0]]})
+        if lots.random() < 0.5:
+            timeline.append({"at_s": next(at_s), "restart": [agents[0]]})
+    if lots.random() < 0.5:
+        disk = lots.choice(["kept", "lost"])
+        timeline.append({"at_s": next(at_s), "reboot": [agents[1]], "down_s": 30, "disk": disk})
+    asked = scenario(
+        agents=agents,
+        duration_s=600,
+        network={"loss": lots.choice([0, 0.1, 0.3, 0.6, 1.0])},
+        timeline=timeline,
+        events={"source": "random", "mean_s": lots.choice([5, 15, 30])},
+        settle={"limit_s": lots.choice([1, 60, 1800])},
+    )
+    return dict(simulate(asked, seed).evidence.exports)
+
+
+@pytest.mark.parametrize("seed", range(RUNS))
+def test_what_came_home_of_a_run_is_on_record_once_and_reconciles_to_one_chain(seed: int, tmp_path: Path) -> None:
+    from harness.field.depot.collected_exports import came_home
+    from harness.field.depot.consolidation import consolidate
+
+    exports = flown(seed)
+    record = consolidate(came_home([write_exports(tmp_path, exports)]))
+    assert record.header.problems == record.header.left_out == []
+    assert events_on_record(record) == events_held(exports)
+    reconciled = reconcile(record)
+    assert reconciled.line.uniform
+    chains = {export.chain_of_block_hashes for export in reconciled.exports.values()}
+    (chain,) = chains
+    assert len(set(chain)) == len(chain)
+    assert set(chain) == {block.block_hash for export in exports.values() for block in export.blocks()}
+    assert tuple(reconciled.line.chain) == chain
+    for agent_id, export in reconciled.exports.items():
+        assert export.current_block == exports[agent_id].current_block
+        assert export.completed == exports[agent_id].completed
+    (*_, last) = read("".join(lines(record, reconciled.line)))
+    assert last == reconciled.line
+
+
+def events_held(exports: dict[int, Export]) -> list[tuple[int, bytes]]:
+    """Each event that any export has, with its agent: those of blocks once, and of what was being built."""
+    import base64
+
+    from ucp.events import decode_events
+
+    blocks = {block.block_hash: block for export in exports.values() for block in export.blocks()}
+    held = [(block.agent_id, event) for block in blocks.values() for event in decode_events(block.event_bytes)]
+    for agent_id, export in exports.items():
+        building = base64.b64decode(export.current_block.event_data)
+        own = (block for block in blocks.values() if block.agent_id == agent_id)
+        if not any(block.event_bytes.startswith(building) for block in own):
+            held += [(agent_id, event) for event in decode_events(building)]
+    return sorted((agent_id, event.encode()) for agent_id, event in held)
+
+
+def events_on_record(record: Consolidation) -> list[tuple[int, bytes]]:
+    return sorted((block.line.agent_id, event.encode()) for block in record.blocks for event in block.events)
+
+
+def test_agents_that_would_all_propose_at_once_still_come_to_one_chain(tmp_path: Path) -> None:
+    chains = [document(agent, f"{agent}.1 {agent}.2", deque=f"{agent}.3", stack=f"{agent}.4") for agent in range(1, 7)]
+    reconciled = reconcile(brought(tmp_path, *chains))
+    assert reconciled.line.uniform
+    assert len(reconciled.line.chain) == 24
+    assert all(len(vehicle.gained) == 20 for vehicle in reconciled.line.vehicles)
+
+
+def test_one_vehicle_alone_keeps_what_it_has_and_says_so(tmp_path: Path) -> None:
+    line = reconcile(brought(tmp_path, document(1, "1.1", deque="1.2"))).line
+    assert not line.uniform or len(line.chain) == 2
+
+
+def test_an_edited_block_is_given_to_nobody(tmp_path: Path) -> None:
+    import base64
+
+    edited = document(2, "1.1 2.1 2.2")
+    edited["chain"][1]["event_data"] = base64.b64encode(made(2, 9).event_data).decode()
+    line = reconcile(brought(tmp_path, document(1, "1.1"), edited)).line
+    assert line.uniform
+    assert line.chain == [made(1, 1).block_hash.hex(), made(2, 2).block_hash.hex()]
+    (left_out,) = line.left_out
+    assert "edited" in left_out
+
+
+def test_what_only_an_earlier_export_has_reaches_the_chain(tmp_path: Path) -> None:
+    from harness.field.depot.collected_exports import came_home
+    from harness.field.depot.consolidation import consolidate
+    from tests.harness.field.depot.exports import write
+
+    write(tmp_path / "before", document(1, "1.1 1.2", exported_at_us=1))
+    write(tmp_path / "after", document(1, "1.3", exported_at_us=2), document(2, "1.3"))
+    line = reconcile(consolidate(came_home([tmp_path]))).line
+    assert line.uniform
+    assert set(line.chain) == {made(1, number).block_hash.hex() for number in (1, 2, 3)}

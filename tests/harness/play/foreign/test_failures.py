@@ -1,0 +1,166 @@
+"""What an agent in virtual time can do wrong: one sentence that names it, and what became of it on record."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import HarnessError, UnsupportedError
+from harness.play.progress import Silent
+from harness.play.simulation.foreign import foreign_agent, virtual_program
+from harness.run.run import Run, run
+from harness.run.simulate import simulate
+from tests.harness.play.foreign.agents import EXPORT, living, played_by, small
+from ucp.messages import BlockAddRequest, encode
+from ucp.trace import in_base64
+
+SHORT = {"agents": 2, "duration_s": 30, "events": {"source": "scripted", "script": [{"at_s": 12.5, "agent": 2}]}}
+EVENT = "if 'event_id' in given:\n    "
+
+
+@pytest.fixture(autouse=True)
+def narrow_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(virtual_program, "MAX_ANSWER_BYTES", 1 << 20)
+    monkeypatch.setattr(foreign_agent, "MAX_TIMERS_PER_S", 50)
+
+
+def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
+    """Agent 2 goes wrong, agent 1 is ours."""
+    one = played_by({2: small(tmp_path, code)}, **{**SHORT, **keys})
+    return run(one, 1, tmp_path / "run", Silent(), "sim")
+
+
+@pytest.mark.parametrize(
+    ("code", "outcome", "sentence"),
+    [
+        (EVENT + "sys.exit(3)", "crashed", "ended by itself with status 3 when it was given an event at 12.5 s"),
+        (EVENT + "os.kill(os.getpid(), 9)", "crashed", "was ended by SIGKILL when it was given an event at 12.5 s"),
+        (
+            EVENT + "time.sleep(9)",
+            "hung",
+            "did not answer within 1 s (with a whole line, flushed) when it was given an event",
+        ),
+        (EVENT + "print('ready')", "crashed", "answered an event at 12.5 s with what is not JSON"),
+        (EVENT + "said = [1]", "crashed", "answered an event at 12.5 s with what is not a JSON object: '[1]'"),
+        (EVENT + "said = {}", "crashed", "answered an event at 12.5 s without a list `sent`: '{}'"),
+        (EVENT + "print('x' * (2 << 20), end='')", "crashed", "answers with a line of more than 1 MiB"),
+        (EVENT + "del said['timer']", "crashed", "without a number of mission seconds, or null, as `timer`"),
+        (EVENT + "said['timer'] = float('nan')", "crashed", "with what is not JSON (expected value"),
+        (EVENT + "said['timer'] = 10 ** 400", "crashed", "not a number of mission seconds, or null, as `timer`"),
+        (EVENT + "said['timer'] = '1'", "crashed", "with the timer '1', not a number of mission seconds"),
+        ("said['timer'] = given['t'] + 1e-9 * ('timer' in given or not number)", "hung", "a timer that ends again and"),
+        ("said['timer'] = 1", "hung", "has a timer that ends again and again at 1 s"),
+        (EVENT + "said['sent'] = ['?']", "crashed", "with a datagram that is not base64: '?'"),
+        (EVENT + "said['sent'] = ['AA=='] * 2000", "crashed", "with 2000 datagrams at once"),
+        (EVENT + "said['sent'] = ['A' * 100000]", "crashed", "with a datagram of 75000 bytes, more than UDP carries"),
+        (EVENT + "del said['trace']", "crashed", "without a list `trace`, which its mission asked for"),
+        (EVENT + "said['trace'] = [{'t': 1}]", "crashed", "with `trace.0`, which is no line of a trace"),
+        (
+            EVENT + "said['trace'] = [{'t': 1, 'dropped': 'x', 'datagram': ''}]",
+            "crashed",
+            "wrote t=1.0 into its trace of an input at 12.5 s",
+        ),
+        (EVENT + "print(json.dumps(said))", "crashed", "wrote what nobody asked for"),
+        (EVENT + "said = {'error': 'no, not I'}", "crashed", "refused an event at 12.5 s: no, not I"),
+        ("if given.get('command') == 'status': said['answer'] = {'ok': True}", "crashed", "without a proper `started`"),
+        (
+            "if given.get('command') == 'export': said['answer'] = 3",
+            "crashed",
+            "gave no `answer` to the command export",
+        ),
+        (
+            EXPORT + "if given.get('command') == 'export': said['answer']['chain'] = [1]",
+            "crashed",
+            "answered to the command export without a proper `chain.0`",
+        ),
+        (
+            EXPORT + "if given.get('command') == 'export': said['answer']['agent_id'] = 7",
+            "crashed",
+            "answered to the command export with that of agent 7",
+        ),
+        (
+            EXPORT + "if given.get('command') == 'export': said['answer']['inception']['block_data'] = 'AA=='",
+            "crashed",
+            "answered to the command export with the chain of another mission",
+        ),
+        ("if given.get('command') == 'export': said['sent'] = ['AA==']", "crashed", "did more than answer when it was"),
+        (EVENT + "said = {'error': 'no such event', 'unsupported': True}", "not supported", "no such event"),
+    ],
+)
+def test_what_goes_wrong_is_one_sentence_and_on_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, outcome: str, sentence: str
+) -> None:
+    if "sleep" in code:
+        monkeypatch.setattr(virtual_program, "ANSWER_LIMIT_S", 1.0)
+    finished = run_with(tmp_path, "import os, time\n" + code)
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (sentence in record["outcome_detail"]) and "agent 2" in record["outcome_detail"], record["outcome_detail"]
+    assert record["agents"]["2"]["outcome"] == outcome
+    assert record["agents"]["1"]["outcome"] == "exported"
+    assert finished.exit_status == (3 if outcome == "not supported" else 1)
+
+
+ENDS_IN_PHASE_TWO = """
+import os, sys
+from ucp import virtual
+answer = virtual.VirtualAgent.answer
+def dying(agent):
+    said = answer(agent)
+    return said if '"handler":"reconcile_phase_2"' not in said else os._exit(7)
+virtual.VirtualAgent.answer = dying
+virtual.main()
+"""
+
+
+def test_of_a_run_that_an_agent_ended_nobody_is_accused(tmp_path: Path) -> None:
+    (tmp_path / "dying.py").write_text(ENDS_IN_PHASE_TWO)
+    dying = [sys.executable, str(tmp_path / "dying.py")]
+    finished = run(played_by({2: dying}, network={"loss": 0.3}), 1, tmp_path / "run", Silent(), "sim")
+    assert "agent 2 ended by itself with status 7" in str(finished.played.outcome_detail)
+    assert finished.exit_status == 1 and not finished.result.bad
+
+
+def test_a_storm_that_feeds_itself_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two agents that answer each datagram with two."""
+    monkeypatch.setattr(foreign_agent, "MAX_SENT_PER_S", 200)
+    code = EVENT + "said['sent'] = ['AA==']\nif 'datagram' in given:\n    said['sent'] = ['AA==', 'AA==']"
+    one = played_by(small(tmp_path, code), **SHORT)
+    with pytest.raises(HarnessError, match=r"agent \d sent more than 200 datagrams within mission second 1\d"):
+        simulate(one, 1, tracing=True)
+
+
+def test_what_is_no_message_of_its_own_reaches_the_others_and_is_dropped(tmp_path: Path) -> None:
+    """Half a header, and what another agent would send."""
+    forged = in_base64(encode(1, 0, BlockAddRequest(bytes(32), bytes(32))))
+    code = EVENT + f"said['sent'] = ['VUMB', '{forged}']"
+    run_with(tmp_path, code, agents=3, duration_s=20)
+    lines = [json.loads(line) for line in (tmp_path / "run/agents/3.trace.jsonl").read_text().splitlines()]
+    assert [line["datagram"] for line in lines if "dropped" in line] == ["VUMB"]
+    assert [line["trigger"]["from"] for line in lines if "trigger" in line] == [1]
+
+
+def test_an_agent_that_does_not_end_by_itself_is_ended(tmp_path: Path) -> None:
+    run_with(tmp_path, "import atexit, time\nif number == 0:\n    atexit.register(time.sleep, 99)")
+    assert not living(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("import time; said['now'] = int(time.time())", "it reads a clock, draws random numbers"),
+        ("import os; said['pid'] = os.getpid()", "it reads a clock, draws random numbers"),
+        ("given.setdefault('seen', globals().setdefault('seen', number)); said['n'] = number", "from an earlier life"),
+    ],
+)
+def test_an_agent_that_is_not_the_same_twice_is_named(tmp_path: Path, code: str, why: str) -> None:
+    finished = run_with(tmp_path, EXPORT + code)
+    detail = str(finished.played.outcome_detail)
+    assert finished.exit_status == 1
+    assert "agent 2 is not the same twice: given" in detail and why in detail, detail
+
+
+def test_what_virtual_time_lacks_is_not_supported(tmp_path: Path) -> None:
+    with pytest.raises(UnsupportedError, match=r"not supported by agent 2 .*with --virtual it ends with status 2"):
+        simulate(played_by({2: ["/bin/sh", "-c", "exit 2"]}, **SHORT), 1)

@@ -1,0 +1,110 @@
+"""`ucp-harness keys`: what stays home stays there, what is handed out is one vehicle's, and nothing secret is told."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.play.keyring.key_directory import Home, KeysError, load_depot_key
+from tests.harness.command import harness
+from ucp.secure.bundle import load_bundle, load_public
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys of three vehicles, and their bundles; nobody changes them."""
+    home = tmp_path_factory.mktemp("keys") / "home"
+    Home.new(home, [1, 7, 28], seals=True, epoch_s=60.0).write_bundles(home.parent / "bundles")
+    return home
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    return Home.new(tmp_path / "home", [1, 7, 28], seals=True, epoch_s=60.0).directory
+
+
+def secrets(home: Path) -> list[str]:
+    """Of all files."""
+    private = json.loads((home / "vehicles.key").read_text())
+    keys = [json.loads((home / name).read_text())["private_key"] for name in ("authority.key", "depot.key")]
+    return [*keys, private["group_secret"], *private["vehicles"].values()]
+
+
+def test_nobody_else_can_read_what_is_secret(made: Path) -> None:
+    assert made.stat().st_mode & 0o777 == 0o700
+    modes = {path.name: path.stat().st_mode & 0o777 for path in (*made.iterdir(), *(made.parent / "bundles").iterdir())}
+    assert modes.pop("public.json") == 0o644
+    assert {*modes} == {f"{n}.bundle.json" for n in (1, 7, 28)} | {"authority.key", "depot.key", "vehicles.key"}
+    assert {*modes.values()} == {0o600}
+
+
+def test_a_bundle_has_the_secrets_of_one_vehicle(made: Path) -> None:
+    text = (made.parent / "bundles/7.bundle.json").read_text()
+    authority, depot, group_secret, first, seventh, last = secrets(made)
+    assert group_secret in text and seventh in text
+    assert not any(secret in text for secret in (authority, depot, first, last))
+    bundle = load_bundle(made.parent / "bundles/7.bundle.json")
+    assert bundle.public == load_public(made / "public.json")
+    assert bundle.public.epoch_s == 60.0
+
+
+@pytest.mark.parametrize("how", [(), ("--json",)])
+def test_inspect_tells_no_secret(made: Path, how: tuple[str, ...]) -> None:
+    done = harness("keys", "inspect", made, made.parent / "bundles", *how)
+    assert done.returncode == 0
+    assert "the bundle of vehicle 28" in done.stdout
+    assert not any(secret in done.stdout + done.stderr for secret in secrets(made))
+
+
+def test_keys_of_two_missions_are_told_apart(made: Path, home: Path) -> None:
+    done = harness("keys", "inspect", made / "public.json", home / "public.json")
+    assert (done.returncode, "keys of 2 missions" in done.stderr) == (1, True)
+
+
+def test_revocations_say_all_that_was_revoked_so_far(home: Path) -> None:
+    assert harness("keys", "revoke", home, "7").returncode == 0
+    done = harness("keys", "revoke", home, "1", "--out", home.parent / "message.json")
+    assert done.stdout.rstrip().endswith("number 2, revoked 1, 7")
+    assert (home.parent / "message.json").read_text() == (home / "revocation.json").read_text()
+    assert [path.name for path in Home(home).write_bundles(home.parent / "left")] == ["28.bundle.json"]
+    for wrong, sentence in ((7, "revoked already"), (9, "not of this mission, which has agents 1, 7, 28")):
+        done = harness("keys", "revoke", home, str(wrong))
+        assert (done.returncode, sentence in done.stderr) == (2, True)
+    with pytest.raises(KeysError, match="agent 7 is revoked"):
+        Home(home).bundle(7)
+
+
+def test_what_is_there_is_not_replaced(home: Path) -> None:
+    done = harness("keys", "new", home, "--agents", "3")
+    assert (done.returncode, "need a new directory" in done.stderr) == (2, True)
+    for _ in range(2):
+        done = harness("keys", "bundle", home, "--out", home.parent / "out", "--agent", "7")
+    assert (done.returncode, "--overwrite" in done.stderr) == (2, True)
+
+
+def edited(path: Path, **keys: Any) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **keys}))
+
+
+def test_keys_that_do_not_belong_together_are_refused(home: Path, made: Path) -> None:
+    (home / "vehicles.key").write_text((made / "vehicles.key").read_text())
+    with pytest.raises(KeysError, match="of another mission"):
+        Home(home).bundle(7)
+    edited(home / "vehicles.key", mission=load_public(home / "public.json").mission.hex())
+    with pytest.raises(KeysError, match="is not the one that"):
+        Home(home).bundle(7)
+    (home / "authority.key").write_text((made / "authority.key").read_text())
+    with pytest.raises(KeysError, match="not the key of the authority"):
+        Home(home).revoke([7])
+    (home / "depot.key").chmod(0o640)
+    with pytest.raises(KeysError, match="chmod 600"):
+        load_depot_key(home)
+
+
+def test_a_revocation_that_was_edited_revokes_nobody(home: Path) -> None:
+    Home(home).revoke([7])
+    for message in ("AAAA", "no base64", 7, None):
+        edited(home / "revocation.json", message=message)
+        with pytest.raises(KeysError, match="`message` is"):
+            Home(home).revocation()

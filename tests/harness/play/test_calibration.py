@@ -1,0 +1,124 @@
+"""`ucp-harness doctor --measure`: its table, JSON and exit status; `tests/netem/test_measure.py` has real packets."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from harness import cli
+from harness.commands import doctor as doctor_module
+from harness.play.machine import calibration
+from harness.play.machine.capabilities import Requirement
+from netem.conditions import NetworkConditions
+from netem.errors import LabError
+from netem.estimates import Heard, Lateness, lost
+from netem.measure import Observer, Question, Study
+
+WORKS = [
+    Requirement("netem", False, False, "unknown"),
+    Requirement("nftables", True, False, "works"),
+    Requirement("engine", True, True, "nftables"),
+]
+NOTHING_WORKS = [Requirement("engine", False, True, "nothing works", "install nftables")]
+STUDY = Study(NetworkConditions(), (Question(1, 4, "loss 0.15", "lost", 0.15, lost),))
+
+
+def losing(*shares: float) -> Observer:
+    """Loses such shares, one stream after the other."""
+    streams = iter(shares)
+
+    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+        first = round(next(streams) * packets)
+        lateness = Lateness([0.0001] * packets, [0.0002] * 10)
+        return {(1, 4): Heard([0.0] * packets, [(number, 0.1) for number in range(first, packets)], lateness)}
+
+    return observe
+
+
+def fake(monkeypatch: pytest.MonkeyPatch, observer: Observer, findings: list[Requirement] = WORKS) -> None:
+    """A machine with these findings, whose network is an observer, and of which one question is asked."""
+    monkeypatch.setattr(doctor_module, "examine", lambda: findings)
+    monkeypatch.setattr(calibration, "studies", lambda engine: (STUDY,))
+    monkeypatch.setattr(calibration, "in_lab", lambda engine: observer)
+
+
+def doctor(*options: str) -> Result:
+    return CliRunner().invoke(cli.app, ["doctor", "--measure", *options])
+
+
+def test_a_table_says_what_was_asked_and_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake(monkeypatch, losing(0.15))
+    done = doctor()
+    assert done.exit_code == 0
+    (row,) = [line.split() for line in done.stdout.splitlines() if "loss 0.15" in line]
+    assert row == ["✔", "loss", "0.15", "lost", "15", "%", "15", "13.86", "to", "16.21", "10000"]
+    assert "by itself took 0.1 ms" in done.stdout
+    assert "nftables: 10000 packets for 1 question" in done.stderr
+
+
+def test_what_lies_outside_once_is_shown_and_forgiven(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake(monkeypatch, losing(0.2, 0.15))
+    done = doctor()
+    assert done.exit_code == 0
+    (first,) = [line.split() for line in done.stdout.splitlines() if "at first" in line]
+    assert first == ["at", "first", "20", "18.72", "to", "21.35", "10000"]
+
+
+def test_what_lies_outside_twice_is_status_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake(monkeypatch, losing(0.2, 0.2))
+    done = doctor()
+    assert done.exit_code == 1
+    assert "✘  loss 0.15" in done.stdout
+
+
+def test_json_has_findings_lateness_and_a_row_for_each_question(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake(monkeypatch, losing(0.2, 0.15))
+    done = doctor("--json")
+    found = json.loads(done.stdout)
+    assert [finding["name"] for finding in found["findings"]] == ["netem", "nftables", "engine"]
+    (engine,) = found["measured"]
+    assert engine["engine"] == "nftables"
+    assert engine["lateness"]["way"] == {"median_s": 0.0001, "p99_s": pytest.approx(0.0001)}
+    (row,) = engine["rows"]
+    assert row["low"] < row["asked"] < row["high"]
+    assert row.pop("before").keys() == {"measured", "low", "high", "packets"}
+    assert {
+        "engine",
+        "condition",
+        "quantity",
+        "unit",
+        "asked",
+        "measured",
+        "low",
+        "high",
+        "packets",
+        "ok",
+    } == row.keys()
+
+
+def test_without_an_engine_there_is_nothing_to_measure_and_status_3(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake(monkeypatch, losing(), NOTHING_WORKS)
+    done = doctor()
+    assert done.exit_code == 3
+    assert "install nftables" in done.stdout
+    as_json = doctor("--json")
+    assert as_json.exit_code == 3
+    assert json.loads(as_json.stdout)["measured"] == []
+
+
+def test_a_machine_that_is_too_busy_is_one_sentence_and_status_3(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def too_busy(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+        raise LabError("A receive buffer overflowed")
+
+    fake(monkeypatch, too_busy)
+    monkeypatch.setattr(sys, "argv", ["ucp-harness", "doctor", "--measure"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 3
+    assert "A receive buffer overflowed" in capsys.readouterr().err

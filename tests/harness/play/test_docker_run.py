@@ -1,0 +1,242 @@
+"""The Docker backend for real: the verdicts of the process backend, its faults, and nothing left behind."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.play.containers import ownership
+from harness.play.keyring.key_directory import Home
+from tests.harness.command import Running, harness, processes, sentences, write_scenario
+from tests.harness.docker import Way, containers, stranger
+from tests.harness.secure.secrets import left_in, secrets, told
+
+pytestmark = pytest.mark.docker
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+ON_DOCKER = ("--backend", "docker", "--image-from-host")
+NO_VEHICLES = {"vehicles": {"kind": "none"}}
+IMPATIENT = (
+    "import harness.play.containers.docker_engine as it; it.ANSWER_LIMIT_S = 6; import harness.cli as c; c.main()"
+)
+"""The command line with an engine that has 6 s to answer, which is enough for one that is not hurt."""
+
+
+def on_docker(tmp_path: Path, *options: object, **keys: Any) -> subprocess.CompletedProcess[str]:
+    return harness("run", write_scenario(tmp_path, **keys), "--out", tmp_path / "run", *ON_DOCKER, *options)
+
+
+def long_run(tmp_path: Path, **keys: Any) -> Running:
+    """A run that goes on until the test ends it."""
+    run = Running(write_scenario(tmp_path, duration_s=100_000, **NO_VEHICLES, **keys), tmp_path / "run", *ON_DOCKER)
+    run.wait_for_mission(1, 2, 3)
+    return run
+
+
+@pytest.mark.parametrize("name", ["loss_15", "partition_heal"])
+def test_scenarios_hold_in_containers(name: str, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    asked = ("--vehicles", "embedded", "--speedup", 40, "--seed", 1, "--out", out)
+    done = harness("run", SCENARIOS / f"{name}.yaml", *ON_DOCKER, *asked, deadline_s=180)
+    assert done.returncode == 0, done.stdout + done.stderr
+    record = json.loads((out / "run.json").read_text())
+    assert [one["verdict"] for one in record["characteristics"].values()] == ["holds"] * 6
+    assert (record["backend"], record["outcome"], record["settled"]) == ("docker", "completed", True)
+    assert record["figures"]["blocks"] > 20
+    if name == "loss_15":
+        for counted in record["counters"]["receivers"].values():
+            assert 0.05 < counted["lost"] / (counted["lost"] + counted["passed"]) < 0.25, counted
+    assert containers(out) == []
+
+
+def test_faults_of_agents_and_vehicles(tmp_path: Path) -> None:
+    timeline = [
+        {"at_s": 40, "pause": [1]},
+        {"at_s": 60, "resume": [1]},
+        {"at_s": 70, "pause": [2]},
+        {"at_s": 80, "kill": [2]},
+        {"at_s": 180, "restart": [2]},
+        {"at_s": 200, "crash": [4]},
+        {"at_s": 400, "reboot": [3], "down_s": 20, "disk": "kept"},
+    ]
+    done = on_docker(
+        tmp_path, agents=4, duration_s=600, speedup=40, timeline=timeline, vehicles={"kind": "embedded"},
+        final_reconcile=True, events={"mean_s": 10}, docker={"memory_mib": 256, "cpus": 1.5, "pids": 50},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    run = tmp_path / "run"
+    agents = json.loads((run / "run.json").read_text())["agents"]
+    assert {key: one["outcome"] for key, one in agents.items()} == {
+        "1": "exported", "2": "exported", "3": "exported", "4": "killed"
+    }  # fmt: skip
+    assert (agents["2"]["restarts"], agents["3"]["reboots"]) == (1, 1)
+    assert (run / "vehicles/2-2/telemetry.tlog").stat().st_size > 0
+    assert "went on from a store" in (run / "agents/3-2/3.log").read_text()
+    assert containers(run) == []
+
+
+def test_captured_keys_do_in_containers_what_they_do_elsewhere_and_no_secret_is_left(tmp_path: Path) -> None:
+    """Sealed, forged in two names, replayed, revoked: what agents dropped, and in whose name they heard what."""
+    home = Home.new(tmp_path / "home", [1, 2, 3], seals=True, epoch_s=30.0)
+    timeline = [
+        {"at_s": 40, "forge": {"message": "Commit Block", "sender": 2}},
+        {"at_s": 45, "forge": {"message": "Commit Block", "sender": 3}},
+        {"at_s": 50, "duplicate": {"for_s": 10}},
+        {"at_s": 70, "kill": [3]},
+        {"at_s": 72, "revoke": [3], "heard_by": [1]},
+        {"at_s": 80, "forge": {"message": "Commit Block", "sender": 3}},
+    ]
+    security = {"keys": str(home.directory), "seal": True, "captured": 3}
+    done = on_docker(
+        tmp_path, agents=3, duration_s=100, speedup=10, security=security, timeline=timeline, events={"mean_s": 8},
+        **NO_VEHICLES,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stdout + done.stderr
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert record["characteristics"]["1"]["verdict"] == "violated"
+    assert all(
+        "agent 3 never" in finding["detail"] for key in "14" for finding in record["characteristics"][key]["evidence"]
+    )
+    dropped = {reason for agent in record["agents"].values() for reason in agent["dropped"]}
+    assert dropped >= {"not signed by its sender", "revoked sender"}
+    left = [("its output", (done.stdout + done.stderr).encode()), *left_in(tmp_path / "run")]
+    assert told(secrets(home, 14), left) == []
+    assert containers(tmp_path / "run") == []
+
+
+def test_after_sigkill_clean_removes_what_is_ours_and_no_more(tmp_path: Path) -> None:
+    run = long_run(tmp_path)
+    held = [f"{ownership.run_name(run.out)}-{role}-{number}" for role in ("agent", "network") for number in (1, 2, 3)]
+    assert containers(run.out) == held
+    with stranger(f"stranger-{os.getpid()}") as engine:
+        assert harness("clean").returncode == 0
+        assert containers(run.out) == held, "it goes on"
+        run.process.kill()
+        run.process.wait()
+        assert processes(run.out), "containers are not the orchestrator's children"
+        cleaned = harness("clean")
+        assert cleaned.returncode == 0
+        assert {f"removed {name}" for name in held} <= set(cleaned.stdout.splitlines())
+        assert containers(run.out) == []
+        assert engine.api.inspect_container(f"stranger-{os.getpid()}")["State"]["Running"]
+    assert not processes(run.out)
+
+
+def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+    run = long_run(tmp_path)
+    run.process.send_signal(signal.SIGINT)
+    status, _, err = run.end()
+    assert status == 130, err
+    assert run.record()["outcome"] == "interrupted"
+    assert (run.out / "agents/1.chain.json").exists()
+    assert containers(run.out) == []
+    assert not processes(run.out)
+
+
+def test_ctrl_c_while_containers_start_leaves_nothing(tmp_path: Path) -> None:
+    scenario = write_scenario(tmp_path, agents=20, duration_s=100_000, **NO_VEHICLES)
+    run = Running(scenario, tmp_path / "run", *ON_DOCKER)
+    run.wait_for(lambda: containers(run.out), "the first container")
+    run.process.send_signal(signal.SIGINT)
+    status, _, err = run.end()
+    assert (status, sentences(err)) == (130, ["the run was interrupted before it began"])
+    assert containers(run.out) == []
+
+
+@pytest.mark.parametrize(
+    ("hurt", "sentence"), [(Way.silent, "stopped answering"), (Way.cut, "the Docker engine has ended")]
+)
+def test_an_engine_that_is_gone_ends_the_run(hurt: Any, sentence: str, tmp_path: Path) -> None:
+    way = Way(tmp_path / "way.sock")
+    scenario = write_scenario(tmp_path, duration_s=100_000, **NO_VEHICLES)
+    out = tmp_path / "run"
+    command = [sys.executable, "-c", IMPATIENT]
+    env = {**os.environ, "DOCKER_HOST": f"unix://{way.path}"}
+    run = Running(scenario, out, *ON_DOCKER, command=command, env=env)
+    run.wait_for_mission(1, 2, 3)
+    hurt(way)
+    status, _, err = run.end()
+    assert status == 3, err
+    assert sentence in sentences(err)[0]
+    assert "`ucp-harness clean`" in sentences(err)[0]
+    assert run.record()["outcome"] == "failed"
+    assert (out / "agents/1.chain.json").exists(), "agents answer as long as they live"
+    assert not processes(out), "they have been killed without the engine"
+    assert harness("clean").returncode == 0
+    assert containers(out) == []
+
+
+def test_a_name_that_is_taken(tmp_path: Path) -> None:
+    name = f"{ownership.run_name(tmp_path / 'run')}-network-2"
+    with stranger(name):
+        done = on_docker(tmp_path, **NO_VEHICLES)
+    assert done.returncode == 3
+    assert sentences(done.stderr) == [
+        f"there is a container {name} already, of a run in the same directory: if that is over, `ucp-harness clean` "
+        f"removes it, else docker rm -f {name}"
+    ]
+    assert json.loads((tmp_path / "run/run.json").read_text())["outcome"] == "failed"
+    assert containers(tmp_path / "run") == []
+
+
+@pytest.mark.parametrize(
+    ("keys", "status", "sentence"),
+    [
+        ({"docker": {"image": "no/such:image"}}, 3, "there is no image no/such:image on this machine: docker pull"),
+        (
+            {"docker": {"image": "ucp-harness-host:empty"}, "agent_command": ["/usr/bin/env", "python3"]},
+            1,
+            "agent 1 ended by itself with status 127: there is no such program in its image ([FATAL tini",
+        ),
+        ({"agent_command": ["/bin/false"]}, 1, "agent 1 ended by itself with status 1; its log is agents/1.log"),
+        (
+            {"docker": {"memory_mib": 6}},
+            1,
+            "agent 1 ended by itself with SIGKILL, out of memory: it may use 6 MiB (`docker.memory_mib`); its log is",
+        ),
+    ],
+)  # fmt: skip
+def test_an_agent_that_cannot_run(keys: Any, status: int, sentence: str, tmp_path: Path) -> None:
+    done = on_docker(tmp_path, agents=[1], **NO_VEHICLES, **keys)
+    assert done.returncode == status, done.stderr
+    assert sentences(done.stderr)[0].startswith(sentence)
+    assert containers(tmp_path / "run") == []
+
+
+def test_captures_see_what_containers_send(tmp_path: Path) -> None:
+    done = on_docker(tmp_path, "--capture", events={"source": "random", "mean_s": 5}, **NO_VEHICLES)
+    assert done.returncode == 0, done.stderr
+    captured = json.loads((tmp_path / "run/run.json").read_text())["capture"]
+    for vehicle in ("1", "2", "3"):
+        assert captured[vehicle]["received"] > 0
+        assert captured[vehicle]["dropped"] == 0
+        assert (tmp_path / f"run/capture/{vehicle}.pcapng").stat().st_size > 1000
+
+
+def test_what_a_program_says_is_in_its_log(tmp_path: Path) -> None:
+    agent = tmp_path / "agent.sh"
+    agent.write_text("#!/bin/sh\necho to $1\necho at home: $(ls /proc/self/fd | wc -l) >&2\nexit 4\n")
+    agent.chmod(0o755)
+    done = on_docker(tmp_path, agents=[7], agent_command=[str(agent)], **NO_VEHICLES)
+    assert sentences(done.stderr)[0].startswith("agent 7 ended by itself with status 4")
+    said = (tmp_path / "run/agents/7.log").read_text()
+    assert "to 7.mission.json" in said
+    assert "at home:" in said
+
+
+def test_a_container_can_do_nothing_to_its_network(tmp_path: Path) -> None:
+    """It has no capability, and a root that it cannot write to."""
+    agent = tmp_path / "agent.sh"
+    agent.write_text("#!/bin/sh\ngrep Cap /proc/self/status\ngrep NoNewPrivs /proc/self/status\ntouch /x\nexit 4\n")
+    agent.chmod(0o755)
+    on_docker(tmp_path, agents=[7], agent_command=[str(agent)], **NO_VEHICLES)
+    said = (tmp_path / "run/agents/7.log").read_text().split("\n")
+    capabilities = [line.split()[1] for line in said if line.startswith("Cap")]
+    assert capabilities == ["0000000000000000"] * 5
+    assert "NoNewPrivs:\t1" in said
+    assert any("Read-only file system" in line for line in said)

@@ -1,0 +1,268 @@
+"""Somebody has things happen to a run that goes on."""
+
+import asyncio
+import json
+import os
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import HarnessError, ScenarioError
+from harness.play.interventions import Interventions
+from harness.play.progress import Silent
+from harness.play.request_socket import SOCKET
+from harness.run.run import Run, run
+from harness.scenario import Scenario, load_scenario
+from tests.harness.virtual import scenario
+
+TIMEOUT_S = 60.0
+
+pytestmark = pytest.mark.whoever
+
+
+def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> Run:
+    """A run in virtual time that stands at second 0 until `do` has it go on."""
+    hand = Interventions(asked, virtual_time=True, paused=True)
+    over = threading.Event()
+
+    def click() -> None:
+        while hand.closed and not over.is_set():
+            over.wait(0.005)
+        try:
+            do(hand)
+        finally:
+            hand.go_on()
+
+    with ThreadPoolExecutor(1) as thread:
+        clicked = thread.submit(click)
+        try:
+            finished = run(asked, 7, out, Silent(), "sim", interventions=hand)
+        finally:
+            over.set()
+        clicked.result(TIMEOUT_S)
+    return finished
+
+
+def files_of(run: Path) -> dict[str, bytes]:
+    """What the agents have left."""
+    return {str(path.relative_to(run)): path.read_bytes() for path in sorted((run / "agents").rglob("*.json*"))}
+
+
+def test_what_was_clicked_can_be_played_again_to_the_last_byte(tmp_path: Path) -> None:
+    asked = scenario(duration_s=600, network={"loss": 0.1}, timeline=[{"at_s": 40, "loss": 0.2}], final_reconcile=True)
+    at_s: list[float] = []
+
+    def click(hand: Interventions) -> None:
+        def ask(**entry: Any) -> None:
+            at_s.append(hand.ask(entry).result(TIMEOUT_S))
+
+        ask(partition=[[1, 2], [3, 4]])
+        assert hand.step(30).result(TIMEOUT_S) == pytest.approx(30.001)
+        hand.step_to_next_run().result(TIMEOUT_S)
+        ask(kill=[2])
+        ask(reboot=[3], down_s=30, disk="kept")
+        hand.step_to_next_run().result(TIMEOUT_S)
+        ask(reboot=[4], down_s=20.5, disk="lost")
+        hand.step(100).result(TIMEOUT_S)
+        ask(heal=True)
+        ask(network={"links": [{"from": 1, "to": 3, "loss": 0.9}]})
+        hand.step(100).result(TIMEOUT_S)
+        ask(loss=0.0)
+
+    finished = played(asked, tmp_path / "run", click)
+    assert finished.record.scenario is not None
+    assert [entry.at_s for entry in finished.record.scenario.timeline] == [40.0, *at_s]
+    marked = {fault.at_s: fault.what for fault in finished.record.faults if fault.by_hand}
+    assert list(marked.values()) == ["partition", "kill", "reboot", "reboot", "heal", "network", "loss"]
+    assert [*marked] == at_s
+    again = run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
+    assert again.record.agents == finished.record.agents
+    assert again.result.to_json() == finished.result.to_json()
+    assert not any(fault.by_hand for fault in again.record.faults)
+
+
+def test_a_run_without_a_click_is_as_ever(tmp_path: Path) -> None:
+    asked = scenario(duration_s=300, network={"loss": 0.1})
+    played(asked, tmp_path / "watched", lambda hand: None)
+    run(asked, 7, tmp_path / "alone", Silent(), "sim")
+    assert files_of(tmp_path / "watched") == files_of(tmp_path / "alone")
+    assert not (tmp_path / "watched/replay.yaml").exists()
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"kill": [2]}, "kill: agent 2 is killed then, not running or paused"),
+    ({"kill": [9]}, "kill names vehicle 9, which does not exist: there are 1, 2, 3, 4, 5"),
+    ({"loss": 1.5}, "`loss` is 1.5: it should be less than or equal to 1"),
+    ({"partition": [[1, 2], [2, 3]]}, "vehicle 2 is in an earlier group too"),
+    ({"lose": 0.5}, "`lose` is unknown: there are"),
+    ({}, "needs exactly one of `loss`"),
+    ({"at_s": 5, "loss": 0.5}, "`at_s` is now: leave it out"),
+    ({"reboot": [1]}, "a reboot needs `down_s`"),
+    ({"reboot": [1], "down_s": 1e6, "disk": "lost"}, "after the mission's end at 300 s"),
+    ({"kill": [3]}, "the timeline's entry at 200 s, kill: agent 3 is killed then, not running or paused"),
+    ({"loss": 0.5}, "this changes loss for good, and the timeline's entry at 90 s until 150 s: which holds when?"),
+]
+
+
+def test_what_cannot_be_is_a_sentence_and_changes_nothing(tmp_path: Path) -> None:
+    strained = {"at_s": 90, "network": {"loss": 0.3, "delay": 0.1}, "for_s": 60}
+    asked = scenario(duration_s=300, timeline=[strained, {"at_s": 200, "kill": [3]}])
+    wrong: list[str] = []
+
+    def click(hand: Interventions) -> None:
+        hand.step(100).result(TIMEOUT_S)
+        hand.ask({"kill": [2]}).result(TIMEOUT_S)
+        before = hand.scenario
+        for entry, sentence in REFUSED:
+            with pytest.raises(ScenarioError) as refusal:
+                hand.ask(entry).result(TIMEOUT_S)
+            if sentence not in str(refusal.value):
+                wrong.append(str(refusal.value))
+        assert hand.scenario is before
+        for seconds in (0, -1, float("nan"), float("inf")):
+            with pytest.raises(ScenarioError, match="is no step"):
+                hand.step(seconds).result(TIMEOUT_S)
+        with pytest.raises(ScenarioError, match="is not how fast time can go"):
+            hand.set_factor(0).result(TIMEOUT_S)
+
+    played(asked, tmp_path / "run", click)
+    assert wrong == []
+
+
+def test_what_is_for_a_while_ends_where_somebody_asks_for_other(tmp_path: Path) -> None:
+    timeline = [{"at_s": 50, "partition": [[1, 2]], "for_s": 500}, {"at_s": 60, "loss": 0.5, "for_s": 400}]
+    asked = scenario(duration_s=600, timeline=timeline)
+
+    def click(hand: Interventions) -> None:
+        hand.step(100).result(TIMEOUT_S)
+        hand.ask({"heal": True}).result(TIMEOUT_S)
+        hand.ask({"loss": 0.1}).result(TIMEOUT_S)
+
+    finished = played(asked, tmp_path / "run", click)
+    told = [(fault.at_s, fault.what, fault.detail) for fault in finished.record.faults]
+    assert told[2:] == [(100.0, "heal, undone", "loss 50 %"), (100.001, "loss, undone", "loss 10 %")]
+    run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
+
+
+def test_where_vehicles_fly_it_is_played_again_just_so(tmp_path: Path) -> None:
+    radio = {"hard_range": {"range_m": 100}, "update_s": 1}
+    flight = [{"vehicles": [1], "plan": [{"take_off": 20}, {"go_to": [300, 0]}, {"go_to": [0, 0]}]}]
+    schedule = [{"nemesis": "halves", "every_s": 50, "for_s": 20}]
+    network, events = {"radio": radio}, {"mean_s": 2}
+    asked = scenario(duration_s=300, agents=3, network=network, flight=flight, schedule=schedule, events=events)
+
+    def click(hand: Interventions) -> None:
+        for number in range(40):
+            hand.step_to_next_run().result(TIMEOUT_S)
+            if number % 10 == 9:
+                hand.step(0.5).result(TIMEOUT_S)
+                hand.ask({"loss": number / 100}).result(TIMEOUT_S)
+
+    played(asked, tmp_path / "run", click)
+    run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
+    assert (tmp_path / "again/tracks.jsonl").read_bytes() == (tmp_path / "run/tracks.jsonl").read_bytes()
+
+
+def test_agents_of_another_make_are_asked_for_nothing_that_their_scenario_does_not(tmp_path: Path) -> None:
+    node = [sys.executable, "-m", "ucp.node"]
+    rebooted = [{"at_s": 80, "reboot": [1], "down_s": 5, "disk": "kept"}]
+    asked = scenario(duration_s=100, agents=2, agent_command={2: node}, timeline=rebooted)
+
+    def click(hand: Interventions) -> None:
+        hand.step(20).result(TIMEOUT_S)
+        with pytest.raises(ScenarioError, match="agent 2 has no disk"):
+            hand.ask({"reboot": [1, 2], "down_s": 5, "disk": "kept"}).result(TIMEOUT_S)
+        with pytest.raises(ScenarioError, match="`flood` needs a rogue node"):
+            hand.ask({"flood": {"per_s": 10, "for_s": 1}}).result(TIMEOUT_S)
+        hand.ask({"reboot": [1], "down_s": 5, "disk": "kept"}).result(TIMEOUT_S)
+        hand.ask({"reboot": [2], "down_s": 5, "disk": "lost"}).result(TIMEOUT_S)
+
+    assert played(asked, tmp_path / "run", click).played.outcome == "completed"
+
+
+def test_who_is_refused_at_once_and_asks_again_is_answered(tmp_path: Path) -> None:
+    def click(hand: Interventions) -> None:
+        hand.step(20).result(TIMEOUT_S)
+        refused = hand.ask({"kill": [99]})
+        refused.add_done_callback(lambda _: again.append(hand.ask({"kill": [98]})))  # in the run's own thread
+        for answer in (refused, *again):
+            with pytest.raises(ScenarioError):
+                answer.result(TIMEOUT_S)
+        threading.Event().wait(0.2)  # the run has gone to sleep again
+        hand.ask({"kill": [2]}).result(TIMEOUT_S)
+
+    again: list[Future[float]] = []
+    assert played(scenario(duration_s=40), tmp_path / "run", click).played.outcome == "completed"
+
+
+def test_after_the_end_nothing_happens_and_every_answer_comes(tmp_path: Path) -> None:
+    asked = scenario(duration_s=100)
+    hand = Interventions(asked, virtual_time=True)
+    with pytest.raises(ScenarioError, match="the mission has not begun"):
+        hand.ask({"loss": 0.5}).result(0)
+    run(asked, 7, tmp_path / "run", Silent(), "sim", interventions=hand)
+    with pytest.raises(ScenarioError, match="the run has ended"):
+        hand.ask({"loss": 0.5}).result(0)
+    with pytest.raises(ScenarioError, match="has ended"):
+        hand.pause().result(0)
+
+
+def test_no_more_waits_than_there_is_room_for(tmp_path: Path) -> None:
+    hand = Interventions(scenario(), virtual_time=False)
+    with pytest.raises(ScenarioError, match="real processes cannot stand still"):
+        hand.pause().result(0)
+    assert issubclass(ScenarioError, HarnessError)
+
+
+def test_another_process_asks_by_the_socket_in_the_runs_directory(tmp_path: Path) -> None:
+    out = tmp_path / ("a directory that lies deep " * 4) / "run"
+    answers: dict[str, Any] = {}
+
+    def click(hand: Interventions) -> None:
+        async def ask() -> None:
+            directory = os.open(out, os.O_PATH)
+            reader, writer = await asyncio.open_unix_connection(f"/proc/self/fd/{directory}/{SOCKET}")
+            for line in LINES:
+                writer.write(line.encode() + b"\n")
+                answers[line] = json.loads(await asyncio.wait_for(reader.readline(), TIMEOUT_S))
+            writer.close()
+            os.close(directory)
+
+        asyncio.run(ask())
+
+    assert played(scenario(duration_s=100, agents=3), out, click).exit_status == 0
+    wrong = {line: answer["error"] for line, answer in answers.items() if not answer["ok"]}
+    assert [answer.get("at_s") for answer in answers.values()][:4] == [10.0, 10.0, 10.001, 10.001]
+    assert answers[LINES[3]]["by_hand"] == [{"at_s": 10.0, "kill": [2]}, {"at_s": 10.001, "loss": 0.5}]
+    assert answers[LINES[3]]["paused"] and answers[LINES[3]]["closed"] is None
+    assert [*wrong] == [*LINES[4:]]
+    assert wrong[LINES[4]].startswith("kill: agent 2 is killed then")
+    assert not (out / SOCKET).exists()
+    assert wrong[LINES[-1]] == "a line of more than 65536 bytes asks too much"
+
+
+LINES = (
+    '{"command": "step", "seconds": 10}',
+    '{"command": "happen", "entry": {"kill": [2]}}',
+    '{"command": "happen", "entry": {"loss": 0.5}}',
+    '{"command": "state"}',
+    '{"command": "happen", "entry": {"kill": [2], "for_s": null}}',
+    '{"command": "happen", "entry": [1]}',
+    '{"command": "step", "seconds": "10"}',
+    '{"command": "step", "seconds": 1e400}',
+    '{"command": "pace", "factor": true}',
+    '{"command": ["pause"]}',
+    "[" * 10_000,
+    "pause",
+    "[]",
+    "null",
+    " " * 70_000,
+)

@@ -1,0 +1,125 @@
+"""Flight makes the network: what the radio loses where the vehicles are, over what the timeline asks."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.errors import ScenarioError
+from harness.play.mission import RunOutcome
+from harness.play.radio_range import RadioRange, tracks_of
+from harness.run.simulate import simulate
+from harness.scenario import Scenario, load_scenario
+from harness.scenario.changes import RANGE, NetworkChange, final_reconcile
+from netem.conditions import LinkConditions, NetworkConditions
+from netem.radio import Place
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+
+
+def scenario(**keys: object) -> Scenario:
+    document = {"name": "Range", "agents": 3, "network": {"radio": {"hard_range": {"range_m": 100}}}, **keys}
+    return Scenario.model_validate(document)
+
+
+def at(*north_m: float) -> dict[int, Place]:
+    return {vehicle: Place(metres, 0.0, 0.0) for vehicle, metres in enumerate(north_m, 1)}
+
+
+def asking(conditions: NetworkConditions) -> NetworkChange:
+    return NetworkChange(5.0, "loss", "", conditions)
+
+
+def test_who_flies_out_of_range_is_cut_off_and_back_again() -> None:
+    reach = RadioRange(scenario())
+    assert reach.move(1.0, at(0, 50, 90)) is None, "all hear all, as before"
+    apart = reach.move(2.0, at(0, 50, 200))
+    assert apart is not None and (apart.at_s, apart.what, apart.detail) == (2.0, RANGE, "1 2 | 3")
+    assert apart.losses == {"1-3": 1.0, "2-3": 1.0}
+    assert apart.conditions.link(3, 1) == LinkConditions(1.0) and apart.conditions.link(1, 2) == LinkConditions()
+    assert reach.move(3.0, at(0, 50, 300)) is None, "no farther than lost"
+    relayed = reach.move(4.0, at(0, 50, 140))
+    assert relayed is not None and relayed.detail == "1 2 3" and relayed.losses == {"2-3": 0.0}
+    together = reach.move(5.0, at(0, 50, 90))
+    assert together is not None and together.conditions == NetworkConditions() and together.losses == {"1-3": 0.0}
+
+
+def test_what_the_timeline_asks_and_where_the_vehicles_are_hold_together() -> None:
+    reach = RadioRange(scenario())
+    reach.move(1.0, at(0, 50, 200))
+    asked = reach.ask(asking(NetworkConditions(LinkConditions(0.2), partition=(frozenset({1}),))))
+    assert asked.conditions.link(1, 2) == LinkConditions(0.2) and asked.conditions.link(1, 3).loss == 1.0
+    assert asked.conditions.is_cut(1, 2) and asked.detail == ""
+    moved = reach.move(2.0, at(0, 50, 90))
+    assert moved is not None and moved.detail == "2 3 | 1", "the partition still stands"
+
+
+def test_a_final_reconcile_hears_over_any_distance() -> None:
+    reach = RadioRange(scenario())
+    reach.move(1.0, at(0, 50, 200))
+    cleared = reach.ask(final_reconcile(9.0))
+    assert cleared.conditions == NetworkConditions() and cleared.losses == {"1-3": 0.0, "2-3": 0.0}
+    assert reach.move(10.0, at(0, 500, 2000)) is None
+
+
+def test_without_a_radio_distance_does_not_matter() -> None:
+    assert RadioRange(scenario(network={})).move(1.0, at(0, 1e6, 2e6)) is None
+
+
+def test_on_record_is_who_is_connected_and_not_each_step_of_it() -> None:
+    played = RunOutcome()
+    change = {"at_s": 1.0, "what": RANGE, "detail": "1 2 | 3", "fully_connected": False}
+    for record in (
+        change,
+        {**change, "at_s": 2.0},
+        {**change, "at_s": 3.0, "detail": "1 2 3"},
+        {**change, "at_s": 4.0, "detail": "1 2 3", "fully_connected": True},
+    ):
+        played.record(record)
+    assert [record["at_s"] for record in played.network] == [1.0, 3.0, 4.0]
+
+
+def test_vehicles_fly_in_virtual_time_where_somebody_asks_where_they_are() -> None:
+    assert tracks_of(scenario(network={})) == {}
+    standing = tracks_of(scenario(vehicles={"type": "rover", "spacing_m": 30}))
+    assert standing[2].in_field(600.0) == pytest.approx(standing[2].in_field(0.0))
+    plan = [{"take_off": 20}, {"go_to": [400, 0]}]
+    flown = tracks_of(scenario(flight=[{"vehicles": [2], "plan": plan}]))
+    north_m, _, up_m = flown[2].at(600.0)
+    assert (north_m, up_m) == pytest.approx((400.0, 20.0), abs=1.0)
+
+
+def test_subswarms_that_fly_apart_split_the_network_and_reconcile_when_they_rejoin() -> None:
+    split_rejoin = load_scenario(SCENARIOS / "split_rejoin.yaml")
+    simulated = simulate(split_rejoin, 1)
+    connected = [(state["at_s"], state["detail"]) for state in simulated.played.network if state["what"] == RANGE]
+    assert [detail for _, detail in connected] == ["1 2 3 4 5", "3 4 5 | 1 2", "1 2 3 4 5"]
+    (_, _), (apart_s, _), (again_s, _) = connected
+    assert apart_s < 300 and again_s > apart_s + 300
+    assert not simulated.result.bad
+    assert simulated.result.figures["distinct_chains"] == 1
+    assert simulated.result.figures["reconciles"] > 0
+
+
+@pytest.mark.parametrize(
+    ("radio", "word"),
+    [
+        ({}, "network.radio. is .*needs one of `hard_range` and `log_distance`"),
+        ({"hard_range": {}, "log_distance": {}}, "needs one of"),
+        ({"hard_range": {"range_m": 0}}, r"radio\.range_m: 0\.0 is not above 0"),
+        ({"log_distance": {"exponent": "steep"}}, r"network\.radio\.log_distance\.exponent"),
+        ({"log_distance": {"range_m": 5}}, r"network\.radio\.log_distance\.range_m. is unknown: there are exponent"),
+        ({"hard_range": {}, "update_s": 0}, r"network\.radio\.update_s"),
+    ],
+)
+def test_a_radio_that_means_nothing_is_answered_in_one_sentence(
+    radio: dict[str, object], word: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "scenario.yaml"
+    path.write_text(f"name: Range\nnetwork: {{radio: {radio}}}\n")
+    with pytest.raises(ScenarioError, match=word):
+        load_scenario(path)
+
+
+def test_a_radio_needs_vehicles() -> None:
+    with pytest.raises(ValueError, match=r"`network.radio` needs vehicles, and `vehicles.kind` is none"):
+        scenario(vehicles={"kind": "none"})

@@ -1,0 +1,221 @@
+"""What agents of a simulated mission work out once for all of them hides no mistake of any of them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from harness.play.simulation import crypto_cache as memory
+from harness.play.simulation.crypto_cache import Signatures, remembered
+from harness.run.simulate import Simulated, simulate
+from tests.harness.virtual import scenario
+from ucp.block import Block
+from ucp.messages import BlockAddRequest, CommitBlock, MalformedDatagramError
+from ucp.secure.block_signature import sign_block
+from ucp.secure.bundle import Bundle, KeySet
+from ucp.secure.crypto_suite import Signed, verify
+from ucp.secure.sealed_datagrams import Arithmetic
+from ucp.secure.secured_agent import SecuredAgent, boot_of
+from ucp.secure.session import Session
+from ucp.secure.window import ReplayWindow
+
+ROSTER = (1, 2, 3, 4)
+KEYS = KeySet.derived(bytes(32), ROSTER)
+OTHERS = KeySet.derived(bytes(31) + b"1", ROSTER)
+QUESTION = BlockAddRequest(bytes(32), bytes(32))
+
+
+def session(bundle: Bundle, arithmetic: Arithmetic) -> Session:
+    return Session(bundle, boot_of(1, bytes(8)), arithmetic=arithmetic)
+
+
+def sealed(bundle: Bundle, arithmetic: Arithmetic, sequence: int = 0) -> bytes:
+    return session(bundle, arithmetic).seal(sequence, QUESTION, None, None, 0)
+
+
+def what_comes_of(datagram: bytes, receiver: Session) -> str:
+    try:
+        return type(receiver.open(datagram, receiver.arithmetic.read(datagram)).said.message).__name__
+    except MalformedDatagramError as dropped:
+        return dropped.reason
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (replace(KEYS.bundle(2), group_secret=OTHERS.group_secret), "not authentic"),
+        (replace(KEYS.bundle(2), public=replace(KEYS.public, mission=bytes(16))), "not authentic"),
+        (
+            replace(KEYS.bundle(2), public=replace(KEYS.public, vehicles=OTHERS.public.vehicles)),
+            "not signed by its sender",
+        ),
+    ],
+    ids=["another secret", "another mission", "another public key"],
+)
+def test_who_has_other_keys_opens_nothing_though_all_others_have(wrong: Bundle, reason: str) -> None:
+    arithmetic = remembered()
+    datagram = sealed(KEYS.bundle(1), arithmetic)
+    right, again, other = (session(bundle, arithmetic) for bundle in (KEYS.bundle(3), KEYS.bundle(4), wrong))
+    came_of = [what_comes_of(datagram, receiver) for receiver in (right, other, again)]
+    assert came_of == ["BlockAddRequest", reason, "BlockAddRequest"]
+
+
+def test_other_bytes_are_opened_anew() -> None:
+    arithmetic = remembered()
+    datagram = sealed(KEYS.bundle(1), arithmetic)
+    assert what_comes_of(datagram, session(KEYS.bundle(2), arithmetic)) == "BlockAddRequest"
+    for place in range(len(datagram)):
+        bent = bytearray(datagram)
+        bent[place] ^= 1
+        receiver = session(KEYS.bundle(3), arithmetic)
+        receiver.public_keys = dict.fromkeys(range(2**16), KEYS.public.vehicles[1])
+        assert what_comes_of(bytes(bent), receiver) != "BlockAddRequest"
+
+
+def test_what_was_heard_is_each_receivers_own_knowledge() -> None:
+    arithmetic = remembered()
+    datagram = sealed(KEYS.bundle(1), arithmetic)
+    for agent_id in (2, 3):
+        receiver = session(KEYS.bundle(agent_id), arithmetic)
+        assert what_comes_of(datagram, receiver) == "BlockAddRequest"
+        assert what_comes_of(datagram, receiver) == "replayed"
+
+
+def test_a_claim_is_good_if_it_verifies_and_not_else() -> None:
+    signatures = Signatures()
+    makers = {agent_id: signatures.signer(KEYS.vehicles[agent_id]) for agent_id in (1, 2)}
+    made = [
+        Signed(KEYS.public.vehicles[each], makers[each].sign(data), data) for each in (1, 2) for data in (b"a", b"b")
+    ]
+    for one in made:
+        for two in made:
+            for three in made:
+                claim = Signed(one.public_key, two.signature, three.signed)
+                assert signatures.verified(claim) == verify(claim) == (claim in made)
+
+
+def test_a_signature_that_was_not_made_here_is_verified() -> None:
+    maker, here = Signatures().signer(KEYS.vehicles[1]), Signatures()
+    claim = Signed(KEYS.public.vehicles[1], maker.sign(b"a"), b"a")
+    assert here.verified(claim)
+    assert not here.verified(claim._replace(signed=b"b"))
+
+
+def test_a_library_whose_signatures_do_not_verify_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "verify", lambda claim: False)
+    signatures = Signatures()
+    maker = signatures.signer(KEYS.vehicles[1])
+    claims = [Signed(KEYS.public.vehicles[1], maker.sign(data), data) for data in map(bytes, range(1, 300))]
+    assert not all(map(signatures.verified, claims))
+
+
+def test_a_memory_that_is_full_forgets_and_is_as_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "SIGNATURES_REMEMBERED", 2)
+    signatures = Signatures()
+    maker = signatures.signer(KEYS.vehicles[1])
+    claims = [Signed(KEYS.public.vehicles[1], maker.sign(data), data) for data in (b"a", b"b", b"c", b"d")]
+    assert all(map(signatures.verified, claims))
+    assert len(signatures._made) == 2
+
+
+# In a whole mission one vehicle of five is wrong
+
+
+def played(monkeypatch: pytest.MonkeyPatch, agent_id: int, spoil: Callable[[SecuredAgent], None]) -> Simulated:
+    """A mission in which `spoil` has been at this agent."""
+    init = SecuredAgent.__init__
+
+    def spoiled(agent: SecuredAgent, *arguments: Any, **options: Any) -> None:
+        init(agent, *arguments, **options)
+        if agent.agent_id == agent_id:
+            spoil(agent)
+
+    monkeypatch.setattr(SecuredAgent, "__init__", spoiled)
+    return simulate(scenario(duration_s=200, events={"mean_s": 10}).secured(), 1, tracing=True)
+
+
+def dropped(run: Simulated) -> dict[str, set[str]]:
+    return {agent_id: set(agent["dropped"]) for agent_id, agent in run.played.agents.items()}
+
+
+def of_one(agent_id: int, *reasons: str) -> dict[str, set[str]]:
+    return {str(each): set(reasons) if each == agent_id else set() for each in range(1, 6)}
+
+
+def of_all_but(agent_id: int, *reasons: str) -> dict[str, set[str]]:
+    return {str(each): set() if each == agent_id else set(reasons) for each in range(1, 6)}
+
+
+def test_a_mission_without_a_mistake_drops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert dropped(played(monkeypatch, 3, lambda agent: None)) == of_one(3)
+
+
+def test_who_has_a_wrong_key_of_another_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoil(agent: SecuredAgent) -> None:
+        agent.session.public_keys = {**agent.session.public_keys, 1: agent.session.public_keys[2]}
+
+    assert dropped(played(monkeypatch, 3, spoil))["3"] >= {"not signed by its sender"}
+
+
+def test_who_verifies_wrongly_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoil(agent: SecuredAgent) -> None:
+        agent.session.arithmetic = replace(agent.session.arithmetic, verified=lambda claim: False)
+
+    assert dropped(played(monkeypatch, 3, spoil)) == of_one(3, "not signed by its sender")
+
+
+def test_whose_window_is_wrong_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Narrow(ReplayWindow):
+        __slots__ = ()
+
+        def is_fresh(self, sequence: int) -> bool:
+            return self._newest < 0
+
+    def spoil(agent: SecuredAgent) -> None:
+        authentic = agent.session._authentic
+
+        def narrowed(*arguments: Any) -> bytes:
+            body = authentic(*arguments)
+            for life in agent.session._lives.values():
+                life.window.__class__ = Narrow
+            return body
+
+        monkeypatch.setattr(agent.session, "_authentic", narrowed)
+
+    assert dropped(played(monkeypatch, 3, spoil))["3"] >= {"replayed"}
+
+
+def test_who_signs_other_bytes_than_it_sends_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoil(agent: SecuredAgent) -> None:
+        sign = agent.session.private_key.sign
+        monkeypatch.setattr(agent.session.private_key, "sign", lambda data: sign(data + b"!"))
+
+    assert dropped(played(monkeypatch, 3, spoil))["1"] == {"not signed by its sender"}
+
+
+def test_who_signs_with_anothers_key_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoil(agent: SecuredAgent) -> None:
+        agent.session.private_key = agent.session.arithmetic.signer(bytes(32))
+
+    assert dropped(played(monkeypatch, 3, spoil))["1"] == {"not signed by its sender"}
+
+
+def test_who_seals_for_another_epoch_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoil(agent: SecuredAgent) -> None:
+        epochs = agent.session.epochs
+        epochs._bundle = epochs._bundle.at_epoch(0, bytes(32))
+
+    run = played(monkeypatch, 3, spoil)
+    assert dropped(run) == {**of_all_but(3, "not authentic"), "3": {"not authentic"}}
+
+
+def test_a_block_in_anothers_name_is_seen_though_its_signature_was_made_here() -> None:
+    arithmetic = remembered()
+    maker, receiver = (
+        SecuredAgent(session(KEYS.bundle(agent_id), arithmetic), agent_id, ROSTER, b"test") for agent_id in (1, 2)
+    )
+    block = Block(3, 1, b"x")
+    signature = sign_block(maker.session.private_key, KEYS.public.mission, block.block_data())
+    receiver.receive_datagram(maker.session.seal(0, CommitBlock(block, bytes(32)), None, signature, 0), 0.0)
+    assert receiver.dropped == {"block not signed by its maker": 1}

@@ -1,0 +1,29 @@
+"""A swarm that is looked at from a fork on: some agents rest on chains of their own, of one block each."""
+
+from collections.abc import Sequence
+
+from harness.proof.bounds import Bounds
+from harness.proof.model.global_states import AGENTS, Swarm
+from harness.proof.model.zones import NOTHING_RUNS
+
+
+def forked(bounds: Bounds, holders: Sequence[int]) -> Swarm:
+    """Of each chain so many agents hold it, and the others hold none: they were out of each other's reach until now.
+
+    The blocks of these chains are the first of `bounds.blocks`.
+    """
+    swarm = Swarm(bounds)
+    agents = list(swarm.initial[AGENTS:])
+    maker = 0
+    for ordinal, count in enumerate(holders, 1):
+        voting = swarm.local.complete(agents[maker], ordinal)
+        ((timer, _),) = voting.started
+        committed = swarm.local.end_timer(voting.local, timer)
+        (commit,) = committed.sent
+        agents[maker] = committed.local
+        for follower in range(maker + 1, maker + count):
+            heard = swarm.local.hear(agents[follower], swarm.name_of(maker, follower), commit)
+            agents[follower] = heard.local
+        maker += count
+    swarm.initial = (len(holders), 0, NOTHING_RUNS, *agents)
+    return swarm

@@ -1,0 +1,119 @@
+"""The specification in TLA+ and the real agents: the same states within the same bounds, and the same verdicts."""
+
+import json
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.proof import Bounds
+from harness.proof.specification import second_opinion, tlc
+from harness.scenario.stagger import Stagger
+from tests.harness.command import harness, sentences
+from tests.machine import require_tlc
+
+NO_GAP = {"finalize_gap_s": 0}
+
+
+@pytest.fixture(autouse=True)
+def _tlc() -> None:
+    require_tlc()
+
+
+@pytest.mark.parametrize(
+    ("agents", "blocks", "network", "timers_any", "settings", "states"),
+    [
+        (2, 2, "lossy", True, {}, 341),
+        (2, 3, "lossless", True, {}, 373),
+        (2, 3, "lossless", False, NO_GAP, 325),
+        (2, 4, "lossless", False, NO_GAP, 2949),
+        (3, 1, "lossy", True, {}, 61),
+        (3, 2, "lossless", True, {"phase2_tie": "block", "vote_names_chain": True}, 106),
+    ],
+)
+def test_they_come_to_the_same_states(
+    agents: int, blocks: int, network: Any, timers_any: bool, settings: dict[str, Any], states: int
+) -> None:
+    opinion = second_opinion(Bounds(agents, blocks, network, timers_any=timers_any, settings=settings))
+    assert (opinion.states, opinion.specified) == (states, states)
+    assert opinion.distinct == states or not timers_any
+    assert opinion.agrees
+    assert "✔ they are the same states" in opinion.in_words()
+    livelock = None if network == "lossy" else blocks == 4
+    assert (opinion.livelock, opinion.specified_livelock) == (livelock, livelock)
+    assert opinion.exit_status == bool(livelock)
+
+
+@pytest.mark.parametrize(
+    ("agents", "blocks", "network", "timers_any", "states"),
+    [(2, 3, "lossless", True, 117), (2, 4, "lossless", False, 487), (2, 2, "lossy", True, 329)],
+)
+def test_they_come_to_the_same_states_where_nothing_crosses(
+    agents: int, blocks: int, network: Any, timers_any: bool, states: int
+) -> None:
+    bounds = Bounds(agents, blocks, network, timers_any=timers_any, settings=NO_GAP, crossing=False)
+    opinion = second_opinion(bounds)
+    assert (opinion.states, opinion.specified) == (states, states)
+    assert opinion.agrees
+    assert opinion.to_json()["crossing"] is False
+    assert opinion.livelock is opinion.specified_livelock is (None if network == "lossy" else False)
+
+
+def test_with_timers_that_differ_they_come_to_the_same_states_and_neither_goes_round() -> None:
+    """Where both do if timers are alike."""
+    stagger: Stagger = {"phase1_timeout_s": 2.5}
+    opinion = second_opinion(Bounds(2, 4, "lossless", settings=NO_GAP, stagger=stagger))
+    assert (opinion.states, opinion.specified) == (2627, 2627)
+    assert opinion.agrees
+    assert opinion.livelock is opinion.specified_livelock is False
+    assert opinion.to_json()["stagger"] == stagger
+
+
+def test_what_is_printed_and_cannot_be_meant_is_rejected_by_both() -> None:
+    opinion = second_opinion(Bounds(2, 2, "lossless", timers_any=True, quirks={"change_without_new_vote": True}))
+    assert (opinion.flaw, opinion.violated) == ("2", "2")
+    assert opinion.exit_status == 1
+
+
+def test_a_wrong_specification_has_other_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in tlc.MODULES.glob("*.tla"):
+        shutil.copy(path, tmp_path)
+    protocol = tmp_path / "UCP.tla"
+    wrong = protocol.read_text().replace("approved == a.voteCount.yes > ", "approved == a.voteCount.yes >= ")
+    assert wrong != protocol.read_text()
+    protocol.write_text(wrong)
+    monkeypatch.setattr(tlc, "MODULES", tmp_path)
+    opinion = second_opinion(Bounds(2, 2, "lossy", timers_any=True))
+    assert not opinion.agrees
+    assert opinion.only_real
+    assert opinion.only_specified
+    assert opinion.exit_status == 1
+
+
+def test_the_command_says_it(tmp_path: Path) -> None:
+    done = harness("prove", "--agents", "1", "--blocks", "1", "--second-opinion", "--json")
+    assert done.returncode == 0
+    document = json.loads(done.stdout)
+    assert document["agree"]
+    assert document["tlc"]["states"] == document["prove"]["states"]
+    done = harness("prove", "--faults", "death", "--second-opinion")
+    assert done.returncode == 2
+    assert sentences(done.stderr) == ["the specification has no faults: leave --faults out"]
+
+
+def test_sigterm_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tlc, "command", lambda memory_mb: ["sh", "-c", "kill -TERM $PPID; exec sleep 60"])
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(KeyboardInterrupt), tlc.checked("Swarm", ""):
+        pass
+    assert not [*tmp_path.iterdir()]
+
+
+def test_without_java_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    done = harness("prove", "--second-opinion")
+    assert done.returncode == 3
+    [sentence] = sentences(done.stderr)
+    assert "apt-get install default-jre-headless" in sentence

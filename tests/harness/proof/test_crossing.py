@@ -1,0 +1,86 @@
+"""Swarms in which all that comes of one act is heard before anybody else acts."""
+
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from harness.proof import Bounds, BoundsError, in_words, prove
+from harness.proof.examples.example import play
+from harness.proof.examples.path_script import Script
+from tests.harness.proof.test_explore import all_seen, by_chance, explored
+
+
+@pytest.mark.parametrize(("agents", "blocks", "network"), [(2, 4, "lossless"), (2, 3, "lossy"), (3, 2, "lossy")])
+def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any) -> None:
+    reduced = explored(agents, blocks, network, crossing=False)
+    whole = explored(agents, blocks, network, crossing=False, reduced=False)
+    assert len(reduced.states) < len(whole.states)
+    assert all_seen(reduced) == all_seen(whole)
+
+
+@pytest.mark.parametrize(("agents", "blocks", "loss"), [(2, 3, 0.4), (3, 2, 0.4), (3, 3, 0.0)])
+def test_whatever_comes_by_chance_if_messages_take_no_time_is_among_it(agents: int, blocks: int, loss: float) -> None:
+    seen = all_seen(explored(agents, blocks, "lossy" if loss else "lossless", crossing=False))
+    for seed in range(60):
+        for there in by_chance(agents, blocks, loss, Random(seed)):
+            assert there in seen
+
+
+@pytest.mark.parametrize(("agents", "blocks", "network"), [(2, 4, "lossless"), (3, 3, "lossless"), (2, 3, "lossy")])
+def test_it_is_part_of_what_there_is_if_messages_cross(agents: int, blocks: int, network: Any) -> None:
+    assert all_seen(explored(agents, blocks, network, crossing=False)) < all_seen(explored(agents, blocks, network))
+
+
+def test_agents_act_one_by_one() -> None:
+    graph = explored(3, 3, "lossy", crossing=False)
+    numbers = {state: number for number, state in enumerate(graph.states)}
+    at_once = 0
+    for number, state in enumerate(graph.states):
+        assert all(len(actions) == 1 for actions in graph.swarm.actions(state))
+        for (_, tied), following in zip(graph.swarm.alternatives(state), graph.quiet[number], strict=True):
+            if len(tied) > 1:  # any of them may be the first
+                at_once += 1
+                for action in tied:
+                    for after in graph.swarm.after(state, (action,), lossy=False):
+                        assert numbers[after] in following
+    assert at_once > 0
+
+
+def test_without_a_loss_nothing_goes_wrong_whatever_coincides(tmp_path: Path) -> None:
+    crossing = prove(Bounds(2, 4, "lossless"), out=tmp_path / "crossing.yaml")
+    assert crossing.livelocks
+    for bounds in (
+        Bounds(2, 4, "lossless", crossing=False),
+        Bounds(5, 5, "lossless", crossing=False, clocks_any=True),
+    ):
+        proof = prove(bounds, out=tmp_path / f"{bounds.agents}.yaml")
+        assert proof.exit_status == 0
+        assert proof.liveness is not None
+        assert (proof.liveness.forks, proof.liveness.astray) == (0, [0])
+        assert next(in_words(proof)).endswith("complete")
+        assert "nothing crosses" in next(in_words(proof))
+        assert proof.to_json()["crossing"] is False
+
+
+def test_with_losses_the_way_round_of_three_needs_no_crossing(tmp_path: Path) -> None:
+    proof = prove(Bounds(3, 3, "lossy", crossing=False), out=tmp_path / "three.yaml")
+    [livelock] = proof.livelocks
+    assert livelock.losses == 3
+
+
+def test_played_as_scenarios_ways_lead_to_as_many_chains() -> None:
+    graph = explored(3, 2, "lossy", crossing=False)
+    forked = 0
+    for number, state in enumerate(graph.states):
+        if number and not graph.quiet[number] and graph.swarm.is_idle(state):
+            chains = len(graph.swarm.chains(state))
+            assert play(Script(graph, graph.path(number)).document("rest")).chains == chains
+            forked += chains > 1
+    assert forked > 1
+
+
+def test_where_messages_take_as_long_as_they_like_they_cross() -> None:
+    with pytest.raises(BoundsError, match=r"--no-crossing is not for --network any"):
+        Bounds(2, 2, "any", crossing=False)

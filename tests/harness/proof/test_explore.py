@@ -1,0 +1,207 @@
+"""All states: whole and reduced, and whatever agents do by chance is among them."""
+
+from collections.abc import Iterator, Sequence
+from functools import cache
+from math import inf
+from random import Random
+from typing import Any
+
+import pytest
+
+from harness.proof import Bounds
+from harness.proof.graph.exploration import Graph, explore
+from harness.proof.graph.workers import Crew
+from harness.proof.model.global_states import AGENTS, Swarm
+from harness.proof.model.known_states import DEAD
+from harness.proof.model.snapshot import key_of, put_back, take
+from harness.proof.questions import convergence
+from harness.scenario.stagger import Stagger, staggered
+from ucp.agent import Agent
+from ucp.clock import MICROSECONDS
+from ucp.events import LoggableEvent
+from ucp.settings import Settings
+
+View = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], bool, tuple[str, ...]]
+Seen = tuple[View, ...]
+
+
+def explored(*arguments: Any, **options: Any) -> Graph:
+    graph = explore(Swarm(Bounds(*arguments, **options)), most_bytes=8e9, most_s=60)
+    assert graph.ended == "complete"
+    return graph
+
+
+def view_of(agent: Agent) -> View:
+    """What one sees of an agent: which blocks are where, and which timers run."""
+    return (
+        tuple(block.timestamp_us // MICROSECONDS for block in agent.state.chain),
+        tuple(block.timestamp_us // MICROSECONDS for block in agent.state.blocks_to_be_committed),
+        tuple(block.timestamp_us // MICROSECONDS for block in agent.state.reconcile_stack),
+        agent.state.reconcile_in_progress,
+        tuple(timer.name for timer in agent.state.timers if timer.deadline is not None),
+    )
+
+
+def seen_of(agents: Sequence[Agent]) -> Seen:
+    """What one sees of agents, whoever is who."""
+    return tuple(sorted(map(view_of, agents)))
+
+
+def by_place(graph: Graph) -> set[Seen]:
+    """What one sees of the agents of each state that are still there, in the order of their places."""
+    local = graph.swarm.local
+    agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
+
+    @cache
+    def view(number: int) -> View:
+        put_back(agent, local.known[number].snapshot)
+        return view_of(agent)
+
+    return {tuple([view(number) for number in state[AGENTS:] if number != DEAD]) for state in graph.states}
+
+
+def all_seen(graph: Graph) -> set[Seen]:
+    return {tuple(sorted(seen)) for seen in by_place(graph)}
+
+
+@pytest.mark.parametrize(
+    ("agents", "blocks", "network", "faults"),
+    [
+        (2, 3, "lossless", ()),
+        (2, 2, "lossy", ("reboot", "duplicate")),
+        (3, 2, "lossless", ("death",)),
+        (4, 2, "lossless", ()),
+    ],
+)
+def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, faults: tuple[str, ...]) -> None:
+    reduced = explored(agents, blocks, network, faults)
+    whole = explored(agents, blocks, network, faults, reduced=False)
+    assert len(reduced.states) < len(whole.states)
+    assert all_seen(reduced) == all_seen(whole)
+
+
+@pytest.mark.parametrize("network", ["lossless", "lossy"])
+def test_how_answers_are_counted_makes_no_difference(network: Any) -> None:
+    in_one, in_every = Swarm(Bounds(3, 2, network)), Swarm(Bounds(3, 2, network), every_count=True)
+    one, every = (explore(swarm, most_bytes=8e9, most_s=60) for swarm in (in_one, in_every))
+    assert in_one.local.steps < in_every.local.steps
+    assert len(one.states) <= len(every.states)
+    assert all_seen(one) == all_seen(every)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "most_told"),
+    [
+        (Bounds(3, 2, "lossy", ("reboot",)), 500_000),
+        (Bounds(3, 2, "lossy", ("reboot",)), 1),
+        (Bounds(3, 2, "lossy", stagger={"phase1_timeout_s": 0.5}, clocks_any=True), 500_000),
+    ],
+)
+def test_on_two_cores_it_is_the_same(bounds: Bounds, most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.proof.graph.workers.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.proof.graph.workers.MOST_TOLD", most_told)
+    alone = explore(Swarm(bounds), most_bytes=8e9, most_s=60)
+    swarm = Swarm(bounds)
+    with Crew(swarm, 2) as crew:
+        shared = explore(swarm, most_bytes=8e9, most_s=60, crew=crew)
+        assert convergence.look(shared, crew=crew) == convergence.look(alone)
+    assert shared.crew_steps > 0
+    assert shared.ended == alone.ended == "complete"
+    assert shared.parents == alone.parents
+    assert [*shared.quiet] == [*alone.quiet]
+    assert shared.crossing == alone.crossing
+    assert shared.transitions == alone.transitions
+    names = [
+        [[graph.swarm.local.known[local].anonymous for local in state[AGENTS:]] for state in graph.states]
+        for graph in (alone, shared)
+    ]
+    assert names[0] == names[1]
+
+
+@pytest.mark.parametrize(("agents", "blocks", "loss"), [(2, 3, 0.4), (3, 2, 0.4), (3, 2, 0.0)])
+def test_whatever_agents_do_by_chance_is_among_it(agents: int, blocks: int, loss: float) -> None:
+    seen = all_seen(explored(agents, blocks, "lossy" if loss else "lossless"))
+    for seed in range(60):
+        for there in by_chance(agents, blocks, loss, Random(seed)):
+            assert there in seen
+
+
+def by_chance(
+    count: int,
+    blocks: int,
+    loss: float,
+    lots: Random,
+    *,
+    clocks_apart: bool = False,
+    most_lost: float = inf,
+    stagger: Stagger | None = None,
+) -> Iterator[Seen]:
+    """What is seen whenever nothing is on the air: messages take no time, blocks come at any time.
+
+    With clocks that are apart the agents' timestamps are years from each other. `most_lost`: so often, at most, an
+    agent loses a message.
+    """
+    settings = [staggered(Settings(max_block_bytes=267), stagger or {}, place) for place in range(count)]
+    roster = range(1, count + 1)
+    agents = [Agent(own_id, roster, b"proof", own) for own_id, own in zip(roster, settings, strict=True)]
+    completed = sorted(lots.uniform(0, 40) if lots.random() < 0.7 else 5.0 * lots.randint(0, 6) for _ in range(blocks))
+    ordinal = 0
+    ahead = [index * clocks_apart for index in lots.sample(range(count), count)]
+    while True:
+        soonest = min(
+            ((at, agent) for agent in agents if (at := agent.next_timer()) is not None), default=None, key=first
+        )
+        if ordinal < blocks and (soonest is None or completed[ordinal] <= soonest[0]):
+            now = completed[ordinal]
+            ordinal += 1
+            acted = lots.choice(agents)
+            shown = ordinal + blocks * ahead[acted.agent_id - 1]
+            acted.add_event(LoggableEvent(shown * MICROSECONDS, 1, bytes(256)), now)
+        elif soonest is not None and soonest[0] < 300:
+            now, acted = soonest
+            timer = min((timer for timer in acted.state.timers if timer.deadline is not None), key=lambda t: t.deadline)
+            acted.end_timer(timer, now)
+        else:
+            return
+        most_lost -= deliver(agents, loss, now, lots, most_lost)
+        yield seen_of(agents)
+
+
+def deliver(agents: Sequence[Agent], loss: float, now: float, lots: Random, most_lost: float = inf) -> int:
+    """How many were lost."""
+    lost = 0
+    while said := [(agent, sent) for agent in agents for sent in agent.messages_to_send()]:
+        for receiver in agents:
+            for sender, (sequence, message) in said:
+                if sender is receiver:
+                    continue
+                if lost < most_lost and lots.random() < loss:
+                    lost += 1
+                else:
+                    receiver.receive_message(sender.agent_id, sequence, message, now)
+    return lost
+
+
+def first(pair: tuple[float, Agent]) -> float:
+    return pair[0]
+
+
+def test_a_snapshot_is_the_whole_state() -> None:
+    agents = [Agent(agent_id, (1, 2), b"proof", Settings(max_block_bytes=267)) for agent_id in (1, 2)]
+    names: dict[bytes, int] = {}
+    keys = []
+    for number in (1, 2, 3):
+        agents[0].add_event(LoggableEvent(number, 1, bytes(256)), float(number))
+        keys.append(key_of(take(agents[0]), lambda digest: names.setdefault(digest, len(names))))
+    assert len(set(keys)) == 3
+    snapshot = take(agents[0])
+    put_back(agents[0], snapshot)
+    assert key_of(take(agents[0]), names.__getitem__) == keys[-1]
+    assert agents[0].state.voting_timer.active
+
+
+def test_what_nobody_knows_how_to_copy_is_refused() -> None:
+    agent = Agent(1, (1, 2), b"proof")
+    vars(agent.state)["new"] = object()
+    with pytest.raises(TypeError, match="object"):
+        take(agent)

@@ -1,0 +1,27 @@
+"""What is kept of states in little room comes out as it went in."""
+
+import pytest
+
+from harness.proof.graph.packed_states import Followers, States
+from harness.proof.model.known_states import DEAD
+
+
+def test_a_state_has_one_number_and_comes_out_as_it_went_in() -> None:
+    wide = (9, 2**31 - 1, 70_000, DEAD, 300)
+    states = States(agents=2)
+    assert [states.add(state) for state in ((0, 0, 0, 1, 2), wide, (0, 0, 0, 2, 1), wide)] == [0, 1, 2, 1]
+    assert len(states) == 3
+    assert states[1] == wide
+    assert states[1:] == [wide, (0, 0, 0, 2, 1)]
+    assert [*states] == [(0, 0, 0, 1, 2), wide, (0, 0, 0, 2, 1)]
+
+
+def test_what_follows_is_kept_by_timer() -> None:
+    whole = [(), ((7,), (), (1, 2, 3)), ((),), ((2_000_000_000,),)]
+    followers = Followers()
+    for by_timer in whole:
+        followers.append(by_timer)
+    assert [*followers] == whole == followers[:]
+    assert followers[2] == ((),)
+    with pytest.raises(IndexError):
+        followers[4]

@@ -1,0 +1,134 @@
+"""The tables of docs/proof.md and docs/livelocks.md say what is found: what takes a moment is looked at again."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import yaml
+
+from harness.proof import Bounds, Proof, prove
+from harness.proof.graph.exploration import explore
+from harness.proof.model.global_states import Swarm
+from harness.proof.questions.convergence import look
+
+DOCS = Path(__file__).parents[3] / "docs"
+PAGE = DOCS / "proof.md"
+MOST_S = 0.5
+"""Rows that take longer are left to whoever measures them."""
+FEW_STATES = 1_000
+"""So many take a moment."""
+
+Row = dict[str, str]
+
+
+def rows() -> Iterator[Row]:
+    """Each row of a table of bounds, with the options that all of the table's have, as the comment above it says."""
+    lines = iter(PAGE.read_text().splitlines())
+    for line in lines:
+        if options := re.fullmatch(r"<!-- prove(.*) -->", line):
+            names = cells(next(lines))
+            assert set(next(lines)) <= set("|-:")
+            while (row := next(lines)).startswith("|"):
+                yield {**dict(zip(names, cells(row), strict=True)), "options": options[1]}
+
+
+def cells(line: str) -> list[str]:
+    plain = line.replace("**", "").replace("`", "").replace("\N{EN DASH}", "-")
+    return [cell.strip() for cell in plain.strip("|").split("|")]
+
+
+def bounds_of(row: Row) -> Bounds:
+    settings = [word for word in row.get("settings", "-").split(", ") if word != "-"]
+    phrases = {"timers in any order", "any block the older", "clocks agree"}
+    by_default = "any" if "--clocks any" in row["options"] else "agreed"
+    clocks = "agreed" if "clocks agree" in settings else "any" if "any block the older" in settings else by_default
+    coincidences = row.get("coincidences", "0" if "--coincidences 0" in row["options"] else "-")
+    return Bounds(
+        int(row["agents"]),
+        int(row["blocks"]),
+        row.get("network", "lossy"),  # type: ignore[arg-type]  # it is checked
+        tuple(name for name in row.get("faults", "-").split(", ") if name != "-"),
+        timers_any="timers in any order" in settings,
+        coincidences=at_most(coincidences),
+        losses=at_most(row.get("losses", "-")),
+        clocks_any=row.get("clocks", clocks) == "any",
+        crossing="--no-crossing" not in row["options"],
+        settings={
+            name: yaml.safe_load(value) for name, value in (word.split() for word in settings if word not in phrases)
+        },
+    )
+
+
+def at_most(cell: str) -> int | None:
+    return None if cell in ("-", "any number") else int(cell)
+
+
+def one_chain(proof: Proof) -> str:
+    """As the page says it: after how many more votes, and how many states cannot yet with 0, 1, ... of them."""
+    live = proof.liveness
+    if live is None:
+        return "not looked at"
+    *cannot, last = [f"{states:,}" for states in live.astray]
+    if live.lost is not None:
+        return f"never, from {last} ({'; '.join(dict.fromkeys([*cannot, last]))})"
+    if not cannot:
+        return "without another vote"
+    return f"{len(cannot)} more vote{'s' if len(cannot) > 1 else ''} ({', '.join(cannot)})"
+
+
+SMALL = [row for row in rows() if float((row.get("seconds") or row["processor seconds"]).replace(",", "")) <= MOST_S]
+
+
+def test_the_page_has_tables() -> None:
+    assert len(SMALL) > 25
+    assert {row["options"] for row in SMALL} == {"", " --no-crossing"}
+
+
+@pytest.mark.parametrize("row", SMALL, ids=lambda row: f"{row['agents']}/{row['blocks']} {row['states']}")
+def test_a_row_says_what_is_found(row: Row, tmp_path: Path) -> None:
+    proof = prove(bounds_of(row), out=tmp_path / "row.yaml")
+    assert proof.complete
+    assert proof.flaw is None, "everything holds in every state"
+    assert row.get("in every state", "holds") == "holds"
+    livelocks = "not looked at" if proof.liveness is None else str(len(proof.liveness.cycles))
+    found = f"{proof.figures.states:,}", f"{proof.figures.transitions:,}", one_chain(proof), livelocks
+    assert found == (row["states"], row["transitions"], row["one chain"], row["livelocks"])
+
+
+class Cell(NamedTuple):
+    """One of the table of ways round: bounds, and what the page says of them."""
+
+    bounds: Bounds
+    said: str
+
+
+def ways_round() -> Iterator[Cell]:
+    """The cells of docs/livelocks.md that have few states."""
+    table = (DOCS / "livelocks.md").read_text().partition("<!-- ways round -->\n")[2].partition("\n\n")[0]
+    head, _, *lines = table.splitlines()
+    columns = [[part.split()[0] for part in name.split(", ")] for name in cells(head)[1:]]
+    for line in lines:
+        changes: dict[str, Any] = {}
+        for part in line.split("`")[1::2]:
+            changes |= yaml.safe_load(part)
+        for (agents, blocks, network), said in zip(columns, cells(line)[1:], strict=True):
+            if said and int(re.sub(r"\D", "", said.split()[1])) <= FEW_STATES:
+                yield Cell(Bounds(int(agents), int(blocks), network, clocks_any=True, **changes), said)  # type: ignore[arg-type]
+
+
+CELLS = [*ways_round()]
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.bounds.in_words())
+def test_there_are_as_many_ways_round_as_the_page_says(cell: Cell) -> None:
+    graph = explore(Swarm(cell.bounds), most_bytes=4e9, most_s=60)
+    assert graph.ended == "complete"
+    assert f"{len(look(graph).cycles)} ({len(graph.states):,})" == cell.said
+
+
+def test_cells_with_and_without_a_way_round_are_looked_at() -> None:
+    assert len(CELLS) > 20
+    assert {cell.said.startswith("0 ") for cell in CELLS if cell.bounds.stagger} == {True}
+    assert {cell.said.startswith("0 ") for cell in CELLS if not cell.bounds.stagger} == {True, False}

@@ -1,0 +1,84 @@
+"""Agents whose timers differ: who is who makes a difference then, but not by which ID, nor which block is which."""
+
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from harness.proof import Bounds, prove
+from harness.proof.examples.path_script import Script
+from harness.proof.graph.exploration import Graph
+from harness.proof.model.global_states import AGENTS
+from harness.run.simulate import simulate
+from harness.scenario.load import parse
+from harness.scenario.stagger import Stagger
+from tests.harness.proof.test_blocks import alike, all_alike, renumbered
+from tests.harness.proof.test_explore import Seen, by_chance, by_place, explored
+
+PHASE_1: Stagger = {"phase1_timeout_s": 0.5}
+
+
+def whichever_block(graph: Graph) -> set[Seen]:
+    """By place; of all that are the same but for which block is which one."""
+    return {min(renumbered(seen)) for seen in by_place(graph)}
+
+
+@pytest.mark.parametrize(
+    ("agents", "blocks", "network", "faults", "stagger"),
+    [
+        (2, 3, "lossless", (), PHASE_1),
+        (2, 2, "lossy", ("reboot",), {"vote_timeout_s": 0.5}),
+        (3, 2, "lossless", ("death",), PHASE_1),
+    ],
+)
+@pytest.mark.parametrize("any_older", [False, True])
+def test_reduced_is_all_that_there_is(
+    agents: int, blocks: int, network: Any, faults: tuple[str, ...], stagger: Stagger, any_older: bool
+) -> None:
+    reduced = explored(agents, blocks, network, faults, stagger=stagger, clocks_any=any_older)
+    whole = explored(agents, blocks, network, faults, stagger=stagger, clocks_any=any_older, reduced=False)
+    assert len(reduced.states) < len(whole.states)
+    look = whichever_block if any_older else by_place
+    assert look(reduced) == look(whole)
+    assert {*map(len, map(reduced.swarm.chains, reduced.states))} == {*map(len, map(whole.swarm.chains, whole.states))}
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.4])
+def test_whatever_agents_do_by_chance_is_among_it(loss: float) -> None:
+    seen = all_alike(explored(3, 2, "lossy" if loss else "lossless", stagger=PHASE_1, clocks_any=True))
+    for seed in range(40):
+        for there in by_chance(3, 2, loss, Random(seed), clocks_apart=True, stagger=PHASE_1):
+            assert alike(there) in seen
+
+
+def test_whichever_block_is_which_there_is_less_to_look_at() -> None:
+    agreed = explored(3, 2, "lossy", stagger=PHASE_1)
+    any_older = explored(3, 2, "lossy", stagger=PHASE_1, clocks_any=True)
+    assert len(any_older.states) < len(agreed.states)
+    assert whichever_block(agreed) <= whichever_block(any_older)
+
+
+def test_a_way_to_rest_is_played_by_the_agents_at_their_places() -> None:
+    graph = explored(2, 3, "lossy", stagger=PHASE_1, clocks_any=True)
+    at_rest = [number for number, state in enumerate(graph.states) if number and graph.swarm.is_idle(state)]
+    played = 0
+    for number in at_rest:
+        script = Script(graph, graph.path(number))
+        document = script.document("staggered")
+        if not script.contradictory:
+            chains = simulate(parse(document), 1, tracing=True).result.chains
+            expected = [graph.swarm.local.known[local].chain for local in graph.states[number][AGENTS:]]
+            assert [len(chain) for _, chain in sorted(chains.items())] == [*map(len, expected)]
+            assert len({*chains.values()}) == len({*expected})
+            played += 1
+    assert played > 10
+
+
+def test_the_cure_is_held_where_any_block_may_be_the_older(tmp_path: Path) -> None:
+    """Two agents in step, which go round with the thesis's timers."""
+    bounds = Bounds(2, 4, "lossless", clocks_any=True)
+    assert prove(bounds, out=tmp_path / "thesis.yaml").livelocks
+    cured = prove(Bounds(2, 4, "lossless", clocks_any=True, stagger=PHASE_1), out=tmp_path / "cured.yaml")
+    assert cured.exit_status == 0
+    assert not cured.livelocks

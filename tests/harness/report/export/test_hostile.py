@@ -1,0 +1,85 @@
+"""What is hostile in a run directory, or a disk that is full, ends in a sentence, and in no half a file."""
+
+import json
+import os
+import shutil
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.errors import MachineError
+from tests.harness.command import harness, sentences
+from tests.harness.mission import edit
+
+
+@pytest.fixture
+def copy(run: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(run, tmp_path / "copy")
+
+
+def test_files_that_are_none_are_named_and_the_rest_is_exported(copy: Path, tmp_path: Path) -> None:
+    (copy / "vehicles" / "1" / "telemetry.tlog").unlink()
+    os.mkfifo(copy / "vehicles" / "1" / "telemetry.tlog")
+    os.mkfifo(copy / "agents" / "7.log")
+    lines = (copy / "network.jsonl").read_text().splitlines()
+    lines.append(json.dumps({"at_s": 150, "what": "range", "losses": {"1-2": 7}}).replace("7", "NaN"))
+    (copy / "network.jsonl").write_text("\n".join(lines))
+    made = ("--mcap", tmp_path / "m", "--perfetto", tmp_path / "p", "--rosbag", tmp_path / "b")
+    exported = harness("export", copy, *made)
+    assert exported.returncode == 0
+    assert sentences(exported.stderr) == [
+        "vehicles/1/telemetry.tlog: cannot be read: it is not a file",
+        "agents/7.log: cannot be read: is not a file",
+    ]
+
+
+def test_a_run_that_broke_off_is_exported_up_to_there(copy: Path, tmp_path: Path) -> None:
+    def killed(record: dict[str, Any]) -> None:
+        for key in ("characteristics", "mission_s", "steps", "records", "liveness"):
+            del record[key]
+        record["outcome"] = "running"
+
+    edit(copy / "run.json", killed)
+    trace = copy / "agents" / "1.trace.jsonl"
+    trace.write_bytes(trace.read_bytes()[:-1000])
+    (copy / "agents" / "1.chain.json").unlink()
+    exported = harness("export", copy, "--perfetto", tmp_path / "p")
+    assert exported.returncode == 0
+    assert sentences(exported.stderr) == [
+        "agents/1.trace.jsonl: cut off in mid-line; what is before that is read",
+        "the run has not recorded its end: it is still going on, or it was killed",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("room", "package"), [("mcap", "mcap.writer"), ("perfetto", "perfetto"), ("rosbag", "rosbags")]
+)
+def test_a_package_that_is_missing_is_named_with_the_way_to_it(
+    room: str, package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.split(".")[0] == package.split(".")[0]]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, f"harness.report.export.{room}_file", raising=False)
+    with pytest.raises(MachineError, match=r"pip install ucp-harness\[export\]"):
+        import_module(f"harness.report.export.{room}_file")
+
+
+def test_a_roster_beyond_reason_is_refused(copy: Path, tmp_path: Path) -> None:
+    edit(copy / "run.json", lambda record: record.update(roster=list(range(1, 5000))))
+    refused = harness("export", copy, "--mcap", tmp_path / "m")
+    assert refused.returncode == 2
+    assert "4999 agents are named in it, and a run has at most 1000" in sentences(refused.stderr)[-1]
+    assert not (tmp_path / "m").exists()
+
+
+@pytest.mark.parametrize("name", ["mcap", "perfetto", "rosbag"])
+def test_where_nothing_can_be_written_nothing_is_left(name: str, run: Path, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    refused = harness("export", run, f"--{name}", file / "below")
+    (sentence,) = sentences(refused.stderr)
+    assert (refused.returncode, file.read_text()) == (2, "mine"), sentence

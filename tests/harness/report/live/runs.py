@@ -1,0 +1,47 @@
+"""Runs to watch."""
+
+from pathlib import Path
+from typing import Any
+
+from harness.report.live.agent_course import Change
+from harness.report.live.feed import Feed
+from tests.harness.field.flights import flown
+
+PLAYED = {
+    "agents": 4,
+    "duration_s": 200,
+    "events": {"mean_s": 8},
+    "network": {"loss": 0.1, "radio": {"hard_range": {"range_m": 5000}}},
+    "timeline": [
+        {"at_s": 40, "partition": [[1, 2], [3, 4]]},
+        {"at_s": 100, "heal": True},
+        {"at_s": 120, "kill": [4]},
+        {"at_s": 150, "restart": [4]},
+    ],
+}
+
+
+def played(directory: Path, **keys: Any) -> Path:
+    """A run in virtual time with a partition, a loss and a return, in which vehicles have places."""
+    return flown(directory, **{**PLAYED, **keys})
+
+
+def film(directory: Path, stride_s: float = 20.0) -> list[Change]:
+    """All that a feed says of a run that is over, read `stride_s` mission seconds at a time."""
+    feed = Feed(directory)
+    told, until_s = [feed.first(live=False)], 0.0
+    while True:
+        changes, more = feed.look(until_s)
+        told += changes
+        if more:
+            continue
+        if (next_s := feed.next_s) is None:
+            break
+        until_s = max(until_s, next_s) + stride_s
+    told += feed.last()
+    feed.close()
+    return told
+
+
+def of_kind(kind: str, told: list[Change]) -> list[Change]:
+    return [change for change in told if change[0] == kind]

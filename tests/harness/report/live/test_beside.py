@@ -1,0 +1,50 @@
+"""The server of a page, beside the run: one that fails, hangs or has much to say is no affair of the run's."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.errors import MachineError
+from harness.play.interventions import Interventions
+from harness.report.live import server_process as module
+from harness.report.live.server_process import beside
+from harness.scenario import Scenario
+
+HAND = Interventions(Scenario(name="watched"), virtual_time=True)
+MUCH = "head -c 300000 /dev/zero | tr '\\0' 'x' >&2; echo >&2"
+"""More than a pipe holds."""
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program in the place of the server's, to be written."""
+    program = tmp_path / "server"
+    program.touch(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    return program
+
+
+def test_one_that_says_much_and_dies_is_told_of_after_the_run(server: Path, tmp_path: Path) -> None:
+    server.write_text(f"#!/bin/sh\n{MUCH}\necho http://here/\n{MUCH}\necho 'no more memory' >&2\nkill -9 $$\n")
+    with beside(tmp_path, 0, HAND) as page:
+        assert page.address == "http://here/"
+        assert not page.run_is_over()
+        assert page.problem == "the page's server ended by itself with SIGKILL (no more memory), and the run went on"
+
+
+def test_one_that_hangs_ends_with_the_run(server: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "LAST_LOOK_S", 0.1)
+    monkeypatch.setattr(module, "ENDING_S", 0.1)
+    server.write_text("#!/bin/sh\ntrap '' TERM\necho http://here/\nexec sleep 1000\n")
+    with beside(tmp_path, 0, HAND) as page:
+        for _ in range(module.MOST_WAITING):  # more than a pipe holds
+            page._say(["t", 100.0])
+        assert not page.run_is_over()
+        assert page.problem == "the page hung: 0.1 s after the run its server had not answered"
+
+
+def test_one_that_cannot_begin_says_why(server: Path, tmp_path: Path) -> None:
+    server.write_text(f"#!/bin/sh\n{MUCH}\necho 'port 80 of 127.0.0.1 cannot be had' >&2\nexit 3\n")
+    with pytest.raises(MachineError, match=r"port 80 of 127\.0\.0\.1 cannot be had"), beside(tmp_path, 0, HAND):
+        pass

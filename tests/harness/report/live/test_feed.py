@@ -1,0 +1,179 @@
+"""The stream of changes that a page is told: the same of a run that goes on and of one that is over."""
+
+import json
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from harness.archive.archive import RunArchive
+from harness.archive.traces import SUFFIX
+from harness.errors import RunDirectoryError
+from harness.report.live import feed as feeds
+from harness.report.live.agent_course import KEY_LENGTH, Change
+from harness.report.live.change_log import FAR_BEHIND_BYTES, Story
+from harness.report.live.feed import Feed
+from tests.harness.report.live.runs import film, of_kind, played
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return played(tmp_path_factory.mktemp("watched") / "run")
+
+
+def chains_of(told: list[Change]) -> dict[int, list[str]]:
+    """What is in each agent's chain at the end, by the changes alone."""
+    chains: dict[int, list[str]] = {}
+    for kind, _, *rest in told:
+        if kind == "z":
+            chains[rest[0]] = []
+        elif kind == "c":
+            for operation, key in rest[1]:
+                if operation == "chain+":
+                    chains.setdefault(rest[0], []).append(key)
+                elif operation == "chain-":
+                    assert chains[rest[0]].pop() == key
+    return chains
+
+
+def test_a_film_ends_with_the_chains_that_the_agents_exported(run: Path) -> None:
+    told = film(run)
+    exports = RunArchive(run).exports.by_agent
+    assert chains_of(told) == {
+        agent: [block.block_hash[:KEY_LENGTH] for block in export.chain] for agent, export in exports.items()
+    }
+    names = {change[2]: f"{change[3]}.{change[4]}" for change in of_kind("b", told)}
+    assert len(names) == len(set(names.values())) > 5
+
+
+def test_what_happens_is_in_order_and_all_there(run: Path) -> None:
+    told = film(run)
+    assert [told[0][0], told[-1][0]] == ["run", "end"]
+    timed = [change for change in told if change[0] in ("b", "c", "s", "n", "z", "p")]
+    assert [change[1] for change in timed] == sorted(change[1] for change in timed)
+    whats = [(change[2], change[5]) for change in of_kind("n", told) if change[2]]
+    assert whats == [("start", ""), ("partition", ""), ("heal", ""), ("kill", "gone"), ("restart", "back")]
+    parts = [change[7] for change in of_kind("n", told) if change[7]]
+    assert parts[:3] == [[[1, 2, 3, 4]], [[1, 2], [3, 4]], [[1, 2, 3, 4]]]
+    assert [change[2] for change in of_kind("z", told)] == [4]
+    assert told[-1][1]["outcome"] == "completed"
+    assert {judgement[0] for judgement in told[-1][1]["judgements"]} >= {"1", "2", "3", "4", "5", "6"}
+
+
+def test_a_message_says_who_took_it_in(run: Path) -> None:
+    told = film(run)
+    sent = sum(len(entry.sent) for trace in RunArchive(run).traces.values() for entry in trace.runs)
+    messages = of_kind("m", told)
+    assert len(messages) == sent
+    masks = Counter(int(change[5], 16).bit_count() for change in messages)
+    assert max(masks) == 3, "nobody hears itself"
+
+
+def test_the_same_is_told_however_it_is_cut(run: Path) -> None:
+    def facts(told: list[Change]) -> list[str]:
+        return sorted(json.dumps(change) for change in told if change[0] not in "t")
+
+    assert facts(film(run)) == facts(film(run, 1e7)) == facts(film(run, 3.3))
+
+
+def test_a_live_run_is_its_files_while_they_grow(run: Path, tmp_path: Path) -> None:
+    """Each file a little at a time, lines cut anywhere; later lives beside the first, as processes have them."""
+    growing = tmp_path / "run"
+    (growing / "agents").mkdir(parents=True)
+    shutil.copy(run / "run.json", growing)
+    sources = [path for path in run.rglob("*.jsonl") if path.is_file()]
+    content = {path: path.read_bytes() for path in sources}
+    feed = Feed(growing)
+    told: list[Change] = []
+    for share in range(0, 101, 7):
+        for path, data in content.items():
+            (growing / path.relative_to(run)).write_bytes(data[: len(data) * share // 98])
+        told += feed.look()[0]
+    told += feed.last()
+    feed.close()
+    assert chains_of(told) == chains_of(film(run))
+    assert len(of_kind("m", told)) == len(of_kind("m", film(run)))
+
+
+def test_the_lives_of_a_process_are_read_once_where_they_were_written(run: Path, tmp_path: Path) -> None:
+    killed = tmp_path / "run"
+    shutil.copytree(run, killed)
+    whole = killed / "agents" / f"4{SUFFIX}"
+    lines = whole.read_bytes().splitlines(keepends=True)
+    again = max(number for number, line in enumerate(lines) if b'"schema"' in line)
+    later = killed / "agents" / "4-2"
+    later.mkdir()
+    (later / whole.name).write_bytes(b"".join(lines[again:]))
+    assert chains_of(film(killed)) == chains_of(film(run)), "put together, as at the end of a run"
+    whole.write_bytes(b"".join(lines[:again]) + b'{"t":12')
+    assert chains_of(film(killed)) == chains_of(film(run)), "and before that"
+
+
+def test_a_run_that_was_killed_is_told_up_to_there(run: Path, tmp_path: Path) -> None:
+    killed = tmp_path / "run"
+    shutil.copytree(run, killed)
+    record = json.loads((killed / "run.json").read_text())
+    for key in ("characteristics", "steps", "records", "liveness", "outcome"):
+        del record[key]
+    (killed / "run.json").write_text(json.dumps(record))
+    (killed / "report.html").unlink()
+    trace = killed / "agents" / f"1{SUFFIX}"
+    trace.write_bytes(trace.read_bytes()[: trace.stat().st_size // 2])
+    told = film(killed)
+    assert told[-1][1] == {"outcome": "running", "detail": None, "judgements": [], "report": False}
+    assert of_kind("note", told) == []
+
+
+def test_damage_is_said_once_and_the_rest_is_shown(run: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "run"
+    shutil.copytree(run, damaged)
+    with (damaged / "agents" / f"2{SUFFIX}").open("r+b") as file:
+        lines = file.read().splitlines(keepends=True)
+        file.seek(0)
+        file.writelines([*lines[:20], b"{\n", *lines[20:]])
+    with (damaged / "network.jsonl").open("ab") as file:
+        file.write(b'nonsense\n{"at_s":1,"what":"x","losses":{"1-99":0.5}}\n')
+    told = film(damaged)
+    assert sorted(note for _, note in of_kind("note", told)) == [
+        "network.jsonl has damaged lines, which are left out",
+        "network.jsonl has lines that mean nothing, which are left out",
+        "the trace of agent 2 is damaged, and read up to there",
+    ]
+    assert len(chains_of(told)) == 4
+
+
+def test_a_block_that_is_there_twice_is_seen_at_once(run: Path, tmp_path: Path) -> None:
+    wrong = played(tmp_path / "run", timeline=[], quirks={"keep_committed_block": True})
+    assert of_kind("x", film(run)) == []
+    against = of_kind("x", film(wrong))
+    assert against, "some wrong agent of ours is wrong at once"
+
+
+def test_what_is_no_run_is_refused_in_a_sentence(tmp_path: Path, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path, why in ((tmp_path / "nowhere", "does not exist"), (tmp_path, "neither a run directory")):
+        with pytest.raises(RunDirectoryError, match=why):
+            Feed(path)
+    monkeypatch.setattr(feeds, "MAX_VEHICLES", 3)
+    with pytest.raises(RunDirectoryError, match="at most 3"):
+        Feed(run)
+
+
+def test_a_slow_reader_of_a_live_run_is_not_given_all_of_it() -> None:
+    story = Story()
+    story.tell([["c", number, 1, [], "", ""] for number in range(100)])
+    story.tell([["m", 0.0, 1, "x" * 1000, None, "0"] for _ in range(FAR_BEHIND_BYTES // 1000)])
+    story.tell([["c", 100, 1, [], "", ""]])
+
+    def read(**how: bool) -> list[str]:
+        start, lines = 0, ""
+        while start < story.size:
+            start, more = story.read(start, **how)
+            assert len(more) <= FAR_BEHIND_BYTES
+            lines += more
+        return [json.loads(line)[0] for line in lines.splitlines()]
+
+    assert Counter(read())["m"] == FAR_BEHIND_BYTES // 1000
+    assert Counter(read(may_skip=True))["c"] == 101
+    assert Counter(read(may_skip=True))["m"] < 1000
+    story.close()

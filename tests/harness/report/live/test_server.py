@@ -1,0 +1,183 @@
+"""The server of the page: who is let in, who is not, and what it does when a browser is slow or goes away."""
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import aiohttp
+import pytest
+
+from harness.errors import MachineError
+from harness.report.live import server as servers
+from harness.report.live.change_log import Story
+from harness.report.live.server import Server
+
+HOSTILE = "</script><img src=x onerror=alert(1)>"
+
+
+@asynccontextmanager
+async def served(directory: Path, story: Story | None = None) -> AsyncIterator[tuple[aiohttp.ClientSession, str]]:
+    async with Server(story or Story(), directory, live=True).open(0) as address, aiohttp.ClientSession() as client:
+        yield client, address
+
+
+def test_only_the_address_with_the_token_opens_the_page(tmp_path: Path) -> None:
+    async def visit() -> None:
+        async with served(tmp_path) as (client, address):
+            port = urlsplit(address).port
+            async with client.get(address) as page:
+                assert page.status == 200
+                policy = page.headers["Content-Security-Policy"]
+                assert "unsafe" not in policy
+                assert "default-src 'none'" in policy
+                assert 'src="watch.js"' in await page.text()
+            for path in ("/", "/live", "/watch.js", "/wrong/", "/wrong/live", "/%C3%A9/", address[:-2]):
+                url = path if path.startswith("http") else f"http://127.0.0.1:{port}{path}"
+                async with client.get(url) as refused:
+                    assert refused.status == 403
+                    assert (
+                        await refused.text() == "This page is for whoever has the address that ucp-harness printed.\n"
+                    )
+            for headers in (
+                {"Host": f"evil.example:{port}"},
+                {"Origin": "http://evil.example"},
+                {"Origin": "null"},
+                {"Host": "127.0.0.1:1"},
+            ):
+                for path in ("", "live", "watch.js", "report.html"):
+                    async with client.get(address + path, headers=headers) as refused:
+                        assert refused.status == 403, (headers, path)
+
+    asyncio.run(visit())
+
+
+def test_no_address_leads_to_another_file(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("secret")
+
+    async def visit() -> None:
+        async with served(tmp_path) as (client, address):
+            port, token = urlsplit(address).port, urlsplit(address).path
+            for path in (
+                "../server.py",
+                "%2e%2e/server.py",
+                "vendor/../../server.py",
+                "run.json",
+                "/etc/passwd",
+                "%00",
+            ):
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                request = f"GET {token}{path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: close\r\n\r\n"
+                writer.write(request.encode())
+                answer = await reader.read()
+                writer.close()
+                assert answer.split()[1] in (b"403", b"404", b"400"), path
+                assert b"secret" not in answer
+            async with client.get(f"{address}vendor/d3/d3.min.js") as library:
+                assert library.status == 200
+            async with client.get(f"{address}report.html") as report:
+                assert report.status == 404
+
+    asyncio.run(visit())
+
+
+def test_the_report_is_shown_as_if_it_came_from_nowhere(tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text(HOSTILE)
+
+    async def visit() -> None:
+        async with served(tmp_path) as (client, address), client.get(f"{address}report.html") as report:
+            assert report.headers["Content-Security-Policy"].startswith("sandbox allow-scripts")
+            assert "allow-same-origin" not in report.headers["Content-Security-Policy"]
+
+    asyncio.run(visit())
+
+
+def test_a_page_hears_all_from_the_beginning_and_then_what_is_new(tmp_path: Path) -> None:
+    story = Story()
+    story.tell([["run", {"name": HOSTILE}], ["t", 1.0]])
+
+    async def visit() -> None:
+        async with served(tmp_path, story) as (client, address), client.ws_connect(f"{address}live") as socket:
+            first = (await socket.receive_str()).splitlines()
+            assert [json.loads(line) for line in first] == [["run", {"name": HOSTILE}], ["t", 1.0]]
+            story.tell([["t", 2.0]])
+            assert json.loads(await socket.receive_str()) == ["t", 2.0]
+            await socket.send_str("x" * (servers.MAX_MESSAGE_BYTES + 1))
+            assert (await socket.receive()).type is aiohttp.WSMsgType.CLOSE, "who says too much is not listened to"
+
+    asyncio.run(visit())
+
+
+def test_a_browser_that_does_not_read_holds_up_nobody(tmp_path: Path) -> None:
+    story = Story()
+
+    async def visit() -> None:
+        server = Server(story, tmp_path, live=True)
+        async with server.open(0) as address, aiohttp.ClientSession() as client:
+            port, path = urlsplit(address).port, urlsplit(address).path
+            key = "dGhlIHNhbXBsZSBub25jZQ=="
+            slow, writer = await asyncio.open_connection("127.0.0.1", port, limit=1024)
+            writer.write(
+                f"GET {path}live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+                f"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\n\r\n".encode()
+            )
+            assert b"101" in await slow.readline()
+            began = time.process_time()
+            for _ in range(40):  # 40 MB, of which it reads nothing
+                story.tell([["note", "x" * 1_000_000]])
+            async with client.ws_connect(f"{address}live", max_msg_size=0) as socket:
+                received = 0
+                while received < story.size:
+                    received += len(await socket.receive_str())
+            assert server.readers >= 1
+            assert time.process_time() - began < 30
+            writer.transport.abort()
+            for _ in range(100):
+                if server.readers == 0:
+                    break
+                await asyncio.sleep(0.05)
+            assert server.readers == 0, "who is gone is forgotten"
+
+    asyncio.run(visit())
+
+
+def test_only_so_many_pages_are_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(servers, "MAX_READERS", 1)
+
+    async def visit() -> None:
+        async with (
+            served(tmp_path) as (client, address),
+            client.ws_connect(f"{address}live"),
+            client.get(f"{address}live") as refused,
+        ):
+            assert refused.status == 503
+            assert "1 pages are open" in await refused.text()
+
+    asyncio.run(visit())
+
+
+def test_a_port_that_is_in_use_is_said_in_a_sentence(tmp_path: Path) -> None:
+    async def visit() -> None:
+        async with served(tmp_path) as (_, address):
+            port = urlsplit(address).port
+            assert port is not None
+            with pytest.raises(MachineError, match=f"port {port} of 127.0.0.1 cannot be had: .*use"):
+                async with Server(Story(), tmp_path, live=False).open(port):
+                    pass
+
+    asyncio.run(visit())
+
+
+def test_it_listens_on_this_machine_alone(tmp_path: Path) -> None:
+    async def visit() -> None:
+        async with served(tmp_path) as (_, address):
+            assert urlsplit(address).hostname == "127.0.0.1"
+            port = f"{urlsplit(address).port:04X}"
+            listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+            assert {local for local in listening if local.endswith(f":{port}")} == {f"0100007F:{port}"}
+            assert not any(f":{port} " in line for line in Path("/proc/net/tcp6").read_text().splitlines()[1:])
+
+    asyncio.run(visit())

@@ -1,0 +1,42 @@
+"""`ucp-harness watch`, and `run --watch`: what a user is told when it cannot be."""
+
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.errors import MachineError
+from harness.report.live.server_process import require_packages
+from tests.harness.command import harness, sentences
+
+
+def test_a_directory_that_is_no_run(tmp_path: Path) -> None:
+    told = harness("watch", tmp_path)
+    assert told.returncode == 2
+    assert len(sentences(told.stderr)) == 1
+    assert "neither a run directory" in told.stderr
+
+
+def test_a_port_that_is_in_use_is_said_before_the_run_begins(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        told = harness("run", "perfect", "--backend", "sim", "--watch", "--watch-port", port, "--out", tmp_path / "run")
+    assert told.returncode == 3
+    assert sentences(told.stderr) == [
+        f"port {port} of 127.0.0.1 cannot be had: Address already in use; choose another, or leave it to us"
+    ]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_package_is_said_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    with pytest.raises(MachineError, match=r"pip install ucp-harness\[watch\]"):
+        require_packages()
+
+
+def test_with_nobody_watching_a_run_ends_as_ever(tmp_path: Path) -> None:
+    told = harness("run", "perfect", "--backend", "sim", "--speedup", 1000, "--watch", "--out", tmp_path / "run")
+    assert told.returncode == 0, told.stderr
+    assert "watch it at http://127.0.0.1:" in told.stdout
+    assert (tmp_path / "run" / "report.html").is_file()

@@ -1,0 +1,73 @@
+"""A recorded run, scripted, is the very same run again."""
+
+from typing import Any
+
+import pytest
+
+from harness.run.simulate import simulate
+from harness.sweep.explore.recording import record
+from harness.sweep.explore.scenario_document import document_of, with_agents
+from harness.sweep.explore.smaller import replays, scenario_of
+from tests.harness.virtual import scenario
+
+APART = [
+    {"vehicles": [1, 2], "plan": [{"take_off": 20}, {"go_to": [300, 0]}]},
+    {"vehicles": [3, 4], "plan": [{"take_off": 20}, {"go_to": [-300, 0]}, {"go_to": [0, 0]}]},
+]
+LOSS: list[dict[str, Any]] = [
+    {"network": {"loss": 0.3}},
+    {"network": {"loss": {"p": 0.1, "r": 0.3}}},
+    {"network": {"loss": 0.2, "delay": {"mean_s": 1, "jitter_s": 0.9, "distribution": "normal"}}},
+    {"network": {"delay": {"mean_s": 1, "jitter_s": 0.9}, "duplicate": 0.3, "reorder": 0.2}},
+    {"network": {"receivers": {3: {"loss": 0.9}}, "links": [{"from": 1, "to": 2, "loss": 0.5, "both": True}]}},
+    {"timeline": [{"at_s": 100, "loss": 0.5}, {"at_s": 200, "partition": [[1, 2]]}, {"at_s": 400, "heal": True}]},
+    {"network": {"loss": 0.2}, "timeline": [{"at_s": 100, "pause": [1]}, {"at_s": 300, "resume": [1]}]},
+    {"network": {"loss": 0.2}, "timeline": [{"at_s": 100, "kill": [1]}, {"at_s": 300, "restart": [1]}]},
+    {"network": {"loss": 0.2}, "quirks": {"ignore_commit": 0.3}},
+    {"network": {"loss": 0.2}, "clocks": {2: {"offset_s": 500, "drift": 0.01}}},
+    {"network": {"loss": 0.2}, "fates": [{"message": "Commit Block", "sender": 1, "delay_s": 3.0}]},
+    {"network": {"radio": {"log_distance": {}}}, "vehicles": {"types": {2: "copter"}}, "flight": APART},
+]
+
+
+@pytest.mark.parametrize("keys", LOSS)
+def test_what_is_scripted_from_a_run_is_that_run(keys: dict[str, Any]) -> None:
+    asked = scenario(agents=4, duration_s=600, final_reconcile=True, **keys)
+    original = simulate(asked, 5, tracing=True)
+    faithful = scenario_of(next(replays(document_of(asked), record(asked, 5))))
+    again = simulate(faithful, 5, tracing=True, deliver_all="quirks" in keys)  # who has quirks hears everything
+    uncounted = {"bytes"}  # events have other data, and blocks other hashes
+    assert again.result.figures.items() - uncounted == original.result.figures.items() - uncounted
+    for agent_id, trace in original.evidence.traces.items():
+        steps = [(run.t, run.handler, run.branch) for run in trace.runs if run.branch != "ignored by quirk"]
+        same = again.evidence.traces[agent_id].runs
+        assert [(run.t, run.handler, run.branch) for run in same] == steps
+    assert not again.played.unmatched_fates
+    assert faithful.network.radio is None and not faithful.flight, "nothing is left to distance"
+
+
+def test_agents_that_are_left_out_fly_no_more() -> None:
+    asked = scenario(agents=4, network={"radio": {"hard_range": {}}}, vehicles={"types": {2: "copter"}}, flight=APART)
+    fewer = scenario_of(with_agents(document_of(asked), [1, 3]))
+    assert [flight.vehicles for flight in fewer.flight] == [[1], [3]]
+    assert fewer.vehicles.types == {}
+    assert scenario_of(with_agents(document_of(asked), [1])).flight_of(3) is None
+
+
+def test_agents_that_are_left_out_take_their_quirks_along() -> None:
+    asked = scenario(agents=4, quirks={"crash_on_tie": {"agents": [2, 3]}, "hide_commits": True})
+    fewer = scenario_of(with_agents(document_of(asked), [1, 3]))
+    assert fewer.quirks_of(3) == {"crash_on_tie": True, "hide_commits": True}
+    assert fewer.quirks_of(1) == {"hide_commits": True}
+    assert "crash_on_tie" not in scenario_of(with_agents(document_of(asked), [1, 4])).quirks
+
+
+def test_a_recording_names_what_was_lost() -> None:
+    asked = scenario(
+        agents=[1, 2],
+        events={"source": "scripted", "script": [{"at_s": 1, "agent": 1}]},
+        settings={"max_block_bytes": 267},
+        fates=[{"message": "Commit Block", "drop": True}],
+    )
+    (lost,) = record(asked, 0).lost
+    assert (lost.message, lost.sender, lost.receiver, lost.count, lost.block) == ("Commit Block", 1, 2, 1, "1.1")

@@ -1,0 +1,52 @@
+"""A judge that needs no simulation: figures that follow from loss and seed."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from harness.checker import Result
+from harness.checker.judgement import Judgement, Verdict
+from harness.scenario import Scenario
+from harness.sweep.matrix import Finished, Matrix, run_matrix
+from harness.sweep.matrix.cell_play import Judge
+from harness.sweep.matrix.matrix_run import on_cores
+from harness.sweep.matrix.results_file import opened
+
+CHARACTERISTICS = ("1", "2", "3", "4", "5", "6")
+
+
+def matrix(
+    *, name: str = "test", loss: tuple[float, ...] = (0.0, 0.5), seeds: int | list[int] = 4, **keys: Any
+) -> Matrix:
+    return Matrix.model_validate(
+        {"name": name, "scenario": {"agents": 5} if "agents" not in keys else {}, "loss": list(loss), "seeds": seeds}
+        | keys
+    )
+
+
+def played(asked: Matrix, jobs: int, judge: Judge, directory: Path | None = None) -> Finished:
+    """Into `directory`, or one that nobody looks into."""
+    with tempfile.TemporaryDirectory() as folder, opened(directory or Path(folder), asked) as results:
+        return run_matrix(asked, results, on_cores(asked, jobs), judge)
+
+
+def judge(scenario: Scenario, seed: int) -> Result:
+    """Without loss all is well; with it seed 2 violates characteristic 3."""
+    loss = scenario.network.loss
+    assert isinstance(loss, float)
+    verdict: Verdict = "violated" if loss and seed == 2 else "holds"
+    return Result(
+        {number: Judgement(number, verdict if number == "3" else "holds", "") for number in CHARACTERISTICS},
+        {
+            "agents": 5,
+            "blocks": 40,
+            "mutual_chain": round(40 * (1 - loss)) - seed % 2,
+            "distinct_chains": 1 if not loss else 2 + seed % 2,
+            "copies_min": 5 if not loss else 1,
+            "copies_mean": 5 - 4 * loss,
+            "reconciles": round(20 * loss) + seed,
+            "messages": 800,
+            "bytes": None,
+            "messages_per_block": 20 + 10 * loss,
+        },
+    )

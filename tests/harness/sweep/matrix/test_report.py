@@ -1,0 +1,204 @@
+"""report.html: what it says of each cell, of its runs and of the nights, and that it stays one small, safe file."""
+
+import html
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from harness.checker import Result
+from harness.scenario import Scenario, load_scenario
+from harness.sweep.matrix import Finished, MatrixRecord
+from harness.sweep.matrix.cell import Run
+from harness.sweep.matrix.cell_play import directory_name
+from harness.sweep.matrix.cell_scenarios import scenario_file, write_scenarios
+from harness.sweep.matrix.matrix_run import compared
+from harness.sweep.matrix.nights import Nights
+from harness.sweep.matrix.report import drilldown, heatmap, to_html, trend
+from harness.sweep.matrix.report.figure_menu import known
+from tests.harness.command import harness
+from tests.harness.sweep.matrix.stub import judge, matrix, played
+
+HOSTILE = "</title></style><script>alert(1)</script><img src=x onerror=alert(2)>\"'{{ 7 * 7 }}"
+
+
+def breaks(scenario: Scenario, seed: int) -> Result:
+    if seed == 3 and scenario.network.loss:
+        raise RuntimeError(HOSTILE)
+    return judge(scenario, seed)
+
+
+def tiles(finished: Finished, name: str) -> dict[str, heatmap.Tile]:
+    """Of one figure, by where their runs are."""
+    (figure,) = [one for one in known(finished.record.cells) if one.metric.name == name]
+    grids = heatmap.heatmap(finished.record, figure).grids
+    return {str(tile.href): tile for grid in grids for _, row in grid.rows for tile in row}
+
+
+def over(finished: Finished, nights: int) -> Nights:
+    record = finished.record
+    days = [record.model_copy(update={"started_at": f"2026-01-{day:02}T02:17:00Z"}) for day in range(1, nights + 1)]
+    return Nights(Path("nights"), days, [])
+
+
+def test_each_cell_has_its_number_and_the_shade_grows_with_it() -> None:
+    finished = played(matrix(loss=(0.0, 0.25, 1.0), agents=[5, 10]), 1, judge)
+    found = tiles(finished, "mutual_share")
+    assert len(found) == 6
+    shown = [found[f"#loss-{loss}-agents-5-sim"] for loss in (0.0, 0.25, 1.0)]
+    assert [tile.mean for tile in shown] == ["98.8\u00a0%", "73.8\u00a0%", "\u22121.25\u00a0%".replace("\u2212", "-")]
+    shades = [tile.shade for tile in tiles(finished, "copies_mean").values()]
+    assert shades[:3] == [10, 8, 0]
+
+
+def test_what_was_violated_or_failed_is_a_sign_and_words_whatever_figure_is_shown() -> None:
+    finished = played(matrix(), 1, breaks)
+    for name in ("uniform", "reconciles", "violated"):
+        well, bad = tiles(finished, name).values()
+        assert well.marks == []
+        assert [(mark.sign, mark.text) for mark in bad.marks] == [("\u2717", "1 violated"), ("!", "1 failed")]
+        assert "1 violated, 1 failed" in bad.in_words
+
+
+def test_a_figure_that_became_worse_is_marked_where_it_is_shown() -> None:
+    finished = played(matrix(), 1, judge)
+    baseline = json.loads(json.dumps(finished.record.to_json()))
+    baseline["cells"][1]["estimates"]["reconciles"] = {"n": 4, "mean": 1.0, "low": 0.5, "high": 1.5}
+    finished = compared(finished, MatrixRecord.model_validate(baseline), "before.json")
+    assert [mark.text for mark in tiles(finished, "reconciles")["#loss-0.5-agents-5-sim"].marks] == [
+        "1 violated",
+        "worse",
+    ]
+    assert [mark.text for mark in tiles(finished, "uniform")["#loss-0.5-agents-5-sim"].marks] == ["1 violated"]
+
+
+def test_cells_that_were_not_played_are_empty_and_half_of_one_is_said() -> None:
+    def interrupted(scenario: Scenario, seed: int) -> Result:
+        if seed == 3:
+            raise KeyboardInterrupt
+        return judge(scenario, seed)
+
+    finished = played(matrix(), 1, interrupted)
+    found = tiles(finished, "uniform")
+    assert found["None"].shade is None
+    assert [mark.text for mark in found["#loss-0.0-agents-5-sim"].marks] == ["2 of 4 runs"]
+    assert "This matrix was interrupted: 2 of 8 runs had ended." in to_html(finished, Path())
+
+
+def test_the_runs_of_a_cell_begin_with_those_that_went_wrong() -> None:
+    well, bad = drilldown.drilldown(played(matrix(), 1, breaks), Path())
+    assert [row.seed for row in well.rows] == [1, 2, 3, 4]
+    assert [row.seed for row in bad.rows] == [3, 2, 1, 4]
+    assert bad.rows[0].failed is not None and bad.rows[0].failed.startswith("RuntimeError: </title>")
+    assert bad.rows[1].verdicts == [*"✓✓✗✓✓✓", *3 * ["\u2013"]]
+    assert bad.rows[1].figures[bad.figures.index("mutual chain")] == "20"
+    assert bad.command == "ucp-harness run cells/loss-0.5-agents-5.yaml --backend sim --seed 3"
+    assert bad.runs == "4 runs, 1 judged bad, 1 failed"
+
+
+def test_a_run_that_was_kept_leads_to_its_report(tmp_path: Path) -> None:
+    finished = played(matrix(seeds=2), 1, judge)
+    runs = [run.model_copy(update={"backend": "process"}) for run in finished.runs]
+    kept = tmp_path / "runs" / directory_name(runs[1].task)
+    kept.mkdir(parents=True)
+    (kept / "report.html").touch()
+    cells = drilldown.drilldown(Finished(finished.record, runs), tmp_path)
+    assert [row.href for row in cells[0].rows] == [None, "runs/loss-0.0-agents-5-process-seed-2/report.html"]
+
+
+def test_more_runs_than_there_is_room_for_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drilldown, "MAX_ROWS", 4)
+    finished = played(matrix(), 1, breaks)
+    assert [(len(cell.rows), cell.left_out) for cell in drilldown.drilldown(finished, Path())] == [(2, 2), (2, 2)]
+    assert "And 2 more in runs.csv." in to_html(finished, Path())
+
+
+def test_the_trend_has_a_panel_for_each_loss_and_a_dot_for_each_night() -> None:
+    finished = played(matrix(agents=[5, 10]), 1, judge)
+    page = to_html(finished, Path(), over(finished, 3))
+    (drawings,) = re.findall(
+        r'<div class="figure of-uniform">\s*<h3>one chain</h3>\s*<h4>.*?</div>\n</div>', page, re.S
+    )
+    assert drawings.count('<g class="panel">') == 4
+    assert drawings.count("<circle") == 4 * 3
+    assert "<title>2026-01-02 02:17: 100\u00a0% (51\u2013100\u00a0%)</title>" in drawings
+    assert drawings.count('class="band"') == 4
+
+
+def test_nights_differ_in_their_panel() -> None:
+    finished = played(matrix(), 1, judge)
+    nights = over(finished, 3).records
+    (figure,) = [one for one in known(finished.record.cells) if one.metric.name == "reconciles"]
+    cell = nights[1].cells[1]
+    busier = {**cell.estimates, "reconciles": cell.estimates["reconciles"].model_copy(update={"mean": 40.0})}
+    nights[1] = nights[1].model_copy(
+        update={"cells": [nights[1].cells[0], cell.model_copy(update={"estimates": busier})]}
+    )
+    ((_, drawing),) = trend.trend(nights, finished.record, figure)
+    first, second = drawing.split('<g class="panel">')[1:]
+    heights = [set(re.findall(r'cy="([\d.]+)"', panel)) for panel in (first, second)]
+    assert [len(one) for one in heights] == [1, 2]
+
+
+def test_a_trend_begins_with_the_second_night_and_the_page_says_so() -> None:
+    finished = played(matrix(), 1, judge)
+    assert "With --nights DIR each finished night is kept" in to_html(finished, Path())
+    assert "The trend begins with the second night: there is one" in to_html(finished, Path(), over(finished, 1))
+    assert "The trend begins" not in to_html(finished, Path(), over(finished, 2))
+
+
+def test_absurd_nights_are_drawn_without_their_absurdity() -> None:
+    finished = played(matrix(), 1, judge)
+    nights = over(finished, 2)
+    for value in (1e308, -1e308, 0.0, 1e-300):
+        estimates = {name: {"n": 4, "mean": value, "low": -value, "high": value} for name in ("uniform", "reconciles")}
+        record = nights.records[0].to_json()
+        record["cells"][0]["estimates"] = estimates
+        record["started_at"] = HOSTILE
+        nights.records[0] = MatrixRecord.model_validate(record)
+        assert "1e+308" not in to_html(finished, Path(), nights)
+
+
+def test_more_nights_than_a_page_can_hold_are_left_away_from_the_front(monkeypatch: pytest.MonkeyPatch) -> None:
+    finished = played(matrix(), 1, judge)
+    monkeypatch.setattr(trend, "MAX_DOTS", 2 * 8 * 3)
+    page = to_html(finished, Path(), over(finished, 5))
+    assert "3 nights, from 2026-01-03 to 2026-01-05" in page
+
+
+def test_hostile_texts_stay_text_and_nothing_is_loaded() -> None:
+    finished = played(matrix(name=HOSTILE, about=HOSTILE), 1, breaks)
+    page = to_html(finished, Path(), Nights(Path(HOSTILE), [], [HOSTILE]))
+    assert "<script" not in page
+    assert "<img" not in page
+    assert html.escape(HOSTILE).replace("&#x27;", "&#39;").replace("&quot;", "&#34;") in page
+    assert "default-src 'none'; style-src 'sha256-" in page
+    assert "script-src" not in page
+    assert not re.findall(r'(?:src|href)="(?!#|data:,|runs/)', page)
+
+
+def test_eight_by_two_hundred_runs_stay_small() -> None:
+    finished = played(matrix(loss=tuple(n / 10 for n in range(8)), seeds=200), 1, judge)
+    page = to_html(finished, Path(), over(finished, 60))
+    assert page.count("<tr><th>") == 1600
+    assert len(page.encode()) < 1_500_000
+
+
+def test_any_run_can_be_played_again_from_its_cells_scenario(tmp_path: Path) -> None:
+    network = {"receivers": {3: {"loss": 0.5}}}
+    scenario = {"duration_s": 300, "events": {"source": "random"}, "clocks": {2: {"offset_s": -2}}, "network": network}
+    asked = matrix(name="again # and: \u2026", agents=[4, 5], loss=(0.15,), scenario=scenario)
+    write_scenarios(asked, tmp_path)
+    for point in asked.points:
+        assert load_scenario(tmp_path / scenario_file(point)) == asked.scenario_at(point)
+    (tmp_path / "matrix.yaml").write_text(yaml.safe_dump(asked.model_dump(mode="json", exclude_unset=True)))
+    assert harness("matrix", tmp_path / "matrix.yaml", "--out", tmp_path / "out").returncode == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    (command,) = re.findall(r"<code>ucp-harness (run .*agents-4.*)</code>", page)
+    assert harness(*command.split(), "--out", "again", cwd=tmp_path / "out").returncode == 0
+    lines = (tmp_path / "out" / "results.jsonl").read_text().splitlines()[1:]
+    (played_first,) = [run for run in map(Run.model_validate_json, lines) if (run.agents, run.seed) == (4, 1)]
+    again = json.loads((tmp_path / "out" / "again" / "run.json").read_text())
+    assert {name: again["figures"][name] for name in played_first.figures} == played_first.figures

@@ -1,0 +1,189 @@
+"""A matrix from its runs to its files, with a judge in the place of the simulation."""
+
+import csv
+import itertools
+import json
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from rich.console import Console
+
+from docs.generate.matrix_thesis import BEGIN, END, OBSERVED, PAGE, put_between_markers
+from docs.generate.matrix_thesis import table as thesis_table
+from harness.checker import Result
+from harness.errors import MachineError
+from harness.scenario import Scenario
+from harness.sweep.matrix import MatrixRecord, matrix_outputs, matrix_table, results_file, run_matrix
+from harness.sweep.matrix.matrix_picture import PANELS, draw
+from harness.sweep.matrix.matrix_run import on_cores
+from harness.sweep.matrix.matrix_summary import to_markdown
+from tests.harness.sweep.matrix.stub import judge, matrix, played
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def shown(record: MatrixRecord, width: int = 80) -> str:
+    console = Console(width=width)
+    with console.capture() as capture:
+        console.print(matrix_table.render(record))
+    return capture.get().replace("\u00a0", " ")
+
+
+def test_each_cell_sums_up_its_runs() -> None:
+    record = played(matrix(), 2, judge).record
+    perfect, lossy = record.cells
+    assert (perfect.loss, perfect.runs, perfect.failed, perfect.violated) == (0.0, 4, 0, {})
+    assert perfect.estimates["uniform"].mean == 1.0
+    assert lossy.estimates["uniform"].mean == 0.0
+    assert lossy.estimates["mutual_share"].mean == pytest.approx((20 - 0.5) / 40)
+    assert lossy.estimates["reconciles"].mean == 12.5
+    assert lossy.verdicts["3"] == {"holds": 3, "violated": 1}
+    assert lossy.violated == {"3": [2]}
+    assert record.exit_status == 1
+
+
+def test_the_result_does_not_depend_on_the_number_of_jobs() -> None:
+    one, two = (played(matrix(seeds=[5, 3, 9]), jobs, judge) for jobs in (1, 2))
+    assert one.runs == two.runs
+    assert [(run.loss, run.seed) for run in one.runs] == [(0.0, 5), (0.0, 3), (0.0, 9), (0.5, 5), (0.5, 3), (0.5, 9)]
+    assert one.record.cells == two.record.cells
+    assert one.record.exit_status == 0
+
+
+def test_a_run_that_fails_is_told_and_the_others_count() -> None:
+    def breaks(scenario: Scenario, seed: int) -> Result:
+        if seed == 3:
+            raise KeyError("block")
+        return judge(scenario, seed)
+
+    record = played(matrix(loss=(0.0,)), 2, breaks).record
+    (cell,) = record.cells
+    assert (cell.runs, cell.failed, cell.estimates["reconciles"].n) == (4, 1, 3)
+    (failed,) = record.failed
+    assert (failed.seed, failed.reason[:17]) == (3, "KeyError: 'block'")
+    assert record.exit_status == 1
+    assert "seed 3 failed: KeyError: 'block'" in shown(record)
+
+
+def test_a_scenario_that_cannot_be_played_is_one_error() -> None:
+    def refuses(scenario: Scenario, seed: int) -> Result:
+        raise MachineError("not in the simulation")
+
+    with pytest.raises(MachineError, match="not in the simulation"):
+        played(matrix(), 2, refuses)
+
+
+def test_an_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
+    calls = itertools.count()
+
+    def interrupted(scenario: Scenario, seed: int) -> Result:
+        if next(calls) == 5:
+            raise KeyboardInterrupt
+        return judge(scenario, seed)
+
+    finished = played(matrix(), 1, interrupted)
+    assert finished.record.outcome == "interrupted"
+    assert finished.record.exit_status == 130
+    assert [cell.runs for cell in finished.record.cells] == [4, 1]
+    matrix_outputs.write(finished, tmp_path)
+    assert json.loads((tmp_path / "matrix.json").read_text())["outcome"] == "interrupted"
+    assert "interrupted: 8 were asked for" in (tmp_path / "matrix.svg").read_text()
+
+
+def test_an_interrupt_before_the_first_run_ended_leaves_files_all_the_same(tmp_path: Path) -> None:
+    def interrupted(scenario: Scenario, seed: int) -> Result:
+        raise KeyboardInterrupt
+
+    finished = played(matrix(), 1, interrupted)
+    matrix_outputs.write(finished, tmp_path)
+    ElementTree.parse(tmp_path / "matrix.svg")  # noqa: S314 - ours
+    assert MatrixRecord.model_validate_json((tmp_path / "matrix.json").read_text()).cells == []
+    assert shown(finished.record)
+
+
+def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> None:
+    finished = played(matrix(), 1, judge)
+    matrix_outputs.write(finished, tmp_path)
+    document = json.loads((tmp_path / "matrix.json").read_text())
+    assert document["schema"] == "ucp-matrix/1"
+    assert MatrixRecord.model_validate(document) == finished.record
+    with (tmp_path / "matrix.csv").open() as file:
+        cells = list(csv.DictReader(file))
+    assert [float(cell["loss"]) for cell in cells] == [0.0, 0.5]
+    assert float(cells[1]["reconciles"]) == 12.5
+    assert float(cells[1]["reconciles_low"]) < 12.5 < float(cells[1]["reconciles_high"])
+    assert [cell["violated_3"] for cell in cells] == ["0", "1"]
+    with (tmp_path / "runs.csv").open() as file:
+        runs = list(csv.DictReader(file))
+    assert len(runs) == 8
+    assert (runs[5]["loss"], runs[5]["seed"], runs[5]["characteristic_3"]) == ("0.5", "2", "violated")
+    assert (runs[5]["bytes"], runs[5]["failed"]) == ("", ""), "unknown is empty"
+
+
+def test_the_table_fits_eighty_columns_and_names_what_was_violated() -> None:
+    lines = shown(played(matrix(), 1, judge).record)
+    assert "\u2026" not in lines
+    assert "100 %" in lines
+    assert "50 % loss: characteristic 3 violated in 1 of 4 runs, seed 2" in lines
+    assert "Means of 4 runs a cell, the same seeds in each, and their 95 % intervals." in lines
+
+
+def test_a_single_run_has_no_interval_and_it_is_said() -> None:
+    record = played(matrix(seeds=1), 1, judge).record
+    assert record.cells[0].estimates["reconciles"].low is None
+    assert "\u00b1" not in shown(record)
+    assert "One run a cell, so there are no intervals." in shown(record)
+    drawing = draw(record)
+    assert 'class="band"' not in drawing
+    assert "no intervals" in drawing
+
+
+def test_the_picture_has_a_panel_for_each_figure_and_a_dot_for_each_mean() -> None:
+    drawing = ElementTree.fromstring(draw(played(matrix(), 1, judge).record))  # noqa: S314 - ours
+    texts = {element.text for element in drawing.iter(f"{SVG}text")}
+    assert {panel.title for panel in PANELS} <= texts
+    lines = sum(len(panel.lines) for panel in PANELS)
+    assert len(list(drawing.iter(f"{SVG}circle"))) == 2 * lines
+    tips = [element.text or "" for element in drawing.iter(f"{SVG}title")]
+    assert "50\u00a0% loss: 12.5 (\u00b12.1)" in tips
+
+
+def test_the_picture_escapes_names_and_refers_to_nothing() -> None:
+    drawing = draw(played(matrix(name='<script>"&'), 1, judge).record)
+    assert "<script" not in drawing
+    ElementTree.fromstring(drawing)  # noqa: S314 - ours
+    assert set(re.findall(r"https?://[^\"']*", drawing)) == {"http://www.w3.org/2000/svg"}
+
+
+@pytest.mark.parametrize("loss", [(0.0,), (1.0,), (0.3,), (0.01, 0.011)])
+def test_any_range_of_losses_can_be_drawn(loss: tuple[float, ...]) -> None:
+    drawing = ElementTree.fromstring(draw(played(matrix(loss=loss), 1, judge).record))  # noqa: S314 - ours
+    places = [float(dot.attrib["cx"]) for dot in drawing.iter(f"{SVG}circle")]
+    assert all(0 < place < 900 for place in places)
+
+
+def test_the_thesis_page_has_a_place_for_the_table_and_every_rate() -> None:
+    record = played(matrix(loss=tuple(OBSERVED)), 1, judge).record
+    page = put_between_markers(PAGE.read_text(), thesis_table(record))
+    rows = page.split(BEGIN)[1].split(END)[0].splitlines()
+    assert len(rows) == 2 + len(OBSERVED)
+    assert all(row.count("|") == rows[0].count("|") for row in rows)
+
+
+def test_how_much_was_tried_is_told_if_asked_for_and_of_what_was_played_only(tmp_path: Path) -> None:
+    asked = matrix(loss=(0.0, 1.0), seeds=2, scenario={"duration_s": 60, "agents": 2})
+    with results_file.opened(tmp_path / "out", asked) as ended:
+        record = run_matrix(asked, ended, on_cores(asked, 1), covers=True).record
+    assert record.tried is not None
+    assert record.tried.runs == 4
+    assert record.tried.all_cells["untold"] is None
+    assert [cell.loss for cell in record.tried.cells] == [0.0, 1.0]
+    assert MatrixRecord.model_validate(record.to_json()) == record
+    assert "Tried by 4 runs" in to_markdown(record)
+    assert "reached" not in (tmp_path / "out" / results_file.FILE).read_text()
+    with results_file.opened(tmp_path / "out", asked) as ended:
+        again = run_matrix(asked, ended, on_cores(asked, 1), covers=True).record
+    assert again.tried is not None
+    assert again.tried.all_cells["untold"] == "4 of 4 runs were played before, and not looked at"

@@ -1,0 +1,1 @@
+"""The agent contract: its text, schemas, test vectors, specification, dissector and example agents."""

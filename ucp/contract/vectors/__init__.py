@@ -1,0 +1,63 @@
+"""Test vectors of the agent contract; `python -m ucp.contract.vectors` writes the files.
+
+hash_vectors.py    events, blocks, inception blocks and chains: bytes and hashes
+message_vectors.py  every message as a datagram
+drop_vectors.py     datagrams that are dropped, and why
+secured_vectors.py   secured datagrams, which need the extra `secure`
+block_vectors.py    after which event a block is full, and its timestamp
+mission_vectors.py  whole missions in virtual time, input by input
+"""
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ucp.contract.vectors import block_vectors, drop_vectors, hash_vectors, message_vectors, mission_vectors
+
+DIRECTORY = Path(__file__).parent
+
+
+def _secured() -> Any:
+    from ucp.contract.vectors import secured_vectors  # draws in cryptography, which who replays missions need not have
+
+    return secured_vectors.vectors()
+
+
+DOCUMENTS: dict[str, Callable[[], Any]] = {
+    "hashes": hash_vectors.vectors,
+    "messages": message_vectors.vectors,
+    "drops": drop_vectors.vectors,
+    "blocks": block_vectors.vectors,
+    "secured": _secured,
+}
+"""Name of a file -> what it has."""
+
+MISSIONS = DIRECTORY / "missions"
+INDEX = MISSIONS / "index.json"
+"""Name of each transcript, what happens in it, and which features it needs."""
+
+
+def texts() -> dict[Path, str]:
+    """Every file and what stands in it."""
+    made = {DIRECTORY / f"{name}.json": _json(vectors()) for name, vectors in DOCUMENTS.items()}
+    index = {}
+    for name, mission in mission_vectors.MISSIONS.items():
+        exchanges = mission().exchanges
+        features = exchanges[0]["input"]["mission"]["features"]
+        index[name] = {"what": mission.__doc__, "features": features, "lines": len(exchanges)}
+        made[MISSIONS / f"{name}.jsonl"] = "".join(json.dumps(exchange) + "\n" for exchange in exchanges)
+    return made | {INDEX: _json(index)}
+
+
+def write_all() -> None:
+    """Write all files anew."""
+    for path, text in texts().items():
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="ascii")
+
+
+def _json(document: Any) -> str:
+    """Bytes are in base64, as everywhere in the contract."""
+    return json.dumps(document, indent=1, default=lambda data: base64.b64encode(data).decode("ascii")) + "\n"

@@ -1,0 +1,5 @@
+"""`python -m ucp.contract.vectors`: write the test vectors of the agent contract anew."""
+
+from ucp.contract.vectors import write_all
+
+write_all()

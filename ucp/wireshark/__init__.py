@@ -1,5 +1,0 @@
-"""A Wireshark dissector of UCP, in Lua. `python -m ucp.wireshark` says where it is."""
-
-from pathlib import Path
-
-DISSECTOR = Path(__file__).with_name("ucp.lua")
