@@ -15,10 +15,10 @@ from collections import Counter
 from pathlib import Path
 
 from harness.errors import UnsupportedError
-from harness.play.simulation.foreign.program_pool import SHARED
+from harness.play.simulation.foreign.virtual_program import SHARED
 from harness.run.parallel import Failed, sweep
 from harness.run.simulate import Simulated, simulate
-from harness.scenario import Scenario, library, load_scenario
+from harness.scenario import Scenario, load, load_scenario
 
 OURS = [sys.executable, "-P", "-m", "ucp.node"]
 
@@ -84,7 +84,7 @@ def same(command: list[str], seeds: int, jobs: int) -> int:
         return "the same" if next(alike) == next(alike) else "different"
 
     came_to: Counter[str] = Counter()
-    names = [name for name in library.names() if not name.endswith("matrix")]
+    names = [name for name in load.names() if not name.endswith("matrix")]
     tasks = [(name, seed) for name in names for seed in range(seeds)]
     with sweep(tasks, work, jobs, what="missions") as outcomes:
         for (name, seed), outcome in outcomes:

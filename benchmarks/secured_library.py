@@ -16,7 +16,7 @@ from typing import NamedTuple
 from harness.errors import HarnessError
 from harness.run.parallel import Failed, cores, sweep
 from harness.run.simulate import simulate
-from harness.scenario import Scenario, library, load_scenario, read_yaml
+from harness.scenario import Scenario, load, load_scenario, read_yaml
 from harness.sweep.matrix.matrix_file import load_matrix
 
 INJECTIONS = "what its rogue node injects, of which agents with keys believe less"
@@ -48,7 +48,7 @@ def in_both(name: str, scenario: Scenario) -> Compared:
 def all_of(names: Sequence[str]) -> Iterator[Compared]:
     """Raises ScenarioError for a file that is none."""
     for name in names:
-        path = library.find(Path(name))
+        path = load.find(Path(name))
         if "loss" not in read_yaml(path, "scenario"):
             yield in_both(name, load_scenario(path))
             continue
@@ -89,7 +89,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=8, help="1..N")
     parser.add_argument("--jobs", type=int, default=cores())
-    parser.add_argument("scenarios", nargs="*", default=library.names())
+    parser.add_argument("scenarios", nargs="*", default=load.names())
     arguments = parser.parse_args()
     seeds = range(1, arguments.seeds + 1)
     try:

@@ -28,7 +28,7 @@ COMMANDS = {
         "Play a scenario, check the six characteristics, write a report.",
     ),
     "scenarios": (
-        "harness.commands.scenarios:scenarios_command",
+        "harness.commands.runs:scenarios_command",
         "List the scenarios that come along: `ucp-harness run loss_15` plays one.",
     ),
     "runs": (
@@ -48,7 +48,7 @@ COMMANDS = {
         "Open a shell in the network of a vehicle whose run goes on (ping, tcpdump, ip); without one, list what runs.",
     ),
     "check": (
-        "harness.commands.check:check_command",
+        "harness.commands.report:check_command",
         "Decide the six characteristics from exported chains, and from traces beside them.",
     ),
     "report": (
@@ -132,7 +132,7 @@ COMMANDS = {
         "Fit how messages, bytes and time grow with agents and blocks, in the simulation; by default about 4 minutes.",
     ),
     "clean": (
-        "harness.commands.clean:clean_command",
+        "harness.commands.doctor:clean_command",
         "Remove the containers of runs on Docker that are over; those of a run that goes on, and all others, stay.",
     ),
     "doctor": (

@@ -14,9 +14,9 @@ from harness.present import text
 from harness.run.parallel import Failed, cores, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.scenario.stagger import Stagger
+from harness.scenario.agent_options import Stagger
+from harness.sweep.matrix.estimate import METRICS, Figures, Metric, figure
 from harness.sweep.matrix.matrix_file import Matrix, Point, load_matrix
-from harness.sweep.matrix.matrix_metrics import METRICS, Figures, Metric, figure
 from harness.sweep.matrix.matrix_table import say_interval, say_mean
 from ucp.agent_files import write_atomically
 

@@ -28,8 +28,7 @@ from harness.archive.history import in_time
 from harness.archive.jsonlines import JsonLines, Record
 from harness.archive.record_file import RecordFile, read_record
 from harness.archive.run_record import JudgedRecord, RunRecord
-from harness.archive.trace_lines import Line, read_lines
-from harness.archive.traces import SUFFIX, Trace, read_trace, why_none
+from harness.archive.traces import SUFFIX, Line, Trace, read_lines, read_trace, why_none
 from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
 from harness.errors import RunDirectoryError
 

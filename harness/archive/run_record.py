@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from harness.backend_names import BackendName
 from harness.scenario import Scenario, faults
+from harness.scenario.agent_options import Stagger
 from harness.scenario.faults import Disk
-from harness.scenario.stagger import Stagger
 from harness.scenario.verdict_names import BESIDE, CharacteristicVerdict, Verdict
 
 SCHEMA = "ucp-run/1"

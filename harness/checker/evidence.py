@@ -20,7 +20,7 @@ from harness.archive.vocabulary import Kind, Unknown, first_of, unknown_words
 from harness.checker.recurring_cycles import cycle_of
 from harness.checker.trace_replay import Life, replay
 from harness.errors import RunDirectoryError
-from harness.play.rogue.line import OF_NO_INJECTION
+from harness.play.rogue.journal import OF_NO_INJECTION
 from ucp.block import HASH_BYTES
 from ucp.state import AgentState
 from ucp.trace import HandlerRun, Sent

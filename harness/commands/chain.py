@@ -7,16 +7,13 @@ from typing import Annotated
 import typer
 
 from harness.archive.archive import RunArchive
-from harness.commands.depot_key import DepotKey, depot_of
-from harness.commands.new_file import write_new
+from harness.commands.shared_options import DepotKey, depot_of, write_new
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST, ExportError
 from harness.report import logbook
-from harness.report.logbook.flown import flown
-from harness.report.logbook.geojson import geojson
-from harness.report.logbook.kml import kml
 from harness.report.logbook.logbook_text import document, lines
-from harness.report.logbook.positions import Track, tracks
+from harness.report.logbook.map_files import geojson, kml
+from harness.report.logbook.positions import Track, flown, tracks
 
 
 def chain_command(

@@ -9,15 +9,13 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from harness.commands.new_file import refuse_existing, write_new
+from harness.commands.shared_options import refuse_existing, write_new
 from harness.commands.terminal import complain, print_json
 from harness.conformance.conformance_page import read_agents, to_html
 from harness.conformance.conformance_run import Asked, conform
 from harness.conformance.results import TITLES, Results
-from harness.conformance.results_table import render, summary, to_junit
-from harness.conformance.run_progress import progress
-from harness.conformance.vector_file import to_lines
-from harness.conformance.vectors import generate
+from harness.conformance.results_table import progress, render, summary, to_junit
+from harness.conformance.vectors import generate, to_lines
 from harness.errors import HarnessError, MachineError
 from harness.play.command_line import located
 from harness.run.parallel import terminated_is_interrupted

@@ -9,17 +9,15 @@ import typer
 from rich.console import Console
 
 from harness.archive.directory import claim
-from harness.commands.depot_key import DepotKey, depot_of
-from harness.commands.new_file import refuse_existing, write_new
+from harness.commands.shared_options import DepotKey, depot_of, refuse_existing, write_new
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.field.depot import record_outputs
 from harness.field.depot.collected_exports import came_home
 from harness.field.depot.consolidation import Consolidation, consolidate
 from harness.field.depot.record_lines import Reconciled
-from harness.field.depot.record_text import in_words
-from harness.report.logbook.geojson import geojson
-from harness.report.logbook.kml import kml
+from harness.field.depot.record_outputs import in_words
+from harness.report.logbook.map_files import geojson, kml
 from harness.report.logbook.positions import Track
 
 if TYPE_CHECKING:

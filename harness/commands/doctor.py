@@ -1,4 +1,4 @@
-"""`ucp-harness doctor`: what this machine can do, and what its network really does."""
+"""`ucp-harness doctor` and `ucp-harness clean`: this machine's abilities, and leftover containers."""
 
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from rich.text import Text
 
 from harness.commands.terminal import print_json
 from harness.errors import CANNOT_HERE, VIOLATED
-from harness.play.machine import calibration
+from harness.play.machine import capabilities
 from harness.play.machine.capabilities import examine
 from harness.play.machine.uml_kernel import Kernel, run_inside
 
@@ -41,14 +41,33 @@ def doctor_command(
         Console().print(table)
     engines = []
     if measure and able:
-        with calibration.saying(Console(stderr=True)) as say:
-            engines = calibration.measure_engines(requirements, say)
+        with capabilities.saying(Console(stderr=True)) as say:
+            engines = capabilities.measure_engines(requirements, say)
     records = [requirement.to_json() for requirement in requirements]
     if as_json:
         print_json({"findings": records, "measured": [engine.to_json() for engine in engines]} if measure else records)
     elif engines:
-        Console().print(calibration.render(engines))
+        Console().print(capabilities.render(engines))
     if not able:
         raise typer.Exit(CANNOT_HERE)
     if not all(engine.ok for engine in engines):
         raise typer.Exit(VIOLATED)
+
+
+def clean_command() -> None:
+    """Remove the containers of runs on Docker that are over; those of a run that goes on, and all others, stay."""
+    from harness.play.containers.docker_engine import Engine
+    from harness.play.containers.ownership import clean
+
+    engine = Engine.connect()
+    try:
+        cleaned = clean(engine)
+    finally:
+        engine.close()
+    console = Console()
+    for name in cleaned.removed:
+        console.print(f"removed {name}", highlight=False, soft_wrap=True)
+    if not cleaned.removed:
+        console.print("there was nothing to remove", highlight=False)
+    if cleaned.still:
+        console.print(f"{len(cleaned.still)} containers belong to runs that go on", highlight=False, style="dim")

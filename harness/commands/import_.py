@@ -10,11 +10,10 @@ from rich.console import Console
 from harness.commands.terminal import complain, print_lines
 from harness.errors import FieldError
 from harness.field.adapters import bring_in
-from harness.field.adapters.adapter import Adapter
-from harness.field.adapters.adapter_loading import load_adapter
+from harness.field.adapters.adapter import Adapter, load_adapter
 from harness.field.adapters.csv_adapter import CommaSeparated
-from harness.field.adapters.import_record import ImportedFlight
 from harness.field.adapters.rosbag_adapter import RosBag
+from harness.field.adapters.written_records import ImportedFlight
 
 
 class Format(Enum):

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from harness.commands.new_file import refuse_existing
-from harness.commands.roster import roster_of
+from harness.commands.shared_options import refuse_existing, roster_of
 from harness.commands.terminal import complain, print_json, print_lines
 from harness.errors import MachineError
 from harness.scenario.load import parse

@@ -12,8 +12,8 @@ from harness.run.parallel import cores
 from harness.sweep import matrix
 from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table, results_file
 from harness.sweep.matrix import nights as nights_of_matrix
-from harness.sweep.matrix.baseline import load_baseline
 from harness.sweep.matrix.matrix_run import compared, on_cluster, on_cores
+from harness.sweep.matrix.nights import load_baseline
 
 
 def matrix_command(

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from harness.commands.roster import roster_of
+from harness.commands.shared_options import roster_of
 from harness.commands.terminal import complain, print_json, print_lines
 from harness.errors import WRONG_REQUEST, MachineError
 from harness.field.depot.mission_comparison import compare
 from harness.field.depot.mission_files import MissionFileError, Plan, write
 from harness.scenario import Scenario, load_scenario
+from harness.scenario.agent_options import in_words
 from harness.scenario.load import parse
-from harness.scenario.quirks import in_words
 from ucp.messages import PORT
 from ucp.sealed import seal_to
 

@@ -10,15 +10,13 @@ from rich.console import Console
 
 from harness.archive.packets import packets_text
 from harness.archive.packets.air_names import Names, runs_of
-from harness.archive.packets.block_story import in_order, story
 from harness.archive.packets.capture_files import Captures, capture_files, read_captures
-from harness.archive.packets.exchanges import Exchanges
-from harness.archive.packets.loss_table import count_losses, matrix
+from harness.archive.packets.exchanges import Exchanges, count_losses, matrix
 from harness.archive.packets.packets_document import document
 from harness.archive.packets.packets_text import Paint, Wording
-from harness.archive.packets.selection import Selection
+from harness.archive.packets.selection import Selection, in_order, story
 from harness.archive.packets.transmissions import join
-from harness.commands.bundle import BundleOption, opener_of
+from harness.commands.shared_options import BundleOption, opener_of
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST
 

@@ -14,9 +14,8 @@ from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
 from harness.field.replay import Player, Record, open_record, open_records
 from harness.field.replay.breakpoints import place
 from harness.field.replay.prompt import Prompt
-from harness.field.replay.replay_document import ReplayedRecord, document, replayed
+from harness.field.replay.replay_document import ReplayedRecord, document, head, replayed, summary
 from harness.field.replay.replay_names import Names
-from harness.field.replay.replay_summary import head, summary
 
 
 def replay_command(

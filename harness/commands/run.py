@@ -21,12 +21,12 @@ from harness.play import progress
 from harness.play.backends import BACKENDS
 from harness.play.interventions import Interventions
 from harness.play.machine.uml_kernel import OUT, Kernel, run_inside
-from harness.report.capture_gaps import gaps
+from harness.report.facts import gaps
 from harness.report.live.server_process import beside
 from harness.run.run import Run, run
 from harness.scenario import Scenario
+from harness.scenario.agent_options import in_words
 from harness.scenario.load import explain
-from harness.scenario.quirks import in_words
 
 
 class Vehicles(StrEnum):
@@ -146,7 +146,7 @@ def _show(console: Console, finished: Run) -> None:
 
 def _emit_compose(console: Console, scenario: Scenario, seed: int, file: Path) -> None:
     from harness.play.containers.compose import write_compose
-    from harness.play.process.vehicle_kinds import choose_vehicles
+    from harness.play.process.fleet import choose_vehicles
     from sitl.system_ids import system_ids
 
     beside = write_compose(scenario, seed, choose_vehicles(scenario), system_ids(scenario.roster), file)

@@ -1,4 +1,4 @@
-"""`ucp-harness runs`: what was run, and its reports."""
+"""`ucp-harness runs` and `ucp-harness scenarios`: recorded runs, and the library."""
 
 import webbrowser
 from datetime import datetime
@@ -14,6 +14,7 @@ from harness.archive.run_listing import RUNS, PastRun, past_runs
 from harness.archive.run_record import RunRecord
 from harness.commands.terminal import MARKS, STYLES, complain, print_json
 from harness.errors import RunDirectoryError
+from harness.scenario import load
 from harness.scenario.verdict_names import BAD_IN_WORDS, Kind, kind_of
 
 
@@ -92,3 +93,13 @@ def _document(run: PastRun) -> dict[str, Any]:
         "verdicts": {key: judgement.verdict for key, judgement in record.judgements.items()},
         "problem": run.problem,
     }
+
+
+def scenarios_command() -> None:
+    """List the scenarios that come along: `ucp-harness run loss_15` plays one."""
+    table = Table.grid(padding=(0, 2))
+    for name in load.names():
+        table.add_row(Text(name, style="bold", no_wrap=True), Text(load.opening(name)))
+    console = Console()
+    console.print(table)
+    console.print(f"in {load.FOLDER}, to copy and edit", highlight=False, soft_wrap=True, style="dim")

@@ -3,7 +3,7 @@
 reference_model.py      the reference beside the agent: what must come of an input, and in which state that leaves it
 alphabet.py   the inputs that there are in a state: each message in the variants that matter, events, timers, commands
 state_space.py     states as far as they differ to an agent, and the walk over all of them, breadth first
-vectors.py    the generated vectors; vector_file.py writes them for others, as virtual_lines.py spells them
+vectors.py    the generated vectors; vectors.py writes them for others, as virtual_lines.py spells them
 tours.py      one agent led through as many vectors as it takes, by the shortest ways
 suite.py      many tours side by side; what is suspected is tried again, alone
 subject.py    an agent under test; over UDP (udp_subject.py, on the air of udp_lab.py) or in virtual time

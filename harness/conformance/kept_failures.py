@@ -1,27 +1,75 @@
-"""What is kept of a failure, in a directory of its own: to look into, and to try again without this harness.
+"""Files kept of each failure, among them a scenario that gives the agent the same inputs.
 
 failure.txt       what was expected and what came
 vector.jsonl      the inputs and answers that lead there, as `COMMAND --virtual` reads and writes them
 scenario.yaml     the same as a scenario, for `ucp-harness run --backend sim`
 air.pcapng        what crossed the air, for Wireshark and `ucp-harness packets`
+
+It can be played in virtual time, and then has all that a run has: its report, its trace, each step judged.
 """
 
+import base64
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from harness.conformance.failure_scenario import scenario_of
 from harness.conformance.observation import Exchange
+from harness.conformance.reference_model import AGENT, INITIAL_DATA, PEERS, ROSTER
 from harness.conformance.results import Case
 from harness.conformance.results_table import lines_of
-from harness.conformance.state_space import VARIANTS
+from harness.conformance.state_space import VARIANTS, Variant
 from harness.conformance.udp_lab import AGENTS, PEERS_ON
 from harness.conformance.virtual_lines import Writer
 from harness.errors import MachineError
+from harness.scenario.scenario_file import Document, to_yaml
 from netem.capture import begin_file
 from netem.frames import udp_broadcast
 from netem.pcapng import PcapngFile
-from ucp.messages import PORT
+from ucp.messages import PORT, decode
+from ucp.settings import Settings
+
+COMMENT = (
+    "Play it with `ucp-harness run FILE --backend sim`, for an agent that has virtual time.",
+    "Its verdict on every step says where the agent did otherwise than Algorithms 1 to 20.",
+)
+
+
+def scenario_of(name: str, command: Sequence[str], variant: Variant, way: Sequence[str]) -> str:
+    """The file."""
+    script: list[Document] = []
+    datagrams: list[Document] = []
+    timeline: list[Document] = [{"at_s": 0, "kill": list(PEERS)}]
+    writer = Writer(variant)
+    for line in writer.lines(way):
+        match line.given:
+            case {"t": at_s, "datagram": datagram}:
+                source = decode(base64.b64decode(datagram)).sender
+                datagrams.append({"source": source, "datagram": datagram, "reaches": {AGENT: at_s}})
+            case {"t": at_s, "event_id": event_id, "data": data, "timestamp_us": timestamp_us}:
+                event = {"event_id": event_id, "data": data, "timestamp_us": timestamp_us}
+                script.append({"at_s": at_s, "agent": AGENT, **event})
+            case {"t": at_s, "command": asked}:
+                timeline.append({"at_s": at_s, asked: [AGENT]})
+    document: Document = {
+        "name": name,
+        "agents": list(ROSTER),
+        "agent_command": {AGENT: list(command)},
+        "duration_s": math.ceil(writer.now) + 1,
+        "initial_data": base64.b64encode(INITIAL_DATA).decode("ascii"),
+        "settings": _unusual(variant.settings.told()),
+        "timeline": timeline,
+        "events": {"source": "scripted"} | ({"script": script} if script else {}),
+        "datagrams": datagrams,
+    }
+    return to_yaml({key: value for key, value in document.items() if value not in ({}, [])}, COMMENT)
+
+
+def _unusual(settings: dict[str, Any]) -> dict[str, Any]:
+    usual = Settings().told()
+    return {name: value for name, value in settings.items() if name not in usual or usual[name] != value}
+
 
 EPOCH_US = 1_700_000_000_000_000
 """Of the capture: mission second 0."""

@@ -1,8 +1,11 @@
-"""The results on the terminal, and as JUnit XML."""
+"""Results on the terminal and as JUnit XML, and the progress of a run."""
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -107,3 +110,28 @@ def _junit_cases(results: Results) -> Iterator[JunitCase]:
             yield JunitCase(headline(case), list(lines_of(case)))
         else:
             yield JunitCase(headline(case), skipped=None if case.verdict == "passed" else case.reason or case.verdict)
+
+
+REDRAW_EVERY_S, LINE_EVERY_S = 0.2, 10.0
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[int, int], None]]:
+    """A function that is told how many vectors have passed, of how many."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, console=console, auto_refresh=False, transient=True, disable=not console.is_terminal)
+    task = bar.add_task("vectors", total=None)
+    last = time.monotonic()
+
+    def told(count: int, total: int) -> None:
+        nonlocal last
+        if time.monotonic() - last < (REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S):
+            return
+        last = time.monotonic()
+        bar.update(task, completed=count, total=total, refresh=True)
+        if not console.is_terminal:
+            console.print(f"{count} of {total} vectors", highlight=False, soft_wrap=True)
+
+    with bar:
+        yield told

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from harness.conformance.alphabet import INPUTS, LOG, TIMER, Input
-from harness.conformance.moment import Moment
-from harness.conformance.reference_model import AGENT, OLD_US, YOUNG_US, Model, Outcome
+from harness.conformance.reference_model import AGENT, OLD_US, YOUNG_US, Model, Moment, Outcome
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.reconcile import IS_TOP_OF_CHAIN
 from ucp.settings import Settings

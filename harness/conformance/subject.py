@@ -1,13 +1,19 @@
-"""An agent under test, and what it should be, whichever way it is driven."""
+"""An agent under test and its mission."""
 
+import base64
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
 
 from harness.conformance.alphabet import INPUTS, TIMER, Input
 from harness.conformance.observation import Exchange, Seen
-from harness.conformance.reference_model import Model
+from harness.conformance.reference_model import AGENT, INITIAL_DATA, ROSTER, Model
 from harness.conformance.state_space import Variant, pair_of, state_of
+from harness.play.process.agent_mission import NO_QUIRKS
+from ucp.features import CONTRACT
+from ucp.mission import SCHEMA
 
 
 class Subject(ABC):
@@ -50,3 +56,36 @@ Start = Callable[[Variant, bool], Awaitable[Subject]]
 """Starts an agent in a mission with such settings, alone or beside others.
 
 Raises NoAgentError, UnsupportedError, AgentEndedError."""
+
+
+NO_KEYS: Mapping[str, Any] = MappingProxyType({})
+
+
+def mission(
+    variant: Variant, *, address: str, broadcast: str, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS
+) -> dict[str, Any]:
+    """`keys` take the place of those that are here."""
+    return {
+        "schema": SCHEMA,
+        "contract": CONTRACT,
+        "features": list(variant.features),
+        "agent_id": AGENT,
+        "roster": list(ROSTER),
+        "initial_data": base64.b64encode(INITIAL_DATA).decode("ascii"),
+        "network": {"address": address, "broadcast": broadcast, "port": port},
+        "events": {
+            "source": "none",
+            "mean_s": 30.0,
+            "position_interval_s": 10.0,
+            "log": ["mode", "arming", "text", "position"],
+            "vehicle_host": "127.0.0.1",
+            "vehicle_port": 5762,
+        },
+        "settings": variant.settings.told(),
+        "quirks": dict(NO_QUIRKS),
+        "seed": 1,
+        "speedup": speedup,
+        "epoch_us": None,
+        "store": None,
+        **keys,
+    }

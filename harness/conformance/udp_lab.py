@@ -19,7 +19,7 @@ from typing import Any, Self
 
 from harness.conformance import ports
 from harness.conformance.state_space import Variant
-from harness.conformance.subject_mission import NO_KEYS, mission
+from harness.conformance.subject import NO_KEYS, mission
 from harness.errors import HarnessError, MachineError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
 from netem.errors import LabUnavailable, NetemError, SpawnError

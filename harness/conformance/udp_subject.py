@@ -17,9 +17,7 @@ from itertools import product
 from typing import Any
 
 from harness.conformance.alphabet import Input
-from harness.conformance.conformance_text import Names, told_datagram
-from harness.conformance.moment import Moment
-from harness.conformance.observation import COMPARED, MOST_ENDED, Exchange, Seen, compare
+from harness.conformance.observation import COMPARED, MOST_ENDED, Exchange, Names, Seen, compare, told_datagram
 from harness.conformance.reference_model import (
     AGENT,
     EVENT_ID,
@@ -29,6 +27,7 @@ from harness.conformance.reference_model import (
     Expire,
     Log,
     Model,
+    Moment,
     Outcome,
 )
 from harness.conformance.state_space import Variant, ends_next, state_of

@@ -1,14 +1,25 @@
-"""The generated vectors: for each reachable pair of a state and an input the shortest way there, and what must come.
+"""The generated vectors, and the file that carries them to others.
 
 Other settings make other agents. Of theirs only those count that differ from the agent with default settings.
+
+The first line says what the file is. Each further one is one step: an input, and what must come of it. `after` is the
+step that comes before it, so that the steps from a mission on are found by going back. `in` and `out` are lines of
+virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64, and `timer` is the
+instant at which the next timer ends, null if none runs. `says` and `sends` are the same in words.
+
+Over UDP the agent's own blocks have other timestamps, and so other hashes: put in those that its export has. Their
+names are 1.1, 1.2 and so on.
 """
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 from harness.conformance.reference_model import Outcome
 from harness.conformance.state_space import VARIANTS, Pair, Step, Variant, explore, in_short
+from harness.conformance.virtual_lines import Line, Writer
 
 
 @dataclass(frozen=True)
@@ -50,3 +61,49 @@ def _all() -> tuple[Vectors, ...]:
 
 def is_of(outcome: Outcome, only: str) -> bool:
     return any(only in (str(run.algorithm), run.handler) for run in outcome.runs)
+
+
+SCHEMA = "ucp-conformance-vectors/1"
+
+
+def to_lines(generated: Sequence[Vectors]) -> Iterator[str]:
+    """Lines of the file, each with its end; the same for the same vectors."""
+    total = sum(len(vectors.wanted) for vectors in generated)
+    yield _line(
+        {"schema": SCHEMA, "vectors": total, "about": "ucp-harness conformance --write; see docs/conformance.md"}
+    )
+    number = 0
+    for vectors in generated:
+        if not vectors.wanted:
+            continue
+        root = number = number + 1
+        first = Writer(vectors.variant).first()
+        yield _line({"step": root, "after": None, "settings": vectors.variant.name, "in": first, "out": None})
+        numbers: dict[tuple[str, ...], int] = {(): root}
+        for step in vectors.wanted.values():
+            way = (*step.way, step.pair.input)
+            known = next(length for length in range(len(way) - 1, -1, -1) if way[:length] in numbers)
+            writer = Writer(vectors.variant)
+            for _ in writer.lines(way[:known]):
+                pass
+            after = numbers[way[:known]]
+            for length in range(known + 1, len(way) + 1):
+                lines = list(writer.lines(way[length - 1 : length]))
+                for place, line in enumerate(lines, 1):
+                    number += 1
+                    judged = length == len(way) and place == len(lines)
+                    yield _line(_step(number, after, line, step.before.text if judged else None))
+                    after = number
+                numbers[way[:length]] = number
+
+
+def _step(number: int, after: int, line: Line, state: str | None) -> dict[str, Any]:
+    """`state` in words is there only of a vector, not of a step on the way to one."""
+    runs = [{"algorithm": run.algorithm, "handler": run.handler, "branch": run.branch} for run in line.outcome.runs]
+    step = {"step": number, "after": after, "input": line.name, "in": line.given, "out": line.answer}
+    words = {"says": line.says, "sends": line.sends, "runs": runs}
+    return {**step, **words, **({"vector": True, "state": state} if state is not None else {})}
+
+
+def _line(document: dict[str, Any]) -> str:
+    return json.dumps(document, separators=(",", ":")) + "\n"

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.conformance.alphabet import INPUTS, TIMER, Input
-from harness.conformance.conformance_text import Names, told, told_datagram
+from harness.conformance.observation import Names, told, told_datagram
 from harness.conformance.reference_model import EVENT_ID, Action, Command, Datagram, Expire, Log, Model, Outcome
 from harness.conformance.state_space import STEP_S, Variant
-from harness.conformance.subject_mission import mission
+from harness.conformance.subject import mission
 from ucp.clock import MICROSECONDS
 
 

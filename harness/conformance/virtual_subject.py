@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.conformance.alphabet import Input
-from harness.conformance.conformance_text import Names, told_datagram
-from harness.conformance.observation import Exchange, Seen, compare
+from harness.conformance.observation import Exchange, Names, Seen, compare, told_datagram
 from harness.conformance.reference_model import Expire, Model, Run
 from harness.conformance.state_space import STEP_S, Variant, ends_next, state_of
 from harness.conformance.subject import Start, Subject

@@ -10,7 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import from_json
 
 from harness.errors import VIOLATED, HarnessError
-from harness.play.last_output import last_words
+from harness.play.command_line import last_words
 
 ANSWER_LIMIT_BYTES = 1024 * 1024
 

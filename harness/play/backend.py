@@ -1,4 +1,4 @@
-"""What a backend is: it says its name, refuses what it cannot play, and opens the swarm that a story is played on.
+"""The interface of a backend, and the seeds that it gives its agents.
 
 Whoever treats backends differently asks one of these properties, and never which backend it is. A new one is a room of
 its own here, its name in `harness.backend_names`, and its place in the table `harness.play.backends`.
@@ -7,6 +7,7 @@ its own here, its name in `harness.backend_names`, and its place in the table `h
 import asyncio
 from abc import ABC, abstractmethod
 from contextlib import AbstractAsyncContextManager
+from random import Random
 from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
@@ -58,3 +59,9 @@ class Backend(ABC):
         also what cannot matter to them, as on any real network. Virtual time goes at the `pace`, if there is one; real
         time heeds none. Raises HarnessError if there is no swarm to be had.
         """
+
+
+def agent_seed(seed: int, agent_id: int, life: int = 1) -> int:
+    """What an agent's events and quirks are drawn from; an agent that was restarted is in its second `life`."""
+    again = f" life {life}" if life > 1 else ""
+    return Random(f"{seed}/agent {agent_id}{again}").getrandbits(63)

@@ -1,4 +1,4 @@
-"""What somebody asks of a run that goes on: that this happens now, and in virtual time, how time goes.
+"""Interventions: a user's requests to a running mission, and the timeline that grows by them.
 
 `Interventions` is given to `harness.run.run.run`, and may then be asked from any thread:
 
@@ -12,9 +12,14 @@ sentences, made by the same code as one that was scheduled. It then stands in th
 `by_hand` among the faults there; `replay.yaml` in the run's directory plays it all again. What was to last for a while,
 and is changed by hand for good, is over by then. What cannot be is a ScenarioError, one sentence, and changes nothing.
 Every answer comes, if only that the run has ended.
+
+So what is told is checked as an entry is, and made by the same code; and it can be played again, from the scenario that
+it has come to.
 """
 
 import asyncio
+import math
+import re
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -27,14 +32,66 @@ from pydantic import ValidationError
 
 from harness.errors import ScenarioError
 from harness.play import mission
-from harness.play.growing_timeline import GrowingTimeline
 from harness.play.mission import Swarm
 from harness.play.pace import NEXT_RUN, Pace
 from harness.play.vehicle_keys import refuse_revocations
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, timeline_of
+from harness.scenario.load import parse
 from harness.scenario.network_states import changed
 from harness.scenario.timeline import TimelineEntry
+
+INSTANT_S = 0.001
+"""Of two entries in one instant the second comes a millisecond later."""
+
+_NAMED = re.compile(r"(?P<list>timeline|fates)\.(?P<number>\d+)(?P<rest>\.|: )?")
+
+
+class GrowingTimeline:
+    """What is played of a scenario by now, and may yet be added to it."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        """With everything in its timeline that was told by now."""
+        self._played_s = 0.0
+        """Until when the timeline has been played."""
+
+    def next_instant(self, swarm: Swarm) -> float:
+        """The first whole millisecond, in mission seconds, at which something may happen that is told now."""
+        return math.ceil(max(swarm.now(), self._played_s + INSTANT_S) * 1000) / 1000
+
+    def retell(self, document: dict[str, Any]) -> None:
+        """From now on this is the scenario. Raises ScenarioError if there can be no such scenario."""
+        try:
+            self.scenario = parse(document)
+        except ScenarioError as error:
+            raise ScenarioError(_of_the_last(str(error), document["timeline"])) from None
+
+    async def until(self, swarm: Swarm, mission_s: float) -> None:
+        """Go on until then, with what the timeline has in between."""
+        for change in [change for change in timeline_of(self.scenario) if self._played_s < change.at_s <= mission_s]:
+            await swarm.until(change.at_s)
+            await swarm.apply(self.as_asked(change))
+            self._played_s = change.at_s
+        await swarm.until(mission_s)
+
+    def as_asked(self, change: Change) -> Change:
+        """The change, with what is known of who asked for it."""
+        return change
+
+
+def _of_the_last(problem: str, timeline: list[dict[str, Any]]) -> str:
+    """What is wrong with a timeline, in the words of whoever told its last entry."""
+    last = len(timeline) - 1
+
+    def name(named: re.Match[str]) -> str:
+        number, rest = int(named["number"]), named["rest"]
+        if named["list"] == "fates" or number >= last:
+            return "" if rest else "this"
+        return f"the timeline's entry at {timeline[number]['at_s']:g} s{', ' if rest == '.' else rest or ''}"
+
+    return _NAMED.sub(name, problem)
+
 
 MOST_WAITING = 100
 """Things that are asked for and have not been done yet; more are refused."""

@@ -16,7 +16,7 @@ from harness.scenario import Scenario
 from ucp.sealed import seal_to
 
 if TYPE_CHECKING:
-    from harness.play.keyring.authority import Authority
+    from harness.play.keyring.key_directory import Authority
     from ucp.secure.bundle import Bundle, PublicKeys
 
 FRESH = "fresh"
@@ -54,7 +54,7 @@ def keys_of(scenario: Scenario, secret: bytes) -> MissionKeys | None:
         return None
     security = scenario.security
     try:
-        from harness.play.keyring.authority import Authority
+        from harness.play.keyring.key_directory import Authority
         from ucp.secure.bundle import KeySet
     except ModuleNotFoundError:
         raise MachineError(
@@ -107,8 +107,7 @@ def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
 
 def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "Authority":
     """Who revokes what the timeline says, when it says so. Raises ScenarioError if nobody can."""
-    from harness.play.keyring.authority import Authority
-    from harness.play.keyring.key_directory import REVOCATION_NAME, Home, KeysError, listed
+    from harness.play.keyring.key_directory import REVOCATION_NAME, Authority, Home, KeysError, listed
 
     revoking = [fault.agents for fault in scenario.faults_in_order() if fault.needs_keys]
     try:

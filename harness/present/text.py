@@ -1,8 +1,11 @@
-"""Values as people read them."""
+"""Values as text: for people, for a terminal, and in Markdown."""
 
 import json
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
+
+from rich.text import Text
 
 _EPOCH_FROM_US = 1_000_000_000_000_000
 """Block timestamps from here on (2001) are since the Unix epoch; smaller ones are since the start of a virtual run."""
@@ -56,3 +59,22 @@ def label(key: str) -> str:
 
 def _shortest(number: float) -> str:
     return f"{number:.2f}".rstrip("0").rstrip(".") if abs(number) < 1e12 else f"{number:g}"
+
+
+def row(fields: Iterable[str]) -> str:
+    """Of a table; the fields are Markdown themselves."""
+    return f"| {' | '.join(fields)} |"
+
+
+def escaped(text: str) -> str:
+    """As words on one line, whatever they hold."""
+    line = " ".join(text.splitlines())
+    return "".join(f"\\{character}" if character in "\\`*_{}[]<>#|~&" else character for character in line)
+
+
+_CONTROL = dict.fromkeys((*range(32), *range(127, 160)), "�")
+
+
+def shown(words: str, style: str = "") -> Text:
+    """One line; what no reader could see is shown as a replacement character."""
+    return Text(words.translate(_CONTROL), style=style)

@@ -3,11 +3,11 @@
 bounds.py     within which everything is looked at
 model/snapshot.py   an agent's whole state: copied, put back, as a key
 model/flaws.py      what must never be at one agent
-model/interned_parts.py      the parts of states, each once
+model/snapshot.py      the parts of states, each once
 model/block_renaming.py     which blocks a state is about, and the same state about others
 model/known_states.py      local states by number, and by which names they know the others
 model/real_agents.py     the real agents, put into whatever state is looked at
-model/step.py       what an input makes of an agent
+model/snapshot.py       what an input makes of an agent
 model/local_steps.py      each step from each local state, computed once, by the real agent
 model/tallies.py    what tallies decide, so that the rest of them may be forgotten
 model/reduction.py  what agents must not do where states that behave alike are one
@@ -21,7 +21,7 @@ model/any_sender.py      network any: each agent by itself, against all that cou
 model/canonical_order.py      of all orders of the agents one that stands for all
 model/global_states.py      global states, and all that may happen next
 graph/expansion.py  what may follow one state
-graph/gc_off.py Python's collector rests meanwhile
+graph/expansion.py Python's collector rests meanwhile
 graph/workers.py       other processes that look at states, too
 graph/packed_states.py     what is kept of each state, in little room
 graph/exploration.py    all of them, breadth first
@@ -31,7 +31,7 @@ questions/extra_votes.py      how many more votes it takes until there is one ch
 questions/convergence.py   whether there is always a way to rest with one chain, and whether one goes round for ever
 questions/livelock.py   the forms of going round, each with a scenario and what it takes to get there
 examples/path_times.py      mission seconds for a way through the graph
-examples/block_ages.py       which block has to be older than which on it
+examples/path_times.py       which block has to be older than which on it
 examples/path_script.py     a way through the graph as a scenario that the simulation plays
 attacker/timeline_entries.py    what a captor says as an entry of that scenario's timeline
 examples/example.py    a scenario, played and written

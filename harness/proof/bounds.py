@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from harness.errors import HarnessError
-from harness.scenario.stagger import Stagger, Staggered, staggered
+from harness.scenario.agent_options import Stagger, Staggered, staggered
 from ucp.quirks import check_quirk
 from ucp.settings import MAX_TIMER_S, Settings
 from ucp.short_value import shown

@@ -77,7 +77,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
         if not is_story(file_path):
             return None
-        from harness.pytest_plugin.stories import StoryFile
+        from harness.pytest_plugin.items import StoryFile
 
         return StoryFile.from_parent(parent, path=file_path)
     if file_path.suffix not in (".yaml", ".yml"):

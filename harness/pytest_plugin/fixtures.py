@@ -9,9 +9,8 @@ import pytest
 from harness.backend_names import BACKEND_NAMES, BackendName
 from harness.errors import ScenarioError
 from harness.play.progress import Silent
-from harness.pytest_plugin.directories import discard, new_directory
 from harness.pytest_plugin.findings import Findings
-from harness.pytest_plugin.judged_run import Trial, one_sentence
+from harness.pytest_plugin.judged_run import Trial, discard, new_directory, one_sentence
 from harness.pytest_plugin.options import Options
 from harness.pytest_plugin.stash import TRIAL
 from harness.pytest_plugin.swarm_in_test import SwarmInTest

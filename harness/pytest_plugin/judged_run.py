@@ -1,19 +1,25 @@
-"""A run that a test is about, and whether it is what its scenario expects."""
+"""A run of a test: its directory, its verdict, and whether the scenario expected it."""
 
+import re
 import shlex
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import cast
 
 import pytest
 
 from harness.archive.archive import RunArchive
-from harness.errors import HarnessError, MachineError
+from harness.errors import HarnessError, MachineError, RunDirectoryError
 from harness.pytest_plugin.findings import JudgementInTest
+from harness.pytest_plugin.options import Options
 from harness.report.agent_programs import in_sentence, programs
 from harness.run.run import Run
 from harness.scenario import Scenario
+from harness.scenario.agent_options import in_words
 from harness.scenario.expect import Expect
-from harness.scenario.quirks import in_words
 
 
 class Trial:
@@ -88,3 +94,30 @@ def one_sentence() -> Iterator[None]:
         raise pytest.skip.Exception(str(error)) from None
     except HarnessError as error:
         raise pytest.fail.Exception(str(error), pytrace=False) from None
+
+
+MAX_NAME = 100
+
+
+def new_directory(node: pytest.Item, options: Options) -> Path:
+    """An empty directory of its own for a run of this test. Raises RunDirectoryError."""
+    name = re.sub(r"\W+", "-", node.nodeid).strip("-")[-MAX_NAME:]
+    if options.keep is None:
+        factory = node.config._tmp_path_factory  # type: ignore[attr-defined] # a file that is a test has no fixtures
+        return cast(pytest.TempPathFactory, factory).mktemp(name)
+    for number in count(1):
+        directory = options.keep / (name if number == 1 else f"{name}-{number}")
+        try:
+            directory.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise RunDirectoryError(f"--ucp-keep: {directory} cannot be made: {error.strerror}") from None
+        return directory
+    raise AssertionError("numbers do not end")
+
+
+def discard(directory: Path, options: Options) -> None:
+    """Remove the directory of a run that went as expected, unless it is to be kept."""
+    if options.keep is None:
+        shutil.rmtree(directory, ignore_errors=True)

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from harness.errors import ScenarioError
 from harness.play import mission
-from harness.play.growing_timeline import INSTANT_S, GrowingTimeline
+from harness.play.interventions import INSTANT_S, GrowingTimeline
 from harness.play.mission import RunOutcome, Sought
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of

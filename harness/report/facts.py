@@ -1,11 +1,14 @@
-"""What the page and report.md both say of a run: what was asked, how it ended, and its figures."""
+"""Facts of a run that the page and report.md share: settings, end, figures, gaps in captures."""
+
+from collections.abc import Mapping
 
 from harness.archive.exports import Exports
-from harness.archive.run_record import RunRecord
+from harness.archive.run_record import CapturedFrames, RunRecord
 from harness.play.backends import in_virtual_time
 from harness.present import text
 from harness.report.agent_programs import programs
-from harness.scenario.quirks import in_words
+from harness.report.chain_tree import ranges
+from harness.scenario.agent_options import in_words
 from sitl.vehicle import VehicleType
 
 FIGURES = {
@@ -72,3 +75,14 @@ def outcome(record: RunRecord) -> tuple[str, str] | None:
 def figures(record: RunRecord) -> list[tuple[str, str]]:
     """Labels and values."""
     return [(FIGURES.get(key, text.label(key)), text.value(figure)) for key, figure in record.figures.items()]
+
+
+def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
+    """A sentence of what the captures of these vehicles lack, if they lack anything."""
+    lacking = sorted(int(vehicle) for vehicle, frames in captured.items() if frames.dropped)
+    if not lacking:
+        return None
+    dropped = sum(frames.dropped for frames in captured.values())
+    received = sum(frames.received for frames in captured.values())
+    whose = f"vehicle{'s' if len(lacking) > 1 else ''} {', '.join(ranges(lacking))}"
+    return f"the capture lacks {dropped} of {received} frames, of {whose}: this machine was too slow to keep up"

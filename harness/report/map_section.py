@@ -10,8 +10,7 @@ from harness.archive.tracks import Tracks
 from harness.present import text
 from harness.present.colours import Ink
 from harness.report import map_svg
-from harness.report.map_geometry import Extent, extent
-from harness.report.map_parts import MAX_STRETCHES, Division, Life, divisions, letter, lives, longest
+from harness.report.map_parts import MAX_STRETCHES, Division, Extent, Life, divisions, extent, letter, lives, longest
 from harness.scenario.changes import RANGE
 from sitl.vehicle import VehicleType
 

@@ -12,7 +12,7 @@ from harness.archive.run_record import RunRecord
 from harness.archive.traces import Trace
 from harness.errors import RunDirectoryError
 from harness.present.colours import Ink
-from harness.report import capture_gaps, swarm_section
+from harness.report import facts, swarm_section
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ReportSource:
         return [
             *map(self.archive.within, problems),
             *self.network.problems,
-            *filter(None, [capture_gaps.gaps(self.record.capture or {})]),
+            *filter(None, [facts.gaps(self.record.capture or {})]),
         ]
 
 

@@ -7,9 +7,8 @@ from harness.errors import RunDirectoryError
 from harness.gc_pause import gc_paused
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.report_source import ReportSource, read_source
-from harness.report.run_junit import to_junit
-from harness.report.run_markdown import to_markdown
 from harness.report.run_page import draw
+from harness.report.run_summary import to_junit, to_markdown
 from ucp.agent_files import write_atomically
 
 

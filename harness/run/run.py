@@ -1,10 +1,11 @@
-"""One run from scenario to verdict: play it, check what it left, write the record and the report."""
+"""One run from scenario to verdict: play, check, write the record, the report and the file that replays it."""
 
 import asyncio
 import platform
 import signal
 import sys
 import time
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -28,10 +29,29 @@ from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import Progress
 from harness.play.request_socket import listening
-from harness.run.replay_file import REPLAY_FILE, replay_of
 from harness.scenario import Scenario
+from harness.scenario.scenario_file import to_yaml
 from netem import uml
 from ucp.agent_files import write_atomically
+
+REPLAY_FILE = "replay.yaml"
+
+
+def replay_of(scenario: Scenario, by_hand_s: Collection[float], seed: int | None, backend: BackendName | None) -> str:
+    """The file; `by_hand_s` are the seconds of the timeline's entries that were asked for by hand."""
+    document = scenario.model_dump(mode="json", exclude_defaults=True)
+    timeline = [{"at_s": entry["at_s"], **entry} for entry in document["timeline"]]
+    document["timeline"] = sorted(timeline, key=lambda entry: entry["at_s"])
+
+    def remark(entry: dict[str, Any]) -> str | None:
+        return "by hand" if entry.get("at_s") in by_hand_s else None
+
+    comment = [
+        "What a run has come to, with what was asked for by hand while it went on. To play it again:",
+        f"    ucp-harness run {REPLAY_FILE} --backend {backend} --seed {seed}",
+    ]
+    return to_yaml(document, comment, remark)
+
 
 PACKAGES = ("ucp-harness", "pymavlink")
 

@@ -13,8 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from harness.scenario.numbered import Arrivals
-from harness.scenario.strict_model import Instant, Model, VehicleId
+from harness.scenario.strict_model import Arrivals, Instant, Model, VehicleId
 
 MessageName = Literal[
     "Block Add Request",

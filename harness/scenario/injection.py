@@ -1,4 +1,4 @@
-"""Injections: what a rogue node on the air sends into the mission, in the names of agents that never sent it.
+"""Injections and stray datagrams: what a scenario sends that none of its agents sent.
 
 timeline:
   - {at_s: 100, replay: {message: Commit Block, sender: 2, count: 3}}
@@ -13,6 +13,9 @@ timeline:
 `message` and `sender` that are left out mean any. The rogue hears everything that agents send, and everybody hears the
 rogue, whatever keeps agents apart. It adds to what is on the air and can take nothing away: an original that it delays,
 corrupts or forges an answer to arrives as well.
+
+datagrams:
+  - {source: 32, datagram: VUMBBQ..., reaches: {10: 812.3, 28: 812.31}}
 """
 
 from typing import Annotated, ClassVar, Literal
@@ -20,7 +23,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from harness.scenario.fates import MessageName
-from harness.scenario.strict_model import Instant, Model, Seconds, VehicleId
+from harness.scenario.strict_model import Data, Instant, Model, Seconds, VehicleId, VehicleKey
 
 InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie"]
 INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie")
@@ -216,3 +219,18 @@ MODELS: dict[str, type[Injection]] = {
     "flood": Flood,
     "lie": Lie,
 }
+
+
+MAX_CHARACTERS = 4 * (65536 // 3 + 1)
+"""What the largest datagram that UDP has is in base64."""
+
+
+class ScriptedDatagram(Model):
+    """`datagram`, in base64, under the address of vehicle `source`, `reaches` these agents at these mission seconds.
+
+    Nothing else becomes of it: no loss, no partition.
+    """
+
+    source: VehicleId
+    datagram: Annotated[Data, Field(max_length=MAX_CHARACTERS)]
+    reaches: Annotated[dict[VehicleKey, Instant], Field(min_length=1)]

@@ -1,4 +1,4 @@
-"""From a file to a scenario (or to whatever else is YAML), and from what pydantic found to a sentence for a person."""
+"""Load a scenario from a file or from the library, and explain validation errors in one sentence."""
 
 import stat
 from collections.abc import Hashable, Iterator
@@ -10,9 +10,37 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from harness.errors import ScenarioError
-from harness.scenario import library
 from harness.scenario.scenario import Scenario
 from ucp.short_value import shown, shown_key
+
+_PACKAGE = Path(__file__).parents[1]
+_INSIDE = _PACKAGE / "scenarios"
+FOLDER = _INSIDE if _INSIDE.is_dir() else _PACKAGE.parent / "scenarios"
+"""In an installed package inside of it; in a checkout beside it. Who copied the package alone has none."""
+
+
+def names() -> list[str]:
+    """All of them, in alphabetical order."""
+    return sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+def find(path: Path) -> Path:
+    """The file that comes along by this name, if it is such a name and no file; else what was given."""
+    named = f"{path}.yaml"
+    if len(path.parts) != 1 or not FOLDER.is_dir() or named not in (scenario.name for scenario in FOLDER.iterdir()):
+        return path
+    return path if path.exists() else FOLDER / named
+
+
+def opening(name: str) -> str:
+    """The sentence that its file begins with."""
+    comment = []
+    for line in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        comment.append(line.removeprefix("#").strip())
+    return " ".join(comment).partition(". ")[0].removesuffix(".") + "."
+
 
 MAX_PROBLEM = 200
 """More of what is wrong with a file is not shown."""
@@ -27,7 +55,7 @@ def load_scenario(path: Path) -> Scenario:
     if "scenario" in document:
         raise ScenarioError(f"{path}: this is a matrix, which `ucp-harness matrix {path}` plays")
     try:
-        return parse(document, beside=library.find(path).parent)
+        return parse(document, beside=find(path).parent)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
 
@@ -81,7 +109,7 @@ def parse_yaml(text: str) -> Any:
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
     """The mapping in a YAML file that should be a `what`, or comes along by that name. Raises ScenarioError."""
-    path = library.find(path)
+    path = find(path)
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):

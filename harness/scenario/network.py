@@ -1,4 +1,4 @@
-"""The air of a scenario: what happens to messages on the way from one vehicle to another.
+"""The network of a scenario: loss, delay, partitions, and the radio's loss over distance.
 
 Three layers: the network, receivers that differ from it, links that differ from their receiver. A layer changes
 the keys that it names. What the values mean, and which go together, `netem.conditions` says; here is how they are
@@ -11,11 +11,60 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
-from harness.scenario.radio_model import RadioModel
 from harness.scenario.strict_model import MAX_AGENTS, Model, Probability, VehicleId, VehicleKey
+from netem import radio
 from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
 from netem.errors import ConditionsError
 from netem.link import MAX_DELAY_S, MAX_LIMIT
+
+
+class HardRange(Model):
+    """Whoever is within `range_m` hears everything, whoever is not hears nothing."""
+
+    range_m: float = radio.HardRange.range_m
+
+    @model_validator(mode="after")
+    def _means_something(self) -> "HardRange":
+        radio.HardRange(self.range_m)
+        return self
+
+
+class LogDistance(Model):
+    """Log-distance path loss with shadowing; `netem.radio.LogDistance` says what the figures are and where from."""
+
+    exponent: float = radio.LogDistance.exponent
+    shadowing_db: float = radio.LogDistance.shadowing_db
+    power_dbm: float = radio.LogDistance.power_dbm
+    sensitivity_dbm: float = radio.LogDistance.sensitivity_dbm
+    frequency_hz: float = radio.LogDistance.frequency_hz
+
+    @model_validator(mode="after")
+    def _means_something(self) -> "LogDistance":
+        radio.LogDistance(**self.model_dump())
+        return self
+
+
+class RadioModel(Model):
+    """One of `hard_range` and `log_distance`.
+
+    Every `update_s` mission seconds conditions follow the vehicles; as processes, at most ten times a second.
+    """
+
+    hard_range: HardRange | None = None
+    log_distance: LogDistance | None = None
+    update_s: Annotated[float, Field(ge=0.1, le=60)] = 1.0
+
+    def radio(self) -> radio.Radio:
+        if self.hard_range is not None:
+            return radio.HardRange(self.hard_range.range_m)
+        assert self.log_distance is not None
+        return radio.LogDistance(**self.log_distance.model_dump())
+
+    @model_validator(mode="after")
+    def _one_model(self) -> "RadioModel":
+        if (self.hard_range is None) == (self.log_distance is None):
+            raise ValueError("needs one of `hard_range` and `log_distance`")
+        return self
 
 
 class Bursts(Model):

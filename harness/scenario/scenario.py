@@ -7,26 +7,29 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
-from harness.scenario.agent_command import AgentCommand
+from harness.scenario.agent_options import (
+    AgentCommand,
+    AskedQuirks,
+    Events,
+    OfSome,
+    Security,
+    Stagger,
+    of_agent,
+    staggered,
+)
+from harness.scenario.agent_options import check as check_quirks
 from harness.scenario.docker import Docker
-from harness.scenario.event_source import Events
 from harness.scenario.expect import Expect
 from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from harness.scenario.faults.fault import KILLED, RUNNING
-from harness.scenario.flight import Flight
+from harness.scenario.injection import ScriptedDatagram
 from harness.scenario.network import NetworkModel
 from harness.scenario.network_states import Step, refuse_ambiguity, steps
-from harness.scenario.numbered import Lateness
-from harness.scenario.quirks import AskedQuirks, OfSome, of_agent
-from harness.scenario.quirks import check as check_quirks
 from harness.scenario.schedule import NEEDED, Schedule
-from harness.scenario.security import Security
-from harness.scenario.stagger import Stagger, staggered
-from harness.scenario.stray_datagrams import ScriptedDatagram
-from harness.scenario.strict_model import MAX_AGENTS, Data, Model, Seconds, VehicleKey
+from harness.scenario.strict_model import MAX_AGENTS, Data, Lateness, Model, Seconds, VehicleKey
 from harness.scenario.timeline import TimelineEntry
-from harness.scenario.vehicles import Vehicles
+from harness.scenario.vehicles import Flight, Vehicles
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError
 from sitl.address import Address

@@ -12,8 +12,8 @@ from pydantic import BaseModel
 from harness.archive.exports import Export
 from harness.archive.packets.packets_document import PacketsRecord
 from harness.archive.run_record import RunRecord
-from harness.field.adapters.import_record import ImportRecord
-from harness.field.depot.manifest import Manifest
+from harness.field.adapters.written_records import ImportRecord
+from harness.field.depot.mission_files import Manifest
 from harness.field.depot.record_lines import ConsolidatedLine
 from harness.field.replay.replay_document import ReplayDocument
 from harness.scenario import Scenario

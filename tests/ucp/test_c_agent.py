@@ -14,8 +14,7 @@ import pytest
 
 import ucp
 from harness.conformance.state_space import VARIANTS, explore
-from harness.conformance.vector_file import to_lines
-from harness.conformance.vectors import Vectors
+from harness.conformance.vectors import Vectors, to_lines
 from harness.play.progress import Silent
 from harness.run.run import run
 from harness.run.simulate import simulate

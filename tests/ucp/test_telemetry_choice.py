@@ -13,7 +13,7 @@ import pytest
 from harness.archive.exports import read_export
 from harness.errors import ScenarioError
 from harness.scenario import load_scenario
-from harness.scenario.event_source import Events
+from harness.scenario.agent_options import Events
 from tests.ucp.test_node import AgentUnderTest, mission
 from tests.ucp.test_telemetry import frames, heartbeat, text
 from ucp.events import decode_events

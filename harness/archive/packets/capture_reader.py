@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import BaseModel, Field, ValidationError
 
 from harness.archive.exports import AgentId
-from harness.archive.packets.datagram import NotUcpError, unwrap
-from harness.archive.packets.message_summary import MessageSummary, summarize
+from harness.archive.packets.datagram import MessageSummary, NotUcpError, summarize, unwrap
 from harness.archive.packets.pcap import INBOUND, OUTBOUND, CaptureFile, Frame
 from ucp.block import MAX_AGENT_ID
 from ucp.messages import TYPE_CODES, MalformedDatagramError, decode

@@ -1,11 +1,11 @@
-"""Which response answers which request, and what became of each request at each vehicle.
+"""Requests with their responses, and the losses between each two vehicles.
 
 Responses are broadcast and do not name the asker. But an agent answers what reaches it at once or never, and in order:
 so, from the last response back to the first, each answers the last request on its subject that reached the responder
 before it, and that no later response answers.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 from harness.archive.packets.capture_reader import Name
@@ -78,3 +78,40 @@ def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission
                 waiting.pop()
             if waiting:
                 yield transmissions[waiting.pop()[1]], response
+
+
+class Pair(NamedTuple):
+    """Of `sent` datagrams that the receiver should have heard, `lost` never reached it."""
+
+    sender: int
+    receiver: Name
+    sent: int
+    lost: int
+
+
+def count_losses(transmissions: Iterable[Transmission]) -> list[Pair]:
+    """All pairs, by sender and receiver. What somebody forged is no agent's loss."""
+    sent: dict[tuple[int, Name], int] = {}
+    lost: dict[tuple[int, Name], int] = {}
+    for transmission in transmissions:
+        if transmission.origin == "forged":
+            continue
+        for receiver in (*transmission.reached, *transmission.lost_by):
+            sent[transmission.sender, receiver] = sent.get((transmission.sender, receiver), 0) + 1
+        for receiver in transmission.lost_by:
+            lost[transmission.sender, receiver] = lost.get((transmission.sender, receiver), 0) + 1
+    pairs = (
+        Pair(sender, receiver, count, lost.get((sender, receiver), 0)) for (sender, receiver), count in sent.items()
+    )
+    return sorted(pairs, key=lambda pair: (pair.sender, isinstance(pair.receiver, str), pair.receiver))
+
+
+def matrix(pairs: list[Pair]) -> Iterator[str]:
+    """A row for each sender, a column for each receiver: lost/sent."""
+    receivers = sorted({pair.receiver for pair in pairs}, key=lambda name: (isinstance(name, str), name))
+    cells = {(pair.sender, pair.receiver): f"{pair.lost}/{pair.sent}" for pair in pairs}
+    width = max(map(len, [*cells.values(), *map(str, receivers)]), default=0)
+    yield "lost/sent, from (down) to (across)"
+    yield " ".join([" " * 6, *(f"{receiver:>{width}}" for receiver in receivers)])
+    for sender in sorted({pair.sender for pair in pairs}):
+        yield " ".join([f"{sender:>6}", *(f"{cells.get((sender, receiver), '-'):>{width}}" for receiver in receivers)])

@@ -9,8 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from harness.archive.packets.air_names import Names
 from harness.archive.packets.capture_files import Captures, Clock
 from harness.archive.packets.capture_reader import Capture, Name
-from harness.archive.packets.exchanges import Exchanges, Outcome
-from harness.archive.packets.loss_table import Pair
+from harness.archive.packets.exchanges import Exchanges, Outcome, Pair
 from harness.archive.packets.transmissions import Origin, Transmission
 
 SCHEMA = "ucp-packets/1"

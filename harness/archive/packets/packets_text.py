@@ -4,11 +4,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from harness.archive.packets.air_names import Names
-from harness.archive.packets.block_story import Chapter, carried_to
 from harness.archive.packets.capture_files import Captures
 from harness.archive.packets.capture_reader import Name
+from harness.archive.packets.datagram import MessageSummary
 from harness.archive.packets.exchanges import Answer, Exchanges, Outcome
-from harness.archive.packets.message_summary import MessageSummary
+from harness.archive.packets.selection import Chapter, carried_to
 from harness.archive.packets.transmissions import Transmission
 from harness.present.text import moment
 from ucp.messages import (

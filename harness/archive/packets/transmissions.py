@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 from harness.archive.packets.capture_files import Captures, Clock
 from harness.archive.packets.capture_reader import Capture, Datagram, Name
-from harness.archive.packets.message_summary import MessageSummary
+from harness.archive.packets.datagram import MessageSummary
 from harness.archive.packets.pcap import OUTBOUND
 
 Origin = Literal["captured", "inferred", "forged"]

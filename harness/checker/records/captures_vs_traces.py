@@ -10,8 +10,7 @@ from harness.archive.packets.capture_files import Captures
 from harness.archive.packets.pcap import INBOUND, OUTBOUND
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import times
-from harness.checker.records.clock_tolerance import slack_s
-from harness.checker.records.contradiction import Contradiction, of_agent
+from harness.checker.records.contradiction import Contradiction, of_agent, slack_s
 
 COUNTS_DATAGRAMS = "nftables"
 """The engine whose counters are of what was broadcast; others also count what they doubled."""

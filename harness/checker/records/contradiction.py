@@ -1,8 +1,11 @@
-"""What two records tell of the same thing and does not agree."""
+"""A contradiction between two records, and the tolerance for their clocks."""
 
 from dataclasses import dataclass
 
+from harness.archive.traces import Header, Trace
 from harness.checker.judgement import Finding
+from harness.checker.waiting import SLACK_WALL_S
+from ucp.clock import MICROSECONDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,3 +23,30 @@ class Contradiction:
 def of_agent(agent_id: int, detail: str, touches: str | None = None, *, short: bool = False) -> Contradiction:
     """One that is about no block."""
     return Contradiction(Finding(agent_id, detail), touches, short)
+
+
+ROUNDED_S = 2e-6
+"""Traces have microseconds."""
+
+
+def in_virtual_time(trace: Trace) -> bool:
+    """Where mission second 0 is the Unix epoch."""
+    return trace.header.clock.get("epoch_us") == 0
+
+
+def slack_s(trace: Trace) -> float:
+    """Two processes on one machine do not start their clocks in the same instant; virtual time has one clock."""
+    speedup = trace.header.clock.get("speedup")
+    if in_virtual_time(trace) or not isinstance(speedup, int | float):
+        return ROUNDED_S
+    return SLACK_WALL_S * speedup
+
+
+def mission_s(timestamp_us: int, header: Header) -> float | None:
+    """When the agent's clock showed this; None if its header does not tell."""
+    clock = header.clock
+    told = [clock.get("epoch_us"), clock.get("offset_s", 0), clock.get("drift", 0)]
+    epoch_us, offset_s, drift = (float(part) if isinstance(part, int | float) else None for part in told)
+    if epoch_us is None or offset_s is None or drift is None or drift <= -1:
+        return None
+    return ((timestamp_us - epoch_us) / MICROSECONDS - offset_s) / (1 + drift)

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from harness.archive.run_record import AgentRecord, HandlerRuns
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
-from harness.checker.records.clock_tolerance import in_virtual_time, slack_s
-from harness.checker.records.contradiction import Contradiction, of_agent
+from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
 from harness.checker.trace_replay import Life
 from ucp.messages import Datagram, datagram_bytes
 from ucp.secure.envelope import ADDED_BYTES

@@ -11,8 +11,7 @@ from dataclasses import astuple
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
-from harness.checker.records.clock_tolerance import ROUNDED_S, mission_s
-from harness.checker.records.contradiction import Contradiction, of_agent
+from harness.checker.records.contradiction import ROUNDED_S, Contradiction, mission_s, of_agent
 from harness.checker.trace_replay import Life
 from ucp.trace import StateSummary
 

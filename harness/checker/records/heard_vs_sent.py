@@ -3,8 +3,7 @@
 from collections.abc import Iterator
 
 from harness.checker.evidence import Evidence, Sending
-from harness.checker.records.clock_tolerance import slack_s
-from harness.checker.records.contradiction import Contradiction
+from harness.checker.records.contradiction import Contradiction, slack_s
 from harness.checker.records.trace_consistency import finding
 from harness.checker.trace_replay import Sight
 from ucp.messages import BlockResponse, CommitBlock

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
-from harness.checker.records.clock_tolerance import slack_s
-from harness.checker.records.contradiction import Contradiction
+from harness.checker.records.contradiction import Contradiction, slack_s
 from harness.checker.trace_replay import Life, Sight
 
 

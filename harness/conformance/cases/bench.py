@@ -11,7 +11,7 @@ from typing import Any
 
 from harness.conformance.reference_model import AGENT, EVENT_ID, INITIAL_DATA
 from harness.conformance.state_space import VARIANTS
-from harness.conformance.subject_mission import NO_KEYS
+from harness.conformance.subject import NO_KEYS
 from harness.conformance.udp_lab import AgentEndedError, Air, Ear, Process
 from ucp.block import InceptionBlock
 from ucp.clock import MICROSECONDS

@@ -11,7 +11,7 @@ from typing import Any
 from harness.conformance.cases.bench import INCEPTION, PATIENCE_S, SPEEDUP, Alone, Bench, WrongError, case, must
 from harness.conformance.reference_model import PEERS
 from harness.conformance.state_space import VARIANTS
-from harness.conformance.subject_mission import NO_KEYS
+from harness.conformance.subject import NO_KEYS
 from harness.conformance.udp_lab import UNSUPPORTED, last_line
 from harness.play.agent_control import AgentRefusedError
 from ucp.messages import ChainContainQuery

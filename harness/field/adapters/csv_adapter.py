@@ -23,15 +23,7 @@ from pathlib import Path
 
 from harness.archive.bounded_file import Opened
 from harness.archive.traces import MAX_LINE_BYTES
-from harness.field.adapters.adapter import (
-    Adapter,
-    ChainExport,
-    Datagram,
-    LoggedEvent,
-    Observation,
-    TraceLine,
-    Unusable,
-)
+from harness.field.adapters.adapter import Adapter, ChainExport, Datagram, LoggedEvent, Observation, TraceLine, Unusable
 from ucp.block import MAX_AGENT_ID
 
 COLUMNS = ("time_s", "agent", "kind", "event", "data")

@@ -22,9 +22,8 @@ from harness.field.adapters.adapter import (
     TraceLine,
     Unusable,
 )
-from harness.field.adapters.import_record import ImportRecord
-from harness.field.adapters.written_records import write_import
-from harness.field.ingest.capture_owner import glance
+from harness.field.adapters.written_records import ImportRecord, write_import
+from harness.field.ingest.file_owners import glance
 from harness.field.ingest.file_search import files_of
 from harness.field.ingest.ingest import LeftOut
 from harness.field.ingest.sorting import Sorter

@@ -24,22 +24,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from harness.errors import MachineError
-from harness.field.adapters.adapter import (
-    Adapter,
-    ChainExport,
-    Datagram,
-    LoggedEvent,
-    Observation,
-    TraceLine,
-    Unusable,
-)
+from harness.field.adapters.adapter import Adapter, ChainExport, Datagram, LoggedEvent, Observation, TraceLine, Unusable
 from harness.field.adapters.bags import (
     MAGICS,
     BagMessage,
     messages,
 )
-from harness.field.adapters.bags.bag_message import Broken
-from harness.field.adapters.bags.decompression import message_data
+from harness.field.adapters.bags.decompression import Broken, message_data
 
 METADATA = "metadata.yaml"
 _METADATA_BEGINS = b"rosbag2_bagfile_information"

@@ -6,7 +6,7 @@ from pathlib import Path
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE
 from harness.errors import ScenarioError
-from harness.scenario import Scenario, library, load_scenario
+from harness.scenario import Scenario, load, load_scenario
 from harness.scenario.load import MAX_SCENARIO_BYTES
 
 YAML = (".yaml", ".yml")
@@ -35,7 +35,7 @@ def subject_of(path: Path, seed: int | None, agent: int | None) -> Subject:
 
     Raises HarnessError.
     """
-    path = library.find(path)
+    path = load.find(path)
     if path.suffix in YAML or (path.is_file() and _is_scenario(path)):
         scenario = load_scenario(path)
         own = scenario.expect.seeds[0] if scenario.expect else 1

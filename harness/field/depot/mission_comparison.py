@@ -22,7 +22,7 @@ from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
 from harness.archive.traces import HEADER, MAX_LINE_BYTES
 from harness.archive.traces import SUFFIX as TRACE_SUFFIX
 from harness.errors import ExportError, HarnessError, RunDirectoryError
-from harness.field.depot.manifest import FILE, Manifest, fingerprint
+from harness.field.depot.mission_files import FILE, Manifest, fingerprint
 from harness.field.depot.mission_files import SUFFIX as MISSION_SUFFIX
 from harness.report.chain_tree import ranges
 from ucp.block import InceptionBlock

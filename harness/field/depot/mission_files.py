@@ -1,27 +1,78 @@
-"""Makes the mission files of a roster, one for each vehicle, with the inception block that all of them share.
+"""The mission files of a roster, and their manifest (`ucp-mission-manifest/1`).
 
 They are what a run gives its agents (`harness.play.process.agent_mission`), but for what a flight has otherwise: time
 passes as it does, no mistake is asked for, every vehicle has an address of its own choosing, and keeps a store, so that
 a brown-out loses nothing. Each is read by the agent's own reader before it is written.
 """
 
+import hashlib
 import ipaddress
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.archive.exports import AgentId, Hash
 from harness.errors import HarnessError, MachineError, RunDirectoryError
-from harness.field.depot.manifest import FILE, Manifest, ManifestInception, fingerprint
 from harness.play.process.agent_mission import NO_QUIRKS, mission_file
 from harness.scenario import Scenario
+from harness.scenario.strict_model import VehicleKey
 from netem.addresses import BROADCAST, address
 from ucp.agent_files import write_json_atomically
-from ucp.block import MAX_EVENT_DATA_BYTES, hash_digest
+from ucp.block import MAX_EVENT_DATA_BYTES, InceptionBlock, hash_digest
 from ucp.features import needed
 from ucp.messages import PORT
 from ucp.mission import MAX_INITIAL_DATA_BYTES, Mission, MissionError, parse_mission
 from ucp.sealed import SEAL_BYTES, sealed_to
+from ucp.settings import Settings
+
+FILE = "manifest.json"
+EXACT = 2**53
+"""Whole numbers up to here are floats as well."""
+
+
+class ManifestInception(BaseModel):
+    """BH_0 and CH_0 (eq. 3.3 and 3.4)."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    block_hash: Hash
+    chain_hash: Hash
+
+    @classmethod
+    def of(cls, initial_data: bytes) -> "ManifestInception":
+        inception = InceptionBlock(initial_data)
+        return cls(block_hash=inception.block_hash.hex(), chain_hash=inception.chain_hash.hex())
+
+
+class Manifest(BaseModel):
+    """`files` are the mission files by agent ID, beside the manifest; `settings_sha256` is `fingerprint`'s."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    schema_: Annotated[Literal["ucp-mission-manifest/1"], Field(alias="schema")] = "ucp-mission-manifest/1"
+    name: str
+    roster: list[AgentId]
+    inception: ManifestInception
+    settings_sha256: Hash
+    broadcast: str
+    port: Annotated[int, Field(ge=1, le=65535)]
+    files: dict[VehicleKey, str]
+
+    def to_json(self) -> dict[str, Any]:
+        return self.model_dump(mode="json", by_alias=True)
+
+
+def fingerprint(settings: Settings) -> str:
+    """SHA-256 of the settings as JSON: keys in order, no spaces, and 10 written as 10.0 is."""
+    known = {
+        name: float(value) if type(value) is int and value < EXACT else value for name, value in settings.told().items()
+    }
+    return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
 
 SUFFIX = ".mission.json"
 

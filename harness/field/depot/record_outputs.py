@@ -1,13 +1,17 @@
-"""The consolidated record as others read it: lines (`harness.field.depot.record_lines`), a table, and tracks for
-maps."""
+"""The consolidated record as files, and its summary in sentences.
+
+maps.
+"""
 
 import csv
 import io
 from binascii import b2a_base64
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 
 from harness.field.depot.consolidation import BlockOnRecord, Consolidation, events_in
-from harness.field.depot.record_lines import Line, Reconciled
+from harness.field.depot.record_lines import Fork, Line, Lost, Reconciled, Way
+from harness.report.chain_tree import ranges
 from harness.report.logbook.positions import LAST_TIMESTAMP_US, Track, track_of, utc
 from ucp.events import LoggableEvent
 from ucp.telemetry import describe, position_of
@@ -77,3 +81,114 @@ def tracks(record: Consolidation) -> list[Track]:
         logged.setdefault(block.line.agent_id, []).extend((event, name) for event in block.events)
     made = (track_of(agent_id, logged[agent_id]) for agent_id in sorted(logged))
     return [track for track in made if track.fixes]
+
+
+FORKS_TOLD = 5
+NAMES_TOLD = 8
+
+
+def in_words(record: Consolidation, reconciled: Reconciled | None = None, *, opened: bool = False) -> Iterator[str]:
+    """What came home, where chains part, what one vehicle alone has, what was lost, and what a reconcile made of it.
+
+    `opened`: the depot's key was there.
+    """
+    header = record.header
+    home = sorted(record.home.latest)
+    of_all = (
+        f"{len(home)} of {len(header.roster)} vehicles" if len(home) < len(header.roster) else _count(home, "vehicle")
+    )
+    building = sum(block.line.events for block in record.unfinished)
+    being_built = f", of which {building} in blocks that were being built" if building else ""
+    blocks = header.blocks - len(record.unfinished)
+    events = "1 event" if header.events == 1 else f"{header.events} events"
+    yield f"{of_all} came home ({agents(home)}), with {_blocks(blocks)} and {events}{being_built}"
+    if header.distinct_chains == 1:
+        whose = "all have one chain" if len(home) > 1 else "it has a chain"
+        yield f"{whose} of {_blocks(header.mutual_chain)}"
+    else:
+        yield (
+            f"{header.distinct_chains} distinct chains: the mutual chain has {_blocks(header.mutual_chain)}, "
+            f"the longest {header.longest_chain}"
+        )
+    if sealed := sum(block.line.sealed for block in record.blocks):
+        closed = _blocks(sealed)
+        yield (
+            f"{closed} not opened by this key: not sealed by the agent that it names, or damaged"
+            if opened
+            else f"{closed} sealed to the depot: --depot-key, with the key of this mission's, opens what it can"
+        )
+    yield from map(fork_in_words, record.forks[:FORKS_TOLD])
+    if len(record.forks) > FORKS_TOLD:
+        yield f"and they part at {len(record.forks) - FORKS_TOLD} more places"
+    yield from _rare(record)
+    yield from lost_in_words(record.lost_blocks)
+    yield from (missing.why for missing in record.missing)
+    if reconciled is not None:
+        yield from reconciled_in_words(reconciled)
+
+
+def fork_in_words(fork: Fork) -> str:
+    where = f"after {_blocks(fork.height)}, at {fork.after}" if fork.after else "at the inception block"
+    return f"chains part {where}: {'; '.join(map(way_in_words, fork.ways))}"
+
+
+def way_in_words(way: Way) -> str:
+    alone = len(way.agents) == 1
+    if way.next is None:
+        return f"{agents(way.agents)} end{'s' if alone else ''}"
+    return f"{agents(way.agents)} go{'es' if alone else ''} on with {way.next}"
+
+
+def lost_in_words(lost: Sequence[Lost]) -> Iterator[str]:
+    """A sentence for each agent whose blocks were lost for the same reason."""
+    by_reason: dict[str, list[Lost]] = {}
+    for each in lost:
+        by_reason.setdefault(each.why, []).append(each)
+    for why, alike in by_reason.items():
+        names = [each.block or "" for each in alike]
+        yield f"lost: {'block' if len(names) == 1 else f'{len(names)} blocks,'} {_few(names)}: {why}"
+
+
+def reconciled_in_words(reconciled: Reconciled) -> Iterator[str]:
+    vehicles = reconciled.vehicles
+    rounds = "1 round" if reconciled.rounds == 1 else f"{reconciled.rounds} rounds"
+    if reconciled.uniform:
+        yield f"reconciled in {rounds}: one chain of {_blocks(len(reconciled.chain))} on {_count(vehicles, 'vehicle')}"
+    else:
+        chains = Counter(vehicle.top_chain_hash for vehicle in vehicles)
+        yield f"reconciled in {rounds}: the chains did not become one, there are {len(chains)} of them"
+    gains = [f"{vehicle.agent_id} gained {len(vehicle.gained)}" for vehicle in vehicles if vehicle.gained]
+    if gains:
+        yield f"blocks that vehicles have now and had not: {', '.join(gains)}"
+    if reconciled.left_out:
+        yield f"not in all chains: {_few(reconciled.left_out)}"
+
+
+def agents(ids: Sequence[int]) -> str:
+    return ", ".join(ranges([*ids]))
+
+
+def _rare(record: Consolidation) -> Iterator[str]:
+    """What the next loss would have taken."""
+    if len(record.home.latest) < 2:
+        return
+    alone: dict[int, list[str]] = {}
+    for block in record.blocks:
+        holders = block.line.holders
+        if len(holders) == 1:
+            alone.setdefault(holders[0], []).append(block.line.name)
+    for agent_id, names in sorted(alone.items()):
+        yield f"{_blocks(len(names))} {'is' if len(names) == 1 else 'are'} with vehicle {agent_id} only: {_few(names)}"
+
+
+def _blocks(number: int) -> str:
+    return "1 block" if number == 1 else f"{number} blocks"
+
+
+def _few(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMES_TOLD} more" if len(names) > NAMES_TOLD else ""
+    return ", ".join(names[:NAMES_TOLD]) + more
+
+
+def _count(things: Sequence[object], what: str) -> str:
+    return f"1 {what}" if len(things) == 1 else f"{len(things)} {what}s"

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from harness.archive.exports import Export
 from harness.archive.traces import Header, Trace
-from harness.field.ingest.capture_owner import Glance
 from harness.field.ingest.copies import told_apart
+from harness.field.ingest.file_owners import Glance
 from harness.field.ingest.ingest import Flight, LeftOut, Remark
 from harness.field.ingest.trace_incarnations import Life
 from ucp.block import InceptionBlock

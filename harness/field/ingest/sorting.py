@@ -9,9 +9,8 @@ from harness.archive.bounded_file import Opened
 from harness.archive.exports import MAX_EXPORT_BYTES, Export, export_of, not_json
 from harness.archive.packets.pcap import MAGICS
 from harness.errors import CaptureError, ExportError
-from harness.field.ingest.capture_owner import Glance, glance
+from harness.field.ingest.file_owners import PUBLIC_SCHEMA, Glance, give_keys, glance, read_public_keys
 from harness.field.ingest.file_search import files_of
-from harness.field.ingest.flight_keys import PUBLIC_SCHEMA, give_keys, read_public_keys
 from harness.field.ingest.flights import put_together
 from harness.field.ingest.ingest import Homecoming, LeftOut, Remark
 from harness.field.ingest.logged_events import read_logged

@@ -14,7 +14,6 @@ comparing   what virtual time did, beside what is on record
 file        the scenario as a file
 """
 
-from harness.field.reconstruct.reconstruct import Reconstruction, reconstruct
-from harness.field.reconstruct.reconstruction_file import write
+from harness.field.reconstruct.reconstruct import Reconstruction, reconstruct, write
 
 __all__ = ["Reconstruction", "reconstruct", "write"]

@@ -1,12 +1,14 @@
-"""From what came home to a scenario that flies it again, and whether it does."""
+"""Reconstruct a flight as a scenario, write it, and check that it replays."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from harness.archive.exports import Export
 from harness.checker.judgement import agents
-from harness.errors import FieldError
+from harness.errors import FieldError, MachineError
 from harness.field.ingest import Flight
 from harness.field.reconstruct.comparing import FirstDifference, first_difference
 from harness.field.reconstruct.known_mission import NOTHING, told
@@ -17,7 +19,7 @@ from harness.field.reconstruct.timetable import Timetable, timetable
 from harness.field.reconstruct.timetable_script import scenario_of
 from harness.run.simulate import InMemory, Simulated, simulate_in_memory
 from harness.scenario.load import parse
-from harness.scenario.scenario_file import Document
+from harness.scenario.scenario_file import Document, to_yaml
 from ucp.clock import MICROSECONDS
 
 if TYPE_CHECKING:
@@ -209,3 +211,29 @@ def _expected(simulated: Simulated, rehearsals: Mapping[int, Rehearsal]) -> Docu
     characteristics = {key: verdict for key, verdict in bad.items() if key.isdecimal()}
     beside = {key: verdict for key, verdict in bad.items() if not key.isdecimal()}
     return {**({"characteristics": characteristics} if characteristics else {}), **beside, "chains": chains}
+
+
+WIDTH = 116
+
+
+def write(reconstruction: Reconstruction, path: Path, sources: Sequence[Path], left_out: Sequence[str]) -> None:
+    """Raises MachineError if the file cannot be written."""
+    sentences = _sentences(reconstruction, path, sources, left_out)
+    comment = [line for sentence in sentences for line in wrap(sentence, WIDTH)]
+    try:
+        path.write_text(to_yaml(reconstruction.document, comment), encoding="utf-8")
+    except OSError as error:
+        raise MachineError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def _sentences(
+    reconstruction: Reconstruction, path: Path, sources: Sequence[Path], left_out: Sequence[str]
+) -> Iterator[str]:
+    yield f"Made by `ucp-harness reconstruct` from {', '.join(map(str, sources))}: it {reconstruction.sentence}."
+    yield from (f"- {problem}" for problem in reconstruction.problems[1:])
+    yield from (f"- {remark}" for remark in reconstruction.remarks)
+    yield from (f"- not used: {sentence}" for sentence in left_out)
+    yield "Nobody is reached but by `fates` and `datagrams`; messages that no handler does anything with are left out."
+    yield "`expect` is what happened. Where that is a mistake which is mended now, say what should happen instead."
+    yield f"  ucp-harness run {path} --backend sim --seed {SEED}"
+    yield f"  pytest {path}"

@@ -15,7 +15,7 @@ from random import Random
 from harness.checker.steps.recorded_inputs import decoded
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.field.reconstruct.agent_inputs import Asked, Booted, Heard, Input, Logged, TimerEnded
-from harness.play.simulation.late_timers import LateTimers, Running
+from harness.play.simulation.fate_script import LateTimers, Running
 from ucp.agent import Agent, why_not_handled
 from ucp.block import next_chain_hash
 from ucp.interest import MATTERS, ONLY_COUNTED

@@ -11,8 +11,8 @@ from harness.field.reconstruct.agent_inputs import Asked, Heard, Logged
 from harness.field.reconstruct.known_mission import Mission
 from harness.field.reconstruct.rehearsal import Rehearsal
 from harness.field.reconstruct.timetable import APART_S, DIGITS, Happening, Life, Timetable
-from harness.scenario.numbered import in_text
 from harness.scenario.scenario_file import Document
+from harness.scenario.strict_model import in_text
 from ucp.messages import MalformedDatagramError, decode
 from ucp.quirks import Quirks
 from ucp.settings import Settings

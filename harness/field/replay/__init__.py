@@ -3,16 +3,16 @@
 agent_record.py     what one agent's trace has to be played: its lines in order, and what lies beside it
 record_search.py    finds records in what a user names
 player.py     plays them, and goes back exactly
-known_blocks.py     blocks by hash, wherever any record has them
+replay_names.py     blocks by hash, wherever any record has them
 peer_messages.py  the messages between the agent and another, as both records have them
-clock_set.py  whether the agent's clock was set while a timer ran
+resumption.py  whether the agent's clock was set while a timer ran
 resumption.py where an agent that was lost can be followed again
 breakpoints.py     places to stop at: a line, a handler, a block
 replay_names.py      what blocks are called, from whatever record says it
-handler_source.py     where a handler's code is
-replay_summary.py    what came of a whole record, for people
+breakpoints.py     where a handler's code is
+replay_document.py    what came of a whole record, for people
 replay_document.py   the same for programs
-terminal_text.py      words for a terminal, whatever a record has for words
+../../present/text.py      words for a terminal, whatever a record has for words
 step_text.py      a step, a state and a difference, for people
 other_agents.py     what the other agents did at that moment
 prompt.py     the commands of whoever steps through it

@@ -1,7 +1,11 @@
-"""Places in a record to stop at: a line, a handler, a block, a difference."""
+"""Breakpoints in a record, and the source lines of handlers."""
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterator
 from difflib import get_close_matches
+from functools import cache
+from itertools import takewhile
+from pathlib import Path
 
 from harness.checker.steps.recorded_inputs import decoded
 from harness.errors import FieldError
@@ -64,3 +68,22 @@ def blocks_of(entry: Entry) -> set[str]:
         if about:
             hashes.add(about.hex())
     return hashes
+
+
+@cache
+def source_of(handler: str) -> str:
+    """Such as "ucp/reconcile.py:187": its first statement, where a breakpoint stops each time that it runs.
+
+    From the working directory, if the code is below that.
+    """
+    code = HANDLERS[handler].run.__code__
+    defined = code.co_firstlineno + sum(1 for line in _decorators(handler))
+    line = min(line for _, _, line in code.co_lines() if line is not None and line > defined)
+    path, working = Path(code.co_filename), Path.cwd()
+    return f"{path.relative_to(working) if path.is_relative_to(working) else path}:{line}"
+
+
+def _decorators(handler: str) -> Iterator[str]:
+    """The lines before its `def`, which run when the module is imported."""
+    lines, _ = inspect.getsourcelines(HANDLERS[handler].run)
+    return takewhile(lambda line: not line.startswith("def "), lines)

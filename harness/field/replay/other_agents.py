@@ -12,7 +12,7 @@ from harness.field.reconstruct.clock_offsets import Line, estimate
 from harness.field.replay.agent_record import Record
 from harness.field.replay.peer_messages import Exchanges
 from harness.field.replay.player import Player
-from harness.field.replay.terminal_text import shown
+from harness.present.text import shown
 from ucp.clock import MICROSECONDS
 from ucp.trace import HandlerRun
 

@@ -12,9 +12,8 @@ from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
 from harness.field.replay.agent_record import Entry, Record
-from harness.field.replay.clock_set import ClockSet
-from harness.field.replay.known_blocks import RecordedBlocks
-from harness.field.replay.resumption import Resumption
+from harness.field.replay.replay_names import RecordedBlocks
+from harness.field.replay.resumption import ClockSet, Resumption
 from ucp.agent import ON_TIMER
 from ucp.state import AgentState
 from ucp.trace import HandlerRun

@@ -9,10 +9,10 @@ from rich.text import Text
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.recorded_inputs import decoded
 from harness.field.replay.agent_record import Entry
-from harness.field.replay.handler_source import source_of
+from harness.field.replay.breakpoints import source_of
 from harness.field.replay.player import Player
 from harness.field.replay.replay_names import SHOWN, Names
-from harness.field.replay.terminal_text import shown
+from harness.present.text import shown
 from ucp.agent import HANDLERS
 from ucp.block import Block
 from ucp.events import MalformedEventsError, decode_events

@@ -23,11 +23,10 @@ import docker.errors
 
 from harness.archive.directory import RunDirectory
 from harness.play.containers import images, ownership
-from harness.play.containers.container import Container, Output
+from harness.play.containers.container import Container, Output, recipe
 from harness.play.containers.docker_engine import CLEAN, DockerError, Engine, Events
 from harness.play.containers.images import Image
-from harness.play.containers.leftovers import remove
-from harness.play.containers.recipe import recipe
+from harness.play.containers.ownership import remove
 from harness.play.process.process_preflight import network_needs
 from harness.play.process.run_lab import Role
 from harness.scenario import Scenario

@@ -1,4 +1,4 @@
-"""Whose a container is: names that people can read, and labels that `ucp-harness clean` goes by.
+"""Names and labels of containers, and the removal of containers that a run left behind.
 
 A run is its orchestrator's as long as that process lives. A process is known by its number and the moment it started,
 in one boot of this machine: numbers are used again.
@@ -7,7 +7,12 @@ in one boot of this machine: numbers are used again.
 import hashlib
 import os
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import docker.errors
+
+from harness.play.containers.docker_engine import DockerError, Engine
 
 RUN = "ucp-harness.run.run"
 VEHICLE = "ucp-harness.vehicle"
@@ -55,3 +60,33 @@ def _started(pid: int) -> str | None:
         return None
     fields = stat[stat.rindex(")") + 2 :].split()  # a command's name may hold spaces and brackets
     return None if fields[0] in "ZX" else fields[_START_TIME]
+
+
+@dataclass
+class Cleaned:
+    """Names of containers: what was `removed`, and what is `still` of runs that are going on."""
+
+    removed: list[str] = field(default_factory=list)
+    still: list[str] = field(default_factory=list)
+
+
+def clean(engine: Engine) -> Cleaned:
+    """Remove every container of a run that is over, and nothing else. Raises DockerError."""
+    cleaned = Cleaned()
+    for container in engine.do("list containers", engine.api.containers, all=True, filters={"label": RUN}):
+        name = container["Names"][0].removeprefix("/")
+        if lives(container["Labels"].get(OWNER, "")):
+            cleaned.still.append(name)
+        else:
+            remove(engine, container["Id"], name)
+            cleaned.removed.append(name)
+    return cleaned
+
+
+def remove(engine: Engine, identity: str, name: str) -> None:
+    """Kill and remove a container, and what it wrote. Raises DockerError."""
+    try:
+        engine.do(f"remove {name}", engine.api.remove_container, identity, v=True, force=True)
+    except docker.errors.APIError as error:
+        if error.status_code not in (404, 409):  # it is gone, or somebody is at it
+            raise DockerError(f"the container {name} could not be removed: {error.explanation}") from None

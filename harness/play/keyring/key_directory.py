@@ -1,4 +1,4 @@
-"""The directory of a mission's keys: the authority's, the depot's, the vehicles', and what everybody may know.
+"""The directory of a mission's keys, and the authority that revokes them.
 
 The authority's and the depot's keys never leave it. Each is a file of its own, as whoever opens what was sealed to the
 depot need not be able to speak for the authority. Others can neither enter the directory nor read what is secret in it.
@@ -232,3 +232,53 @@ def listed(agents: Iterable[int]) -> str:
     first, *others = sorted({*agents})
     shown = ", ".join(map(str, [first, *others[:MOST_NAMED]])) + (", ..." if len(others) > MOST_NAMED else "")
     return f"agents {shown}" if others else f"agent {shown}"
+
+
+class Authority:
+    """Each revocation says all that were revoked so far; `last` was made before, if any was.
+
+    Without its `private_key` there are no others. What is revoked here is written nowhere: a mission that is played
+    leaves what is at home as it was.
+    """
+
+    def __init__(self, public: PublicKeys, private_key: bytes | None, last: Revocation | None = None) -> None:
+        self._public = public
+        self._private_key = private_key
+        self._last = last
+
+    @classmethod
+    def of(cls, keys: KeySet) -> "Authority":
+        """Of keys that were made just now."""
+        return cls(keys.public, keys.authority)
+
+    @classmethod
+    def in_directory(cls, home: Home, public: PublicKeys) -> "Authority":
+        """By what is there: the authority's key, the last revocation, both, or nothing. Raises KeysError."""
+        private_key = home.authority(public) if (home.directory / AUTHORITY_NAME).exists() else None
+        return cls(public, private_key, home.revocation(public))
+
+    @property
+    def revoked(self) -> frozenset[int]:
+        """All by now."""
+        return self._last.revoked if self._last else frozenset()
+
+    def refuse(self, agents: Iterable[int], directory: object) -> None:
+        """Raises KeysError if it cannot revoke these. `directory` is where its keys were looked for."""
+        lacking = {*agents} - self.revoked
+        if self._private_key is not None or not lacking:
+            return
+        made = f"{REVOCATION_NAME} there revokes {listed(self.revoked)} alone" if self._last else "none is there"
+        raise KeysError(
+            f"to revoke {listed(lacking)} takes the authority's key, or a revocation made before, and {made}: name the "
+            f"directory that `ucp-harness keys new` made, or write {directory}/{REVOCATION_NAME} with "
+            "`ucp-harness keys revoke --out`"
+        )
+
+    def revoke(self, agent_id: int) -> bytes:
+        """The revocation of this one, as a message's body: that which was made before if it says so, or the next."""
+        if self._last is None or agent_id not in self._last.revoked:
+            assert self._private_key is not None, "was refused"
+            signer = Ed25519PrivateKey.from_private_bytes(self._private_key)
+            number = self._last.number + 1 if self._last else 1
+            self._last = Revocation.signed(signer, self._public.mission, number, self.revoked | {agent_id})
+        return self._last.encode()

@@ -3,9 +3,9 @@
 import base64
 from typing import Any
 
-from harness.play.seeds import agent_seed
+from harness.play.backend import agent_seed
 from harness.scenario import Scenario
-from harness.scenario.event_source import Events
+from harness.scenario.agent_options import Events
 from sitl.vehicle import AGENT_PORT
 from ucp.features import CONTRACT, needed
 from ucp.messages import PORT

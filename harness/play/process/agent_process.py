@@ -28,8 +28,7 @@ from harness.play.agent_control import (
     AgentUnsupportedError,
     Status,
 )
-from harness.play.command_line import located
-from harness.play.last_output import UNSUPPORTED, last_words, last_words_in, of_a_shell
+from harness.play.command_line import UNSUPPORTED, last_words, last_words_in, located, of_a_shell
 from harness.play.process.agent_mission import mission_file
 from harness.play.process.run_lab import MissionLab, Program
 from harness.play.vehicle_keys import Handed

@@ -60,8 +60,8 @@ class Processes(Backend):
         delivers_all: bool = False,
         pace: Pace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
+        from harness.play.process.fleet import choose_vehicles
         from harness.play.process.program_backend import ProcessRun
-        from harness.play.process.vehicle_kinds import choose_vehicles
 
         # Another run is another mission: its blocks must not be taken for this one's.
         own = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()

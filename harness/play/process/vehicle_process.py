@@ -11,7 +11,7 @@ from typing import Any
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
 from harness.play.process.run_lab import MissionLab, Program
-from harness.scenario.flight import Flight
+from harness.scenario.vehicles import Flight
 from netem.radio import Place
 from sitl.circumstances import Circumstance
 from sitl.ground_station import GroundStation

@@ -1,4 +1,4 @@
-"""What the rogue node has sent, as lines of `rogue.jsonl`: one for each datagram, and of a flood, counts.
+"""The rogue node's journal, `rogue.jsonl`, and the sequence numbers that identify an injection.
 
 Of one injection the first LINES datagrams have a line each. Those after them are counted by mission second: their line
 has `count` and `bytes`, and `messages` and `refused` by type and reason.
@@ -9,6 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 from harness.play.rogue.rogue import RogueDatagram
+from ucp.messages import MalformedDatagramError, block_named, decode
+from ucp.secure.envelope import NAMES, read_clear
+from ucp.secure.envelope import VERSION as SECURED
 
 LINES = 2000
 
@@ -44,3 +47,48 @@ class Journal:
     def _flush(self, number: int) -> None:
         if counted := self._counted.pop(number, None):
             self._write(counted)
+
+
+OF_NO_INJECTION = -1
+"""The number of the injection of a datagram that the scenario itself has (`harness.scenario.injection`)."""
+
+
+def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:
+    """The record of a datagram, sent at `at_s`; `refused` is why no agent would take it for a message."""
+    record = {"at_s": round(at_s, 6), "injection": injection, "what": what, "source": source}
+    if datagram[2:3] == bytes([SECURED]):
+        return {**record, "bytes": len(datagram), **_secured(datagram)}
+    try:
+        sender, sequence, message = decode(datagram)
+    except MalformedDatagramError as malformed:
+        return {**record, "bytes": len(datagram), "refused": malformed.reason}
+    block = block_named(message)
+    decoded = {"message": message.NAME, "sender": sender, "sequence": sequence}
+    return {**record, **decoded, "block": block.hex() if block else None, "bytes": len(datagram)}
+
+
+def _secured(datagram: bytes) -> dict[str, Any]:
+    """What is in clear of a sealed datagram."""
+    try:
+        clear = read_clear(datagram)
+    except MalformedDatagramError as malformed:
+        return {"refused": malformed.reason}
+    if clear.type not in NAMES:
+        return {"refused": "a revocation"}
+    return {"message": NAMES[clear.type], "sender": clear.sender, "sequence": clear.sequence, "block": None}
+
+
+FORGED_FROM = 1 << 31
+"""No agent counts its datagrams up to this; from here on they are the rogue's."""
+_EACH = 1 << 17
+"""Of one injection: more than a flood has datagrams."""
+
+
+def forged_sequence(injection: int, count: int) -> int:
+    """That of the datagram with this count, from 0, of the injection with this number, from 1."""
+    return FORGED_FROM + (injection - 1) * _EACH + count % _EACH
+
+
+def injection_of(sequence: int) -> int | None:
+    """The number of the injection that forged the datagram; None if an agent sent it."""
+    return (sequence - FORGED_FROM) // _EACH + 1 if sequence >= FORGED_FROM else None

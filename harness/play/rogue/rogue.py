@@ -16,9 +16,8 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 from harness.play.rogue import crafted
+from harness.play.rogue.journal import forged_sequence, line_of
 from harness.play.rogue.lies import Overheard, UnheardError
-from harness.play.rogue.line import line_of
-from harness.play.rogue.sequences import forged_sequence
 from harness.scenario.injection import Corrupt, DelayedCopy, Duplicate, Flood, Forge, Injection, Lie, Replay
 from ucp.block import HASH_BYTES, next_chain_hash
 from ucp.clock import MICROSECONDS
@@ -38,7 +37,7 @@ from ucp.secure.envelope import NAMES, REQUEST_OF, read_clear
 from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
-    from harness.play.rogue.captured_bundle import CapturedKeys
+    from harness.play.rogue.crafted import CapturedKeys
     from ucp.secure.sealed_datagrams import Request
 
 REMEMBERED = 10_000

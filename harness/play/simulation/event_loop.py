@@ -12,15 +12,14 @@ from random import Random
 from typing import TYPE_CHECKING, cast
 
 from harness.gc_pause import gc_paused
+from harness.play.backend import agent_seed
 from harness.play.mission import Sought
-from harness.play.seeds import agent_seed
 from harness.play.simulation.air import Happening, InFlight, Logged, StrayDatagram, VirtualAir
-from harness.play.simulation.fate_script import FateScript, NameOf
+from harness.play.simulation.fate_script import FateScript, LateTimers, NameOf
 from harness.play.simulation.incarnations import BlockNames, Incarnation, Secured
-from harness.play.simulation.late_timers import LateTimers
-from harness.play.simulation.recorder import Recorder
 from harness.play.simulation.recurrence import Recurrence
-from harness.play.simulation.seals import seals_of
+from harness.play.simulation.run_files import Recorder
+from harness.play.simulation.secured_agents import seals_of
 from harness.play.simulation.simulated_agent import OwnAgent, Stored, VirtualAgent
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
@@ -34,7 +33,7 @@ from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
     from harness.play.simulation.foreign.foreigners import Foreigners
-    from harness.play.simulation.foreign.program_pool import Programs
+    from harness.play.simulation.foreign.virtual_program import Programs
     from harness.play.simulation.secured_agents import Keys
     from harness.play.simulation.simulated_rogue import VirtualRogue
     from ucp.secure.bundle import PublicKeys

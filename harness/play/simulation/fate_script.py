@@ -1,13 +1,15 @@
-"""Plays scripted fates (`harness.scenario.fates`): decides single messages before chance has its say."""
+"""Scripted fates of single messages, and timers that expire late."""
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from harness.scenario.fates import Fate
-from harness.scenario.numbered import numbered
+from harness.scenario.strict_model import numbered
 from netem.medium import RandomDraws
 from ucp.messages import Message, block_named
+from ucp.state import AgentState
 
 RIGHT_AFTER_S = 1e-6
 
@@ -163,3 +165,43 @@ class FateScript:
         part.fitting += 1
         counts = part.fate.counts
         return counts is None or part.fitting in counts
+
+
+class Running(NamedTuple):
+    """A timer that runs: the `number`th, from 0, that the agent has started, and when it ends by the agent's clock."""
+
+    name: str
+    number: int
+    deadline: float
+
+
+class LateTimers:
+    """Those of one agent, through all of its lives. `text` is as in a scenario."""
+
+    def __init__(self, text: str = "") -> None:
+        self.running: dict[str, Running] = {}
+        """By name."""
+        self._late_by_s = dict(numbered(text))
+        self._started = 0
+
+    def look(self, state: AgentState) -> None:
+        """See which timers run after an input; of several that it has started the one that `timers` names first."""
+        for timer in state.timers:
+            known, deadline = self.running.get(timer.name), timer.deadline
+            if deadline is None:
+                self.running.pop(timer.name, None)
+            elif known is None or known.deadline != deadline:
+                self.running[timer.name] = Running(timer.name, self._started, deadline)
+                self._started += 1
+
+    @property
+    def all_have_ended(self) -> bool:
+        """Whether none of those that are told to be late runs or is to come: from now on all end when they should."""
+        late = self._late_by_s.keys()
+        running = {timer.number for timer in self.running.values()}
+        return self._started > max(late, default=-1) and running.isdisjoint(late)
+
+    def next(self, at: Callable[[float], float]) -> tuple[float, Running] | None:
+        """When which ends next, in mission seconds; `at` is when the agent's clock shows something."""
+        ends = ((at(timer.deadline) + self._late_by_s.get(timer.number, 0.0), timer) for timer in self.running.values())
+        return min(ends, default=None, key=lambda end: (end[0], end[1].deadline))

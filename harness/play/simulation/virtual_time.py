@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from harness.archive.directory import RunDirectory
 from harness.errors import InterruptedRunError, MachineError, ScenarioError
 from harness.play.backend import Backend
-from harness.play.ground_station_check import refuse_what_no_ground_station_sees
 from harness.play.pace import Pace
+from harness.play.process.process_preflight import refuse_what_no_ground_station_sees
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
@@ -20,7 +20,7 @@ from harness.scenario.faults import VehicleFault
 
 if TYPE_CHECKING:
     from harness.play.simulation.captured_air import VirtualCapture
-    from harness.play.simulation.foreign.program_pool import Programs
+    from harness.play.simulation.foreign.virtual_program import Programs
     from harness.play.simulation.station_tracks import TracksOnStation
 
 
@@ -163,7 +163,7 @@ def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["Programs | 
     if not scenario.foreign:
         yield None
         return
-    from harness.play.simulation.foreign.program_pool import Programs
+    from harness.play.simulation.foreign.virtual_program import Programs
 
     with closing(Programs(rundir.agents)) as programs:
         yield programs

@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 
 from harness.proof.attacker.timeline_entries import Wording
 from harness.proof.bounds import EVENT_FILLS_BLOCK
-from harness.proof.examples.block_ages import Ages
-from harness.proof.examples.path_times import Run, instants_s, windows_s
+from harness.proof.examples.path_times import Ages, Run, instants_s, windows_s
 from harness.proof.graph.exploration import Graph
 from harness.proof.model.global_states import AGENTS, Move
 from harness.proof.model.instant import Action, Wave
 from harness.proof.model.known_states import DEAD
-from harness.proof.model.step import Step
-from harness.scenario.numbered import in_text
+from harness.proof.model.snapshot import Step
+from harness.scenario.strict_model import in_text
 from netem.medium import LATENCY
 
 LATENCY_S = 0.02

@@ -1,12 +1,19 @@
-"""When the instants of a way through the graph were: mission seconds that the timers' durations allow.
+"""Mission seconds of each instant on a path, and the order in which its blocks were made.
 
 Every instant is a variable, every duration a bound on a difference of two; the shortest paths over the bounds are a
 solution (Bellman and Ford), if there is one.
+
+Where any block may be the older (`Bounds.clocks_any`) a scenario says what the clocks showed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from math import inf
+from typing import Any
+
+from harness.proof.model.block_renaming import Ordinals
+from ucp.clock import MICROSECONDS
 
 APART_S = (5.0, 2.0, 1.0, 0.5, 0.2, 0.0)
 """How far from each other two instants should be: as far as can be."""
@@ -76,3 +83,49 @@ def _later(count: int, runs: Sequence[Run], apart_s: float, *, punctual: bool) -
         elif punctual:
             later.append((run.until, run.started, apart_s - run.duration_s))
     return later
+
+
+class Ages:
+    """Takes down what the way asks for. Blocks are told by the numbers that they have in its states, which change."""
+
+    def __init__(self) -> None:
+        self._events: list[int] = []
+        """For each block which of the events completes it."""
+        self._older: dict[int, set[int]] = {}
+        """For each event those with older blocks."""
+
+    def completed(self, ordinal: int) -> None:
+        """The next event completes this block."""
+        assert ordinal == len(self._events) + 1, "blocks are numbered as they are completed"
+        self._older[len(self._events)] = set()
+        self._events.append(len(self._events))
+
+    def renumber(self, blocks: Ordinals) -> None:
+        """From now on these blocks are the first, the second, and so on; those that nobody has come after them."""
+        if blocks:
+            rest = [ordinal for ordinal in range(1, len(self._events) + 1) if ordinal not in blocks]
+            self._events = [self._events[ordinal - 1] for ordinal in (*blocks, *rest)]
+
+    def asked(self, oldest: int, others: Collection[int]) -> None:
+        """One block has to be older than others; the inception block is, anyway."""
+        for other in others if oldest else ():
+            self._older[self._events[other - 1]].add(self._events[oldest - 1])
+
+    def date(self, events: list[dict[str, Any]]) -> bool:
+        """Let the events have timestamps of which that is true, if it is not true as they are.
+
+        False if no timestamps make it true: a tie goes one way now and another way then, or an agent's clock goes back.
+        """
+        for index, event in enumerate(events):
+            own = [earlier for earlier in range(index) if events[earlier]["agent"] == event["agent"]]
+            self._older[index].update(own)  # an agent's clock does not go back
+        if all(older < younger for younger, all_older in self._older.items() for older in all_older):
+            return True
+        try:
+            in_order = [*TopologicalSorter(self._older).static_order()]
+        except CycleError:
+            return False
+        moments = sorted(round(event["at_s"] * MICROSECONDS) for event in events)
+        for index, timestamp_us in zip(in_order, moments, strict=True):
+            events[index]["timestamp_us"] = timestamp_us
+        return True

@@ -1,6 +1,8 @@
-"""What may follow one state."""
+"""Expand one state, with Python's cycle collector switched off."""
 
-from collections.abc import Callable, Sequence
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import chain
 from typing import NamedTuple
 
@@ -58,3 +60,15 @@ def _quiet(swarm: Swarm, state: State, number_of: NumberOf, ending: Sequence[Act
             by_timer.append(tuple(dict.fromkeys(chain.from_iterable(choices))))
     crossing = dict.fromkeys(chain.from_iterable(after[actions] for actions in after if len(actions) > 1))
     return Expansion(0, tuple(by_timer), tuple(crossing))
+
+
+@contextmanager
+def cycles_left_alone() -> Iterator[None]:
+    """Python's collector rests; in processes that are forked meanwhile, for good."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
-from harness.proof.graph.expansion import Expansion, expanded
-from harness.proof.graph.gc_off import cycles_left_alone
+from harness.proof.graph.expansion import Expansion, cycles_left_alone, expanded
 from harness.proof.graph.packed_states import Followers, States
 from harness.proof.graph.workers import Crew
 from harness.proof.model.flaws import Flaw

@@ -17,7 +17,7 @@ from harness.proof.bounds import Bounds
 from harness.proof.model.flaws import Flaw
 from harness.proof.model.known_states import DEAD
 from harness.proof.model.local_steps import LocalStates
-from harness.proof.model.step import Step
+from harness.proof.model.snapshot import Step
 from harness.proof.model.zones import NOTHING_RUNS, Zones
 from harness.proof.progress_bar import Ended, Progress, memory_bytes
 

@@ -10,9 +10,9 @@ from itertools import chain, groupby, islice, permutations, product
 from typing import Any, NamedTuple
 
 from harness.proof.model.block_renaming import Ordinals
-from harness.proof.model.interned_parts import NAMES_OF_OTHERS
 from harness.proof.model.known_states import DEAD
 from harness.proof.model.local_steps import LocalStates
+from harness.proof.model.snapshot import NAMES_OF_OTHERS
 from harness.proof.model.zones import Zones
 
 Places = tuple[int, ...]

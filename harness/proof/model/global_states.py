@@ -18,7 +18,7 @@ from harness.proof.model.flaws import Flaw
 from harness.proof.model.instant import Action, Actions, Agents, Instants, Wave, Way
 from harness.proof.model.known_states import DEAD
 from harness.proof.model.local_steps import LocalStates
-from harness.proof.model.step import Started
+from harness.proof.model.snapshot import Started
 from harness.proof.model.zones import NOTHING_RUNS, Zones
 
 State = tuple[int, ...]

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 from harness.proof.bounds import Bounds
 from harness.proof.model.known_states import DEAD
 from harness.proof.model.local_steps import LocalStates
-from harness.proof.model.step import Started, Step
+from harness.proof.model.snapshot import Started, Step
 
 Heard = tuple[tuple[int, int], ...]
 """What reaches an agent in one go: (sender, as the agent knows it, and message), in the order of the senders."""

@@ -10,8 +10,7 @@ from typing import Any
 from harness.proof.bounds import Bounds
 from harness.proof.model.block_renaming import Blocks
 from harness.proof.model.flaws import Flaw, flaw_of, is_deceived
-from harness.proof.model.interned_parts import NAMES_OF_OTHERS, Parts
-from harness.proof.model.snapshot import Snapshot, dead
+from harness.proof.model.snapshot import NAMES_OF_OTHERS, Parts, Snapshot, dead
 from ucp.state import AgentState
 
 DEAD = -1

@@ -14,8 +14,7 @@ from harness.proof.model.known_states import DEAD, FIRST, FIRST_OTHER, KnownStat
 from harness.proof.model.real_agents import Agents, end_at_once, end_timer, is_heard, log
 from harness.proof.model.reduction import ReductionError, check_that_nothing_is_lost
 from harness.proof.model.reference_step import Give, Reference
-from harness.proof.model.snapshot import NOW_S, RUNNING_S, Snapshot, put_back, take
-from harness.proof.model.step import End, Step
+from harness.proof.model.snapshot import NOW_S, RUNNING_S, End, Snapshot, Step, put_back, take
 from harness.proof.model.tallies import TALLIES, Tallies
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS

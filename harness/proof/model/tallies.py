@@ -2,11 +2,9 @@
 
 from collections.abc import Callable, Sequence
 
-from harness.proof.model.interned_parts import NAMES_OF_OTHERS
 from harness.proof.model.known_states import DEAD, KnownStates
 from harness.proof.model.reduction import ReductionError
-from harness.proof.model.snapshot import Snapshot
-from harness.proof.model.step import End, Step
+from harness.proof.model.snapshot import NAMES_OF_OTHERS, End, Snapshot, Step
 from ucp.reconcile import most_named
 
 TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))

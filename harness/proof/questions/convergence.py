@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
+from harness.proof.graph.expansion import cycles_left_alone
 from harness.proof.graph.exploration import Graph
-from harness.proof.graph.gc_off import cycles_left_alone
 from harness.proof.graph.workers import Crew
 from harness.proof.questions.attractor import Attractor, Check
 from harness.proof.questions.extra_votes import UndecidedError, Votes

@@ -2,7 +2,7 @@
 docs/spec.md.
 
 tlc.py       whether TLC is here; a module given to it, and what it says
-spec_settings.py  which settings of agents the specification has
+spec_states.py  which settings of agents the specification has
 spec_states.py    a state of the specification, and one of the real agents, as the same tuple
 second_opinion.py   the same bounds looked at twice: by `harness.proof` and by TLC
 recorded_lives.py  lives of agents, written as the specification reads them

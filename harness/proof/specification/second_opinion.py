@@ -13,9 +13,9 @@ from harness.proof.progress_bar import Ended, Progress
 from harness.proof.proof import INCOMPLETE, Limits
 from harness.proof.questions import convergence
 from harness.proof.specification import spec_states as states
-from harness.proof.specification.spec_settings import readings, unspecified
+from harness.proof.specification.spec_states import readings, unspecified
 from harness.proof.specification.tlc import checked, command, in_tla
-from harness.scenario.stagger import Staggered
+from harness.scenario.agent_options import Staggered
 from ucp.clock import MICROSECONDS
 
 MEGABYTE = 1e6

@@ -1,4 +1,4 @@
-"""A state of the specification, and one of the real agents, as the same tuple: so that sets of them can be compared.
+"""States and settings of the specification, and the same of the real agents.
 
 Blocks are called 1, 2, ... in the order in which they were completed; a chain hash is the blocks of its chain.
 """
@@ -7,6 +7,7 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from harness.proof.graph.exploration import Graph
 from harness.proof.model.global_states import AGENTS
 from harness.proof.model.local_steps import LocalStates
 from ucp.clock import MICROSECONDS
+from ucp.settings import Settings
 from ucp.state import AgentState
 
 Plain = tuple[Any, ...]
@@ -136,3 +138,30 @@ class _Translator:
             ),
             NO_HASH if majority is None else block[majority],
         )
+
+
+SPECIFIED = frozenset(
+    (
+        *("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s"),
+        *("max_block_bytes", "max_event_bytes"),
+        *("vote_names_chain", "changed_before_tally", "phase1_tie", "phase2_tie"),
+    )
+)
+
+
+def unspecified(settings: Settings) -> str | None:
+    """A setting that is not as by default, and that the specification does not have."""
+    default = Settings()
+    names = (item.name for item in fields(Settings))
+    changed = (name for name in names if getattr(settings, name) != getattr(default, name))
+    return next((name for name in changed if name not in SPECIFIED), None)
+
+
+def readings(settings: Settings) -> dict[str, bool]:
+    """The constants that are readings of the thesis with a setting."""
+    return {
+        "VoteNamesChain": settings.vote_names_chain,
+        "ChangedBeforeTally": settings.changed_before_tally,
+        "Phase1TiePops": settings.phase1_tie == "pop",
+        "Phase2TieTakesBlock": settings.phase2_tie == "block",
+    }

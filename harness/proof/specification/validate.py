@@ -14,7 +14,7 @@ from harness.archive.traces import Trace, read_trace, why_none
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import INTERRUPTED, VIOLATED, WRONG_REQUEST
 from harness.proof.specification.recorded_lives import Chains, Life, lives, module
-from harness.proof.specification.spec_settings import readings, unspecified
+from harness.proof.specification.spec_states import readings, unspecified
 from harness.proof.specification.tlc import CheckerError, command, in_tla
 from harness.proof.specification.tlc import checked as looked_at
 from harness.run.simulate import simulate

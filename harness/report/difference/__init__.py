@@ -11,8 +11,14 @@ which of two messages arrives first is for the kernel to say. Where they part fi
 `steps` reads a trace line by line, `runs` compares, `keys` says what was asked for differently.
 """
 
-from harness.report.difference.differing_keys import KeyDifference
-from harness.report.difference.run_difference import AgentDifference, ChainParting, Difference, Parting, compare
-from harness.report.difference.step_difference import Step
+from harness.report.difference.run_difference import (
+    AgentDifference,
+    ChainParting,
+    Difference,
+    KeyDifference,
+    Parting,
+    Step,
+    compare,
+)
 
 __all__ = ["AgentDifference", "ChainParting", "Difference", "KeyDifference", "Parting", "Step", "compare"]

@@ -1,18 +1,87 @@
-"""Comparing two run directories."""
+"""Compare two run directories: files, keys, and the steps of their traces."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE
+from harness.archive.traces import Line
 from harness.errors import RunDirectoryError
 from harness.report.agent_programs import Program, programs
 from harness.report.chain_tree import ranges
-from harness.report.difference.differing_keys import KeyDifference, differing_keys
-from harness.report.difference.step_difference import Step, completed_blocks, name
+
+
+@dataclass(frozen=True)
+class Step:
+    """A handler run as two runs are compared by it; `t`, in mission seconds, and `line` only say where it is.
+
+    `changes` are (operation, block), `sent` are (message, block), and a block is its name, None for no block.
+    """
+
+    life: int
+    handler: str
+    branch: str
+    trigger: dict[str, int | str]
+    changes: tuple[tuple[str, str], ...]
+    sent: tuple[tuple[str, str | None], ...]
+    t: float = field(compare=False)
+    line: int = field(compare=False)
+
+    @classmethod
+    def of(cls, line: Line, names: Mapping[str, str]) -> "Step":
+        """`names` are those of the blocks by hash; one that has none goes by the beginning of its hash."""
+        run = line.parsed()
+        return cls(
+            line.life,
+            run.handler,
+            run.branch,
+            run.trigger,
+            tuple((operation, name(block, names)) for operation, block in run.changes),
+            tuple((sent.message, sent.block and name(sent.block, names)) for sent in run.sent),
+            run.t,
+            line.number,
+        )
+
+
+def name(block_hash: str, names: Mapping[str, str]) -> str:
+    return names.get(block_hash, block_hash[:12])
+
+
+def completed_blocks(lines: Iterable[Line], agent_id: int) -> dict[str, str]:
+    """Hash -> `<agent>.<ordinal>` of each block that the agent completed, in all its lives."""
+    names: dict[str, str] = {}
+    for line in lines:
+        if b'"complete"' in line.text:
+            for operation, block in line.parsed().changes:
+                if operation == "complete":
+                    names.setdefault(block, f"{agent_id}.{len(names) + 1}")
+    return names
+
+
+@dataclass(frozen=True)
+class KeyDifference:
+    """A key such as `network.loss` or `timeline.0.at_s`, and its value in either; None also where there is none."""
+
+    key: str
+    a: Any
+    b: Any
+
+
+def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
+    """The innermost keys that differ, in the order of `a`. Lists of different lengths differ as a whole."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        pairs = [(name, a.get(name), b.get(name)) for name in {**a, **b}]
+    elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        pairs = [(index, value_a, value_b) for index, (value_a, value_b) in enumerate(zip(a, b, strict=True))]
+    else:
+        if a != b:
+            yield KeyDifference(key, a, b)
+        return
+    for name, value_a, value_b in pairs:
+        yield from differing_keys(value_a, value_b, f"{key}.{name}" if key else str(name))
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,11 @@ from harness.archive.tracks import Tracks
 from harness.errors import ExportError, RunDirectoryError
 from harness.report import logbook
 from harness.report.export.logs import log_files, read_log
-from harness.report.export.run_clock import MissionTime, mission_time
 from harness.report.export.samples import (
     Broadcast,
     Level,
     LossesChanged,
+    MissionTime,
     NetworkChanged,
     Place,
     Position,
@@ -37,6 +37,7 @@ from harness.report.export.samples import (
     Spread,
     Step,
     Voted,
+    mission_time,
 )
 from harness.report.export.telemetry import read_telemetry, telemetry_logs
 from harness.report.logbook.positions import tracks

@@ -12,8 +12,7 @@ from itertools import chain, islice
 from pathlib import Path
 
 from harness.archive.bounded_file import Opened
-from harness.report.export.run_clock import MissionTime
-from harness.report.export.samples import Level, Said
+from harness.report.export.samples import Level, MissionTime, Said
 
 MAX_BYTES = 32 * 1024 * 1024
 MAX_LINE_BYTES = 64 * 1024

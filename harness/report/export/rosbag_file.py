@@ -16,17 +16,8 @@ from harness.archive.history import LATEST_S
 from harness.archive.traces import Gap, Header
 from harness.errors import MachineError
 from harness.report.export.exported_run import Recording
-from harness.report.export.links import FIELD, Line, Links, vehicle_frame
-from harness.report.export.samples import (
-    LossesChanged,
-    Metres,
-    NetworkChanged,
-    Position,
-    Said,
-    Sample,
-    Step,
-    Telemetry,
-)
+from harness.report.export.samples import LossesChanged, Metres, NetworkChanged, Position, Said, Sample, Step, Telemetry
+from harness.report.export.scene import FIELD, Line, Links, vehicle_frame
 
 try:
     import numpy

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from pymavlink import mavutil
 
-from harness.report.export.run_clock import MissionTime
-from harness.report.export.samples import Telemetry
+from harness.report.export.samples import MissionTime, Telemetry
 
 NAME = "telemetry.tlog"
 MAX_BYTES = 1024 * 1024 * 1024

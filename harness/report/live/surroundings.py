@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from harness.archive.connectivity import NETWORK_FILE, Network, NetworkLine, Pair
 from harness.archive.tracks import TRACKS_FILE, TrackLine
 from harness.report.live.agent_course import Change
-from harness.report.live.growing_file import GrowingFile
+from harness.report.live.live_trace import GrowingFile
 from harness.scenario.changes import RANGE
 from harness.scenario.faults import named
 from harness.scenario.faults.fault import PAUSED, Fault

@@ -1,16 +1,19 @@
-"""Where the vehicles were: the logged positions of every vehicle in order of time, for maps.
+"""Positions of the vehicles over time, from logged events or from the run's own tracks.
 
 A vehicle's events are taken from wherever a copy of its blocks survived: from every chain, deque and reconcile stack of
 the logbook. A vehicle that was lost is on the map as far as others hold its blocks.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from harness.archive.exports import ExportedBlock
+from harness.archive.run_record import RunRecord
+from harness.archive.tracks import Fix, Tracks
 from harness.report.logbook.book import Logbook
+from sitl.vehicle import Home
 from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.telemetry import position_of
 
@@ -100,3 +103,28 @@ def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Trac
         age_s = None if at_us is None else (event.timestamp_us - at_us) / 1e6
         track.entries.append(Entry(block, event, own is not None, position, age_s))
     return track
+
+
+class Place(NamedTuple):
+    """1e-7 degrees, and millimetres above mean sea level."""
+
+    lat_e7: int
+    lon_e7: int
+    alt_mm: int
+
+
+def flown(record: RunRecord, recorded: Tracks) -> list[Track]:
+    """A track without events for each vehicle that is on record, on the field of the scenario's home."""
+    if record.scenario is None:
+        return []
+    home = record.scenario.vehicles.field
+    return [_track(vehicle, fixes, home) for vehicle, fixes in recorded.by_vehicle.items()]
+
+
+def _track(vehicle: int, fixes: Sequence[Fix], home: Home) -> Track:
+    return Track(vehicle, [], [(round(fix.at_s * 1e6), _place(fix, home)) for fix in fixes])
+
+
+def _place(fix: Fix, home: Home) -> Place:
+    there = home.offset(fix.north_m, fix.east_m)
+    return Place(round(there.lat_deg * 1e7), round(there.lon_deg * 1e7), round((there.alt_m + fix.up_m) * 1e3))

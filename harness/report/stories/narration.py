@@ -13,9 +13,8 @@ from math import floor, inf, isfinite
 
 from harness.archive.history import in_time
 from harness.archive.traces import Trace
-from harness.report.stories.message_text import ANSWERS, told
 from harness.report.stories.story_file import Section
-from harness.report.stories.story_names import INCEPTION, LocalChain, Names
+from harness.report.stories.story_names import ANSWERS, INCEPTION, LocalChain, Names, told
 from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun, Sent
 

@@ -1,18 +1,17 @@
 """Looking for a run that violates a characteristic, and for the smallest one that still does.
 
-search.py    seed after seed, until a run violates one
+exploring.py    seed after seed, until a run violates one
 tape.py      what happened in a run by chance, taken down: events, and messages that were lost
 scenario_document.py  a scenario as a document that can be cut to pieces
 shrink.py    tries smaller documents, by delta debugging, on all cores
 smaller.py   what smaller means: fewer agents, events and fates, less time, less chance
-smallest_scenario.py     the smallest one as a scenario file, for people
+shrink.py     the smallest one as a scenario file, for people
 exploring.py       the story: all of these, one after the other
 explore_text.py     what is said meanwhile, and at the end
 guided/      instead of seed after seed: scenarios changed, and kept where they reach something new
 """
 
 from harness.sweep.explore.explore_text import in_words, watching
-from harness.sweep.explore.exploring import MAX_RUNS, Explored, Watcher, explore
-from harness.sweep.explore.search import Violation
+from harness.sweep.explore.exploring import MAX_RUNS, Explored, Violation, Watcher, explore
 
 __all__ = ["MAX_RUNS", "Explored", "Violation", "Watcher", "explore", "in_words", "watching"]

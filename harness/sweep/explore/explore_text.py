@@ -8,8 +8,7 @@ from rich.console import Console
 
 from harness.run.finding import ENDED, evidence_lines
 from harness.scenario.verdict_names import BAD_IN_WORDS
-from harness.sweep.explore.exploring import Explored, Watcher
-from harness.sweep.explore.search import Violation
+from harness.sweep.explore.exploring import Explored, Violation, Watcher
 
 _WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}
 

@@ -1,4 +1,4 @@
-"""From a scenario to the smallest run that violates a characteristic: search, record, shrink, write."""
+"""Explore seeds until a run violates a characteristic, then record, shrink and write it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -7,14 +7,52 @@ from pathlib import Path
 from harness.checker.judgement import Judgement
 from harness.errors import INTERRUPTED, VIOLATED
 from harness.run.finding import Judge, claim, evidence_lines, simulated, write
+from harness.run.parallel import Failed, sweep
 from harness.run.simulate import same_twice
 from harness.scenario import Scenario
 from harness.sweep.explore.recording import Recording, record
 from harness.sweep.explore.scenario_document import Document, document_of
-from harness.sweep.explore.search import Searched, Violation, search
-from harness.sweep.explore.shrink import BudgetSpentError, Shrinker
+from harness.sweep.explore.shrink import BudgetSpentError, Shrinker, file_of
 from harness.sweep.explore.smaller import replays, scenario_of, shrink, size
-from harness.sweep.explore.smallest_scenario import file_of
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """The run of `seed` violates these characteristics, by number, and judgements beside them, by key."""
+
+    seed: int
+    keys: tuple[str, ...]
+
+
+@dataclass
+class Searched:
+    """What became of seeds from the first on. `failed`: seed -> why there is no verdict on its run."""
+
+    played: int = 0
+    violation: Violation | None = None
+    failed: dict[int, str] = field(default_factory=dict)
+    interrupted: bool = False
+
+
+def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> Searched:
+    """Play `seeds` in order; the lowest that violates a characteristic is the one found, however many `jobs`.
+
+    Ctrl-C ends it early. Raises HarnessError if the scenario cannot be played.
+    """
+    searched = Searched()
+    try:
+        with sweep(seeds, lambda seed: judge(scenario, seed).bad, jobs, what="seeds" if shown else None) as outcomes:
+            for seed, outcome in outcomes:
+                searched.played += 1
+                if isinstance(outcome, Failed):
+                    searched.failed[seed] = outcome.reason
+                elif outcome:
+                    searched.violation = Violation(seed, outcome)
+                    break
+    except KeyboardInterrupt:
+        searched.interrupted = True
+    return searched
+
 
 MAX_RUNS = 5000
 

@@ -10,7 +10,7 @@ from typing import Any
 from harness.scenario import Scenario
 from harness.scenario.faults import ASKED_FOR
 from harness.scenario.injection import INJECTIONS
-from harness.scenario.numbered import in_text, numbered
+from harness.scenario.strict_model import in_text, numbered
 from harness.sweep.explore.recording import Logged, Lost
 
 Document = dict[str, Any]

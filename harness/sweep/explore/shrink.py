@@ -1,4 +1,4 @@
-"""Delta debugging: tries smaller documents, keeps the first that still violates, and tries again from there.
+"""Shrink a document by delta debugging, and write the smallest scenario that still fails.
 
 What is tried, and how it ends, is the same however many processes try: candidates count in their order, and what
 others found out meanwhile about later ones is forgotten.
@@ -8,13 +8,15 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from harness.run.parallel import sweep
 from harness.scenario import Scenario
-from harness.sweep.explore.scenario_document import Document
+from harness.scenario.scenario_file import to_yaml
+from harness.sweep.explore.recording import Lost, Recording
+from harness.sweep.explore.scenario_document import Document, at
 
 T = TypeVar("T")
 
@@ -108,3 +110,23 @@ def _leaving_out(items: Sequence[T], parts: int) -> Iterator[list[T]]:
 
 def _key(document: Document) -> str:
     return json.dumps(document, sort_keys=True)
+
+
+def file_of(document: Document, header: list[str], recording: Recording) -> str:
+    """`recording` of this very document says when each message was sent that a fate is about."""
+    sent: dict[Any, Lost] = {(lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost}
+
+    def remark(entry: Document) -> str | None:
+        key = entry.get("message"), entry.get("sender"), entry.get("receiver"), _hashable(entry.get("count"))
+        if (lost := sent.get(key)) is None:
+            return None
+        return f"sent at {lost.at_s:.3f} s" + (f", block {lost.block}" if lost.block else "")
+
+    comment = [*header]
+    if at(document, "settings.max_block_bytes") is not None:
+        comment.append("Blocks are full as soon as another event of the largest size might not fit: here, after one.")
+    return to_yaml(document, comment, remark)
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

@@ -1,11 +1,11 @@
 """The matrix: one scenario over loss rates, numbers of agents, backends and many seeds, on all cores or a Dask cluster.
 
 matrix_file.py       what is asked: the matrix file       estimate.py   a mean or a share with its 95 % interval
-matrix_metrics.py     what is measured of each run         cell.py       all runs at one point, summed up
+estimate.py     what is measured of each run         cell.py       all runs at one point, summed up
 cell_play.py        one run                              results_file.py    results.jsonl, from which a matrix goes on
 matrix_run.py         all of them                          cluster.py    spread over a Dask cluster
-matrix_record.py      matrix.json                          baseline.py, comparison.py   beside an earlier night
-matrix_outputs.py     the files                            matrix_summary.py  matrix_junit.py  matrix_picture.py
+matrix_record.py      matrix.json                          nights.py, comparison.py   beside an earlier night
+matrix_outputs.py     the files                            matrix_summary.py  matrix_outputs.py  matrix_picture.py
 cell_scenarios.py   some of them
 report/        report.html                          nights.py     what its trend is drawn from
 matrix_table.py       the table on the terminal

@@ -8,9 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
 from harness.scenario.verdict_names import JUDGED, Verdict, kind_of
-from harness.sweep.matrix.estimate import Estimate, estimate_share
+from harness.sweep.matrix.estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, estimate_share
 from harness.sweep.matrix.matrix_file import Point, Task
-from harness.sweep.matrix.matrix_metrics import BEFORE_FINAL_RECONCILE, METRICS
 
 
 class Placed(BaseModel):

@@ -8,8 +8,7 @@ from collections.abc import Iterator, Sequence
 from pydantic import BaseModel
 
 from harness.sweep.matrix.cell import Cell, Placed
-from harness.sweep.matrix.estimate import Estimate
-from harness.sweep.matrix.matrix_metrics import BY_NAME
+from harness.sweep.matrix.estimate import BY_NAME, Estimate
 
 
 class Change(Placed):

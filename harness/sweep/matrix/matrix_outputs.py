@@ -1,4 +1,4 @@
-"""What a matrix leaves in its directory.
+"""The files of a matrix, among them junit.xml.
 
 matrix.json   all of it, schema `ucp-matrix/1`
 matrix.csv    one row a cell
@@ -14,22 +14,45 @@ directories that were kept of runs as processes, cells/ the scenarios with which
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from harness.errors import MachineError
+from harness.present.junit import Case, to_xml
 from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS, JUDGED
 from harness.sweep.matrix.cell import Cell, Run
 from harness.sweep.matrix.cell_scenarios import write_scenarios
-from harness.sweep.matrix.matrix_junit import to_junit
-from harness.sweep.matrix.matrix_metrics import METRICS
+from harness.sweep.matrix.estimate import METRICS
 from harness.sweep.matrix.matrix_picture import draw
+from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
 from harness.sweep.matrix.matrix_summary import to_markdown
+from harness.sweep.matrix.matrix_table import name_of, troubles, unsupported
 from harness.sweep.matrix.nights import Nights
 from harness.sweep.matrix.report import to_html
 from ucp.agent_files import write_atomically, write_json_atomically
+
+
+def to_junit(record: MatrixRecord) -> str:
+    """A cell fails if a run of it violated a characteristic or failed, or if it is worse than the baseline; a cell
+    without all its runs is skipped, and one that an agent does not support."""
+    return to_xml(record.matrix.name, "matrix", record.started_at, record.wall_s, _cases(record))
+
+
+def _cases(record: MatrixRecord) -> Iterator[Case]:
+    cells = {cell.point: cell for cell in record.cells}
+    for point in record.matrix.points:
+        name, cell = name_of(record.matrix, point), cells.get(point)
+        if wrong := list(troubles(record, cell)) if cell else []:
+            yield Case(name, wrong)
+        elif lacking := list(unsupported(record, cell)) if cell else []:
+            yield Case(name, skipped="; ".join(lacking))
+        elif cell is None or cell.runs < len(record.matrix.seed_list):
+            ended = cell.runs if cell else 0
+            yield Case(name, skipped=f"interrupted: {ended} of {len(record.matrix.seed_list)} runs had ended")
+        else:
+            yield Case(name)
 
 
 def write(finished: Finished, directory: Path, nights: Nights | None = None) -> None:

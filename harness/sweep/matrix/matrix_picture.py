@@ -15,8 +15,7 @@ from harness.play.backends import in_virtual_time
 from harness.present import svg, text
 from harness.present.svg import Area, Axis, n
 from harness.sweep.matrix.cell import Cell
-from harness.sweep.matrix.estimate import Estimate
-from harness.sweep.matrix.matrix_metrics import BY_NAME
+from harness.sweep.matrix.estimate import BY_NAME, Estimate
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import say, series, series_name
 

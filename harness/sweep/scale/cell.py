@@ -6,8 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel
 
-from harness.sweep.matrix.estimate import Estimate
-from harness.sweep.matrix.matrix_metrics import Figures, Metric
+from harness.sweep.matrix.estimate import Estimate, Figures, Metric
 from harness.sweep.scale.growth import Law, Variable, fit
 from harness.sweep.scale.metrics import BY_NAME, MACHINE_METRICS, METRICS
 from harness.sweep.scale.model import Scale, Size

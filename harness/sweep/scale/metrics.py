@@ -6,7 +6,7 @@ Most of it is virtual, and the same on every machine. What a run costs this mach
 from harness.checker import Result
 from harness.play.mission import RunOutcome
 from harness.scenario import Scenario
-from harness.sweep.matrix.matrix_metrics import Figures, Metric, figure, uniform
+from harness.sweep.matrix.estimate import Figures, Metric, figure, uniform
 
 METRICS = (
     Metric("blocks", "blocks", figure("blocks")),

@@ -9,8 +9,7 @@ from pydantic import Field
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
-from harness.scenario.agent_command import AgentCommand
-from harness.scenario.event_source import Events
+from harness.scenario.agent_options import AgentCommand, Events
 from harness.scenario.network import NetworkModel
 from harness.scenario.scenario import Settle
 from harness.scenario.strict_model import MAX_AGENTS, Model, Probability, Seconds

@@ -9,8 +9,7 @@ from rich.text import Text
 
 from harness.present import text as words
 from harness.scenario.verdict_names import BAD_IN_WORDS
-from harness.sweep.matrix.estimate import Estimate
-from harness.sweep.matrix.matrix_metrics import Metric
+from harness.sweep.matrix.estimate import Estimate, Metric
 from harness.sweep.scale.cell import Cell, Growth
 from harness.sweep.scale.growth import Exponent, Law, Variable
 from harness.sweep.scale.metrics import BY_NAME

@@ -8,8 +8,7 @@ from tempfile import TemporaryDirectory
 from harness.archive.packets import packets_text
 from harness.archive.packets.air_names import Names
 from harness.archive.packets.capture_files import read_captures
-from harness.archive.packets.exchanges import Exchanges
-from harness.archive.packets.loss_table import count_losses
+from harness.archive.packets.exchanges import Exchanges, count_losses
 from harness.archive.packets.packets_document import document
 from harness.archive.packets.packets_text import Wording
 from harness.archive.packets.pcap import OUTBOUND, CaptureFile, Frame

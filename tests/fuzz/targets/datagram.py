@@ -6,8 +6,7 @@ from pathlib import Path
 from scapy.config import conf
 from scapy.packet import Raw
 
-from harness.archive.packets.datagram import NotUcpError, unwrap
-from harness.archive.packets.message_summary import summarize
+from harness.archive.packets.datagram import NotUcpError, summarize, unwrap
 from harness.archive.packets.pcap import CaptureFile
 from tests.fuzz.finding import require
 from ucp.events import MalformedEventsError, decode_events

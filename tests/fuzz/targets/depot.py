@@ -10,8 +10,7 @@ from harness.field.depot.collected_exports import came_home
 from harness.field.depot.consolidation import consolidate
 from harness.field.depot.mission_comparison import compare
 from harness.field.depot.mission_files import Plan, write
-from harness.field.depot.record_outputs import lines, table, tracks
-from harness.field.depot.record_text import in_words
+from harness.field.depot.record_outputs import in_words, lines, table, tracks
 from tests.fuzz.finding import sound
 from tests.fuzz.targets.home import sound_run
 from tests.harness.virtual import scenario

@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 from harness import checker
 from harness.errors import HarnessError
-from harness.play.simulation.foreign import foreigners, program_pool
+from harness.play.simulation.foreign import foreigners, virtual_program
 from harness.play.simulation.foreign.virtual_program import Program
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
@@ -86,7 +86,7 @@ def run(data: bytes) -> None:
 def _play(replaced: dict[int, bytes]) -> list[bytes]:
     """The good answers."""
     ours = type("Replaced", (_Ours,), {"answers": [], "replaced": replaced})
-    with patch.object(program_pool, "Program", ours), patch.object(foreigners, "SHARED", program_pool.Programs()):
+    with patch.object(virtual_program, "Program", ours), patch.object(foreigners, "SHARED", virtual_program.Programs()):
         try:
             played = simulate(SCENARIO, 1, tracing=True)
         except HarnessError as error:

@@ -12,12 +12,12 @@ from tempfile import TemporaryDirectory
 from harness import checker
 from harness.archive.archive import RunArchive
 from harness.archive.run_record import RogueInjection
-from harness.archive.trace_lines import read_lines
+from harness.archive.traces import read_lines
 from harness.errors import HarnessError
 from harness.field.adapters import bring_in
 from harness.field.adapters.csv_adapter import CommaSeparated
-from harness.field.adapters.import_record import FILE, ImportRecord
 from harness.field.adapters.rosbag_adapter import RosBag
+from harness.field.adapters.written_records import FILE, ImportRecord
 from harness.field.ingest import Homecoming, sort_out
 from harness.field.replay import Player, open_record
 from tests.fuzz.finding import require, sound

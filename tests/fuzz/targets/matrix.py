@@ -5,10 +5,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness.errors import HarnessError
-from harness.scenario.library import FOLDER
-from harness.sweep.matrix.baseline import load_baseline
+from harness.scenario.load import FOLDER
 from harness.sweep.matrix.comparison import compare
 from harness.sweep.matrix.matrix_file import Matrix, load_matrix
+from harness.sweep.matrix.nights import load_baseline
 from harness.sweep.matrix.results_file import FILE, opened
 from tests.fuzz.finding import require, sound
 from tests.harness.sweep.matrix.stub import judge, matrix, played

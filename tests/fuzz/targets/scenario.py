@@ -11,8 +11,7 @@ from tempfile import TemporaryDirectory
 from harness.errors import HarnessError
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.scenario.library import FOLDER
-from harness.scenario.load import load_scenario, parse
+from harness.scenario.load import FOLDER, load_scenario, parse
 from harness.scenario.scenario_file import ORDER, to_yaml
 from tests.fuzz.finding import require, sound
 

@@ -7,13 +7,11 @@ from random import Random
 import pytest
 
 from harness.archive.packets.air_names import Names, runs_of
-from harness.archive.packets.block_story import carried_to, story
 from harness.archive.packets.capture_files import Captures as Read
 from harness.archive.packets.capture_files import capture_files, read_captures
-from harness.archive.packets.exchanges import Answer, Exchanges
-from harness.archive.packets.loss_table import Pair, count_losses
+from harness.archive.packets.exchanges import Answer, Exchanges, Pair, count_losses
 from harness.archive.packets.packets_text import Wording
-from harness.archive.packets.selection import Selection
+from harness.archive.packets.selection import Selection, carried_to, story
 from harness.archive.packets.transmissions import Transmission, join
 from harness.errors import CaptureError
 from tests.harness.captures import INBOUND, OUTBOUND, Captures, PcapNg, Scene, frame, pcap, wall_ns

@@ -17,9 +17,8 @@ from harness.archive.archive import RunArchive
 from harness.archive.exports import ExportedBlock, ExportMaker
 from harness.report import logbook
 from harness.report.logbook import Logbook
-from harness.report.logbook.geojson import geojson
-from harness.report.logbook.kml import kml
 from harness.report.logbook.logbook_text import document, lines
+from harness.report.logbook.map_files import geojson, kml
 from harness.report.logbook.positions import LAST_TIMESTAMP_US, Track, tracks
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.mission import CONNECTED, edit, fly, write_exports, write_run

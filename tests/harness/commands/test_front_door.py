@@ -33,7 +33,7 @@ print(*(name for name in sys.modules if name.split(".")[0] in ("harness", "ucp",
 def test_whoever_flies_no_vehicle_imports_no_mavlink() -> None:
     script = """
 import sys
-import harness.commands.check, harness.commands.run
+import harness.commands.report, harness.commands.run
 print(*(name for name in sys.modules if name.startswith("pymavlink")))
 """
     listed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -7,7 +7,7 @@ import yaml
 
 from docs.generate.wrong_agents import quirky
 from harness.conformance.alphabet import LOG, TIMER
-from harness.conformance.failure_scenario import scenario_of
+from harness.conformance.kept_failures import scenario_of
 from harness.conformance.reference_model import AGENT
 from harness.conformance.state_space import VARIANTS
 from harness.conformance.virtual_lines import Writer

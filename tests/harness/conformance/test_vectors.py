@@ -5,8 +5,7 @@ from collections import Counter
 
 import pytest
 
-from harness.conformance.vector_file import to_lines
-from harness.conformance.vectors import Vectors, generate
+from harness.conformance.vectors import Vectors, generate, to_lines
 from ucp.agent import HANDLERS
 from ucp.virtual import InputError, VirtualAgent
 

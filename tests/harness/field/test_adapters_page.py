@@ -8,7 +8,7 @@ import pytest
 from harness.archive.packets.capture_files import capture_files, read_captures
 from harness.errors import FieldError
 from harness.field.adapters import bring_in
-from harness.field.adapters.adapter_loading import load_adapter
+from harness.field.adapters.adapter import load_adapter
 from harness.field.adapters.csv_adapter import CommaSeparated
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of

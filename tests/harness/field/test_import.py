@@ -16,8 +16,8 @@ from harness.archive.traces import read_trace
 from harness.errors import FieldError, MachineError
 from harness.field.adapters import bring_in
 from harness.field.adapters.csv_adapter import CommaSeparated
-from harness.field.adapters.import_record import ImportRecord
 from harness.field.adapters.rosbag_adapter import RosBag
+from harness.field.adapters.written_records import ImportRecord
 from harness.field.ingest import sort_out
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of

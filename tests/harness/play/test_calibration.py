@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from harness import cli
 from harness.commands import doctor as doctor_module
-from harness.play.machine import calibration
+from harness.play.machine import capabilities
 from harness.play.machine.capabilities import Requirement
 from netem.conditions import NetworkConditions
 from netem.errors import LabError
@@ -42,8 +42,8 @@ def losing(*shares: float) -> Observer:
 def fake(monkeypatch: pytest.MonkeyPatch, observer: Observer, findings: list[Requirement] = WORKS) -> None:
     """A machine with these findings, whose network is an observer, and of which one question is asked."""
     monkeypatch.setattr(doctor_module, "examine", lambda: findings)
-    monkeypatch.setattr(calibration, "studies", lambda engine: (STUDY,))
-    monkeypatch.setattr(calibration, "in_lab", lambda engine: observer)
+    monkeypatch.setattr(capabilities, "studies", lambda engine: (STUDY,))
+    monkeypatch.setattr(capabilities, "in_lab", lambda engine: observer)
 
 
 def doctor(*options: str) -> Result:

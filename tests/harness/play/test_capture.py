@@ -11,7 +11,7 @@ import pytest
 
 from harness.archive.run_record import CapturedFrames
 from harness.play.progress import Silent
-from harness.report.capture_gaps import gaps
+from harness.report.facts import gaps
 from harness.run.run import run
 from netem.frames import udp_broadcast
 from tests.captured import Frame, comment, frames, statistics

@@ -7,8 +7,8 @@ import pytest
 
 from harness.play.rogue import journal
 from harness.play.rogue.crafted import corrupted, random_message
+from harness.play.rogue.journal import forged_sequence, injection_of
 from harness.play.rogue.rogue import Rogue, RogueDatagram
-from harness.play.rogue.sequences import forged_sequence, injection_of
 from harness.scenario.injection import MAX_FLOOD, MODELS
 from ucp.block import Block, next_chain_hash
 from ucp.messages import (

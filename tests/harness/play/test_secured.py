@@ -7,7 +7,7 @@ from harness.play.progress import Silent
 from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.security import Security
+from harness.scenario.agent_options import Security
 from tests.harness.virtual import scenario
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"

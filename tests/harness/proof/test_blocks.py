@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds, prove
-from harness.proof.examples.block_ages import Ages
 from harness.proof.examples.path_script import Script
+from harness.proof.examples.path_times import Ages
 from harness.proof.graph.exploration import Graph, explore
 from harness.proof.model.global_states import AGENTS, Swarm
 from harness.run.simulate import simulate

@@ -15,7 +15,7 @@ from harness.proof.model.global_states import AGENTS, Swarm
 from harness.proof.model.known_states import DEAD
 from harness.proof.model.snapshot import key_of, put_back, take
 from harness.proof.questions import convergence
-from harness.scenario.stagger import Stagger, staggered
+from harness.scenario.agent_options import Stagger, staggered
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent

@@ -19,7 +19,7 @@ from harness.proof.graph.workers import Crew
 from harness.proof.model.any_sender import collect
 from harness.proof.model.global_states import Swarm
 from harness.proof.progress_bar import memory_bytes
-from harness.scenario.stagger import Stagger
+from harness.scenario.agent_options import Stagger
 from tests.harness.command import COMMAND, harness, sentences
 
 

@@ -11,8 +11,8 @@ from harness.proof.examples.path_script import Script
 from harness.proof.graph.exploration import Graph
 from harness.proof.model.global_states import AGENTS
 from harness.run.simulate import simulate
+from harness.scenario.agent_options import Stagger
 from harness.scenario.load import parse
-from harness.scenario.stagger import Stagger
 from tests.harness.proof.test_blocks import alike, all_alike, renumbered
 from tests.harness.proof.test_explore import Seen, by_chance, by_place, explored
 

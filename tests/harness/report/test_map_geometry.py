@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.archive.tracks import Fix
-from harness.report.map_geometry import FINEST, Extent, Point, Projection, extent, simplified, thinned
+from harness.report.map_parts import FINEST, Extent, Point, Projection, extent, simplified, thinned
 
 LAND = Extent(south_m=-100, north_m=100, west_m=-200, east_m=200)
 TO_PX = Projection(LAND, 10, 20, 800, 600)

@@ -11,7 +11,7 @@ from harness.archive.run_record import FaultRecord, JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
 from harness.checker.agreement import had_a_chance
-from harness.play.seeds import agent_seed
+from harness.play.backend import agent_seed
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
 from tests.harness.virtual import scenario

@@ -9,7 +9,7 @@ from harness.errors import ScenarioError
 from harness.run.simulate import Simulated, simulate
 from harness.scenario.expect import Expect
 from harness.scenario.load import parse
-from harness.scenario.numbered import in_text, numbered
+from harness.scenario.strict_model import in_text, numbered
 from tests.harness.virtual import scenario
 from ucp.block import Block, InceptionBlock, next_chain_hash
 from ucp.events import LoggableEvent

@@ -4,7 +4,7 @@ An index is not asked for, nor `metadata.yaml`: a bag whose recorder was killed,
 What is behind a damaged place is used. Sizes that a file claims are believed up to a bound. What the messages mean is
 for the package rosbags to say (harness.field.adapters.rosbag_adapter).
 
-bag_message.py      what is found in a bag: messages, and places that cannot be read
+decompression.py      what is found in a bag: messages, and places that cannot be read
 version_1.py  version 1
 mcap_bag.py       version 2 in MCAP
 sqlite.py     version 2 in SQLite
@@ -20,8 +20,7 @@ from typing import NamedTuple
 
 from harness.archive.bounded_file import Opened
 from harness.field.adapters.bags import mcap_bag, sqlite, version_1
-from harness.field.adapters.bags.bag_message import MAX_FILE_BYTES, Broken, Found, Item
-from harness.field.adapters.bags.decompression import ZSTD_MAGIC, unpacked_file
+from harness.field.adapters.bags.decompression import MAX_FILE_BYTES, ZSTD_MAGIC, Broken, Found, Item, unpacked_file
 
 MAGICS = (version_1.MAGIC, mcap_bag.MAGIC, sqlite.MAGIC, ZSTD_MAGIC)
 """What a bag begins with."""

@@ -4,7 +4,7 @@ import re
 import struct
 from collections.abc import Iterator
 
-from harness.field.adapters.bags.bag_message import (
+from harness.field.adapters.bags.decompression import (
     MAX_CHUNK_BYTES,
     MAX_RECORDS,
     MAX_TRIES,
@@ -12,8 +12,8 @@ from harness.field.adapters.bags.bag_message import (
     Buffer,
     Item,
     Topics,
+    unpacked,
 )
-from harness.field.adapters.bags.decompression import unpacked
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 2, 3, 4, 5, 6, 15

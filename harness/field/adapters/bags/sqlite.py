@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from harness.field.adapters.bags.bag_message import (
+from harness.field.adapters.bags.decompression import (
     MAX_CHUNK_BYTES,
     MAX_FILE_BYTES,
     MAX_MESSAGE_BYTES,

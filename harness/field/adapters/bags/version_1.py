@@ -4,7 +4,7 @@ import re
 import struct
 from collections.abc import Iterator
 
-from harness.field.adapters.bags.bag_message import (
+from harness.field.adapters.bags.decompression import (
     MAX_CHUNK_BYTES,
     MAX_RECORDS,
     MAX_TRIES,
@@ -12,8 +12,8 @@ from harness.field.adapters.bags.bag_message import (
     Buffer,
     Item,
     Topics,
+    unpacked,
 )
-from harness.field.adapters.bags.decompression import unpacked
 
 MAGIC = b"#ROSBAG V2.0\n"
 _U32, _TIME = struct.Struct("<I"), struct.Struct("<II")

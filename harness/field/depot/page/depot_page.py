@@ -12,8 +12,7 @@ from harness.field.depot.consolidation import Consolidation
 from harness.field.depot.depot_reconcile import Reconciliation
 from harness.field.depot.page import holdings, position_map, time_chart
 from harness.field.depot.record_lines import Block
-from harness.field.depot.record_outputs import tracks
-from harness.field.depot.record_text import agents, fork_in_words, in_words, reconciled_in_words
+from harness.field.depot.record_outputs import agents, fork_in_words, in_words, reconciled_in_words, tracks
 from harness.present import text as words
 from harness.present.colours import Ink, inks
 from harness.report import html

@@ -16,9 +16,8 @@ from harness.present import text
 from harness.present.colours import Ink
 from harness.present.svg import FONT, n
 from harness.report.logbook.positions import Entry, Track, Whereabouts
-from harness.report.map_geometry import Point, Projection, extent, thinned
-from harness.report.map_svg import end_mark, frame, start_mark
-from harness.report.map_tags import tags
+from harness.report.map_parts import Point, Projection, extent, thinned
+from harness.report.map_svg import end_mark, frame, start_mark, tags
 from ucp.telemetry import describe
 
 METRES_PER_DEGREE = 111_195.0

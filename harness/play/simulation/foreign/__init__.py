@@ -1,7 +1,7 @@
 """Agents that are not ours in virtual time: programs that are given lines and answer with lines.
 
 virtual_program.py   one of them as a process: what it is told, what it says, and for how long one waits
-program_pool.py  those that wait for their next mission
+virtual_program.py  those that wait for their next mission
 answer.py    what a line of theirs says
 failure.py   how one ends a mission
 foreigners.py  whose program plays whom

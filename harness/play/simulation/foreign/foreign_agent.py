@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from harness.archive.exports import Export
 from harness.play.agent_control import Status
-from harness.play.last_output import last_words, of_a_shell
+from harness.play.command_line import last_words, of_a_shell
 from harness.play.simulation.foreign.answer import (
     Answer,
     AnswerError,

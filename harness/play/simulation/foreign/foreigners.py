@@ -9,8 +9,7 @@ from harness.errors import MachineError, ScenarioError
 from harness.play.process.agent_mission import mission_file
 from harness.play.process.agent_process import agent_command, reboots_with_disk
 from harness.play.simulation.foreign.foreign_agent import ForeignAgent, LifeRecord
-from harness.play.simulation.foreign.program_pool import SHARED, Programs
-from harness.play.simulation.foreign.virtual_program import Program
+from harness.play.simulation.foreign.virtual_program import SHARED, Program, Programs
 from harness.play.simulation.simulated_agent import Stored, VirtualAgent
 from harness.scenario import Scenario
 from netem import addresses

@@ -2,7 +2,7 @@
 
 mutation.py    a scenario changed by chance into another
 hunt_trial.py     one run, with a liveness phase at its end: what it reached, and what it showed
-timer_paths.py      when timers ended in it, and who voted in vain on which way: what comes near a livelock
+hunt_trial.py      when timers ended in it, and who voted in vain on which way: what comes near a livelock
 finding_identity.py  what a finding is, whichever run shows it
 hunt.py      changing, playing, keeping
 corpus.py    what is kept between nights, in a directory

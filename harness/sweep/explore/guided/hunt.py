@@ -1,4 +1,4 @@
-"""The hunt: documents are changed, played, and kept if they reach something new; kept ones are changed again.
+"""The hunt: change documents, play them, and keep those that reach something new.
 
 It goes by rounds. What a round tries depends on what was kept before it and on the lots alone, never on how fast
 anything was, so that it is the same however many processes play.
@@ -19,11 +19,31 @@ from harness.proof.coverage.reached import MOST
 from harness.run.parallel import Failed, sweep
 from harness.scenario import Scenario
 from harness.sweep.explore.guided.finding_identity import Identity
-from harness.sweep.explore.guided.hunt_trial import Apart, Tried, tried, with_liveness_phase
+from harness.sweep.explore.guided.hunt_trial import Apart, Tried, Ways, tried, with_liveness_phase
 from harness.sweep.explore.guided.mutation import Limits, changed
-from harness.sweep.explore.guided.reached_overflow import Beyond
-from harness.sweep.explore.guided.timer_paths import Ways
 from harness.sweep.explore.scenario_document import Document, with_key
+
+BITS = 1 << 28
+"""32 MiB. Of ten million numbers one in thirty is taken for another that was there before."""
+
+
+class Beyond:
+    """Numbers of local states, or of pairs, which are digests. `count` is how many there are, at least."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._bits = bytearray(BITS // 8)
+
+    def __contains__(self, number: int) -> bool:
+        place = number % BITS
+        return bool(self._bits[place >> 3] >> (place & 7) & 1)
+
+    def add(self, number: int) -> None:
+        """Take down one that is not there."""
+        place = number % BITS
+        self._bits[place >> 3] |= 1 << (place & 7)
+        self.count += 1
+
 
 ROUND = 64
 """Runs that are tried before it is looked at what they reached."""

@@ -1,13 +1,17 @@
-"""One run of a hunt: a document, played with a liveness phase at its end, and what it reached and showed.
+"""One run of a hunt: its document, its verdict, and the timers that ended in it.
 
 In the liveness phase all conditions are cleared and no more events are logged; the swarm must become idle. Where it
 then has several chains, whoever plays it may play it again with a final reconcile, after which there must be one.
+
+A livelock is such a way that never ends. Those that end are near it.
 """
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from typing import NamedTuple
 
 from harness.checker import Evidence, Result
 from harness.checker.evidence import Watch
@@ -20,11 +24,53 @@ from harness.run.finding import ended_by
 from harness.scenario import Scenario
 from harness.sweep.explore.guided.finding_identity import Identity, identities
 from harness.sweep.explore.guided.mutation import AFTER_LAST_S, FEW_BLOCKS, Limits, with_events
-from harness.sweep.explore.guided.timer_paths import Ways, in_vain, timers_ended
 from harness.sweep.explore.recording import Logged, record
 from harness.sweep.explore.scenario_document import Document, at, cut_after, document_of, timeline, with_key
+from ucp.agent import ON_TIMER
 from ucp.events import EVENT_HEADER_BYTES
 from ucp.settings import Settings
+
+APPROVED = (ON_TIMER["voting"].name, "approved")
+MOST = 16
+"""Of a longer way only so many timers, the last, tell it from others."""
+
+Ways = tuple[tuple[str, ...], ...]
+"""Of each agent which timers ended, in order."""
+
+
+class Ended(NamedTuple):
+    """A timer ended, and its handler took this branch."""
+
+    at_s: float
+    agent_id: int
+    timer: str
+    handler: str
+    branch: str
+
+
+def timers_ended(evidence: Evidence) -> list[Ended]:
+    """Of all agents, in order."""
+    return sorted(
+        Ended(run.t, agent_id, str(run.trigger["timer"]), run.handler, run.branch)
+        for agent_id, trace in evidence.traces.items()
+        for run in trace.runs
+        if "timer" in run.trigger
+    )
+
+
+def in_vain(ended: Iterable[Ended]) -> Ways:
+    """The longest that agents went on without a vote that was approved; none if not at least two votes failed on it."""
+    longest: Sequence[Ended] = ()
+    for approved, stretch in groupby(ended, lambda each: (each.handler, each.branch) == APPROVED):
+        if not approved:
+            longest = max(longest, [*stretch], key=len)
+    if sum(each.timer == "voting" for each in longest) < 2:
+        return ()
+    ways = defaultdict[int, list[str]](list)
+    for each in longest[-MOST:]:
+        ways[each.agent_id].append(each.timer)
+    return tuple(sorted(map(tuple, ways.values())))
+
 
 MOST_BLOCKS = 12
 """Runs have no more: states of many blocks are new in every run, and tell nothing."""

@@ -9,7 +9,7 @@ from random import Random
 from typing import Any, NamedTuple, get_args
 
 from harness.scenario.fates import MessageName
-from harness.scenario.numbered import in_text, numbered
+from harness.scenario.strict_model import in_text, numbered
 from harness.sweep.explore.scenario_document import Document, at, script, timeline, with_agents, with_key
 from ucp.settings import Settings
 

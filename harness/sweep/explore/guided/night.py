@@ -30,8 +30,8 @@ from harness.sweep.explore.guided.mutation import Limits
 from harness.sweep.explore.guided.night_page import to_html
 from harness.sweep.explore.recording import record
 from harness.sweep.explore.scenario_document import Document
+from harness.sweep.explore.shrink import file_of
 from harness.sweep.explore.smaller import scenario_of
-from harness.sweep.explore.smallest_scenario import file_of
 
 Status = Literal["new", "resolved", "rare", "ongoing"]
 

@@ -1,7 +1,7 @@
 """report.html of a matrix: one file, which loads nothing and runs no script.
 
 matrix_page.py       gathers it            page.html.j2, page.css   how it looks, with the parts of a run's report
-figure_menu.py    what can be shown     heatmap.py   of each cell     trend.py   over the nights
+heatmap.py    what can be shown     heatmap.py   of each cell     trend.py   over the nights
 drilldown.py  the runs of a cell, and how to play them again
 """
 

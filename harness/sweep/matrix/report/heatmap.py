@@ -1,19 +1,61 @@
-"""A figure at each point of the matrix: a table of loss and numbers of agents for each backend.
+"""Figures at each point of a matrix as a heatmap, and the menu of figures.
 
 The shade grows with the figure. It has one hue, so that anybody sees it, and each cell says its number; a sign and
 words say what was violated, failed, or changed.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from harness.present import text as words
 from harness.present.colours import ramp
 from harness.sweep.matrix.cell import Cell
-from harness.sweep.matrix.estimate import Estimate
+from harness.sweep.matrix.estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, Metric, estimate_share, figure
 from harness.sweep.matrix.matrix_file import Point
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import name_of, say, say_interval, say_mean, violated
-from harness.sweep.matrix.report.figure_menu import Figure
+
+MEANINGS = {
+    "uniform": "Share of the runs that end with one uniform chain on all agents.",
+    "mutual_share": "Share of a run\u2019s blocks that end in the chain that all agents have in common.",
+    "distinct_chains": "How many different chains there are at the end.",
+    "reconciles": "Reconciles of all agents.",
+    "copies_mean": "In how many chains a block is at the end, mean of the blocks.",
+    "copies_min": "In how many chains the block is at the end that fewest have.",
+    "messages_per_block": "Messages that all agents sent for each block.",
+    "uniform_before_final_reconcile": "Share of the runs that the mission left with one uniform chain.",
+    "mutual_share_before_final_reconcile": "Share of a run\u2019s blocks that the mission left in all chains.",
+    "finished": "Share of the runs whose agents became idle once no more events came.",
+    "violated": "Share of the runs that violated a characteristic.",
+}
+_FINISHED = Metric("finished", "finished", figure("finished"), "share of runs")
+_VIOLATED = Metric("violated", "violated", figure("violated"), "share of runs")
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    metric: Metric
+
+    @property
+    def meaning(self) -> str:
+        return MEANINGS[self.metric.name]
+
+    def of(self, cell: Cell) -> Estimate:
+        if self.metric is _VIOLATED:
+            return estimate_share(violated(cell), cell.runs - cell.failed - cell.unsupported)
+        if self.metric is _FINISHED:
+            return cell.finished
+        return cell.estimates.get(self.metric.name, Estimate(n=0))
+
+
+def known(cells: Iterable[Cell]) -> list[Figure]:
+    """Those that a run told, first what the mission left; the violated at least."""
+    cells = list(cells)
+    names = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
+    metrics = [metric for metric in BEFORE_FINAL_RECONCILE + METRICS if metric.name in names]
+    judged = [_FINISHED] if any(cell.finished.n for cell in cells) else []
+    return [Figure(metric) for metric in (*metrics, *judged, _VIOLATED)]
+
 
 SHADES = 11
 _LIGHT = ramp((236, 244, 250), (0, 78, 122), SHADES)

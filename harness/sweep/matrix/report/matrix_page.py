@@ -15,7 +15,7 @@ from harness.sweep.matrix.matrix_run import Finished
 from harness.sweep.matrix.matrix_summary import tried_in_words, verdict
 from harness.sweep.matrix.matrix_table import explanation, improvements, name_of, troubles, unjudged
 from harness.sweep.matrix.nights import Nights
-from harness.sweep.matrix.report import figure_menu, heatmap, trend
+from harness.sweep.matrix.report import heatmap, trend
 from harness.sweep.matrix.report.drilldown import drilldown
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
@@ -25,7 +25,7 @@ _STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
 def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -> str:
     """`directory` is where the page will be, beside the runs that were kept; `nights` has this one too, if finished."""
     record = finished.record
-    shown = figure_menu.known(record.cells)
+    shown = heatmap.known(record.cells)
     drawn = trend.nights_drawn(nights.records, record, len(shown)) if nights else []
     return html.render(
         _TEMPLATE,
@@ -55,7 +55,7 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
     )
 
 
-def _choosing(shown: list[figure_menu.Figure]) -> str:
+def _choosing(shown: list[heatmap.Figure]) -> str:
     """Of what is drawn for each figure only the chosen one's is shown; on paper all heatmaps are."""
     others = [
         f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown

@@ -16,7 +16,7 @@ from harness.sweep.matrix.estimate import Estimate
 from harness.sweep.matrix.matrix_picture import Dot, curve
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import say, series, series_name
-from harness.sweep.matrix.report.figure_menu import Figure
+from harness.sweep.matrix.report.heatmap import Figure
 
 COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
 MAX_DOTS = 12_000

@@ -19,8 +19,7 @@ from harness.field.depot.collected_exports import came_home
 from harness.field.depot.consolidation import Consolidation, consolidate
 from harness.field.depot.depot_reconcile import reconcile
 from harness.field.depot.record_lines import Block, ConsolidatedLine, Event, Header, Lost, Reconciled
-from harness.field.depot.record_outputs import lines
-from harness.field.depot.record_text import in_words
+from harness.field.depot.record_outputs import in_words, lines
 from tests.harness.command import harness, sentences, write_scenario
 from tests.harness.field.depot.exports import DATA, brought, document, made, names, write
 from ucp.block import Block as UcpBlock

@@ -9,9 +9,8 @@ import pytest
 
 from harness.archive.exports import Export
 from harness.errors import RunDirectoryError
-from harness.field.depot.manifest import Manifest
 from harness.field.depot.mission_comparison import Comparison, compare
-from harness.field.depot.mission_files import MissionFileError, Plan, write
+from harness.field.depot.mission_files import Manifest, MissionFileError, Plan, write
 from tests.harness.command import harness, sentences
 from tests.harness.virtual import scenario
 from ucp.agent import Agent

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from harness.errors import HarnessError
-from harness.play.simulation.foreign.program_pool import Programs
+from harness.play.simulation.foreign.virtual_program import Programs
 from harness.run.simulate import simulate
 from harness.sweep.matrix.cell_play import Player
 from harness.sweep.matrix.matrix_file import Matrix

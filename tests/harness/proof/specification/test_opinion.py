@@ -10,7 +10,7 @@ import pytest
 
 from harness.proof import Bounds
 from harness.proof.specification import second_opinion, tlc
-from harness.scenario.stagger import Stagger
+from harness.scenario.agent_options import Stagger
 from tests.harness.command import harness, sentences
 from tests.machine import require_tlc
 

@@ -19,7 +19,7 @@ from harness.errors import RunDirectoryError
 from harness.proof.coverage import Reached
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.library import find
+from harness.scenario.load import find
 from harness.sweep.explore.guided import Night, spend
 from harness.sweep.explore.guided.corpus import MOST_BYTES, opened
 from harness.sweep.explore.guided.finding_identity import identities

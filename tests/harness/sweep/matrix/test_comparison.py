@@ -10,12 +10,11 @@ from harness.checker import Result
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
 from harness.sweep.matrix import Finished, MatrixRecord, matrix_outputs
-from harness.sweep.matrix.baseline import load_baseline
 from harness.sweep.matrix.cell import Cell
 from harness.sweep.matrix.comparison import compare
-from harness.sweep.matrix.estimate import Estimate
-from harness.sweep.matrix.matrix_metrics import BY_NAME
+from harness.sweep.matrix.estimate import BY_NAME, Estimate
 from harness.sweep.matrix.matrix_run import compared
+from harness.sweep.matrix.nights import load_baseline
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
 WORSE = {

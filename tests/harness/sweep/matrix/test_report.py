@@ -17,7 +17,7 @@ from harness.sweep.matrix.cell_scenarios import scenario_file, write_scenarios
 from harness.sweep.matrix.matrix_run import compared
 from harness.sweep.matrix.nights import Nights
 from harness.sweep.matrix.report import drilldown, heatmap, to_html, trend
-from harness.sweep.matrix.report.figure_menu import known
+from harness.sweep.matrix.report.heatmap import known
 from tests.harness.command import harness
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 

@@ -1,12 +1,23 @@
-"""The keys of a vehicle are taken back: it was lost, and nobody knows to whom."""
+"""Orders from the ground: reconcile, revoke keys, stop logging events."""
 
 from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import Field
 
-from harness.scenario.faults.fault import KILLED, PAUSED, REBOOTING, RUNNING, SWITCHED_OFF, Fault, Lives
+from harness.scenario.faults.fault import BAR, KILLED, PAUSED, REBOOTING, RUNNING, SWITCHED_OFF, Fault, Lives
 from harness.scenario.strict_model import VehicleId
+
+
+class Reconcile(Fault):
+    """They begin a reconcile, as the operator asks (Section 5.1); one that reconciles already goes on with that."""
+
+    what = "reconcile"
+    needs = (RUNNING,)
+
+    async def strike(self, lives: Lives, agent_id: int) -> None:
+        await lives.reconcile(agent_id)
+
 
 Hearers = Annotated[list[VehicleId], Field(min_length=1)]
 
@@ -31,3 +42,16 @@ class Revoke(Fault):
 
     async def strike(self, lives: Lives, agent_id: int) -> None:
         await lives.revoke(agent_id, self.heard_by)
+
+
+class StopEvents(Fault):
+    """They log no more events, as a vehicle on the ground does (Section 4.2); votes and reconciles go on."""
+
+    what = "stop_events"
+    needs = (RUNNING,)
+    stops_events = True
+    mark = BAR
+    meaning = "logs no more events"
+
+    async def strike(self, lives: Lives, agent_id: int) -> None:
+        await lives.stop_logging(agent_id)

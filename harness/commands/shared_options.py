@@ -1,0 +1,111 @@
+"""Options and arguments that several commands share."""
+
+import contextlib
+import shutil
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from harness.errors import MachineError, RunDirectoryError, ScenarioError
+
+if TYPE_CHECKING:
+    from ucp.secure.opening import Opener
+    from ucp.secure.sealing import Depot
+
+BundleOption = Annotated[
+    Path | None,
+    typer.Option("--bundle", help="Opens what a secured mission sealed: any vehicle's, of `ucp-harness keys bundle`."),
+]
+
+
+def opener_of(bundle: Path | None) -> "Opener | None":
+    """What opens the datagrams of that vehicle's mission; None without a bundle. Raises KeysError, MachineError."""
+    if bundle is None:
+        return None
+    try:
+        from harness.play.keyring import KeysError
+        from ucp.secure.bundle import load_bundle
+        from ucp.secure.keyfile import KeyFileError
+        from ucp.secure.opening import Opener
+    except ModuleNotFoundError:
+        raise MachineError("--bundle takes a further package: `pip install ucp-harness[secure]`") from None
+    try:
+        return Opener(load_bundle(bundle))
+    except KeyFileError as error:
+        raise KeysError(f"--bundle: {error}") from None
+
+
+DepotKey = Annotated[
+    Path | None,
+    typer.Option(
+        "--depot-key", help="Opens event data that is sealed to the depot: its key, of `ucp-harness keys new`."
+    ),
+]
+
+
+def depot_of(path: Path | None) -> "Depot | None":
+    """Whose key is in the file; None without a file. Raises KeysError, MachineError."""
+    if path is None:
+        return None
+    try:
+        from harness.play.keyring.key_directory import load_depot_key
+    except ModuleNotFoundError:
+        raise MachineError("--depot-key takes a further package: `pip install ucp-harness[secure]`") from None
+    return load_depot_key(path)
+
+
+def roster_of(text: str) -> int | list[int]:
+    """As a scenario has it: a number of agents, or their IDs. Raises ScenarioError."""
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isascii() and part.isdecimal() and len(part) < 10 for part in parts):
+        raise ScenarioError(f"`--agents` is {text!r}: it should be a number of agents, or IDs as 10,28,32")
+    return int(parts[0]) if len(parts) == 1 else [int(part) for part in parts]
+
+
+def refuse_existing(paths: Iterable[Path]) -> None:
+    """Raises RunDirectoryError if one of them is there already: before work begins that would be for nothing."""
+    for path in paths:
+        if path.exists():
+            raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten")
+
+
+def write_new(path: Path, parts: Iterable[str]) -> None:
+    """Raises RunDirectoryError if the file is there already or cannot be made, MachineError if the disk refuses."""
+    try:
+        file = path.open("x", encoding="utf-8", newline="")
+    except FileExistsError:
+        raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten") from None
+    except OSError as error:
+        raise RunDirectoryError(f"{path} cannot be made: {error.strerror}; choose another file") from None
+    try:
+        with file:
+            file.writelines(parts)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            path.unlink()
+        raise MachineError(f"{path} cannot be written: {error.strerror}") from None
+
+
+@contextlib.contextmanager
+def newly(path: Path) -> Iterator[None]:
+    """Whatever makes the file or directory makes it whole: of half of it nothing is left.
+
+    Raises RunDirectoryError if it is there already or cannot be made, MachineError if the disk refuses.
+    """
+    refuse_existing([path])
+    if not path.absolute().parent.is_dir():
+        raise RunDirectoryError(f"{path} cannot be made: its directory is not there; choose another file")
+    try:
+        yield
+    except FileExistsError:
+        raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten") from None
+    except BaseException as error:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise MachineError(f"{path} cannot be written: {error.strerror}") from None
+        raise
