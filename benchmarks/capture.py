@@ -18,14 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.rounds import Spread, show
-from netem import probe
+from netem import _probe
 from netem.capture import LiveCapture
 from netem.errors import CaptureError
 from netem.lab import Lab, LabError
 
 _PORT = 14600
 _RATES = (5_000, 10_000, 20_000, 40_000)
-_BURST = 20  # of netem.probe, between two pauses
+_BURST = 20  # of netem._probe, between two pauses
 _FASTEST = 0
 _FASTEST_PACKETS = 200_000
 
@@ -62,7 +62,7 @@ def _pause_s(rate: int) -> float:
 async def _broadcast(lab: Lab, packets: int, size: int, pause_s: float, folder: Path) -> float:
     """Seconds that it took."""
     numbers = (_PORT, packets, 0, lab.broadcast, size, pause_s)
-    argv = [sys.executable, "-I", "-S", probe.__file__, "broadcast", *map(str, numbers)]
+    argv = [sys.executable, "-I", "-S", _probe.__file__, "broadcast", *map(str, numbers)]
     output = folder / "broadcast.log"
     start = time.perf_counter()
     sender = await lab.spawn(1, argv, cwd=folder, env=dict(os.environ), stdout=output, stderr=output)

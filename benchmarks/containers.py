@@ -18,11 +18,11 @@ from typing import Any
 from benchmarks.rounds import Spread, show
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
-from harness.play.containers.container_backend import Containers
-from harness.play.containers.container_preflight import require_root
-from harness.play.process.agent_process import AgentProcess, agent_command
-from harness.play.process.process_backend import Processes
-from harness.play.process.run_lab import OpenLab
+from harness.play.containers._container_backend import Containers
+from harness.play.containers._container_preflight import require_root
+from harness.play.process._agent_process import AgentProcess, agent_command
+from harness.play.process._process_backend import Processes
+from harness.play.process._run_lab import OpenLab
 from harness.scenario.load import parse
 from netem.errors import NetemError
 from ucp.clock import MissionClock

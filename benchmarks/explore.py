@@ -15,8 +15,8 @@ from random import Random
 from harness.proof import Bounds
 from harness.proof.coverage import Existing, Reached, existing
 from harness.scenario import Scenario
-from harness.sweep.explore.guided.hunt import Candidate, Hunt
-from harness.sweep.explore.guided.hunt_trial import beginnings, tried
+from harness.sweep.explore.guided._hunt import Candidate, Hunt
+from harness.sweep.explore.guided._hunt_trial import beginnings, tried
 
 LOSS = {"network": {"loss": 0.15}}
 SCENARIOS = {

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from benchmarks.rounds import Spread, show
-from netem import namespaces
+from netem import _namespaces
 from netem.conditions import LinkConditions, NetworkConditions
 from netem.lab import EngineName, Lab, LabError, LabUnavailable
 
@@ -54,7 +54,7 @@ async def lab_once(vehicles: int, log: Path) -> _Row:
 
 def mininet_once(hosts: int) -> _Row:
     """Seconds that Mininet takes for as many hosts, in namespaces that take with them what it leaves behind."""
-    argv = namespaces.command([_PYTHON, str(_MININET), str(hosts)], user_namespace=False)
+    argv = _namespaces.command([_PYTHON, str(_MININET), str(hosts)], user_namespace=False)
     done = subprocess.run(argv, capture_output=True, text=True, timeout=_MININET_DEADLINE_S, check=False)
     if done.returncode != 0:
         raise SystemExit(f"Mininet failed with {hosts} hosts:\n{done.stderr}")

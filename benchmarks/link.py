@@ -26,11 +26,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.rounds import Spread, show
-from netem import addresses, namespaces
+from netem import _namespaces, addresses
+from netem._fabric import Fabric
+from netem._nft import NftablesEngine
 from netem.engine import Engine
 from netem.errors import EngineError
-from netem.fabric import Fabric
-from netem.nft import NftablesEngine
 from netem.tc import NetemEngine
 
 _DATAGRAM = bytes(512)
@@ -76,15 +76,15 @@ class Link:
 
 
 def veth_pair() -> Link:
-    namespaces.unshare_network()
-    one = namespaces.open_network()
-    namespaces.unshare_network()
-    two = namespaces.open_network()
+    _namespaces.unshare_network()
+    one = _namespaces.open_network()
+    _namespaces.unshare_network()
+    two = _namespaces.open_network()
     _ip(f"link add eth0 type veth peer name eth0 netns /proc/{os.getpid()}/fd/{one}", *_own(2))
-    namespaces.enter_network(one)
+    _namespaces.enter_network(one)
     _ip(*_own(1))
     ends = {1: one, 2: two}
-    return Link("veth", lambda vehicle: namespaces.inside(ends[vehicle], one))
+    return Link("veth", lambda vehicle: _namespaces.inside(ends[vehicle], one))
 
 
 def _own(vehicle: int) -> list[str]:
@@ -98,7 +98,7 @@ def _ip(*commands: str) -> None:
 
 def switch(engine: type[Engine] | None) -> Link:
     """As `netem.init` makes it; raises EngineError where the engine does not work."""
-    namespaces.unshare_network()
+    _namespaces.unshare_network()
     fabric = Fabric([1, 2], {})
     if engine is not None:
         engine(fabric)
@@ -256,12 +256,12 @@ def main() -> None:
         found = rows(measure(options.rounds, options.seconds))
         show(found, {"figure": ",.1f", "ratio": ".2f"}, options.json)
         return
-    possible, word = namespaces.probe()
+    possible, word = _namespaces.probe()
     if not possible:
-        sys.stderr.write(f"This machine does not let us make a private network ({word}). {namespaces.way_out(word)}\n")
+        sys.stderr.write(f"This machine does not let us make a private network ({word}). {_namespaces.way_out(word)}\n")
         sys.exit(3)
     argv = [sys.executable, "-m", "benchmarks.link", "--inside", *sys.argv[1:]]
-    sys.exit(subprocess.run(namespaces.command(argv, user_namespace=os.geteuid() != 0), check=False).returncode)
+    sys.exit(subprocess.run(_namespaces.command(argv, user_namespace=os.geteuid() != 0), check=False).returncode)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,8 @@ from itertools import product
 
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.sweep.explore.exploring import simulated as explored
-from harness.sweep.matrix.cell_play import simulated as cell
+from harness.sweep.explore._exploring import simulated as explored
+from harness.sweep.matrix._cell_play import simulated as cell
 
 LOSS = (0.0, 0.10, 0.15, 0.25, 0.30, 0.50, 0.75, 1.00)
 """Of scenarios/thesis_matrix.yaml."""

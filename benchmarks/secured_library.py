@@ -17,7 +17,7 @@ from harness.errors import HarnessError
 from harness.run.parallel import Failed, cores, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load, load_scenario, read_yaml
-from harness.sweep.matrix.matrix_file import load_matrix
+from harness.sweep.matrix._matrix_file import load_matrix
 
 INJECTIONS = "what its rogue node injects, of which agents with keys believe less"
 REVOCATIONS = "its revocations, which nobody without keys hears"

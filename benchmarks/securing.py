@@ -26,7 +26,7 @@ from harness.play.progress import Silent
 from harness.run.run import run
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.sweep.matrix.cell_play import simulated
+from harness.sweep.matrix._cell_play import simulated
 from ucp.block import Block
 from ucp.messages import (
     BlockAddRequest,

@@ -1,6 +1,6 @@
 """What an engine is: it makes the kernel do to packets what conditions say, and reports what it did.
 
-Two engines stand behind this interface: `netem.tc` (tc-netem(8)) and `netem.nft` (nft(8)). Both count per
+Two engines stand behind this interface: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). Both count per
 receiver, as the kernel does, every packet passed, lost and cut off; counts live as long as the lab and are
 not reset by a change. After every change the kernel is asked what it holds, and a difference to what was
 asked is an error, not a note: the conditions before are then put back. Packets that are under way when
@@ -16,9 +16,9 @@ from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, ClassVar
 
+from netem._fabric import Fabric
 from netem.conditions import NetworkConditions
 from netem.errors import EngineError
-from netem.fabric import Fabric
 from netem.link import GilbertElliott, LinkConditions
 
 RESOLUTION = 1.5e-9

@@ -1,6 +1,6 @@
 """The lab's first process: builds the network, then serves the orchestrator until it hangs up.
 
-Run as `python -m netem.init FD` inside fresh namespaces (see `netem.namespaces`), where it is PID 1; `FD`
+Run as `python -m netem.init FD` inside fresh namespaces (see `netem._namespaces`), where it is PID 1; `FD`
 is its end of the control socket. One thread and one loop, because setns(2) moves a thread and every child
 must be born in the right network. Nothing here waits for anything but the kernel: a TCP connection is
 made without blocking, and a child's end is reported when it happens.
@@ -23,12 +23,12 @@ from dataclasses import dataclass
 from errno import EINPROGRESS, ETIMEDOUT
 from typing import Any
 
-from netem import choice, namespaces
+from netem import _choice, _namespaces
+from netem._fabric import Fabric
+from netem._lab_protocol import Receiver, WireError, encode
 from netem.conditions import NetworkConditions
 from netem.engine import Engine
 from netem.errors import ConditionsError, EngineError, NetemError
-from netem.fabric import Fabric
-from netem.lab_protocol import Receiver, WireError, encode
 
 _MAX_UNREAD = 64 << 20  # bytes waiting for an orchestrator that does not read
 
@@ -156,7 +156,7 @@ class Server:
             os.set_inheritable(descriptor, False)
         self._fabric = Fabric(message["vehicles"], networks)
         try:
-            self._engine, reason = choice.choose(message["engine"], self._fabric, message["needs"])
+            self._engine, reason = _choice.choose(message["engine"], self._fabric, message["needs"])
         except EngineError as error:
             return {"engine": None, "reason": str(error)}
         return {"engine": self._engine.name, "reason": reason}
@@ -179,7 +179,7 @@ class Server:
                     start_new_session=True,
                 )
         except PermissionError as error:
-            raise PermissionError(error.errno, f"{error.strerror} to {namespaces.user()}", error.filename) from None
+            raise PermissionError(error.errno, f"{error.strerror} to {_namespaces.user()}", error.filename) from None
         finally:
             for file in files:
                 os.close(file)

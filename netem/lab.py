@@ -8,7 +8,7 @@ Nothing of it is visible from outside: no interface, rule or name in the caller'
 sockets are shared with the caller. The lab ends with `close`, or with the caller's process, however that
 ends. Processes have the lab's own numbers: `LabProcess.pid` means nothing outside.
 
-Open it from the main thread: the death signal that guards it (see `netem.namespaces`) follows the thread
+Open it from the main thread: the death signal that guards it (see `netem._namespaces`) follows the thread
 that opened it. From another thread it is left out, and the closing of the control socket alone ends the
 lab, which a stopped (SIGSTOP) lab would not notice.
 """
@@ -26,11 +26,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from netem import addresses, namespaces
+from netem import _namespaces, addresses
+from netem._lab_channel import Channel
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import ConditionsError, LabError, LabUnavailable, SpawnError
-from netem.lab_channel import Channel
 
 EngineName = Literal["netem", "nftables"]
 
@@ -123,7 +123,7 @@ class Lab:
         ids = _checked(vehicles)
         given = dict(networks or {})
         word = ""
-        for user_namespace in (False,) if given else namespaces.ways_in():
+        for user_namespace in (False,) if given else _namespaces.ways_in():
             lab = await cls._enter(ids, user_namespace, given, log)
             try:
                 refusal = await asyncio.wait_for(lab._start(engine, needs, given, log), _OPEN_DEADLINE_S)
@@ -136,13 +136,13 @@ class Lab:
             if refusal is None:
                 return lab
             word = refusal
-        if (failure := namespaces.not_executed(word)) is not None:
+        if (failure := _namespaces.not_executed(word)) is not None:
             program, why = failure
-            reason = f"{namespaces.user()} cannot execute {program} ({why})"
-            raise LabUnavailable(f"The lab's first process could not be started: {reason}", namespaces.way_out(word))
+            reason = f"{_namespaces.user()} cannot execute {program} ({why})"
+            raise LabUnavailable(f"The lab's first process could not be started: {reason}", _namespaces.way_out(word))
         raise LabUnavailable(
             f"This machine does not let us make a private network ({word})",
-            f"{namespaces.way_out(word)} Or run it inside User Mode Linux: --kernel uml.",
+            f"{_namespaces.way_out(word)} Or run it inside User Mode Linux: --kernel uml.",
         )
 
     @classmethod
@@ -150,7 +150,7 @@ class Lab:
         cls, vehicles: tuple[int, ...], user_namespace: bool, networks: Mapping[int, int], log: Path
     ) -> Lab:
         ours, theirs = socket.socketpair()
-        argv = namespaces.command(
+        argv = _namespaces.command(
             [sys.executable, "-P", "-m", "netem.init", str(theirs.fileno())],
             user_namespace=user_namespace,
             die_with_parent=threading.current_thread() is threading.main_thread(),
@@ -171,7 +171,7 @@ class Lab:
         except FileNotFoundError as error:
             ours.close()
             word = f"{error.filename} is not installed"
-            raise LabUnavailable(word, namespaces.way_out(word)) from None
+            raise LabUnavailable(word, _namespaces.way_out(word)) from None
         except BaseException:
             ours.close()
             raise

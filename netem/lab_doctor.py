@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from netem import namespaces
+from netem import _namespaces
 from netem.lab import Lab, LabError
 
 
@@ -32,8 +32,8 @@ class LabRequirement:
 
 def examine() -> list[LabRequirement]:
     """Everything that the lab needs, in the order in which it needs it. Takes about half a second."""
-    ok, word = namespaces.probe()
-    requirements = [LabRequirement("namespaces", ok, word, "" if ok else namespaces.way_out(word))]
+    ok, word = _namespaces.probe()
+    requirements = [LabRequirement("namespaces", ok, word, "" if ok else _namespaces.way_out(word))]
     if not ok:
         return requirements
     with tempfile.TemporaryDirectory() as folder:

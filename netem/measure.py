@@ -10,7 +10,7 @@ outside is measured once more, with a fresh stream: the second answer counts, th
 fails a run of thirty rows once in 30,000; what is really wrong is wrong twice.
 
 Asked is what the engine promises, to the last digit: of a delay the mean and the deviation of the table that netem is
-given (`netem.distributions`), of corruption what a checksum can find.
+given (`netem._distributions`), of corruption what a checksum can find.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from statistics import fmean, median, pstdev, quantiles
 from typing import Any, get_args
 
 from netem import estimates
+from netem._distributions import SCALE, table
 from netem.conditions import NetworkConditions
-from netem.distributions import SCALE, table
 from netem.engine import RESOLUTION
 from netem.estimates import Estimate, Heard, Lateness
 from netem.link import Delay, Distribution, GilbertElliott, LinkConditions

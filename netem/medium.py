@@ -27,8 +27,8 @@ from math import inf
 from random import Random
 from typing import Protocol
 
+from netem._distributions import SCALE, table
 from netem.conditions import NetworkConditions
-from netem.distributions import SCALE, table
 from netem.link import Delay, GilbertElliott, LinkConditions
 
 LATENCY = Delay(mean_s=0.026, jitter_s=0.024)

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from netem import probe
+from netem import _probe
 from netem.engine import Applied
 from netem.errors import LabError
 from netem.estimates import Heard, Lateness
@@ -162,7 +162,7 @@ async def _quiet(lab: Lab) -> Applied:
 
 
 class _Program:
-    """A program of `netem.probe` that runs in a vehicle."""
+    """A program of `netem._probe` that runs in a vehicle."""
 
     def __init__(self, process: LabProcess, output: Path) -> None:
         self._process = process
@@ -171,7 +171,7 @@ class _Program:
     @classmethod
     async def start(cls, lab: Lab, folder: Path, vehicle: int, program: str, *arguments: object) -> _Program:
         output = folder / f"{program}-{vehicle}.log"
-        argv = [sys.executable, "-I", "-S", str(Path(probe.__file__)), program, *map(str, arguments)]
+        argv = [sys.executable, "-I", "-S", str(Path(_probe.__file__)), program, *map(str, arguments)]
         environment = {"PATH": os.environ["PATH"]}
         process = await lab.spawn(vehicle, argv, cwd=folder, env=environment, stdout=output, stderr=output)
         return cls(process, output)

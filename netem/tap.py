@@ -20,8 +20,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from netem import addresses
+from netem._ring import BLOCK_BYTES, RETIRE_MS, Ring
 from netem.pcapng import PcapngFile
-from netem.ring import BLOCK_BYTES, RETIRE_MS, Ring
 
 _MEMORY = 256 << 20
 """Bytes of all rings together, at most: the faster one port is, the slower are the others, on one machine."""

@@ -33,13 +33,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from errno import ENOENT
 
+from netem._fabric import Fabric
+from netem._netlink import Netlink, Request
+from netem._tc_requests import MAX_KIND, Class, TrafficControl
 from netem.conditions import NetworkConditions
 from netem.engine import Applied, Engine, ReceiverFigures
 from netem.errors import EngineError, NetlinkError
-from netem.fabric import Fabric
 from netem.link import Distribution, LinkConditions
-from netem.netlink import Netlink, Request
-from netem.tc_requests import MAX_KIND, Class, TrafficControl
 
 _Numbers = dict[frozenset[int], int]
 

@@ -12,7 +12,7 @@ says an empty line every few seconds, and at last the command's exit status: wit
 never a status.
 
 Its programs keep their floating point and vector registers also on processors that it does not know
-(`netem.uml_registers`).
+(`netem._uml_registers`).
 
 Whatever happens to the caller, nothing stays: User Mode Linux is one process group of the host, led by a shell that
 kills the group and removes its directory as soon as the caller closes its end of a pipe, or dies.
@@ -36,7 +36,7 @@ from pathlib import Path
 from types import FrameType
 from typing import BinaryIO
 
-from netem import uml_registers
+from netem import _uml_registers
 from netem.errors import UmlError
 
 MODULES = Path("/usr/lib/uml/modules")
@@ -116,7 +116,7 @@ def find() -> Path:
         "user-mode-linux": kernel is not None and MODULES.is_dir(),
         "kmod": shutil.which("modprobe", path=path),
         "iproute2": shutil.which("ip", path=path),
-        "gcc": uml_registers.has_compiler() or not uml_registers.needed(Path(kernel) if kernel else None),
+        "gcc": _uml_registers.has_compiler() or not _uml_registers.needed(Path(kernel) if kernel else None),
     }
     missing = [package for package, here in packages.items() if not here]
     if kernel is None or missing:
@@ -131,7 +131,7 @@ def examine() -> str:
     status = run(["true"], cwd=Path("/"), env={"PATH": SYSTEM_PATH})
     if status != 0:
         raise UmlError(f"User Mode Linux failed: it boots, but `true` ends in it with status {status}")
-    how = "kept by a library that is preloaded" if uml_registers.needed(kernel) else "kept by itself"
+    how = "kept by a library that is preloaded" if _uml_registers.needed(kernel) else "kept by itself"
     return f"{kernel}, in which this processor's registers are {how}"
 
 
@@ -148,7 +148,7 @@ def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
         (folder / "command").write_text(_command(argv, cwd, env))
         (folder / "init").write_text(_init(folder / "command"))
         (folder / "init").chmod(0o755)
-        guest = _Guest(kernel, folder, uml_registers.preload(folder) if uml_registers.needed(kernel) else {})
+        guest = _Guest(kernel, folder, _uml_registers.preload(folder) if _uml_registers.needed(kernel) else {})
         try:
             with _typing_ctrl_c(guest):
                 return guest.follow()

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
+from sitl._vehicle_state import Version
 from sitl.airframes import BINARIES, Airframe, airframe
 from sitl.installed import current, install_command, sha256
 from sitl.parameters import in_lines
@@ -35,7 +36,6 @@ from sitl.vehicle import (
     VehicleType,
     check_launch,
 )
-from sitl.vehicle_state import Version
 
 OWN_DEFAULTS = "vehicle.parm"
 ENVIRONMENT = "ARDUPILOT_SITL"  # a directory that holds binaries and, better, their default parameters

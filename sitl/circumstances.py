@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from sitl.vehicle import VehicleError
 
 if TYPE_CHECKING:  # a scenario names circumstances, and imports no MAVLink for it
-    from sitl.pilot_link import Link
+    from sitl._pilot_link import Link
 
 ANSWER_S = 3.0
 """Of our time, and at a speedup below 1 of simulated time: a vehicle answers within one turn of its main loop."""

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
+from sitl._autopilot import Autopilot
+from sitl._port import Port
 from sitl.airframes import USUAL
-from sitl.autopilot import Autopilot
-from sitl.port import Port
 from sitl.setup import USUAL as USUAL_SETUP
 from sitl.setup import Setup
 from sitl.vehicle import (

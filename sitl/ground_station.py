@@ -15,9 +15,9 @@ from typing import Any, Self, cast
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sitl._mavlink_frames import FrameSplitter
+from sitl._operator import CommandLog
 from sitl.address import Address, connected
-from sitl.mavlink_frames import FrameSplitter
-from sitl.operator import CommandLog
 
 MOST_DATAGRAMS_PER_S = 1000
 """From the ground station; more are dropped, and counted."""

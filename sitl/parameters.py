@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 
-from sitl.text_file import text_of
+from sitl._text_file import text_of
 from sitl.vehicle import VehicleError
 
 MAX_BYTES = 1_000_000  # all parameters of an ArduCopter 4.7 have 35 kB

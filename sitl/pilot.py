@@ -1,6 +1,6 @@
 """The pilot: the client that flies a vehicle over MAVLink, real ArduPilot and the embedded vehicle alike.
 
-A pilot keeps a link (pilot_link.py), and pursues one procedure after another (procedure.py): a take-off, a plan by
+A pilot keeps a link (_pilot_link.py), and pursues one procedure after another (procedure.py): a take-off, a plan by
 mission or
 in GUIDED, the end of a flight; and of the first two at first only what comes before arming. Whatever a procedure waits
 for has a limit, and so has the vehicle's silence: a vehicle that spins, crawls, falls mute or leaves is given up with a
@@ -17,19 +17,19 @@ from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 
-from sitl.by_guided import GuidedFlight
-from sitl.by_mission import MissionFlight
+from sitl._by_guided import GuidedFlight
+from sitl._by_mission import MissionFlight
+from sitl._introduction import Introduction
+from sitl._pilot_link import Link
+from sitl._route import route
+from sitl._take_off import TakeOff, Termination
+from sitl._vehicle_state import VehicleState
 from sitl.circumstances import Circumstance, bring_about
-from sitl.introduction import Introduction
 from sitl.modes import mode_name
 from sitl.parameters import ParameterError, unknown
-from sitl.pilot_link import Link
 from sitl.plan import By, Plan
 from sitl.procedure import GettingReady, HopelessError, Procedure, Step
-from sitl.route import route
-from sitl.take_off import TakeOff, Termination
 from sitl.vehicle import FlightError, Home, VehicleType
-from sitl.vehicle_state import VehicleState
 
 SILENCE_S = 10.0  # of our time; a vehicle says something every simulated second
 LEAST_WAIT_S = 3.0  # of our time: however fast simulated time runs, a busy machine is given this long for a step

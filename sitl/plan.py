@@ -2,7 +2,7 @@
 
 A plan is a value and knows no MAVLink; `Plan.check` says whether a type of vehicle can fly it. Vehicles with the same
 plan keep the formation of their homes. What the legs leave open (altitudes, speeds, a plane's approach) is filled in by
-sitl/route.py, once for everybody who flies or computes the plan.
+sitl/_route.py, once for everybody who flies or computes the plan.
 """
 
 from __future__ import annotations

@@ -13,10 +13,10 @@ from typing import Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sitl._pilot_link import Link
+from sitl._vehicle_state import VehicleState
 from sitl.modes import MODES
-from sitl.pilot_link import Link
 from sitl.vehicle import VehicleType
-from sitl.vehicle_state import VehicleState
 
 STEP_LIMIT_S = 60.0
 READY_FOR_S = 3.0

@@ -10,8 +10,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.autopilot import FRAMES, MAX_ALTITUDE_M, Autopilot
-from sitl.mission_inbox import MissionInbox
+from sitl._autopilot import FRAMES, MAX_ALTITUDE_M, Autopilot
+from sitl._mission_inbox import MissionInbox
 from sitl.modes import MODES
 from sitl.streams import STREAMS, autopilot_version
 
@@ -24,7 +24,7 @@ NO_POSITION = (
     | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
     | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
 )
-TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # of a plane; what else can be set is in failsafes.py
+TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # of a plane; what else can be set is in _failsafes.py
 SYSTEM_ID = "SYSID_THISMAV"
 
 

@@ -10,9 +10,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.autopilot import Autopilot
-from sitl.failsafes import BATTERY_FULL_V
-from sitl.kinematics import Motion, Point
+from sitl._autopilot import Autopilot
+from sitl._failsafes import BATTERY_FULL_V
+from sitl._kinematics import Motion, Point
 from sitl.track import Track
 from sitl.vehicle import READY_S, Home, VehicleType
 

@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
-from sitl.text_file import text_of
+from sitl._text_file import text_of
 from sitl.vehicle import Home, VehicleError
 
 LOCATIONS = "locations.txt"

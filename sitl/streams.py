@@ -9,7 +9,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.autopilot import CURRENT_ARMED_A, CURRENT_IDLE_A, Autopilot
+from sitl._autopilot import CURRENT_ARMED_A, CURRENT_IDLE_A, Autopilot
 from sitl.modes import MODES
 from sitl.vehicle import Home, VehicleType
 

@@ -9,11 +9,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl.kinematics import Course, Motion, Rest, Segment, end_of
-from sitl.leg_by_leg import leg_by_leg
-from sitl.models import AT_ONCE, MODELS, MotionModel
+from sitl._kinematics import Course, Motion, Rest, Segment, end_of
+from sitl._leg_by_leg import leg_by_leg
+from sitl._models import AT_ONCE, MODELS, MotionModel
+from sitl._route import Waypoint, landing_begins, route
 from sitl.plan import By, Plan
-from sitl.route import Waypoint, landing_begins, route
 from sitl.vehicle import VehicleType
 
 

@@ -16,9 +16,9 @@ from typing import NoReturn
 
 import pytest
 
-from harness.play.containers.container_preflight import require_root
+from harness.play.containers._container_preflight import require_root
 from harness.play.containers.docker_engine import DockerError, Engine
-from harness.proof.specification import tlc
+from harness.proof.specification import _tlc
 from netem import uml
 from netem.errors import UmlError
 from netem.lab import Lab, LabUnavailable
@@ -68,8 +68,8 @@ def require_docker() -> None:
 def require_tlc() -> None:
     """The same of TLC, and of the Java that it needs."""
     try:
-        tlc.command()
-    except tlc.NoCheckerError as error:
+        _tlc.command()
+    except _tlc.NoCheckerError as error:
         do_without("tlc", str(error))
 
 

@@ -6,7 +6,7 @@ the block, so it lives in `ucp.chain`. A block therefore never changes when it i
 
 from functools import lru_cache
 
-from ucp.dataclass import dataclass, field
+from ucp._dataclass import dataclass, field
 from ucp.wire import Kind, struct_of
 
 try:  # hashlib brings OpenSSL along, which is a quarter of an agent's memory, for a few hashes a minute

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ucp._request import check_request
 from ucp.loop import Loop
-from ucp.request import check_request
 
 MAX_LINE_BYTES = 64 * 1024
 MAX_NAME = 40

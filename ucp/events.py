@@ -7,7 +7,7 @@ big-endian (Section 4.1).
 from random import Random
 from typing import Literal
 
-from ucp.dataclass import dataclass
+from ucp._dataclass import dataclass
 from ucp.wire import Kind, struct_of
 
 EVENT_FIELDS = {"timestamp_us": Kind.U64, "event_id": Kind.U8, "length": Kind.U16}

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable
 from typing import Generic, Literal, ParamSpec
 
-from ucp.dataclass import dataclass
+from ucp._dataclass import dataclass
 from ucp.messages import Message
 
 P = ParamSpec("P")

@@ -16,8 +16,8 @@ Nobody changes a message. That nobody could would make each take three times as 
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
+from ucp._dataclass import dataclass
 from ucp.block import BLOCK_HEADER, HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
-from ucp.dataclass import dataclass
 from ucp.wire import VARIABLE, Fields, Kind, struct_of
 
 PORT = 14600

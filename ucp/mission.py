@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any, Literal, TypeGuard, get_args
 
+from ucp._dataclass import dataclass
 from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
-from ucp.dataclass import dataclass
 from ucp.events import DEFAULT_LOG, MAX_MEAN_S, MEAN_TIME_BETWEEN_EVENTS_S, EventKind
 from ucp.features import FEATURES
 from ucp.sealed import SEAL_BYTES, sealed_to

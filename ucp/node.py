@@ -17,6 +17,7 @@ from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any, cast
 
+from ucp._status import status_of
 from ucp.agent import Agent
 from ucp.agent_files import LogFile, TraceFile, write_json_atomically
 from ucp.clock import MissionClock
@@ -27,7 +28,6 @@ from ucp.features import UNSUPPORTED
 from ucp.loop import Loop, Timer
 from ucp.messages import MalformedDatagramError
 from ucp.mission import Mission, MissionError, UnsupportedMissionError, is_epoch, load_mission
-from ucp.status import status_of
 from ucp.store import Store, StoreError
 from ucp.trace import Commanded, Entry, HandlerRun, header_line
 
@@ -92,7 +92,7 @@ class Node:
         if mission.security is None:
             return Agent
         try:
-            from ucp.secure.secured_vehicle import secured_agent  # needs the extra `secure`
+            from ucp.secure._secured_vehicle import secured_agent  # needs the extra `secure`
         except ModuleNotFoundError as error:
             raise UnsupportedMissionError(
                 f"needs the feature 'secured', and {error.name} is not installed here"

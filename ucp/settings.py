@@ -3,8 +3,8 @@
 import math
 from typing import Any, Literal, get_args
 
+from ucp._dataclass import dataclass
 from ucp.block import MAX_EVENT_DATA_BYTES
-from ucp.dataclass import dataclass
 from ucp.events import MAX_EVENT_BYTES
 from ucp.short_value import shown
 

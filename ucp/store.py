@@ -20,8 +20,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from ucp._dataclass import dataclass, field
 from ucp.block import BLOCK_HEADER, Block
-from ucp.dataclass import dataclass, field
 from ucp.messages import decode_block
 from ucp.short_value import shown
 from ucp.state import AgentState

@@ -10,7 +10,7 @@ import base64
 import json
 from typing import Any, Protocol
 
-from ucp.dataclass import dataclass
+from ucp._dataclass import dataclass
 from ucp.messages import Datagram, Message, block_named
 
 SCHEMA = "ucp-trace/2"

@@ -15,6 +15,8 @@ from collections.abc import Callable
 from random import Random
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
+from ucp._request import check_request
+from ucp._status import status_of
 from ucp.agent import Agent
 from ucp.block import Block
 from ucp.clock import MICROSECONDS
@@ -22,8 +24,6 @@ from ucp.events import LoggableEvent
 from ucp.export import export_chain
 from ucp.messages import MalformedDatagramError
 from ucp.mission import MAX_MISSION_BYTES, Mission, MissionError, UnsupportedMissionError, is_epoch, parse_mission
-from ucp.request import check_request
-from ucp.status import status_of
 from ucp.store import SecuredState, StoredState, block_on_disk
 from ucp.trace import Commanded, HandlerRun, in_base64
 
@@ -244,7 +244,7 @@ def _maker(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
     if mission.security is None:
         return Agent
     try:
-        from ucp.secure.secured_vehicle import secured_in_virtual_time  # needs the extra `secure`
+        from ucp.secure._secured_vehicle import secured_in_virtual_time  # needs the extra `secure`
     except ModuleNotFoundError as error:
         why = f"this mission needs the feature 'secured', and {error.name} is not installed here"
         raise InputError(why, unsupported=True) from None

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from docs.generate.matrix_thesis import BEGIN, END, put_between_markers
 from harness.present import text
-from harness.sweep.scale.metrics import BY_NAME
-from harness.sweep.scale.picture import draw
+from harness.sweep.scale._metrics import BY_NAME
+from harness.sweep.scale._picture import draw
 from harness.sweep.scale.record import ScaleRecord
 from harness.sweep.scale.table import GROWN, SIZED, SYMBOLS, rows, say, say_exponent, say_quality
 from ucp.agent_files import write_atomically

@@ -15,8 +15,8 @@ from harness.run.parallel import Failed, cores, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.scenario.agent_options import Stagger
-from harness.sweep.matrix.estimate import METRICS, Figures, Metric, figure
-from harness.sweep.matrix.matrix_file import Matrix, Point, load_matrix
+from harness.sweep.matrix._estimate import METRICS, Figures, Metric, figure
+from harness.sweep.matrix._matrix_file import Matrix, Point, load_matrix
 from harness.sweep.matrix.matrix_table import say_interval, say_mean
 from ucp.agent_files import write_atomically
 

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 from harness.present import text as words
-from harness.sweep.matrix.cell import Cell
-from harness.sweep.matrix.estimate import METRICS
-from harness.sweep.matrix.matrix_picture import draw
+from harness.sweep.matrix._cell import Cell
+from harness.sweep.matrix._estimate import METRICS
+from harness.sweep.matrix._matrix_picture import draw
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import say_interval, say_mean
 from ucp.agent_files import write_atomically

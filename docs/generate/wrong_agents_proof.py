@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+from harness.proof._progress_bar import Ended
 from harness.proof.bounds import Bounds
-from harness.proof.graph.exploration import explore
-from harness.proof.model.any_sender import collect
-from harness.proof.model.flaws import Flaw
-from harness.proof.model.global_states import Swarm
-from harness.proof.progress_bar import Ended
-from harness.proof.questions import convergence
+from harness.proof.graph._exploration import explore
+from harness.proof.model._any_sender import collect
+from harness.proof.model._flaws import Flaw
+from harness.proof.model._global_states import Swarm
+from harness.proof.questions import _convergence
 from ucp.agent import HANDLERS
 from ucp.quirks import QUIRKS
 
@@ -75,7 +75,7 @@ def consequence(quirk: str, most_s: float = MOST_S) -> str:
         return f"characteristic {graph.flaw.kind}" if graph.flaw.kind.isdecimal() else graph.flaw.kind
     if graph.ended != "complete":
         return f"not decided ({graph.ended})"
-    live = convergence.look(graph)
+    live = _convergence.look(graph)
     if live.lost is not None:
         return "no way to one chain"
     if live.cycles:

@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from harness.archive._jsonlines import JsonLines, Record
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, Link, read_connectivity, read_link_losses
 from harness.archive.directory import PUBLIC_KEYS_FILE, ROGUE_FILE
 from harness.archive.exports import (
@@ -25,7 +26,6 @@ from harness.archive.exports import (
     read_exports,
 )
 from harness.archive.history import in_time
-from harness.archive.jsonlines import JsonLines, Record
 from harness.archive.record_file import RecordFile, read_record
 from harness.archive.run_record import JudgedRecord, RunRecord
 from harness.archive.traces import SUFFIX, Line, Trace, read_lines, read_trace, why_none

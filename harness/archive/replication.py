@@ -1,6 +1,6 @@
 """How far the data had spread when: the agents' chains along mission time, from their traces.
 
-The figures are those of the checker (`harness.checker.figures`), at every moment instead of at the end: chains are
+The figures are those of the checker (`harness.checker._figures`), at every moment instead of at the end: chains are
 those of living agents, and copies those of each completed block in these chains.
 """
 

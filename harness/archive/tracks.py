@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from harness.archive.jsonlines import JsonLines
+from harness.archive._jsonlines import JsonLines
 
 TRACKS_FILE = "tracks.jsonl"
 

@@ -1,10 +1,10 @@
 """The checker: decides from exports, and more from traces, whether the six characteristics hold (Section 4.3).
 
-One file per characteristic, each a function from `Evidence` to `Judgement`; `verdict.py` gathers them. Beside
+One file per characteristic, each a function from `Evidence` to `Judgement`; `_verdict.py` gathers them. Beside
 them, `survival.py` says what the loss of vehicles took and could take.
 """
 
+from harness.checker._verdict import Result, check
 from harness.checker.evidence import Evidence, gather
-from harness.checker.verdict import Result, check
 
 __all__ = ["Evidence", "Result", "check", "gather"]

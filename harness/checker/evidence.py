@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
@@ -14,21 +14,21 @@ from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
 from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_files, read_captures
-from harness.archive.run_record import AgentRecord, Counters, Cycle, JudgedRecord
+from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, Unknown, first_of, unknown_words
-from harness.checker.recurring_cycles import cycle_of
-from harness.checker.trace_replay import Life, replay
+from harness.checker._trace_replay import Life, replay
 from harness.errors import RunDirectoryError
-from harness.play.rogue.journal import OF_NO_INJECTION
+from harness.play.rogue.rogue_line import OF_NO_INJECTION
 from ucp.block import HASH_BYTES
 from ucp.state import AgentState
 from ucp.trace import HandlerRun, Sent
 
 if TYPE_CHECKING:
-    from harness.checker.records import Examination
     from ucp.secure.bundle import PublicKeys
     from ucp.secure.crypto_suite import Signed
+
+Derived = TypeVar("Derived")
 
 Sending = tuple[tuple[float, Sent], ...]
 """What an agent sent when with one type and sequence number: one message in each of its lives, at most."""
@@ -117,6 +117,9 @@ class Evidence:
     """Whether a signature is good, of who knows it better than by verifying it: a swarm played in this process."""
     watch: Watch | None = None
     """Is shown each step that the step judge follows."""
+    _derived: dict[Callable[["Evidence"], Any], Any] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @cached_property
     def names(self) -> dict[str, str]:
@@ -163,12 +166,12 @@ class Evidence:
             sendings[agent_id] = dict(of_agent)
         return sendings
 
-    @cached_property
-    def examination(self) -> "Examination":
-        """What the records tell about the same things, held against each other."""
-        from harness.checker.records import cross_examine  # which looks at evidence
-
-        return cross_examine(self)
+    def once(self, derive: Callable[["Evidence"], Derived]) -> Derived:
+        """Return `derive(self)`, computed at the first call and remembered afterwards."""
+        if derive not in self._derived:
+            self._derived[derive] = derive(self)
+        derived: Derived = self._derived[derive]
+        return derived
 
     @property
     def roster(self) -> list[int] | None:
@@ -246,11 +249,6 @@ class Evidence:
         """Agents that are not idle at the end, and neither stand still nor are switched off."""
         gone = {*self.paused_at_end, *self.switched_off}
         return [agent_id for agent_id, export in self.exports.items() if not export.idle and agent_id not in gone]
-
-    @cached_property
-    def cycle(self) -> Cycle | None:
-        """What the busy agents go round in, if it is shown that they never finish."""
-        return cycle_of(self)
 
     @property
     def ended_at_s(self) -> float | None:

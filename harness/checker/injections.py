@@ -20,7 +20,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.run_record import InjectedMessages, RogueInjection
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import unknown_words
-from harness.play.rogue.journal import injection_of
+from harness.play.rogue.rogue_line import injection_of
 from harness.scenario import Scenario
 from harness.scenario.changes import injections_of
 from ucp.trace import HandlerRun

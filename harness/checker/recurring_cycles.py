@@ -8,16 +8,13 @@ Agents that only have a lot left to do are in neither: their chains change.
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from harness.archive.run_record import Cycle, CycleStep, CycleWait
 from harness.archive.traces import Trace
+from harness.checker._waiting import ALL_TIMERS, longest
+from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, agents
-from harness.checker.waiting import ALL_TIMERS, longest
 from ucp.trace import HandlerRun
-
-if TYPE_CHECKING:
-    from harness.checker.evidence import Evidence
 
 SEVERAL = 5
 """So often in a row is no coincidence."""
@@ -38,7 +35,7 @@ SHORTEST_PAUSE_S = 0.05
 """What follows sooner follows at once, for people."""
 
 
-def cycle_of(evidence: "Evidence") -> Cycle | None:
+def cycle_of(evidence: Evidence) -> Cycle | None:
     """What agents go round in, some of which are not idle at the end; None if that is not shown."""
     busy = evidence.busy
     if not busy:
@@ -58,7 +55,7 @@ def cycle_of(evidence: "Evidence") -> Cycle | None:
     )
 
 
-def _last_ran_s(evidence: "Evidence", standstill: Cycle) -> float:
+def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
     """When the last of the agents that hang ran anything of its own."""
     traces = [evidence.traces.get(agent_id) for agent_id in standstill.agents]
     ran_at = [runs[-1].t for trace in traces if trace is not None and (runs := _own_runs(trace))]
@@ -75,7 +72,7 @@ class _Round:
     times: int
 
 
-def _in_traces(evidence: "Evidence", busy: Sequence[int], times: int) -> Cycle | None:
+def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | None:
     rounds: dict[int, _Round] = {}
     since_s, ended_at_s, connected_s = 0.0, evidence.ended_at_s, evidence.connected_since_s
     if ended_at_s is None or connected_s is None:
@@ -158,7 +155,7 @@ def _matches(keys: Sequence[object]) -> list[int]:
     return matching
 
 
-def _waits(evidence: "Evidence", rounds: dict[int, _Round], period_s: float) -> Iterator[CycleWait]:
+def _waits(evidence: Evidence, rounds: dict[int, _Round], period_s: float) -> Iterator[CycleWait]:
     """Whom each agent asks in its reconciles without ever counting an answer, and who refuses it, in the last round."""
     for agent_id, each in rounds.items():
         heard, refused_by = set[int](), set[int]()

@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from harness.checker.agreement import had_a_chance, never, why_no_chance, why_unknown, without
+from harness.checker._agreement import had_a_chance, never, why_no_chance, why_unknown, without
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from harness.archive.archive import RunArchive
-from harness.commands.shared_options import DepotKey, depot_of, write_new
+from harness.commands._shared_options import DepotKey, depot_of, write_new
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST, ExportError
 from harness.report import logbook

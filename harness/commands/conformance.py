@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from harness.commands.shared_options import refuse_existing, write_new
+from harness.commands._shared_options import refuse_existing, write_new
 from harness.commands.terminal import complain, print_json
 from harness.conformance.conformance_page import read_agents, to_html
 from harness.conformance.conformance_run import Asked, conform

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from harness.archive.directory import claim
-from harness.commands.shared_options import DepotKey, depot_of, refuse_existing, write_new
+from harness.commands._shared_options import DepotKey, depot_of, refuse_existing, write_new
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.field.depot import record_outputs

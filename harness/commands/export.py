@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from harness.commands.shared_options import DepotKey, depot_of, newly, refuse_existing
+from harness.commands._shared_options import DepotKey, depot_of, newly, refuse_existing
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.report.export import Recording

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from harness.commands.shared_options import refuse_existing, roster_of
+from harness.commands._shared_options import refuse_existing, roster_of
 from harness.commands.terminal import complain, print_json, print_lines
 from harness.errors import MachineError
 from harness.scenario.load import parse

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from harness.commands.shared_options import roster_of
+from harness.commands._shared_options import roster_of
 from harness.commands.terminal import complain, print_json, print_lines
 from harness.errors import WRONG_REQUEST, MachineError
 from harness.field.depot.mission_comparison import compare

@@ -16,7 +16,7 @@ from harness.archive.packets.packets_document import document
 from harness.archive.packets.packets_text import Paint, Wording
 from harness.archive.packets.selection import Selection, in_order, story
 from harness.archive.packets.transmissions import join
-from harness.commands.shared_options import BundleOption, opener_of
+from harness.commands._shared_options import BundleOption, opener_of
 from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST
 

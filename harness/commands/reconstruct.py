@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from harness.commands.shared_options import BundleOption, DepotKey, depot_of, opener_of
+from harness.commands._shared_options import BundleOption, DepotKey, depot_of, opener_of
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, RunDirectoryError
 from harness.field.ingest import sort_out

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from harness.conformance import udp_subject
-from harness.conformance import virtual_subject as virtual
-from harness.conformance.blame import Evidence
-from harness.conformance.handwritten import by_hand
-from harness.conformance.kept_failures import keep
-from harness.conformance.results import Case, Results, Row
-from harness.conformance.suite import (
+from harness.conformance import _udp_subject
+from harness.conformance import _virtual_subject as virtual
+from harness.conformance._blame import Evidence
+from harness.conformance._handwritten import by_hand
+from harness.conformance._kept_failures import keep
+from harness.conformance._suite import (
     ALONE_AT_ONCE,
     FAILURES_OF_A_KIND,
     MOST_SUSPICIONS,
@@ -22,7 +21,8 @@ from harness.conformance.suite import (
     Suite,
     Tally,
 )
-from harness.conformance.udp_lab import Air
+from harness.conformance._udp_lab import Air
+from harness.conformance.results import Case, Results, Row
 from harness.conformance.vectors import Vectors, generate
 
 IN_VIRTUAL_TIME = 2
@@ -77,7 +77,7 @@ async def _run(
                 await program.close()
         return
     async with Air(place, asked.command, SIDE_BY_SIDE + ALONE_AT_ONCE) as air:
-        start = udp_subject.starting(air)
+        start = _udp_subject.starting(air)
         await _play(
             Suite(start, generated, told, side_by_side=SIDE_BY_SIDE, enough=asked.enough), until, asked, results
         )

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from harness.conformance.observation import Exchange
+from harness.conformance._observation import Exchange
 from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED
 from ucp.agent import HANDLERS
 from ucp.trace import in_base64

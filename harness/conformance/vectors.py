@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
-from harness.conformance.reference_model import Outcome
-from harness.conformance.state_space import VARIANTS, Pair, Step, Variant, explore, in_short
-from harness.conformance.virtual_lines import Line, Writer
+from harness.conformance._reference_model import Outcome
+from harness.conformance._state_space import VARIANTS, Pair, Step, Variant, explore, in_short
+from harness.conformance._virtual_lines import Line, Writer
 
 
 @dataclass(frozen=True)

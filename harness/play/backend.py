@@ -12,8 +12,8 @@ from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
+from harness.play._pace import Pace
 from harness.play.mission import Swarm
-from harness.play.pace import Pace
 from harness.play.progress import Progress
 from harness.scenario import Scenario
 

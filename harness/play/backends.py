@@ -4,8 +4,8 @@ from typing import Any
 
 from harness.backend_names import BackendName
 from harness.play.backend import Backend
-from harness.play.containers.container_backend import Containers
-from harness.play.process.process_backend import Processes
+from harness.play.containers._container_backend import Containers
+from harness.play.process._process_backend import Processes
 from harness.play.simulation.virtual_time import VirtualTime
 
 BACKENDS: dict[BackendName, Backend] = {backend.name: backend for backend in (Processes(), Containers(), VirtualTime())}

@@ -32,9 +32,9 @@ from pydantic import ValidationError
 
 from harness.errors import ScenarioError
 from harness.play import mission
+from harness.play._pace import NEXT_RUN, Pace
+from harness.play._vehicle_keys import refuse_revocations
 from harness.play.mission import Swarm
-from harness.play.pace import NEXT_RUN, Pace
-from harness.play.vehicle_keys import refuse_revocations
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, timeline_of
 from harness.scenario.load import parse

@@ -35,14 +35,14 @@ examples/path_times.py       which block has to be older than which on it
 examples/path_script.py     a way through the graph as a scenario that the simulation plays
 attacker/timeline_entries.py    what a captor says as an entry of that scenario's timeline
 examples/example.py    a scenario, played and written
-proof.py      all of that together
-proof_text.py      what came out, for people
+_proof.py      all of that together
+_proof_text.py      what came out, for people
 ../../docs/generate/wrong_agents_proof.py  what tells each wrong agent from the right one
 """
 
+from harness.proof._progress_bar import Progress
+from harness.proof._proof import INCOMPLETE, Limits, Proof, prove
+from harness.proof._proof_text import in_words
 from harness.proof.bounds import Bounds, BoundsError, Network
-from harness.proof.progress_bar import Progress
-from harness.proof.proof import INCOMPLETE, Limits, Proof, prove
-from harness.proof.proof_text import in_words
 
 __all__ = ["INCOMPLETE", "Bounds", "BoundsError", "Limits", "Network", "Progress", "Proof", "in_words", "prove"]

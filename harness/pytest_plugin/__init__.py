@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from harness.backend_names import BACKEND_NAMES
-from harness.pytest_plugin.stash import TRIAL
+from harness.pytest_plugin._stash import TRIAL
 
 if TYPE_CHECKING:
-    from harness.pytest_plugin.findings import Findings
-    from harness.pytest_plugin.swarm_in_test import SwarmInTest
+    from harness.pytest_plugin._findings import Findings
+    from harness.pytest_plugin._swarm_in_test import SwarmInTest
 
 MARKERS = (
     "swarm(agents=5, backend='sim', seed=1, ...): what the fixture `swarm` is; any key of a scenario",
@@ -66,7 +66,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_cmdline_main(config: pytest.Config) -> int | None:
     if config.getoption("--ucp-kernel") == "host":
         return None
-    from harness.pytest_plugin.kernel_option import session_inside
+    from harness.pytest_plugin._kernel_option import session_inside
 
     return session_inside(config)
 
@@ -77,16 +77,16 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
         if not is_story(file_path):
             return None
-        from harness.pytest_plugin.items import StoryFile
+        from harness.pytest_plugin._items import StoryFile
 
         return StoryFile.from_parent(parent, path=file_path)
     if file_path.suffix not in (".yaml", ".yml"):
         return None
-    from harness.pytest_plugin.yaml_files import is_asked_for, is_ours
+    from harness.pytest_plugin._yaml_files import is_asked_for, is_ours
 
     if not is_asked_for(file_path, parent.config) or not is_ours(file_path):
         return None
-    from harness.pytest_plugin.items import ScenarioFile
+    from harness.pytest_plugin._items import ScenarioFile
 
     return ScenarioFile.from_parent(parent, path=file_path)
 
@@ -94,7 +94,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 @pytest.fixture
 def swarm(request: pytest.FixtureRequest) -> Iterator[SwarmInTest]:
     """Agents to tell what happens, sentence by sentence: five of them, without loss, unless a marker says otherwise."""
-    from harness.pytest_plugin.fixtures import swarm_for
+    from harness.pytest_plugin._fixtures import swarm_for
 
     yield from swarm_for(request.node)
 
@@ -102,7 +102,7 @@ def swarm(request: pytest.FixtureRequest) -> Iterator[SwarmInTest]:
 @pytest.fixture
 def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
     """What was found when the scenario of the marker `scenario` was played."""
-    from harness.pytest_plugin.fixtures import scenario_for
+    from harness.pytest_plugin._fixtures import scenario_for
 
     yield from scenario_for(request.node)
 

@@ -5,7 +5,7 @@ the same in fewer words, and `write` writes it all. Each picture has its own mod
 files.
 """
 
-from harness.report.report_source import ReportSource, read_source
-from harness.report.write_report import write, write_report
+from harness.report._report_source import ReportSource, read_source
+from harness.report._write_report import write, write_report
 
 __all__ = ["ReportSource", "read_source", "write", "write_report"]

@@ -13,8 +13,7 @@ from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
 from harness.present import text as words
 from harness.present.colours import Ink
-from harness.report.chain_tree import Node, chain_tree, holders, marks, ranges
-from harness.report.chain_tree_layout import (
+from harness.report._chain_tree_layout import (
     BOX_HEIGHT,
     FONT_SIZE,
     LINE_HEIGHT,
@@ -23,6 +22,7 @@ from harness.report.chain_tree_layout import (
     Placed,
     lay_out,
 )
+from harness.report.chain_tree import Node, chain_tree, holders, marks, ranges
 
 STYLE = (Path(__file__).parent / "chain_tree.css").read_text(encoding="utf-8")
 

@@ -19,6 +19,7 @@ from harness.archive.directory import RunDirectory
 from harness.archive.run_record import RogueInjection, RunRecord, Survival
 from harness.backend_names import BackendName
 from harness.checker.injections import account
+from harness.checker.recurring_cycles import cycle_of
 from harness.checker.survival import survival
 from harness.checker.timer_lag import TimerLag, timer_lag
 from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
@@ -177,8 +178,15 @@ class Recording:
         result, survived = checker.check(evidence), survival(evidence)
         wall_s = time.monotonic() - self._started
         rogue = account(self._scenario, archive)
-        cycle = evidence.cycle.model_dump() if evidence.cycle else None
-        self._update(**result.to_json(), cycle=cycle, survival=survived, rogue=rogue, wall_s=round(wall_s, 1))
+        found = evidence.once(cycle_of)
+        cycle = found.model_dump() if found else None
+        self._update(
+            **result.to_json(),
+            cycle=cycle,
+            survival=survived,
+            rogue=rogue,
+            wall_s=round(wall_s, 1),
+        )
         archive.forget_record()
         try:
             page = report.write_report(archive)

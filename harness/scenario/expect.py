@@ -50,7 +50,7 @@ FigureName = Literal[
     "mutual_chain_before_final_reconcile",
     "distinct_chains_before_final_reconcile",
 ]
-"""As in `harness.checker.figures`."""
+"""As in `harness.checker._figures`."""
 
 NUMBERS = {number: int(number) for number in CHARACTERISTICS}
 """The characteristics; JSON has strings for keys."""

@@ -55,13 +55,13 @@ def test_an_agent_whose_handler_does_something_else_is_found(monkeypatch: pytest
 
 
 def test_a_reader_that_drops_lines_without_a_word_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.field.ingest.trace_incarnations.TraceReader._left_out", lambda reader: iter(()))
+    monkeypatch.setattr("harness.field.ingest._trace_incarnations.TraceReader._left_out", lambda reader: iter(()))
     with pytest.raises(FailedError, match="nobody says"):
         _some_mutation_fails("trace")
 
 
 def test_a_reader_that_raises_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.field.ingest.trace_incarnations._entry", lambda line: 1 // (b"NaN" not in line))
+    monkeypatch.setattr("harness.field.ingest._trace_incarnations._entry", lambda line: 1 // (b"NaN" not in line))
     with pytest.raises((ZeroDivisionError, FailedError)):
         _some_mutation_fails("trace")
 

@@ -8,8 +8,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from harness.play.containers import ownership
+from harness.play.containers._images import HOST_IMAGE, from_host, idle_command
 from harness.play.containers.docker_engine import DEFAULT_HOST, Engine
-from harness.play.containers.images import HOST_IMAGE, from_host, idle_command
 
 
 def containers(run: Path) -> list[str]:

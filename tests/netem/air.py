@@ -5,7 +5,7 @@
     air.py stream ETHERTYPE...   a frame of each to everyone, with the time, every few milliseconds until SIGTERM
     air.py serve PORT        a TCP server that greets
 
-and `receive` and `broadcast` of `netem.probe`. `listen` says "ready", and on SIGTERM what it got, one JSON object.
+and `receive` and `broadcast` of `netem._probe`. `listen` says "ready", and on SIGTERM what it got, one JSON object.
 Times are nanoseconds of the real-time clock, which every process of a kernel shares.
 """
 
@@ -17,7 +17,7 @@ import struct
 import sys
 import time
 
-from netem.probe import broadcast, collect, receive, say
+from netem._probe import broadcast, collect, receive, say
 
 _STREAM_PAUSE_S = 0.005
 

@@ -37,7 +37,7 @@ def capture(vehicles: Sequence[int], folder: Path, story: Story, engine: str | N
 
 
 def numbers(folder: Path, vehicle: int, *, outbound: bool) -> list[int]:
-    """Those that `netem.probe` gave the datagrams."""
+    """Those that `netem._probe` gave the datagrams."""
     found = frames(folder / f"{vehicle}.pcapng")
     return [struct.unpack_from("!I", frame.payload)[0] for frame in found if frame.outbound == outbound]
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from netem._lab_channel import Channel
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError, LabError, SpawnError
 from netem.lab import Lab, LabProcess, in_words
-from netem.lab_channel import Channel
 from tests.netem.conftest import DEADLINE_S, PORT, Air, play, until
 
 pytestmark = pytest.mark.lab

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from netem import namespaces
+from netem import _namespaces
 from netem.lab import Lab, LabUnavailable
 from netem.lab_doctor import examine
 from tests.machine import unavailable
@@ -158,8 +158,8 @@ def test_a_program_that_a_user_cannot_execute_is_named_with_the_user() -> None:
 def test_each_way_to_forbid_namespaces_has_its_own_way_out(
     monkeypatch: pytest.MonkeyPatch, name: str, value: int, expected: str
 ) -> None:
-    monkeypatch.setattr(namespaces, "_sysctl", lambda asked: value if asked == name else None)
-    assert expected in namespaces.way_out("unshare: unshare failed: Operation not permitted")
+    monkeypatch.setattr(_namespaces, "_sysctl", lambda asked: value if asked == name else None)
+    assert expected in _namespaces.way_out("unshare: unshare failed: Operation not permitted")
 
 
 def test_a_missing_tool_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

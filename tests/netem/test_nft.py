@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from netem import addresses
+from netem._nft import NftablesEngine
 from netem.conditions import LinkConditions, NetworkConditions
 from netem.errors import EngineError
-from netem.nft import NftablesEngine
 
 VEHICLES = range(1, 31)
 

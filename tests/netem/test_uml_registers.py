@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from netem import uml, uml_registers
+from netem import _uml_registers, uml
 from netem.errors import UmlError
 from tests.machine import do_without, require_uml
 
@@ -18,14 +18,14 @@ SECONDS = 3
 
 
 KERNEL = shutil.which("linux.uml")
-WAYS = ["as here"] if uml_registers.needed(Path(KERNEL) if KERNEL else None) else ["as here", "preloaded"]
+WAYS = ["as here"] if _uml_registers.needed(Path(KERNEL) if KERNEL else None) else ["as here", "preloaded"]
 
 
 @pytest.fixture(params=WAYS)
 def guest(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """User Mode Linux as this processor has it, and with the library that keeps registers where it is not wanted."""
     if request.param == "preloaded":
-        monkeypatch.setenv(uml_registers.FORCE, "1")
+        monkeypatch.setenv(_uml_registers.FORCE, "1")
     require_uml()
 
 
@@ -34,7 +34,7 @@ def check(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The program that looks at its registers; it says what it lost, and then ends with status 1."""
     program = tmp_path_factory.mktemp("registers") / "check"
     argv = ["cc", "-O1", "-fno-builtin", "-pthread", "-o", str(program), str(PROGRAMS / "check.c")]
-    if not uml_registers.has_compiler():
+    if not _uml_registers.has_compiler():
         do_without("cc", "no C compiler (Debian packages `gcc` and `libc6-dev`)")
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     if done.returncode != 0:
@@ -68,11 +68,11 @@ def test_hashes_copies_and_floats_come_out_as_on_the_host(guest: None, capfd: py
 def test_registers_that_are_lost_are_noticed(
     check: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv(uml_registers.FORCE, "1")
+    monkeypatch.setenv(_uml_registers.FORCE, "1")
     require_uml()
     if " avx " not in Path("/proc/cpuinfo").read_text():
         pytest.skip("this processor has no more registers than what is kept anyway")
-    monkeypatch.setattr(uml_registers, "SOURCE", PROGRAMS / "forgetful.c")
+    monkeypatch.setattr(_uml_registers, "SOURCE", PROGRAMS / "forgetful.c")
     assert run(str(check), str(SECONDS)) == 1
     assert " 0 vector" not in capfd.readouterr().out
 
@@ -91,17 +91,17 @@ def test_registers_that_are_lost_are_noticed(
 def test_the_library_is_for_new_processors_and_old_kernels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: set[str], version: str, needed: bool
 ) -> None:
-    monkeypatch.delenv(uml_registers.FORCE, raising=False)
-    monkeypatch.setattr(uml_registers, "_FLAGS", flags)
+    monkeypatch.delenv(_uml_registers.FORCE, raising=False)
+    monkeypatch.setattr(_uml_registers, "_FLAGS", flags)
     kernel = tmp_path / "linux.uml"
     kernel.write_text(f"#!/bin/sh\necho '{version}'\n")
     kernel.chmod(0o755)
-    assert uml_registers.needed(kernel) is needed
+    assert _uml_registers.needed(kernel) is needed
 
 
 def test_a_missing_compiler_is_named_where_it_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv(uml_registers.FORCE, "1")
+    monkeypatch.setenv(_uml_registers.FORCE, "1")
     with pytest.raises(UmlError, match=r"apt install .*gcc"):
         uml.find()
 
@@ -112,7 +112,7 @@ def test_a_compiler_that_fails_is_an_error_with_its_word(tmp_path: Path, monkeyp
     compiler.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     with pytest.raises(UmlError, match=r"cc could not compile \(as: not found\).*--reinstall gcc"):
-        uml_registers.preload(tmp_path)
+        _uml_registers.preload(tmp_path)
 
 
 @pytest.mark.uml

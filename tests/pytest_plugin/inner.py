@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 # Imported before pytester takes its picture of what is imported, so that inner runs find it and are quick.
-import harness.pytest_plugin.items
+import harness.pytest_plugin._items
 import harness.report  # noqa: F401
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

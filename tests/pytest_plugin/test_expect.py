@@ -4,7 +4,7 @@ from typing import Any, get_args
 
 import pytest
 
-from harness.checker.verdict import CHECKS
+from harness.checker._verdict import CHECKS
 from harness.run.simulate import simulate
 from harness.scenario.expect import NUMBERS, Expect, FigureName
 from tests.harness.virtual import scenario

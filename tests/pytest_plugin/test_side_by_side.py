@@ -129,8 +129,8 @@ def test_a_project_that_does_not_use_it_pays_for_no_import(pytester: pytest.Pyte
 
     def test_theirs():
         assert {name for name in sys.modules if name.split(".")[0] in ("harness", "ucp", "netem", "pydantic")} == {
-            "harness", "harness.backend_names", "harness.pytest_plugin", "harness.pytest_plugin.stash",
-            "harness.pytest_plugin.yaml_files",
+            "harness", "harness.backend_names", "harness.pytest_plugin", "harness.pytest_plugin._stash",
+            "harness.pytest_plugin._yaml_files",
         }
     """)
     pytester.makeini("[pytest]\ntestpaths = .\naddopts = -p no:hypothesispytest")

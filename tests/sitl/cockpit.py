@@ -6,12 +6,12 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.autopilot import Autopilot
-from sitl.kinematics import Point
-from sitl.mission_upload import Mission
+from sitl._autopilot import Autopilot
+from sitl._kinematics import Point
+from sitl._mission_upload import Mission
+from sitl._route import route
 from sitl.modes import MODES
 from sitl.plan import Plan
-from sitl.route import route
 from sitl.serial_channel import Channel
 from sitl.vehicle import VehicleType
 from tests.sitl.flying import HOME

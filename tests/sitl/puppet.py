@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from sitl.autopilot import Autopilot
+from sitl._autopilot import Autopilot
 from sitl.pilot import Pilot
 from sitl.serial_channel import Channel
 from sitl.vehicle import VehicleType

@@ -7,10 +7,10 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.kinematics import Point
-from sitl.mission_upload import on_earth
+from sitl._kinematics import Point
+from sitl._mission_upload import on_earth
+from sitl._plane import LOITER_RADIUS_M
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
-from sitl.plane import LOITER_RADIUS_M
 from sitl.vehicle import VehicleType
 from tests.sitl.cockpit import ACCEPTED, FAILED, UNSUPPORTED, Cockpit
 from tests.sitl.flying import HOME

@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 import sitl.circumstances
-from sitl.autopilot import Autopilot
+from sitl._autopilot import Autopilot
 from sitl.circumstances import (
     COMPASS_LOST,
     GPS_LOST,

@@ -12,9 +12,9 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
-import sitl.autopilot
-import sitl.mission_inbox
-import sitl.mission_upload
+import sitl._autopilot
+import sitl._mission_inbox
+import sitl._mission_upload
 import sitl.pilot
 from sitl.modes import MODES
 from sitl.pilot import Pilot
@@ -222,7 +222,7 @@ def test_a_mission_that_is_acknowledged_and_forgotten_is_uploaded_again(tmp_path
 
 
 def test_a_request_that_is_lost_begins_the_upload_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sitl.mission_upload, "RESEND_S", 0.1)
+    monkeypatch.setattr(sitl._mission_upload, "RESEND_S", 0.1)
     lost: list[bytes] = []
 
     def strings(puppet: Puppet) -> None:
@@ -241,13 +241,13 @@ def test_a_request_that_is_lost_begins_the_upload_anew(tmp_path: Path, monkeypat
 def test_a_mission_that_is_refused_ends_the_flight_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sitl.mission_inbox, "MAX_ITEMS", 2)
+    monkeypatch.setattr(sitl._mission_inbox, "MAX_ITEMS", 2)
     with pytest.raises(FlightError, match="it refused its mission with MAV_MISSION_NO_SPACE"):
         puppet_flown(tmp_path, lambda puppet: None)
 
 
 def test_a_vehicle_that_spins_and_never_gets_ready_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sitl.autopilot, "READY_S", math.inf)
+    monkeypatch.setattr(sitl._autopilot, "READY_S", math.inf)
     monkeypatch.setattr(sitl.pilot, "LEAST_WAIT_S", 0.1)
     with pytest.raises(FlightError, match="ready to arm, 180 simulated seconds were not enough; it never said why"):
         puppet_flown(tmp_path, lambda puppet: None)
@@ -291,7 +291,7 @@ def test_a_vehicle_that_is_ready_has_only_to_be_armed(by: By, vehicle_type: Vehi
             await pilot.get_ready(flight)
             assert pilot.state.position is not None
             assert (puppet.vehicle.ready, puppet.vehicle.armed) == (True, False)
-            assert puppet.vehicle.now_s >= sitl.autopilot.READY_S + READY_FOR_S
+            assert puppet.vehicle.now_s >= sitl._autopilot.READY_S + READY_FOR_S
             assert bool(puppet.vehicle.mission) is (by == "mission")
             mission = puppet.vehicle.mission
             flying = asyncio.create_task(pilot.fly(flight))
@@ -310,14 +310,14 @@ def test_a_vehicle_that_takes_back_that_it_is_ready_is_not(tmp_path: Path) -> No
             link = pilot.link
 
             def take_back(frame: bytes) -> bytes:
-                if 2.0 < puppet.vehicle.now_s - sitl.autopilot.READY_S < 30.0 and message_id(frame) == SYS_STATUS:
+                if 2.0 < puppet.vehicle.now_s - sitl._autopilot.READY_S < 30.0 and message_id(frame) == SYS_STATUS:
                     link.state.ready_to_arm = False
                     return b""
                 return frame
 
             puppet.tamper = take_back
             await pilot.get_ready(pilot.flight(DRIVE, "mission"))
-            assert puppet.vehicle.now_s > sitl.autopilot.READY_S + 30.0 + READY_FOR_S
+            assert puppet.vehicle.now_s > sitl._autopilot.READY_S + 30.0 + READY_FOR_S
 
     asyncio.run(fly())
 

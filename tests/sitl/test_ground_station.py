@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 import sitl.ground_station
+from sitl._mavlink_frames import FrameSplitter
+from sitl._operator import MOST_COMMANDS, CommandLog
 from sitl.address import Address, connected
 from sitl.ground_station import GroundStation
-from sitl.mavlink_frames import FrameSplitter
-from sitl.operator import MOST_COMMANDS, CommandLog
 from sitl.vehicle import VehicleError
 from tests.sitl.flying import DEADLINE_S
 

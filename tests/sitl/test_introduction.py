@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from sitl._vehicle_state import Version
 from sitl.parameters import ParameterError
-from sitl.vehicle_state import Version
 from tests.sitl.puppet import message_id, on_strings
 
 

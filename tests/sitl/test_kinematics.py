@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.kinematics import Arc, Climbing, Course, Fall, Line, Motion, Point, Rest, Segment, end_of
-from sitl.models import MODELS
-from sitl.plane import LOITER_RADIUS_M
+from sitl._kinematics import Arc, Climbing, Course, Fall, Line, Motion, Point, Rest, Segment, end_of
+from sitl._models import MODELS
+from sitl._plane import LOITER_RADIUS_M
 from sitl.vehicle import VehicleType
 
 metres = st.floats(-2000, 2000)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.mission_inbox import MAX_ITEMS
+from sitl._mission_inbox import MAX_ITEMS
 from sitl.plan import GoTo, Land, Plan, TakeOff
 from tests.sitl.cockpit import Cockpit
 

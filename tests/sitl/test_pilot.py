@@ -11,15 +11,15 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
+import sitl._pilot_link
+import sitl._take_off
 import sitl.pilot
-import sitl.pilot_link
-import sitl.take_off
-from sitl.autopilot import Autopilot
+from sitl._autopilot import Autopilot
+from sitl._vehicle_state import Battery, Position
 from sitl.pilot import Pilot
 from sitl.serial_channel import Channel
 from sitl.streams import heartbeat
 from sitl.vehicle import FlightError, VehicleType
-from sitl.vehicle_state import Battery, Position
 from tests.sitl.flying import DEADLINE_S, HOME, connect, embedded
 
 SPEEDUP = 100.0
@@ -63,7 +63,7 @@ def test_it_takes_an_embedded_vehicle_off_and_the_tlog_holds_the_flight(tmp_path
 
 
 def test_it_measures_the_real_time_factor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sitl.pilot_link, "MIN_RATE_SPAN_S", 0.3)
+    monkeypatch.setattr(sitl._pilot_link, "MIN_RATE_SPAN_S", 0.3)
 
     async def factor(port: int, speedup: float) -> float:
         async with piloting(port, tmp_path / "3.tlog", speedup=speedup) as pilot:
@@ -88,7 +88,7 @@ async def failure(port: int, tlog: Path, sysid: int = 3) -> str:
 def test_a_missed_deadline_names_the_vehicle_the_step_and_its_last_words(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sitl.take_off, "SLOWEST_CLIMB_MS", 100.0)
+    monkeypatch.setattr(sitl._take_off, "SLOWEST_CLIMB_MS", 100.0)
     monkeypatch.setattr(sitl.pilot, "LEAST_WAIT_S", 0.5)
     with embedded(speedup=SPEEDUP) as vehicle:
         message = asyncio.run(failure(vehicle.pilot_port, tmp_path / "3.tlog"))

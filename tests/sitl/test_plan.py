@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from sitl.kinematics import Point
+from sitl._kinematics import Point
+from sitl._route import route
 from sitl.plan import MAX_LEGS, GoTo, Land, Leg, Loiter, Plan, PlanError, TakeOff
-from sitl.route import route
 from sitl.vehicle import VehicleType
 
 

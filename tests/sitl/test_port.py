@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.autopilot import Autopilot
-from sitl.port import MAX_UNSENT_BYTES, Port
+from sitl._autopilot import Autopilot
+from sitl._port import MAX_UNSENT_BYTES, Port
 from sitl.streams import heartbeat
 from tests.sitl.flying import DEADLINE_S, HOME, free_ports
 

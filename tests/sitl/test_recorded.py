@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.pilot_link import Link
+from sitl._pilot_link import Link
 from sitl.vehicle import Home
 from tests.sitl.recorded import Name, frames, messages
 from ucp.telemetry import EVENT_KINDS, POSITION, STATUS_TEXT, WAYPOINT, Position, TelemetryEvents, describe

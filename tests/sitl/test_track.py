@@ -11,8 +11,8 @@ from typing import Literal
 
 import pytest
 
+from sitl._plane import LOITER_RADIUS_M
 from sitl.plan import By, GoTo, Land, Loiter, Plan, PlanError, TakeOff
-from sitl.plane import LOITER_RADIUS_M
 from sitl.track import Track, track
 from sitl.vehicle import VehicleType
 from tests.sitl.cockpit import Cockpit

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import ucp
-from harness.conformance.state_space import VARIANTS, explore
+from harness.conformance._state_space import VARIANTS, explore
 from harness.conformance.vectors import Vectors, to_lines
 from harness.play.progress import Silent
 from harness.run.run import run

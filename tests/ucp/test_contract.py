@@ -21,8 +21,8 @@ from harness.scenario import Scenario
 from tests.ucp.test_node import AgentUnderTest, mission
 from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER
 from ucp.contract import schemas, vectors
-from ucp.contract.schemas.control_schema import MAY_BE_MISSING, REQUESTS, STATUS
-from ucp.contract.schemas.trace_schema import DROPS, OPERATIONS, SECURED_DROPS
+from ucp.contract.schemas._control_schema import MAY_BE_MISSING, REQUESTS, STATUS
+from ucp.contract.schemas._trace_schema import DROPS, OPERATIONS, SECURED_DROPS
 from ucp.contract.vectors.replay import differences
 from ucp.features import FEATURES, needed
 from ucp.messages import RequestForBlock, encode

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import TypeAdapter
 
-from ucp.dataclass import dataclass, field
+from ucp._dataclass import dataclass, field
 from ucp.settings import Settings
 
 

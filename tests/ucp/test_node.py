@@ -29,7 +29,7 @@ from ucp.store import Store
 
 DEADLINE_S = 10.0
 NEEDED = {
-    *("agent", "block", "chain", "clock", "commit", "control", "core", "dataclass", "events", "export", "features"),
+    *("agent", "block", "chain", "clock", "commit", "control", "core", "_dataclass", "events", "export", "features"),
     *(
         "agent_files",
         "handler",
@@ -42,7 +42,7 @@ NEEDED = {
         "short_value",
         "state",
     ),
-    *("sealed", "status", "store", "timers", "trace", "wire"),
+    *("sealed", "_status", "store", "timers", "trace", "wire"),
 }
 """The modules of `ucp` that every agent loads."""
 

@@ -1,9 +1,9 @@
 """Wrong agents: mistakes that an agent can be asked to make, to see what finds them.
 
-quirk.py      what a quirk is, and how it takes the place of what is right
-commit_quirks.py     the quirks of Algorithms 1-6
-reconcile_quirks.py  the quirks of Algorithms 7-20
-core_quirks.py       the quirks of what all handlers share
+_quirk.py      what a quirk is, and how it takes the place of what is right
+_commit_quirks.py     the quirks of Algorithms 1-6
+_reconcile_quirks.py  the quirks of Algorithms 7-20
+_core_quirks.py       the quirks of what all handlers share
 
 An agent has quirks only if its mission, its scenario or the command `quirk` names them. The thesis's own are among
 them: `ignore_commit` (Section 4.2), and those of its tests and field tests (Sections 4.2 and 4.3) `crash_on_tie`,
@@ -17,8 +17,8 @@ from typing import Any
 
 from ucp.agent import HANDLERS
 from ucp.handler import EventHandler
-from ucp.quirks import commit_quirks, core_quirks, reconcile_quirks
-from ucp.quirks.quirk import CRASHED, Quirk, ending_by_exceptions
+from ucp.quirks import _commit_quirks, _core_quirks, _reconcile_quirks
+from ucp.quirks._quirk import CRASHED, Quirk, ending_by_exceptions
 
 __all__ = ["CRASHED", "QUIRKS", "Quirk", "Quirks", "UnknownQuirkError", "check_quirk", "in_force", "wrong_handlers"]
 
@@ -27,7 +27,7 @@ Quirks = dict[str, bool | float]
 
 QUIRKS: dict[str, Quirk] = {
     quirk.name: quirk
-    for module in (commit_quirks, reconcile_quirks, core_quirks)
+    for module in (_commit_quirks, _reconcile_quirks, _core_quirks)
     for quirk in vars(module).values()
     if isinstance(quirk, Quirk)
 }

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 
 from ucp.agent import Agent, why_not_handled
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
+from ucp.secure._signatures import BlockSignatures
 from ucp.secure.envelope import BOOT_BYTES, CLEAR, LAST_SEQUENCE, REQUESTS, REVOCATION, Clear
 from ucp.secure.revocation import Revocation, RevocationError
 from ucp.secure.sealed_datagrams import Opened, Request
 from ucp.secure.session import Session
-from ucp.secure.signatures import BlockSignatures
 from ucp.store import SecuredState, StoredState
 from ucp.trace import Commanded, Recorded, in_base64
 

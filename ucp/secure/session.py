@@ -11,6 +11,8 @@ its signature.
 from collections.abc import Callable
 
 from ucp.messages import TYPE_CODES, MalformedDatagramError, Message
+from ucp.secure._epochs import Epochs
+from ucp.secure._window import ReplayWindow
 from ucp.secure.bundle import Bundle
 from ucp.secure.envelope import (
     LAST_SEQUENCE,
@@ -23,9 +25,7 @@ from ucp.secure.envelope import (
     WITH_BLOCK,
     Clear,
 )
-from ucp.secure.epochs import Epochs
 from ucp.secure.sealed_datagrams import ARITHMETIC, NOTHING_ASKED, Arithmetic, Opened, Request, domain_of
-from ucp.secure.window import ReplayWindow
 
 
 class _Life:

@@ -40,9 +40,9 @@ charged or changed. A vehicle that does not know its percentage has no levels; i
 """
 
 from ucp.events import DEFAULT_LOG, EventKind
-from ucp.telemetry.connection import VehicleConnection
-from ucp.telemetry.event_text import describe
-from ucp.telemetry.records import (
+from ucp.telemetry._connection import VehicleConnection
+from ucp.telemetry._event_text import describe
+from ucp.telemetry._records import (
     ARMED,
     BATTERY,
     DISARMED,
@@ -56,7 +56,7 @@ from ucp.telemetry.records import (
     Position,
     position_of,
 )
-from ucp.telemetry.translator import TelemetryEvents
+from ucp.telemetry._translator import TelemetryEvents
 
 __all__ = [
     "ARMED",

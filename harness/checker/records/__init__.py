@@ -11,31 +11,31 @@ from dataclasses import dataclass
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.records import (
-    algorithms,
-    captures_vs_traces,
-    completed_blocks,
-    conditions_vs_network,
-    counters,
-    export_vs_trace,
-    headers,
-    heard_vs_sent,
-    trace_consistency,
+    _algorithms,
+    _captures_vs_traces,
+    _completed_blocks,
+    _conditions_vs_network,
+    _counters,
+    _export_vs_trace,
+    _headers,
+    _heard_vs_sent,
+    _trace_consistency,
 )
 from harness.checker.records.contradiction import Contradiction
 
 NAME = "every record"
 
 COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
-    headers.compare,
-    algorithms.compare,
-    trace_consistency.compare,
-    counters.compare,
-    export_vs_trace.compare,
-    completed_blocks.compare,
-    heard_vs_sent.compare,
-    conditions_vs_network.compare,
-    captures_vs_traces.compare_counters,
-    captures_vs_traces.compare_captures,
+    _headers.compare,
+    _algorithms.compare,
+    _trace_consistency.compare,
+    _counters.compare,
+    _export_vs_trace.compare,
+    _completed_blocks.compare,
+    _heard_vs_sent.compare,
+    _conditions_vs_network.compare,
+    _captures_vs_traces.compare_counters,
+    _captures_vs_traces.compare_captures,
 )
 
 
@@ -76,7 +76,7 @@ def _untold(evidence: Evidence) -> Iterator[int]:
 
 def check(evidence: Evidence) -> Judgement:
     """`contradict` at the first contradiction; `not applicable` where a trace is missing or not whole."""
-    examination = evidence.examination
+    examination = evidence.once(cross_examine)
     findings = [contradiction.finding for contradiction in examination.contradictions]
     if findings:
         reason = f"{times(len(findings))}: what two records tell about the same thing does not agree"

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from harness.archive.traces import Header, Trace
+from harness.checker._waiting import SLACK_WALL_S
 from harness.checker.judgement import Finding
-from harness.checker.waiting import SLACK_WALL_S
 from ucp.clock import MICROSECONDS
 
 

@@ -13,6 +13,7 @@ from harness.archive.traces import Trace
 from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
+from harness.checker.records import cross_examine
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
 from harness.checker.steps.recorded_inputs import Blocks, decoded
@@ -52,7 +53,9 @@ def check(evidence: Evidence) -> Judgement:
         unjudged[agent_id] = "there is no trace"
     for agent_id, words in evidence.unknown.items():
         unjudged.setdefault(agent_id, f"the trace is not wholly understood: {first_of(words)}")
-    unjudged |= {agent_id: f"the trace is not whole: {why}" for agent_id, why in evidence.examination.short.items()}
+    unjudged |= {
+        agent_id: f"the trace is not whole: {why}" for agent_id, why in evidence.once(cross_examine).short.items()
+    }
     if unjudged or not evidence.traces:
         return Judgement(NAME, "not applicable", _why(unjudged))
     return Judgement(NAME, "as specified", f"{steps} handler runs, each as Algorithms 1 to 20 say")

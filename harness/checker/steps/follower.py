@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import branch_is_known, tally_is_known, timer_that_ended, timers_are_known
+from harness.checker.steps._reference import Before, ReferenceCore
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.recorded_inputs import (
     Blocks,
@@ -16,7 +17,6 @@ from harness.checker.steps.recorded_inputs import (
     sealed_of,
     stored_blocks,
 )
-from harness.checker.steps.reference import Before, ReferenceCore
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of, why_not_handled
 from ucp.block import Block

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from harness.archive.traces import Header
-from harness.checker.waiting import SLACK_WALL_S
+from harness.checker._waiting import SLACK_WALL_S
 from ucp.block import MAX_AGENT_ID
 from ucp.core import Seal
 from ucp.settings import Settings

@@ -30,7 +30,7 @@ from harness.field.adapters.bags import (
     BagMessage,
     messages,
 )
-from harness.field.adapters.bags.decompression import Broken, message_data
+from harness.field.adapters.bags._decompression import Broken, message_data
 
 METADATA = "metadata.yaml"
 _METADATA_BEGINS = b"rosbag2_bagfile_information"

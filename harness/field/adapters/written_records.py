@@ -17,9 +17,9 @@ from harness.archive.traces import SUFFIX as TRACE_SUFFIX
 from harness.archive.traces import Gap, Trace, gap_line
 from harness.checker.records.contradiction import ROUNDED_S, mission_s
 from harness.errors import RunDirectoryError
-from harness.field.ingest.ingest import Flight, Homecoming, Remark
-from harness.field.ingest.logged_events import SUFFIX as LOGGED_SUFFIX
-from harness.field.ingest.logged_events import EventLine
+from harness.field.ingest._ingest import Flight, Homecoming, Remark
+from harness.field.ingest._logged_events import SUFFIX as LOGGED_SUFFIX
+from harness.field.ingest._logged_events import EventLine
 from harness.scenario.strict_model import VehicleKey
 
 FILE = "import.json"

@@ -35,7 +35,7 @@ from harness.errors import ExportError
 from harness.field.depot.mission_comparison import INCEPTION, ROSTER, Carried, UnreadableFileError
 from harness.field.depot.mission_comparison import read as read_carried
 from harness.field.ingest import LeftOut
-from harness.field.ingest.file_search import files_of
+from harness.field.ingest._file_search import files_of
 from harness.gc_pause import gc_paused
 from harness.report.logbook.book import logged_telemetry
 from ucp.block import Block, InceptionBlock, next_chain_hash

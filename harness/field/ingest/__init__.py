@@ -4,7 +4,7 @@ Field data is broken: lines are cut, two flights are in one file, a file is ther
 Everything usable is used, and whatever is left out is named.
 """
 
-from harness.field.ingest.ingest import Flight, Homecoming, LeftOut, Remark
-from harness.field.ingest.sorting import sort_out
+from harness.field.ingest._ingest import Flight, Homecoming, LeftOut, Remark
+from harness.field.ingest._sorting import sort_out
 
 __all__ = ["Flight", "Homecoming", "LeftOut", "Remark", "sort_out"]

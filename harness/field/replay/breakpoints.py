@@ -9,8 +9,8 @@ from pathlib import Path
 
 from harness.checker.steps.recorded_inputs import decoded
 from harness.errors import FieldError
-from harness.field.replay.agent_record import Entry
-from harness.field.replay.player import Player
+from harness.field.replay._agent_record import Entry
+from harness.field.replay._player import Player
 from harness.field.replay.replay_names import Names, is_block
 from ucp.agent import HANDLERS
 from ucp.messages import MalformedDatagramError, block_named

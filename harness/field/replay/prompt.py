@@ -8,12 +8,12 @@ from collections.abc import Callable, Sequence
 from rich.console import Console, RenderableType
 
 from harness.errors import FieldError
-from harness.field.replay.agent_record import Entry
+from harness.field.replay._agent_record import Entry
+from harness.field.replay._other_agents import Others
+from harness.field.replay._player import Player
+from harness.field.replay._step_text import Words
 from harness.field.replay.breakpoints import Place, next_place, place
-from harness.field.replay.other_agents import Others
-from harness.field.replay.player import Player
 from harness.field.replay.replay_names import Names
-from harness.field.replay.step_text import Words
 
 AROUND = 5
 """Lines that `list` shows before and after."""

@@ -10,9 +10,9 @@ from rich.text import Text
 
 from harness.checker.judgement import times
 from harness.checker.steps.deviation import Deviation
-from harness.field.replay.agent_record import Record
+from harness.field.replay._agent_record import Record
+from harness.field.replay._player import Found
 from harness.field.replay.breakpoints import source_of
-from harness.field.replay.player import Found
 from harness.field.replay.replay_names import Names
 from harness.present.text import shown
 from ucp.agent import HANDLERS

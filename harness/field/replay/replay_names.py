@@ -7,7 +7,7 @@ from functools import cached_property
 from harness.archive.block_names import name_blocks
 from harness.archive.traces import Trace
 from harness.checker.steps.recorded_inputs import Blocks, NotOnRecordError, decoded
-from harness.field.replay.agent_record import Record
+from harness.field.replay._agent_record import Record
 from ucp.block import Block
 from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError
 

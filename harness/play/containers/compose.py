@@ -13,12 +13,12 @@ import yaml
 
 from harness.archive.directory import PUBLIC_KEYS_FILE
 from harness.errors import RunDirectoryError, ScenarioError
-from harness.play.containers import images, ownership
-from harness.play.containers.container_backend import Containers
-from harness.play.containers.container_preflight import refuse_debuggers_that_are_not_in_the_image
-from harness.play.containers.images import Image
+from harness.play._vehicle_keys import FRESH, FRESH_BYTES, MissionKeys, keys_of
+from harness.play.containers import _images, ownership
+from harness.play.containers._container_backend import Containers
+from harness.play.containers._container_preflight import refuse_debuggers_that_are_not_in_the_image
+from harness.play.containers._images import Image
 from harness.play.process.agent_mission import mission_file
-from harness.play.vehicle_keys import FRESH, FRESH_BYTES, MissionKeys, keys_of
 from harness.scenario import Scenario
 from netem import addresses
 from sitl.vehicle import VehicleKind
@@ -115,7 +115,7 @@ def _services(
 ) -> dict[str, Any]:
     ours, build = _our_image(scenario, beside)
     asked = scenario.docker.image
-    in_named = set(images.agents_in_named(scenario))
+    in_named = set(_images.agents_in_named(scenario))
     services: dict[str, Any] = {}
     initial_data = f"{scenario.name}, seed {seed}, by hand".encode()
     if keys is not None:
@@ -163,14 +163,14 @@ def _our_image(scenario: Scenario, beside: Path) -> tuple[Image, dict[str, Any]]
     context = beside / "image"
     context.mkdir()
     if scenario.docker.image_from_host:
-        image = images.host_image()
+        image = _images.host_image()
         (context / "Dockerfile").write_text(f"FROM scratch\nLABEL {ownership.PROJECT}=host\n", encoding="utf-8")
         return image, {"build": f"./{beside.name}/image"}
-    for name, content in images.context().items():
+    for name, content in _images.context().items():
         (context / name).parent.mkdir(parents=True, exist_ok=True)
         (context / name).write_bytes(content)
-    build = {"context": f"./{beside.name}/image", "network": "host", "args": images.build_arguments()}
-    return Image(images.project_name(), "python3"), {"build": build}
+    build = {"context": f"./{beside.name}/image", "network": "host", "args": _images.build_arguments()}
+    return Image(_images.project_name(), "python3"), {"build": build}
 
 
 def _service(scenario: Scenario, image: Image, argv: list[str], directory: str, beside: Path) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def _user_mode_linux() -> Requirement:
 
 
 def _docker() -> Requirement:
-    from harness.play.containers.container_preflight import require_root
+    from harness.play.containers._container_preflight import require_root
     from harness.play.containers.docker_engine import DockerError, Engine
 
     use = "--backend docker: vehicles and agents in containers"

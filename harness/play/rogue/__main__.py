@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from harness.archive.directory import ROGUE_CONTROL, ROGUE_FILE
-from harness.play.rogue.journal import Journal
-from harness.play.rogue.rogue import Rogue
+from harness.play.rogue._journal import Journal
+from harness.play.rogue._rogue import Rogue
 from harness.scenario.injection import MODELS, Lie
 from netem.frames import udp_broadcast
 from ucp.clock import MissionClock
@@ -27,7 +27,7 @@ from ucp.loop import Loop, Timer
 from ucp.messages import PORT
 
 if TYPE_CHECKING:
-    from harness.play.rogue.crafted import CapturedKeys
+    from harness.play.rogue._crafted import CapturedKeys
 
 LINK = "eth0"
 DATAGRAMS_PER_TURN = 64
@@ -128,7 +128,7 @@ class RogueNode:
 
 
 def _keys(path: Path) -> "CapturedKeys":
-    from harness.play.rogue.crafted import CapturedKeys  # needs the extra `secure`
+    from harness.play.rogue._crafted import CapturedKeys  # needs the extra `secure`
     from ucp.secure.bundle import load_bundle
 
     return CapturedKeys(load_bundle(path), partial(os.urandom, 8))

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
+from harness.play.simulation._simulated_agent import VirtualAgent
 from harness.play.simulation.air import Happening
-from harness.play.simulation.simulated_agent import VirtualAgent
 from harness.scenario.scenario import Clock
 from ucp.clock import MICROSECONDS
 from ucp.events import RandomEvents

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from harness.play.simulation._simulated_agent import Stored
 from harness.play.simulation.run_files import Recorder
-from harness.play.simulation.simulated_agent import Stored
 from harness.play.simulation.simulation import Simulation
 from harness.scenario import Scenario
 from ucp.store import StoredState

@@ -89,7 +89,7 @@ class Recorder(Protocol):
         """A change of the network, or a fault of agents, was made."""
 
     def injected(self, record: dict[str, Any]) -> None:
-        """The rogue node has sent something; see `harness.play.rogue.journal`."""
+        """The rogue node has sent something; see `harness.play.rogue._journal`."""
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Here are the vehicles now, if any fly."""

@@ -1,7 +1,7 @@
 """Secured agents in virtual time, and the seals on record that cannot be made again.
 
 All of it comes of the run's seed. Every datagram is sealed, and opened by whom it reaches; what many receivers work out
-of the same bytes is remembered (`crypto_cache.py`).
+of the same bytes is remembered (`_crypto_cache.py`).
 """
 
 import base64
@@ -12,10 +12,10 @@ from functools import partial
 from random import Random
 from typing import Any
 
-from harness.play.rogue.crafted import CapturedKeys
-from harness.play.simulation.crypto_cache import remembered
-from harness.play.simulation.simulated_agent import OwnAgent
-from harness.play.vehicle_keys import keys_of
+from harness.play._vehicle_keys import keys_of
+from harness.play.rogue._crafted import CapturedKeys
+from harness.play.simulation._crypto_cache import remembered
+from harness.play.simulation._simulated_agent import OwnAgent
 from harness.scenario import Scenario
 from harness.scenario.agent_options import ScriptedEvent
 from netem.medium import LATENCY

@@ -12,17 +12,17 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from harness.errors import ScenarioError
+from harness.play._radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.agent_control import Status
 from harness.play.mission import RunOutcome, Sought
-from harness.play.radio_range import TRACK_S, RadioRange, tracks_of
-from harness.play.rogue.journal import OF_NO_INJECTION, line_of
+from harness.play.rogue.rogue_line import OF_NO_INJECTION, line_of
+from harness.play.simulation._event_loop import ANY_LIFE, Clockwork
+from harness.play.simulation._recurrence import LOOK_AFTER_S, Recurrence, Waiting
+from harness.play.simulation._simulated_agent import Stored
 from harness.play.simulation.air import NEVER, StrayDatagram, VirtualAir
-from harness.play.simulation.event_loop import ANY_LIFE, Clockwork
 from harness.play.simulation.fate_script import FateScript, NameOf
 from harness.play.simulation.incarnations import Incarnation
-from harness.play.simulation.recurrence import LOOK_AFTER_S, Recurrence, Waiting
 from harness.play.simulation.run_files import Recorder
-from harness.play.simulation.simulated_agent import Stored
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, disconnected_until, injected_nothing
 from harness.scenario.fates import Fate
@@ -33,10 +33,10 @@ from sitl.track import Track
 from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
-    from harness.play.pace import Pace
+    from harness.play._pace import Pace
+    from harness.play.simulation.foreign._foreign_agent import LifeRecord
+    from harness.play.simulation.foreign._virtual_program import Programs
     from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
-    from harness.play.simulation.foreign.foreign_agent import LifeRecord
-    from harness.play.simulation.foreign.virtual_program import Programs
 
 ENGINE = "virtual time"
 BREATH_S = 20.0

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from harness.archive.directory import RunDirectory
 from harness.errors import InterruptedRunError, MachineError, ScenarioError
+from harness.play._pace import Pace
 from harness.play.backend import Backend
-from harness.play.pace import Pace
 from harness.play.process.process_preflight import refuse_what_no_ground_station_sees
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
@@ -19,9 +19,9 @@ from harness.scenario import Scenario
 from harness.scenario.faults import VehicleFault
 
 if TYPE_CHECKING:
-    from harness.play.simulation.captured_air import VirtualCapture
-    from harness.play.simulation.foreign.virtual_program import Programs
-    from harness.play.simulation.station_tracks import TracksOnStation
+    from harness.play.simulation._captured_air import VirtualCapture
+    from harness.play.simulation._station_tracks import TracksOnStation
+    from harness.play.simulation.foreign._virtual_program import Programs
 
 
 class VirtualTime(Backend):
@@ -125,7 +125,7 @@ def _of_real_vehicles(scenario: Scenario) -> list[str]:
 
 
 async def _open_station(simulation: Simulation) -> "TracksOnStation":
-    from harness.play.simulation.station_tracks import TracksOnStation  # draws in MAVLink
+    from harness.play.simulation._station_tracks import TracksOnStation  # draws in MAVLink
 
     return await TracksOnStation.open(simulation.scenario, simulation.tracks, simulation.now)
 
@@ -163,14 +163,14 @@ def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["Programs | 
     if not scenario.foreign:
         yield None
         return
-    from harness.play.simulation.foreign.virtual_program import Programs
+    from harness.play.simulation.foreign._virtual_program import Programs
 
     with closing(Programs(rundir.agents)) as programs:
         yield programs
 
 
 def _refuse_what_foreign_agents_cannot(scenario: Scenario) -> None:
-    from harness.play.simulation.foreign.foreigners import commands_of
+    from harness.play.simulation.foreign._foreigners import commands_of
 
     commands_of(scenario)
     late = sorted(agent_id for agent_id in scenario.lateness if agent_id in scenario.foreign)
@@ -186,7 +186,7 @@ def _failure(error: OSError, rundir: RunDirectory) -> MachineError:
 
 
 def _captures(rundir: RunDirectory, scenario: Scenario) -> "VirtualCapture":
-    from harness.play.simulation.captured_air import VirtualCapture  # draws in what builds networks
+    from harness.play.simulation._captured_air import VirtualCapture  # draws in what builds networks
 
     try:
         return VirtualCapture(rundir.capture(), scenario.roster)

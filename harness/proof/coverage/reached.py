@@ -11,7 +11,7 @@ from typing import Any
 from harness.checker.evidence import Evidence
 from harness.checker.steps import check
 from harness.checker.steps.recorded_inputs import decoded
-from harness.proof.model.shape import Held, Shape, shape_of
+from harness.proof.model._shape import Held, Shape, shape_of
 from ucp.agent import HANDLERS
 from ucp.state import AgentState
 from ucp.trace import HandlerRun

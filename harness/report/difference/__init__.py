@@ -11,7 +11,7 @@ which of two messages arrives first is for the kernel to say. Where they part fi
 `steps` reads a trace line by line, `runs` compares, `keys` says what was asked for differently.
 """
 
-from harness.report.difference.run_difference import (
+from harness.report.difference._run_difference import (
     AgentDifference,
     ChainParting,
     Difference,

@@ -5,6 +5,6 @@ trace for Perfetto, a bag for ROS 2.
 writes them down.
 """
 
-from harness.report.export.exported_run import Recording
+from harness.report.export._exported_run import Recording
 
 __all__ = ["Recording"]

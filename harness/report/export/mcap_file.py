@@ -12,10 +12,10 @@ from typing import IO, Any
 
 from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
 from harness.errors import MachineError
-from harness.report.export.exported_run import Recording
-from harness.report.export.samples import LossesChanged, Position, Said, Telemetry
-from harness.report.export.scene import FIELD, vehicle_frame
-from harness.report.export.topics import Topics
+from harness.report.export._exported_run import Recording
+from harness.report.export._samples import LossesChanged, Position, Said, Telemetry
+from harness.report.export._scene import FIELD, vehicle_frame
+from harness.report.export._topics import Topics
 
 try:
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -25,7 +25,7 @@ try:
     from mcap.writer import Writer
     from mcap_protobuf.schema import register_schema
 
-    from harness.report.export.scene import Scene, colours_of
+    from harness.report.export._scene import Scene, colours_of
 except ImportError:
     raise MachineError("writing MCAP takes further packages: `pip install ucp-harness[export]`") from None
 

@@ -16,8 +16,8 @@ from typing import IO, Any
 
 from harness.archive.history import Message
 from harness.errors import MachineError
-from harness.report.export.exported_run import Recording
-from harness.report.export.samples import NetworkChanged, Position, Said, Sample, Spread, Step
+from harness.report.export._exported_run import Recording
+from harness.report.export._samples import NetworkChanged, Position, Said, Sample, Spread, Step
 from ucp.trace import HandlerRun
 
 try:

@@ -15,9 +15,18 @@ from typing import Any, Literal
 from harness.archive.history import LATEST_S
 from harness.archive.traces import Gap, Header
 from harness.errors import MachineError
-from harness.report.export.exported_run import Recording
-from harness.report.export.samples import LossesChanged, Metres, NetworkChanged, Position, Said, Sample, Step, Telemetry
-from harness.report.export.scene import FIELD, Line, Links, vehicle_frame
+from harness.report.export._exported_run import Recording
+from harness.report.export._samples import (
+    LossesChanged,
+    Metres,
+    NetworkChanged,
+    Position,
+    Said,
+    Sample,
+    Step,
+    Telemetry,
+)
+from harness.report.export._scene import FIELD, Line, Links, vehicle_frame
 
 try:
     import numpy

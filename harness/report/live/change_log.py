@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterable
 from functools import partial
 
-from harness.report.live.agent_course import Change
+from harness.report.live._agent_course import Change
 
 MAX_BYTES = 512 * 1024 * 1024
 CHUNK_BYTES = 256 * 1024

@@ -33,8 +33,8 @@ from harness.archive.run_record import RunRecord
 from harness.errors import RunDirectoryError
 from harness.play.backends import in_virtual_time
 from harness.present.colours import inks
-from harness.report.live.agent_course import Change, Course, Heard, Sent
-from harness.report.live.surroundings import Around
+from harness.report.live._agent_course import Change, Course, Heard, Sent
+from harness.report.live._surroundings import Around
 from harness.scenario.faults import ASKED_FOR, VehicleFault
 from harness.scenario.verdict_names import kind_of
 

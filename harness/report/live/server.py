@@ -20,7 +20,7 @@ from typing import Any
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from harness.errors import MachineError
-from harness.report.live.agent_course import Change
+from harness.report.live._agent_course import Change
 from harness.report.live.change_log import Story
 
 _PAGE = Path(__file__).parent / "page"

@@ -1,17 +1,17 @@
 """Looking for a run that violates a characteristic, and for the smallest one that still does.
 
-exploring.py    seed after seed, until a run violates one
+_exploring.py    seed after seed, until a run violates one
 tape.py      what happened in a run by chance, taken down: events, and messages that were lost
-scenario_document.py  a scenario as a document that can be cut to pieces
-shrink.py    tries smaller documents, by delta debugging, on all cores
-smaller.py   what smaller means: fewer agents, events and fates, less time, less chance
-shrink.py     the smallest one as a scenario file, for people
-exploring.py       the story: all of these, one after the other
-explore_text.py     what is said meanwhile, and at the end
+_scenario_document.py  a scenario as a document that can be cut to pieces
+_shrink.py    tries smaller documents, by delta debugging, on all cores
+_smaller.py   what smaller means: fewer agents, events and fates, less time, less chance
+_shrink.py     the smallest one as a scenario file, for people
+_exploring.py       the story: all of these, one after the other
+_explore_text.py     what is said meanwhile, and at the end
 guided/      instead of seed after seed: scenarios changed, and kept where they reach something new
 """
 
-from harness.sweep.explore.explore_text import in_words, watching
-from harness.sweep.explore.exploring import MAX_RUNS, Explored, Violation, Watcher, explore
+from harness.sweep.explore._explore_text import in_words, watching
+from harness.sweep.explore._exploring import MAX_RUNS, Explored, Violation, Watcher, explore
 
 __all__ = ["MAX_RUNS", "Explored", "Violation", "Watcher", "explore", "in_words", "watching"]

@@ -21,10 +21,10 @@ from typing import Any
 from harness.errors import MachineError
 from harness.present.junit import Case, to_xml
 from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS, JUDGED
-from harness.sweep.matrix.cell import Cell, Run
-from harness.sweep.matrix.cell_scenarios import write_scenarios
-from harness.sweep.matrix.estimate import METRICS
-from harness.sweep.matrix.matrix_picture import draw
+from harness.sweep.matrix._cell import Cell, Run
+from harness.sweep.matrix._cell_scenarios import write_scenarios
+from harness.sweep.matrix._estimate import METRICS
+from harness.sweep.matrix._matrix_picture import draw
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
 from harness.sweep.matrix.matrix_summary import to_markdown

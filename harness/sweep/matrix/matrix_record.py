@@ -6,10 +6,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
 from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED
-from harness.sweep.matrix.cell import Cell, Placed
-from harness.sweep.matrix.comparison import Comparison
-from harness.sweep.matrix.matrix_coverage import Tried
-from harness.sweep.matrix.matrix_file import Matrix
+from harness.sweep.matrix._cell import Cell, Placed
+from harness.sweep.matrix._comparison import Comparison
+from harness.sweep.matrix._matrix_coverage import Tried
+from harness.sweep.matrix._matrix_file import Matrix
 
 SCHEMA = "ucp-matrix/1"
 

@@ -10,12 +10,12 @@ from functools import partial
 from harness.errors import InterruptedRunError, ScenarioError
 from harness.run.parallel import Failed, cores, sweep
 from harness.run.run import versions
-from harness.sweep.matrix.cell import Run, sum_up
-from harness.sweep.matrix.cell_play import Judge, Player, simulated
-from harness.sweep.matrix.cluster import cluster
-from harness.sweep.matrix.comparison import Comparison, compare
-from harness.sweep.matrix.matrix_coverage import Tally
-from harness.sweep.matrix.matrix_file import Matrix, Point, Task
+from harness.sweep.matrix._cell import Run, sum_up
+from harness.sweep.matrix._cell_play import Judge, Player, simulated
+from harness.sweep.matrix._cluster import cluster
+from harness.sweep.matrix._comparison import Comparison, compare
+from harness.sweep.matrix._matrix_coverage import Tally
+from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
 from harness.sweep.matrix.results_file import Results
 

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from harness.present import text
 from harness.present.text import escaped, row
 from harness.report.agent_programs import asked_for, in_sentence
-from harness.sweep.matrix.cell import Cell
-from harness.sweep.matrix.estimate import METRICS
-from harness.sweep.matrix.matrix_coverage import Tried
+from harness.sweep.matrix._cell import Cell
+from harness.sweep.matrix._estimate import METRICS
+from harness.sweep.matrix._matrix_coverage import Tried
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import (
     axes,

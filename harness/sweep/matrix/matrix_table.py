@@ -8,10 +8,10 @@ from rich.text import Text
 
 from harness.present import text as words
 from harness.scenario.verdict_names import BAD_IN_WORDS, CHARACTERISTICS
-from harness.sweep.matrix.cell import Cell
-from harness.sweep.matrix.comparison import Change
-from harness.sweep.matrix.estimate import BY_NAME, METRICS, Estimate, Metric
-from harness.sweep.matrix.matrix_file import Matrix, Point
+from harness.sweep.matrix._cell import Cell
+from harness.sweep.matrix._comparison import Change
+from harness.sweep.matrix._estimate import BY_NAME, METRICS, Estimate, Metric
+from harness.sweep.matrix._matrix_file import Matrix, Point
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 NAMED = 5

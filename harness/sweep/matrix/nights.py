@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.errors import MachineError, RunDirectoryError, ScenarioError
-from harness.sweep.matrix.matrix_file import Matrix
+from harness.sweep.matrix._matrix_file import Matrix
 from harness.sweep.matrix.matrix_record import SCHEMA, MatrixRecord
 from ucp.agent_files import write_json_atomically
 from ucp.short_value import shown

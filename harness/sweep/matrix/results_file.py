@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 from harness.archive.directory import claim
 from harness.errors import MachineError, RunDirectoryError
-from harness.sweep.matrix.cell import Run
-from harness.sweep.matrix.matrix_file import Matrix, Task
+from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._matrix_file import Matrix, Task
 from ucp.agent_files import write_atomically
 
 FILE = "results.jsonl"

@@ -12,11 +12,11 @@ from typing import Any
 
 from harness.errors import MachineError
 from harness.sweep.matrix.matrix_outputs import to_csv
-from harness.sweep.scale.cell import Run
-from harness.sweep.scale.metrics import MACHINE_METRICS
-from harness.sweep.scale.page import to_html
-from harness.sweep.scale.picture import draw
-from harness.sweep.scale.run import Finished
+from harness.sweep.scale._cell import Run
+from harness.sweep.scale._metrics import MACHINE_METRICS
+from harness.sweep.scale._page import to_html
+from harness.sweep.scale._picture import draw
+from harness.sweep.scale._run import Finished
 from ucp.agent_files import write_atomically, write_json_atomically
 
 

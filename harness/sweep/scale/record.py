@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.errors import INTERRUPTED, VIOLATED
-from harness.sweep.scale.cell import Cell, Growth
+from harness.sweep.scale._cell import Cell, Growth
 from harness.sweep.scale.model import Scale
 
 MACHINE = {

@@ -9,10 +9,10 @@ from rich.text import Text
 
 from harness.present import text as words
 from harness.scenario.verdict_names import BAD_IN_WORDS
-from harness.sweep.matrix.estimate import Estimate, Metric
-from harness.sweep.scale.cell import Cell, Growth
-from harness.sweep.scale.growth import Exponent, Law, Variable
-from harness.sweep.scale.metrics import BY_NAME
+from harness.sweep.matrix._estimate import Estimate, Metric
+from harness.sweep.scale._cell import Cell, Growth
+from harness.sweep.scale._growth import Exponent, Law, Variable
+from harness.sweep.scale._metrics import BY_NAME
 from harness.sweep.scale.record import ScaleRecord
 
 NAMED = 5

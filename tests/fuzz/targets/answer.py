@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError, Status
 from tests.fuzz.finding import require, sound
+from ucp._status import status_of
 from ucp.agent import Agent
-from ucp.status import status_of
 
 
 def run(data: bytes) -> None:

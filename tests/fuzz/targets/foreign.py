@@ -12,8 +12,8 @@ from unittest.mock import patch
 
 from harness import checker
 from harness.errors import HarnessError
-from harness.play.simulation.foreign import foreigners, virtual_program
-from harness.play.simulation.foreign.virtual_program import Program
+from harness.play.simulation.foreign import _foreigners, _virtual_program
+from harness.play.simulation.foreign._virtual_program import Program
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.fuzz.finding import require, sound
@@ -86,7 +86,10 @@ def run(data: bytes) -> None:
 def _play(replaced: dict[int, bytes]) -> list[bytes]:
     """The good answers."""
     ours = type("Replaced", (_Ours,), {"answers": [], "replaced": replaced})
-    with patch.object(virtual_program, "Program", ours), patch.object(foreigners, "SHARED", virtual_program.Programs()):
+    with (
+        patch.object(_virtual_program, "Program", ours),
+        patch.object(_foreigners, "SHARED", _virtual_program.Programs()),
+    ):
         try:
             played = simulate(SCENARIO, 1, tracing=True)
         except HarnessError as error:

@@ -13,7 +13,7 @@ from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from harness.play.simulation.crypto_cache import remembered
+from harness.play.simulation._crypto_cache import remembered
 from tests.fuzz.finding import require
 from ucp.block import Block
 from ucp.events import LoggableEvent
@@ -27,11 +27,11 @@ from ucp.messages import (
     Message,
     NextInSequenceResponse,
 )
+from ucp.secure._epochs import AHEAD, SENDERS_KEPT
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
 from ucp.secure.envelope import CLEAR, MAGIC, SEAL_BYTES, VERSION, read_clear
-from ucp.secure.epochs import AHEAD, SENDERS_KEPT
 from ucp.secure.opening import Opener
 from ucp.secure.revocation import Revocation
 from ucp.secure.sealed_datagrams import ARITHMETIC, NOTHING_ASKED, Arithmetic, Request, domain_of

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, read_connectivity
-from harness.play.radio_range import in_words
+from harness.play._radio_range import in_words
 from harness.scenario import Scenario
 from tests.harness.report.flights import still, write_flight, write_lines
 

@@ -11,6 +11,7 @@ import pytest
 from harness.checker import check
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Judgement
+from harness.checker.recurring_cycles import cycle_of
 from harness.play.simulation.simulation import Simulation
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
@@ -97,10 +98,10 @@ def test_traces_show_it_whenever_the_run_ends(name: str, monkeypatch: pytest.Mon
     for more_s in range(0, 30, 2):
         run = simulate(Scenario.model_validate({**document, "settle": {"limit_s": 250 + more_s}}), seed=1, tracing=True)
         assert liveness(run).verdict == "never finishes", f"{run.played.mission_s:.0f} s"
-        assert run.evidence.cycle is not None
-        assert set(run.evidence.busy) <= set(run.evidence.cycle.agents)
+        assert run.evidence.once(cycle_of) is not None
+        assert set(run.evidence.busy) <= set(run.evidence.once(cycle_of).agents)
         idle.add(len(run.evidence.busy))
-        go_round.add(tuple(run.evidence.cycle.agents))
+        go_round.add(tuple(run.evidence.once(cycle_of).agents))
     assert len(idle) > 1 or name != "drawn_in"
     assert len(go_round) == 1, "whoever goes round is told, idle or not"
 
@@ -152,7 +153,7 @@ def test_traces_tell_since_when_an_agent_hangs() -> None:
     hanging = scenario(agents=4, duration_s=900, network={"loss": 0.3}, quirks={"crash_on_tie": True})
     for seed in range(10):
         run = simulate(hanging, seed, tracing=True)
-        cycle = run.evidence.cycle
+        cycle = run.evidence.once(cycle_of)
         if cycle is not None:
             tied_at = {
                 agent_id: next(line.t for line in trace.runs if line.branch.endswith(CRASHED))

@@ -8,7 +8,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.run_record import RogueInjection
 from harness.archive.traces import Header, Trace
 from harness.checker.injections import account, in_words
-from harness.play.rogue.journal import forged_sequence
+from harness.play.rogue.rogue_line import forged_sequence
 from tests.harness.virtual import scenario
 from ucp.trace import HandlerRun, StateSummary
 

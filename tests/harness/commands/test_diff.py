@@ -13,7 +13,7 @@ import pytest
 from harness.errors import RunDirectoryError
 from harness.play.progress import Silent
 from harness.report.difference import AgentDifference, ChainParting, KeyDifference, compare
-from harness.report.difference.run_difference import differing_keys
+from harness.report.difference._run_difference import differing_keys
 from harness.run.run import run
 from harness.scenario import load_scenario
 from tests.harness.command import harness, sentences

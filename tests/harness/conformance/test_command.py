@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from docs.generate.wrong_agents import quirky
+from harness.conformance._state_space import VARIANTS, explore
+from harness.conformance._udp_lab import AgentEndedError, NoAgentError
+from harness.conformance._virtual_subject import Program
 from harness.conformance.conformance_run import Asked, conform
 from harness.conformance.results_table import to_junit
-from harness.conformance.state_space import VARIANTS, explore
-from harness.conformance.udp_lab import AgentEndedError, NoAgentError
 from harness.conformance.vectors import Vectors
-from harness.conformance.virtual_subject import Program
 from tests.harness.command import harness, processes, sentences
 
 OURS = (sys.executable, "-P", "-m", "ucp.node")
@@ -123,7 +123,7 @@ def test_where_its_start_is_cancelled_nothing_of_it_is_left(tmp_path: Path) -> N
 def test_a_program_that_closes_its_standard_output_and_goes_on_is_told(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("harness.conformance.virtual_subject.GRACE_S", 0.1)
+    monkeypatch.setattr("harness.conformance._virtual_subject.GRACE_S", 0.1)
 
     async def ask() -> None:
         program = await Program.start(("sh", "-c", "exec >&-; sleep 1000"), tmp_path / "errors.log")

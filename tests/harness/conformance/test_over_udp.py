@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from docs.generate.wrong_agents import quirky
-from harness.conformance.alphabet import INPUTS, LOG
+from harness.conformance._alphabet import INPUTS, LOG
+from harness.conformance._observation import Seen
+from harness.conformance._state_space import VARIANTS, explore
+from harness.conformance._udp_lab import Air
+from harness.conformance._udp_subject import BESIDE_OTHERS, OverUdp
 from harness.conformance.conformance_run import Asked, conform
-from harness.conformance.observation import Seen
 from harness.conformance.results import Results
 from harness.conformance.results_table import to_junit
-from harness.conformance.state_space import VARIANTS, explore
-from harness.conformance.udp_lab import Air
-from harness.conformance.udp_subject import BESIDE_OTHERS, OverUdp
 from harness.conformance.vectors import Vectors
 
 pytestmark = pytest.mark.lab

@@ -6,11 +6,11 @@ import pytest
 import yaml
 
 from docs.generate.wrong_agents import quirky
-from harness.conformance.alphabet import LOG, TIMER
-from harness.conformance.kept_failures import scenario_of
-from harness.conformance.reference_model import AGENT
-from harness.conformance.state_space import VARIANTS
-from harness.conformance.virtual_lines import Writer
+from harness.conformance._alphabet import LOG, TIMER
+from harness.conformance._kept_failures import scenario_of
+from harness.conformance._reference_model import AGENT
+from harness.conformance._state_space import VARIANTS
+from harness.conformance._virtual_lines import Writer
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 

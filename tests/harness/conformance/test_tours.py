@@ -3,12 +3,12 @@
 import asyncio
 import time
 
-from harness.conformance.alphabet import Input
-from harness.conformance.observation import Exchange, Seen
-from harness.conformance.state_space import VARIANTS, Variant, advance, explore, pair_of, state_of
-from harness.conformance.subject import Subject
-from harness.conformance.suite import Suite
-from harness.conformance.tours import Map
+from harness.conformance._alphabet import Input
+from harness.conformance._observation import Exchange, Seen
+from harness.conformance._state_space import VARIANTS, Variant, advance, explore, pair_of, state_of
+from harness.conformance._subject import Subject
+from harness.conformance._suite import Suite
+from harness.conformance._tours import Map
 from harness.conformance.vectors import Vectors
 
 

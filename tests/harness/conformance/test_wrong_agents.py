@@ -7,9 +7,9 @@ import pytest
 
 from docs.generate.wrong_agents.conformance_page import ALIKE, PAGE
 from docs.generate.wrong_agents.trials_page import rows_of
-from harness.conformance.alphabet import INPUTS, LOG, TIMER
-from harness.conformance.reference_model import Model
-from harness.conformance.state_space import STEP_S, VARIANTS
+from harness.conformance._alphabet import INPUTS, LOG, TIMER
+from harness.conformance._reference_model import Model
+from harness.conformance._state_space import STEP_S, VARIANTS
 from ucp.quirks import QUIRKS, wrong_handlers
 
 WAY = (LOG, "vote no", "vote no", TIMER, LOG, "vote yes", "vote no", LOG, TIMER, LOG, "vote no", TIMER, TIMER)

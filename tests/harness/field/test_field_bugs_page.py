@@ -26,6 +26,6 @@ def test_the_logs_are_small_and_of_six_vehicles() -> None:
 
 
 def test_the_lines_that_the_page_comes_to_are_those_of_the_code() -> None:
-    code = (ROOT / "ucp/quirks/reconcile_quirks.py").read_text().splitlines()
+    code = (ROOT / "ucp/quirks/_reconcile_quirks.py").read_text().splitlines()
     assert code[164].strip() == "raise NameError"
     assert code[189].strip() == "core.start(core.phase_three_timer, 0.0)"

@@ -262,8 +262,8 @@ def test_an_earlier_export_gives_way_to_a_later(home: Path) -> None:
 
 
 def test_a_bomb_is_read_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.field.ingest.trace_incarnations.NOTHING_WITHIN_BYTES", 1 << 20)
-    monkeypatch.setattr("harness.field.ingest.sorting.MAX_EXPORT_BYTES", 1 << 20)
+    monkeypatch.setattr("harness.field.ingest._trace_incarnations.NOTHING_WITHIN_BYTES", 1 << 20)
+    monkeypatch.setattr("harness.field.ingest._sorting.MAX_EXPORT_BYTES", 1 << 20)
     (tmp_path / "bomb").write_bytes(gzip.compress(bytes(50 << 20)))
     homecoming = sort_out([tmp_path])
     assert not homecoming.flights

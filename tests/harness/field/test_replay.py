@@ -14,7 +14,7 @@ from harness.archive.archive import RunArchive
 from harness.checker import steps
 from harness.errors import FieldError
 from harness.field.replay import Player, open_record
-from harness.field.replay import player as player_module
+from harness.field.replay import _player as player_module
 from harness.field.replay.breakpoints import next_place, place, source_of
 from harness.field.replay.replay_names import Names
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences

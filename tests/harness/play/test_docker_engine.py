@@ -18,9 +18,9 @@ import pytest
 import requests
 import yaml
 
-from harness.play.containers import container_preflight, docker_engine, images, ownership
-from harness.play.containers.container import STDERR, STDOUT, Output
-from harness.play.containers.images import Image
+from harness.play.containers import _container_preflight, _images, docker_engine, ownership
+from harness.play.containers._container import STDERR, STDOUT, Output
+from harness.play.containers._images import Image
 from harness.play.keyring.key_directory import Home
 from harness.scenario import Scenario
 from tests.harness.command import harness, sentences, write_scenario
@@ -125,7 +125,7 @@ def test_an_image_that_cannot_be_built_is_one_sentence() -> None:
     api = SimpleNamespace(close=lambda: None, inspect_image=inspect, build=lambda **_: iter(steps))
     one = docker_engine.Engine(api)  # type: ignore[arg-type]
     with pytest.raises(docker_engine.DockerError, match=r"could not be built \(no such host\): .*--image-from-host"):
-        images.project(one, said.append)
+        _images.project(one, said.append)
     assert said[1:] == ["building the image: Step 1/9 : ARG BASE"] * 2
     one.close()
 
@@ -133,13 +133,13 @@ def test_an_image_that_cannot_be_built_is_one_sentence() -> None:
 def test_only_root_can_lay_cables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with pytest.raises(docker_engine.DockerError, match="use sudo"):
-        container_preflight.require_root()
+        _container_preflight.require_root()
 
 
 def test_a_debugger_has_to_be_in_the_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     document = {"name": "gdb", "vehicles": {"each": {2: {"debugger": "gdb"}}}}
     with pytest.raises(docker_engine.DockerError, match=r"the project's image has no gdb: use .*--image-from-host"):
-        container_preflight.refuse_debuggers_that_are_not_in_the_image(Scenario.model_validate(document))
+        _container_preflight.refuse_debuggers_that_are_not_in_the_image(Scenario.model_validate(document))
     from_host = Scenario.model_validate({**document, "docker": {"image_from_host": True}})
     for place, shared in ((tmp_path, False), (Path(sys.prefix, "bin"), True)):
         monkeypatch.setattr("shutil.which", lambda name, place=place: str(place / name))
@@ -148,7 +148,7 @@ def test_a_debugger_has_to_be_in_the_image(tmp_path: Path, monkeypatch: pytest.M
             if shared
             else pytest.raises(docker_engine.DockerError, match="in no directory that containers")
         ):
-            container_preflight.refuse_debuggers_that_are_not_in_the_image(from_host)
+            _container_preflight.refuse_debuggers_that_are_not_in_the_image(from_host)
 
 
 def test_user_mode_linux_has_no_engine(tmp_path: Path) -> None:
@@ -201,13 +201,13 @@ def test_what_a_container_says_goes_to_the_right_file_however_it_is_cut(tmp_path
 
 
 def test_the_image_is_built_from_the_packages_and_named_by_their_content(monkeypatch: pytest.MonkeyPatch) -> None:
-    context = images.context()
+    context = _images.context()
     assert {"Dockerfile", "ucp/node.py", "sitl/embedded.py"} < set(context)
     assert not any("__pycache__" in name or name.startswith("harness") for name in context)
-    name = images.project_name()
-    assert name == images.project_name()
-    monkeypatch.setattr(images, "context", lambda: {**context, "ucp/node.py": b"pass"})
-    assert images.project_name() != name
+    name = _images.project_name()
+    assert name == _images.project_name()
+    monkeypatch.setattr(_images, "context", lambda: {**context, "ucp/node.py": b"pass"})
+    assert _images.project_name() != name
 
 
 def test_an_image_has_its_own_interpreter_environment_and_files(tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def test_an_image_has_its_own_interpreter_environment_and_files(tmp_path: Path) 
     program.touch()
     argv = [sys.executable, "-m", "ucp.node", str(program), "/no/such"]
     env = {**os.environ, "HOW": "so"}
-    ours, foreign, host = Image("a", "python3"), Image("b", "python3", foreign=True), images.host_image()
+    ours, foreign, host = Image("a", "python3"), Image("b", "python3", foreign=True), _images.host_image()
     assert ours.command(argv)[0] == "python3"
     assert ours.environment(env) == {"HOW": "so"}
     assert (ours.shared(argv), foreign.shared(argv)) == ([program], [])

@@ -11,7 +11,7 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from harness.play.simulation import station_tracks
+from harness.play.simulation import _station_tracks
 from harness.scenario import Scenario
 from sitl.modes import MODES
 from sitl.track import track
@@ -117,14 +117,14 @@ def test_tracks_in_virtual_time_are_seen_and_refuse_commands(tmp_path: Path) -> 
 
 
 def test_vehicles_whose_time_stands_still_are_heard_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(station_tracks, "SHOW_S", 0.0)
-    monkeypatch.setattr(station_tracks, "SILENT_S", 0.0)
+    monkeypatch.setattr(_station_tracks, "SHOW_S", 0.0)
+    monkeypatch.setattr(_station_tracks, "SILENT_S", 0.0)
     link = mavutil.mavlink_connection("udpin:127.0.0.1:0", dialect="ardupilotmega")
     asked = Scenario.model_validate({"name": "held", "agents": 2, "gcs": f"127.0.0.1:{link.port.getsockname()[1]}"})
 
     async def stand_still() -> None:
         standing = {vehicle: track("copter", None) for vehicle in (1, 2)}
-        shown = await station_tracks.TracksOnStation.open(asked, standing, lambda: 0.0)
+        shown = await _station_tracks.TracksOnStation.open(asked, standing, lambda: 0.0)
         for _ in range(5):
             shown.show(0.0, lost=set())
             await asyncio.sleep(0.01)

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from harness.errors import ScenarioError
+from harness.play._radio_range import RadioRange, tracks_of
 from harness.play.mission import RunOutcome
-from harness.play.radio_range import RadioRange, tracks_of
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.changes import RANGE, NetworkChange, final_reconcile

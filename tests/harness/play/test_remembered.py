@@ -6,19 +6,19 @@ from typing import Any
 
 import pytest
 
-from harness.play.simulation import crypto_cache as memory
-from harness.play.simulation.crypto_cache import Signatures, remembered
+from harness.play.simulation import _crypto_cache as memory
+from harness.play.simulation._crypto_cache import Signatures, remembered
 from harness.run.simulate import Simulated, simulate
 from tests.harness.virtual import scenario
 from ucp.block import Block
 from ucp.messages import BlockAddRequest, CommitBlock, MalformedDatagramError
+from ucp.secure._window import ReplayWindow
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import Bundle, KeySet
 from ucp.secure.crypto_suite import Signed, verify
 from ucp.secure.sealed_datagrams import Arithmetic
 from ucp.secure.secured_agent import SecuredAgent, boot_of
 from ucp.secure.session import Session
-from ucp.secure.window import ReplayWindow
 
 ROSTER = (1, 2, 3, 4)
 KEYS = KeySet.derived(bytes(32), ROSTER)

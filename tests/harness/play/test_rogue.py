@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from harness.play.rogue import journal
-from harness.play.rogue.crafted import corrupted, random_message
-from harness.play.rogue.journal import forged_sequence, injection_of
-from harness.play.rogue.rogue import Rogue, RogueDatagram
+from harness.play.rogue import _journal
+from harness.play.rogue._crafted import corrupted, random_message
+from harness.play.rogue._rogue import Rogue, RogueDatagram
+from harness.play.rogue.rogue_line import forged_sequence, injection_of
 from harness.scenario.injection import MAX_FLOOD, MODELS
 from ucp.block import Block, next_chain_hash
 from ucp.messages import (
@@ -189,9 +189,9 @@ def test_sequence_numbers_tell_the_injection_and_are_no_agent_s() -> None:
 
 
 def test_the_journal_has_a_line_for_each_datagram_and_counts_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal, "LINES", 2)
+    monkeypatch.setattr(_journal, "LINES", 2)
     lines: list[dict[str, Any]] = []
-    book = journal.Journal(lines.append)
+    book = _journal.Journal(lines.append)
     for at_s, datagram in ((1.0, COMMIT), (1.1, COMMIT[:-1]), (2.1, COMMIT), (2.9, COMMIT[:5]), (3.0, COMMIT)):
         book.add(RogueDatagram(1, "replay", 1, datagram), at_s)
     book.close()

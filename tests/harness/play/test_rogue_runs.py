@@ -16,8 +16,8 @@ from harness.archive.run_record import InjectedMessages, RunRecord
 from harness.errors import ScenarioError
 from harness.play.process.process_preflight import on_the_air
 from harness.play.progress import Silent
-from harness.play.rogue.journal import injection_of
-from harness.report.rogue_section import section
+from harness.play.rogue.rogue_line import injection_of
+from harness.report._rogue_section import section
 from harness.run.run import Run, run
 from harness.run.simulate import simulate
 from harness.scenario import Scenario

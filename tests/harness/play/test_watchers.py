@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 from harness.errors import HarnessError
-from harness.play.process.watchers import Watchers
+from harness.play.process._watchers import Watchers
 
 
 class LostError(HarnessError):

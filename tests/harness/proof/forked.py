@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from harness.proof.bounds import Bounds
-from harness.proof.model.global_states import AGENTS, Swarm
-from harness.proof.model.zones import NOTHING_RUNS
+from harness.proof.model._global_states import AGENTS, Swarm
+from harness.proof.model._zones import NOTHING_RUNS
 
 
 def forked(bounds: Bounds, holders: Sequence[int]) -> Swarm:

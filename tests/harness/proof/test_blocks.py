@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds, prove
-from harness.proof.examples.path_script import Script
-from harness.proof.examples.path_times import Ages
-from harness.proof.graph.exploration import Graph, explore
-from harness.proof.model.global_states import AGENTS, Swarm
+from harness.proof.examples._path_script import Script
+from harness.proof.examples._path_times import Ages
+from harness.proof.graph._exploration import Graph, explore
+from harness.proof.model._global_states import AGENTS, Swarm
 from harness.run.simulate import simulate
 from harness.scenario.load import parse
 from tests.harness.proof.test_explore import Seen, all_seen, by_chance, explored

@@ -13,16 +13,16 @@ from harness.errors import ScenarioError
 from harness.play.process.process_preflight import refuse_what_needs_virtual_time
 from harness.play.rogue.lies import made_block
 from harness.proof import Bounds, BoundsError, in_words, prove
-from harness.proof.attacker.attacker import Captor
-from harness.proof.attacker.forgeries import NOBODYS, Asked, Material, asked, letters
-from harness.proof.examples.path_script import Script
-from harness.proof.graph.exploration import Graph, explore
-from harness.proof.model.any_sender import collect
-from harness.proof.model.global_states import AGENTS, LEFT, LIES, ONCE, Swarm
-from harness.proof.model.known_states import DEAD
-from harness.proof.model.local_steps import LocalStates
-from harness.proof.model.shape import Held, shape_of
-from harness.proof.model.snapshot import NOW_S, put_back, take
+from harness.proof.attacker._attacker import Captor
+from harness.proof.attacker._forgeries import NOBODYS, Asked, Material, asked, letters
+from harness.proof.examples._path_script import Script
+from harness.proof.graph._exploration import Graph, explore
+from harness.proof.model._any_sender import collect
+from harness.proof.model._global_states import AGENTS, LEFT, LIES, ONCE, Swarm
+from harness.proof.model._known_states import DEAD
+from harness.proof.model._local_steps import LocalStates
+from harness.proof.model._shape import Held, shape_of
+from harness.proof.model._snapshot import NOW_S, put_back, take
 from harness.run.simulate import simulate
 from harness.scenario.load import parse
 from tests.harness.command import harness, sentences
@@ -43,8 +43,8 @@ from ucp.messages import (
     NextInSequenceResponse,
     RequestForBlock,
 )
+from ucp.secure._signatures import BlockSignatures
 from ucp.secure.secured_agent import SecuredAgent
-from ucp.secure.signatures import BlockSignatures
 from ucp.settings import Settings
 
 CAPTURED = 3

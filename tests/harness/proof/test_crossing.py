@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds, BoundsError, in_words, prove
-from harness.proof.examples.example import play
-from harness.proof.examples.path_script import Script
+from harness.proof.examples._example import play
+from harness.proof.examples._path_script import Script
 from tests.harness.proof.test_explore import all_seen, by_chance, explored
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds
-from harness.proof.graph.exploration import Graph, explore
-from harness.proof.graph.workers import Crew
-from harness.proof.model.global_states import AGENTS, Swarm
-from harness.proof.model.known_states import DEAD
-from harness.proof.model.snapshot import key_of, put_back, take
-from harness.proof.questions import convergence
+from harness.proof.graph._exploration import Graph, explore
+from harness.proof.graph._workers import Crew
+from harness.proof.model._global_states import AGENTS, Swarm
+from harness.proof.model._known_states import DEAD
+from harness.proof.model._snapshot import key_of, put_back, take
+from harness.proof.questions import _convergence
 from harness.scenario.agent_options import Stagger, staggered
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS
@@ -98,13 +98,13 @@ def test_how_answers_are_counted_makes_no_difference(network: Any) -> None:
     ],
 )
 def test_on_two_cores_it_is_the_same(bounds: Bounds, most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.proof.graph.workers.WORTH_A_CREW", 10)
-    monkeypatch.setattr("harness.proof.graph.workers.MOST_TOLD", most_told)
+    monkeypatch.setattr("harness.proof.graph._workers.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.proof.graph._workers.MOST_TOLD", most_told)
     alone = explore(Swarm(bounds), most_bytes=8e9, most_s=60)
     swarm = Swarm(bounds)
     with Crew(swarm, 2) as crew:
         shared = explore(swarm, most_bytes=8e9, most_s=60, crew=crew)
-        assert convergence.look(shared, crew=crew) == convergence.look(alone)
+        assert _convergence.look(shared, crew=crew) == _convergence.look(alone)
     assert shared.crew_steps > 0
     assert shared.ended == alone.ended == "complete"
     assert shared.parents == alone.parents

@@ -6,15 +6,15 @@ import pytest
 
 from harness.archive.run_record import Cycle
 from harness.proof import Bounds, Progress, in_words, prove
-from harness.proof.examples.example import Example
-from harness.proof.graph.exploration import explore
-from harness.proof.model.global_states import AGENTS, BLOCKS, ZONE, Swarm
-from harness.proof.model.instant import Action
-from harness.proof.model.zones import NOTHING_RUNS, Zones
-from harness.proof.progress_bar import Budget
-from harness.proof.questions.extra_votes import Votes
-from harness.proof.questions.graph_cycles import cycles
-from harness.proof.questions.livelock import Livelock, show
+from harness.proof._progress_bar import Budget
+from harness.proof.examples._example import Example
+from harness.proof.graph._exploration import explore
+from harness.proof.model._global_states import AGENTS, BLOCKS, ZONE, Swarm
+from harness.proof.model._instant import Action
+from harness.proof.model._zones import NOTHING_RUNS, Zones
+from harness.proof.questions._extra_votes import Votes
+from harness.proof.questions._graph_cycles import cycles
+from harness.proof.questions._livelock import Livelock, show
 from tests.harness.proof.test_explore import explored
 
 
@@ -60,7 +60,7 @@ def test_forms_that_clocks_can_show_come_first_and_what_is_not_played_is_counted
     for number, each in enumerate((ways, ways[::-1])):
         shown = [livelock.contradictory for livelock in show(graph, each, tmp_path / f"{number}.yaml", "round")]
         assert shown == [False, True]
-    monkeypatch.setattr("harness.proof.questions.livelock.MOST_FORMS", 1)
+    monkeypatch.setattr("harness.proof.questions._livelock.MOST_FORMS", 1)
     proof = prove(Bounds(4, 4, "lossless", clocks_any=True), out=tmp_path / "some.yaml")
     assert [livelock.contradictory for livelock in proof.livelocks] == [False]
     assert "  1 more, of other forms, was not played" in [*in_words(proof)]

@@ -6,8 +6,8 @@ from random import Random
 import pytest
 
 from harness.proof import Bounds, in_words, prove
-from harness.proof.examples.path_script import Script
-from harness.proof.model.global_states import LEFT, LOSSES
+from harness.proof.examples._path_script import Script
+from harness.proof.model._global_states import LEFT, LOSSES
 from tests.harness.proof.test_explore import all_seen, by_chance, explored
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from harness.proof.graph.packed_states import Followers, States
-from harness.proof.model.known_states import DEAD
+from harness.proof.graph._packed_states import Followers, States
+from harness.proof.model._known_states import DEAD
 
 
 def test_a_state_has_one_number_and_comes_out_as_it_went_in() -> None:

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from harness.proof import Bounds, Proof, prove
-from harness.proof.graph.exploration import explore
-from harness.proof.model.global_states import Swarm
-from harness.proof.questions.convergence import look
+from harness.proof.graph._exploration import explore
+from harness.proof.model._global_states import Swarm
+from harness.proof.questions._convergence import look
 
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = DOCS / "proof.md"

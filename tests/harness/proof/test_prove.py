@@ -14,11 +14,11 @@ import pytest
 
 from harness.errors import INTERRUPTED
 from harness.proof import INCOMPLETE, Bounds, BoundsError, Limits, Progress, in_words, prove
-from harness.proof.graph.exploration import LOOK_EVERY, explore
-from harness.proof.graph.workers import Crew
-from harness.proof.model.any_sender import collect
-from harness.proof.model.global_states import Swarm
-from harness.proof.progress_bar import memory_bytes
+from harness.proof._progress_bar import memory_bytes
+from harness.proof.graph._exploration import LOOK_EVERY, explore
+from harness.proof.graph._workers import Crew
+from harness.proof.model._any_sender import collect
+from harness.proof.model._global_states import Swarm
 from harness.scenario.agent_options import Stagger
 from tests.harness.command import COMMAND, harness, sentences
 
@@ -181,7 +181,7 @@ def test_nobody_goes_on_who_was_interrupted(monkeypatch: pytest.MonkeyPatch) -> 
         assert multiprocessing.active_children()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("harness.proof.graph.workers.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.proof.graph._workers.WORTH_A_CREW", 10)
     swarm = Swarm(Bounds(3, 3, "lossy"))
     with Crew(swarm, 2) as crew:
         graph = explore(swarm, most_bytes=8e9, most_s=60, crew=crew, watch=interrupt)
@@ -194,7 +194,7 @@ def test_ctrl_c_while_a_crew_begins_is_not_lost(monkeypatch: pytest.MonkeyPatch)
     """What is called at a fork swallows all exceptions."""
     interruptions = [signal.SIGINT]
     os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
-    monkeypatch.setattr("harness.proof.graph.workers.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.proof.graph._workers.WORTH_A_CREW", 10)
     swarm = Swarm(Bounds(2, 3, "lossy"))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's job in the background ignores
     try:
@@ -208,7 +208,7 @@ def test_ctrl_c_while_a_crew_begins_is_not_lost(monkeypatch: pytest.MonkeyPatch)
 
 def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        import_module("harness.proof.proof"), "explore", lambda *_, **__: replace(explored, seconds=61.0)
+        import_module("harness.proof._proof"), "explore", lambda *_, **__: replace(explored, seconds=61.0)
     )
     explored = explore(Swarm(Bounds(2, 2, "lossy")), most_bytes=8e9, most_s=60)
     proof = prove(Bounds(2, 2, "lossy"), Limits(most_bytes=8e9, most_s=60), tmp_path / "none.yaml")
@@ -217,7 +217,7 @@ def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: py
 
 
 def test_what_the_whole_graph_is_asked_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.proof.progress_bar.LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr("harness.proof._progress_bar.LOOK_EVERY_S", 0.0)
     told: list[Progress] = []
     proof = prove(Bounds(2, 3, "lossless"), out=tmp_path / "asked.yaml", watch=told.append)
     assert proof.liveness is not None
@@ -237,9 +237,9 @@ def take_long(*_: object) -> None:
 
 
 def test_time_is_up_also_for_who_is_long_about_one_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.proof.graph.workers.WORTH_A_CREW", 10)
-    monkeypatch.setattr("harness.proof.graph.workers.WAIT_S", 0.01)
-    monkeypatch.setattr("harness.proof.graph.workers.expanded", take_long)
+    monkeypatch.setattr("harness.proof.graph._workers.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.proof.graph._workers.WAIT_S", 0.01)
+    monkeypatch.setattr("harness.proof.graph._workers.expanded", take_long)
     swarm = Swarm(Bounds(3, 3, "lossy"))
     with Crew(swarm, 2) as crew:
         graph = explore(swarm, most_bytes=8e9, most_s=0.5, crew=crew)

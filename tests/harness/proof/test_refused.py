@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds
-from harness.proof.graph.exploration import explore
-from harness.proof.questions import convergence
-from harness.proof.questions.convergence import Liveness
+from harness.proof.graph._exploration import explore
+from harness.proof.questions import _convergence
+from harness.proof.questions._convergence import Liveness
 from tests.harness.proof.forked import forked
 
 THESIS: dict[str, Any] = {}
@@ -21,7 +21,7 @@ def after_the_fork(agents: int, holders: list[int], keys: dict[str, Any]) -> Liv
     bounds = Bounds(agents, len(holders) + 1, "lossless", **keys)
     graph = explore(forked(bounds, holders), most_bytes=8e9, most_s=300)
     assert graph.ended == "complete"
-    return convergence.look(graph)
+    return _convergence.look(graph)
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds, prove
-from harness.proof.examples.path_script import Script
-from harness.proof.graph.exploration import Graph
-from harness.proof.model.global_states import AGENTS
+from harness.proof.examples._path_script import Script
+from harness.proof.graph._exploration import Graph
+from harness.proof.model._global_states import AGENTS
 from harness.run.simulate import simulate
 from harness.scenario.agent_options import Stagger
 from harness.scenario.load import parse

@@ -3,8 +3,8 @@
 from itertools import product
 from random import Random
 
-from harness.proof.examples.path_times import Run, instants_s
-from harness.proof.model.zones import NOTHING_RUNS, Zones
+from harness.proof.examples._path_times import Run, instants_s
+from harness.proof.model._zones import NOTHING_RUNS, Zones
 
 DURATIONS = (10, 5)
 

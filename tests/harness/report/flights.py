@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.directory import TRACKS_FILE
-from harness.play.radio_range import RadioRange
+from harness.play._radio_range import RadioRange
 from harness.scenario import Scenario
 from harness.scenario.changes import NetworkChange, timeline_of
 from netem.radio import Place

@@ -10,7 +10,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.lenient_model import fit
 from harness.archive.run_record import RunRecord
 from harness.report import write_report
-from harness.report.run_summary import to_junit
+from harness.report._run_summary import to_junit
 from tests.harness.report.runs import result_of, write_run
 
 Case = tuple[str, str, str] | None

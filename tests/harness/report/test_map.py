@@ -12,9 +12,9 @@ from harness.archive.archive import RunArchive
 from harness.archive.connectivity import NETWORK_FILE, Topology, read_connectivity
 from harness.archive.tracks import TRACKS_FILE, read_tracks
 from harness.present.colours import Ink, inks
-from harness.report import map_section, write_report
+from harness.report import _map_section, write_report
+from harness.report._map_section import Section
 from harness.report.map_parts import divisions, letter, longest
-from harness.report.map_section import Section
 from harness.scenario import Scenario
 from sitl.vehicle import VehicleType
 from tests.harness.report.flights import Way, split_and_rejoin, still, write_flight, write_lines
@@ -40,7 +40,7 @@ def drawn(run_dir: Path, seconds: int = 600, ways: dict[int, Way] | None = None,
 
 def section_of(run_dir: Path, ink: dict[int, Ink]) -> Section | None:
     network = read_connectivity(run_dir / NETWORK_FILE, ink)
-    return map_section.section(read_tracks(run_dir / TRACKS_FILE, ink), network, ink, {})
+    return _map_section.section(read_tracks(run_dir / TRACKS_FILE, ink), network, ink, {})
 
 
 def paths(section: Section) -> list[tuple[str, str, list[tuple[float, float]]]]:
@@ -95,7 +95,7 @@ def test_each_type_of_vehicle_has_its_shape(tmp_path: Path) -> None:
     drawn(tmp_path)
     ink, network = inks(FIVE), read_connectivity(tmp_path / NETWORK_FILE, FIVE)
     types: dict[int, VehicleType] = {1: "copter", 2: "plane", 3: "rover", 4: "copter", 5: "copter"}
-    section = map_section.section(read_tracks(tmp_path / TRACKS_FILE, ink), network, ink, types)
+    section = _map_section.section(read_tracks(tmp_path / TRACKS_FILE, ink), network, ink, types)
     assert section is not None
     assert [meaning for _, meaning in section.legend][-3:] == ["copter", "plane", "rover"]
     shapes = re.findall(r'class="dot whole" d="(.*?)".*?<title>vehicle (\d)', section.moments[0].picture)

@@ -7,7 +7,7 @@ from typing import Any
 
 from harness.archive.connectivity import read_connectivity
 from harness.archive.run_record import RunRecord
-from harness.report.network_section import ground_station, happened, strip
+from harness.report._network_section import ground_station, happened, strip
 
 
 def drawn(path: Path, *lines: dict[str, Any]) -> list[str]:

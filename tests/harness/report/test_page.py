@@ -17,7 +17,7 @@ from harness.archive.exports import BEFORE_FINAL_RECONCILE
 from harness.archive.run_record import AgentRecord, RunRecord
 from harness.errors import RunDirectoryError
 from harness.report import write_report
-from harness.report.swarm_section import counts
+from harness.report._swarm_section import counts
 from tests.harness.report.runs import exports, result_of, write_exports, write_run
 
 HOSTILE = "</title></style><script>alert(1)</script><img src=x onerror=alert(2)>\"'{{ 7 * 7 }}"

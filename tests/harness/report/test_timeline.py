@@ -16,7 +16,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.history import Commit, History, Phase, Reconcile, Tie, Vote
 from harness.archive.replication import Replication
 from harness.play.progress import Silent
-from harness.report import timeline_charts, timeline_lanes, timeline_section, write_report
+from harness.report import _timeline_charts, _timeline_lanes, _timeline_section, write_report
 from harness.run.run import run
 from tests.harness.play.test_recurrence import in_step
 from tests.harness.report.runs import write_run
@@ -135,7 +135,7 @@ def test_a_long_restless_run_is_thinned_and_says_so() -> None:
     commits = [Commit(agent, at_s + part / 4, "aa", "heard") for agent, at_s in spans for part in range(4)]
     ties = [Tie(agent, at_s, "tie: block") for agent, at_s in spans]
     restless = History(votes, reconciles, commits, ties, None)
-    picture = timeline_lanes.draw(restless, [], [], range(1, 51), {}, 200.0, "")
+    picture = _timeline_lanes.draw(restless, [], [], range(1, 51), {}, 200.0, "")
     assert picture.notes == [
         "Of 10000 votes the 6000 longest are drawn",
         "Of 10000 reconciles the 6000 longest are drawn",
@@ -145,16 +145,16 @@ def test_a_long_restless_run_is_thinned_and_says_so() -> None:
     voters = {agent for agent in range(1, 51) if f"agent {agent}: vote" in picture.drawing}
     assert voters == set(range(1, 51)), "no agent is left out for another"
     assert len(picture.drawing) < 4_000_000
-    groups = timeline_lanes.gathered(commits, 200.0)
-    assert len(groups) <= timeline_lanes.MAX_COMMITS
+    groups = _timeline_lanes.gathered(commits, 200.0)
+    assert len(groups) <= _timeline_lanes.MAX_COMMITS
     assert sum(map(len, groups)) == len(commits), "no commit is lost, only drawn together"
     assert all(len({commit.agent for commit in group}) == 1 for group in groups)
 
 
 def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> None:
     spreads = [Replication(float(at_s), 9 - 9 * (at_s == 777), 9, 1, 1, 1.0) for at_s in range(5000)]
-    kept = timeline_charts.thinned(spreads, 5000.0)
-    assert len(kept) <= timeline_charts.MAX_MOMENTS
+    kept = _timeline_charts.thinned(spreads, 5000.0)
+    assert len(kept) <= _timeline_charts.MAX_MOMENTS
     assert spreads[777] in kept
     assert kept[-1] == spreads[-1]
     assert [one.at_s for one in kept] == sorted(one.at_s for one in kept)
@@ -162,7 +162,7 @@ def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> No
 
 @pytest.mark.parametrize(
     ("module", "limit", "said"),
-    [(archive, "LARGE_BYTES", "traces are too large"), (timeline_section, "MAX_ARROWS", "too many for a page")],
+    [(archive, "LARGE_BYTES", "traces are too large"), (_timeline_section, "MAX_ARROWS", "too many for a page")],
 )
 def test_messages_above_a_limit_are_left_out_and_that_is_said(
     troubled: Path, monkeypatch: pytest.MonkeyPatch, module: Any, limit: str, said: str

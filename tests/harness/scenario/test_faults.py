@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from harness.archive.run_record import FaultRecord, JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
-from harness.checker.agreement import had_a_chance
+from harness.checker._agreement import had_a_chance
 from harness.play.backend import agent_seed
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
@@ -135,7 +135,7 @@ def test_losing_a_block_over_a_brown_out_is_a_violation(monkeypatch: pytest.Monk
     alone = [{"at_s": 0, "partition": [[2], [1, 3, 4, 5]]}, {"at_s": 400, "heal": True}]
     reboot = {"at_s": 300, "reboot": [2], "down_s": 30, "disk": "kept"}
     assert verdicts(played([*alone, reboot], final_reconcile=True)) == {"holds"}
-    monkeypatch.setattr("harness.play.simulation.simulated_agent.StoredState.of", lambda agent: StoredState())
+    monkeypatch.setattr("harness.play.simulation._simulated_agent.StoredState.of", lambda agent: StoredState())
     assert played([*alone, reboot], final_reconcile=True).result.characteristics["5"].verdict == "violated"
 
 

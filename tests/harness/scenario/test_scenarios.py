@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from harness.checker.recurring_cycles import cycle_of
 from harness.checker.survival import survival
 from harness.checker.uniform_chain import common_prefix
 from harness.run.simulate import Simulated, simulate
@@ -234,7 +235,7 @@ def by_turns(run: Simulated, seed: int) -> None:
 def going_round(run: Simulated) -> tuple[float, float | None]:
     """Since when, and with which period."""
     assert run.result.bad == ("5", "6", "liveness")
-    cycle = run.evidence.cycle
+    cycle = run.evidence.once(cycle_of)
     assert cycle is not None and cycle.proven
     assert run.played.mission_s < 400
     return cycle.since_s, cycle.period_s

@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 
 from docs.generate.cures import STAGGER
-from harness.checker.records import headers
+from harness.checker.records import _headers
 from harness.errors import ScenarioError
 from harness.proof import Bounds, BoundsError
-from harness.proof.graph.exploration import explore
-from harness.proof.model.global_states import Swarm
-from harness.proof.questions.convergence import look
+from harness.proof.graph._exploration import explore
+from harness.proof.model._global_states import Swarm
+from harness.proof.questions._convergence import look
 from harness.run.simulate import simulate
 from harness.scenario.agent_options import Stagger
 from harness.scenario.load import load_scenario, parse
@@ -30,7 +30,7 @@ def test_each_agent_is_told_timers_of_its_own_and_records_agree() -> None:
     assert not simulated.result.bad
     trace = simulated.evidence.traces[7]
     trace.header.settings["vote_timeout_s"] = 10.0
-    assert len([*headers.compare(simulated.evidence)]) == 1
+    assert len([*_headers.compare(simulated.evidence)]) == 1
 
 
 def test_agents_in_step_get_out_of_step() -> None:

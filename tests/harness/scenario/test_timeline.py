@@ -12,7 +12,7 @@ from harness.play.process.process_preflight import network_needs
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.changes import NetworkChange, timeline_of
-from harness.sweep.explore.scenario_document import cut_after, document_of, moved, scripted, with_agents
+from harness.sweep.explore._scenario_document import cut_after, document_of, moved, scripted, with_agents
 from netem.conditions import Delay, LinkConditions
 from tests.harness.command import harness, write_scenario
 from tests.harness.virtual import scenario

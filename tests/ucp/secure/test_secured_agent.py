@@ -7,9 +7,9 @@ import pytest
 from tests.ucp.secure.swarm import KEYS, ROSTER, agent, completes_a_block, secrets_of
 from ucp.block import Block
 from ucp.messages import BlockAddRequest, BlockResponse, CommitBlock, RequestForBlock, encode
+from ucp.secure._epochs import AHEAD
 from ucp.secure.bundle import KeySet
 from ucp.secure.envelope import CLEAR, MAX_DATAGRAM_BYTES, sealed_bytes
-from ucp.secure.epochs import AHEAD
 from ucp.secure.secured_agent import SecuredAgent
 from ucp.secure.session import Session
 from ucp.store import StoredState

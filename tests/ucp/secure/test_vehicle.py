@@ -15,11 +15,11 @@ from tests.ucp.secure.swarm import KEYS, ROSTER, agent, completes_a_block, secre
 from tests.ucp.test_node import AgentUnderTest, mission
 from ucp.export import export_chain
 from ucp.mission import Mission, MissionError, parse_mission
+from ucp.secure._secured_vehicle import secured_agent
 from ucp.secure.block_signature import claim_of_block
 from ucp.secure.bundle import bundle_name, load_bundle, write_bundle
 from ucp.secure.crypto_suite import verify
 from ucp.secure.revocation import Revocation
-from ucp.secure.secured_vehicle import secured_agent
 from ucp.store import SecuredState, Store
 
 

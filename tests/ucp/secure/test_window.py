@@ -2,7 +2,7 @@
 
 from random import Random
 
-from ucp.secure.window import WINDOW, ReplayWindow
+from ucp.secure._window import WINDOW, ReplayWindow
 
 
 def test_a_number_counts_once_and_not_when_it_is_older_than_the_window() -> None:

@@ -10,16 +10,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ucp.contract.schemas import chain_export_schema, control_schema, mission_schema, trace_schema, virtual_schema
+from ucp.contract.schemas import (
+    _chain_export_schema,
+    _control_schema,
+    _mission_schema,
+    _trace_schema,
+    _virtual_schema,
+)
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 DOCUMENTS: dict[str, Callable[[], dict[str, Any]]] = {
-    "mission": mission_schema.schema,
-    "trace": trace_schema.schema,
-    "chain-export": chain_export_schema.schema,
-    "control": control_schema.schema,
-    "virtual": virtual_schema.schema,
+    "mission": _mission_schema.schema,
+    "trace": _trace_schema.schema,
+    "chain-export": _chain_export_schema.schema,
+    "control": _control_schema.schema,
+    "virtual": _virtual_schema.schema,
 }
 """What there is a schema of, by name."""
 

@@ -1,11 +1,11 @@
 """Test vectors of the agent contract; `python -m ucp.contract.vectors` writes the files.
 
-hash_vectors.py    events, blocks, inception blocks and chains: bytes and hashes
-message_vectors.py  every message as a datagram
+_hash_vectors.py    events, blocks, inception blocks and chains: bytes and hashes
+_message_vectors.py  every message as a datagram
 drop_vectors.py     datagrams that are dropped, and why
-secured_vectors.py   secured datagrams, which need the extra `secure`
-block_vectors.py    after which event a block is full, and its timestamp
-mission_vectors.py  whole missions in virtual time, input by input
+_secured_vectors.py   secured datagrams, which need the extra `secure`
+_block_vectors.py    after which event a block is full, and its timestamp
+_mission_vectors.py  whole missions in virtual time, input by input
 """
 
 import base64
@@ -14,22 +14,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ucp.contract.vectors import block_vectors, drop_vectors, hash_vectors, message_vectors, mission_vectors
+from ucp.contract.vectors import _block_vectors, _hash_vectors, _message_vectors, _mission_vectors, drop_vectors
 
 DIRECTORY = Path(__file__).parent
 
 
 def _secured() -> Any:
-    from ucp.contract.vectors import secured_vectors  # draws in cryptography, which who replays missions need not have
+    from ucp.contract.vectors import _secured_vectors  # draws in cryptography, which who replays missions need not have
 
-    return secured_vectors.vectors()
+    return _secured_vectors.vectors()
 
 
 DOCUMENTS: dict[str, Callable[[], Any]] = {
-    "hashes": hash_vectors.vectors,
-    "messages": message_vectors.vectors,
+    "hashes": _hash_vectors.vectors,
+    "messages": _message_vectors.vectors,
     "drops": drop_vectors.vectors,
-    "blocks": block_vectors.vectors,
+    "blocks": _block_vectors.vectors,
     "secured": _secured,
 }
 """Name of a file -> what it has."""
@@ -43,7 +43,7 @@ def texts() -> dict[Path, str]:
     """Every file and what stands in it."""
     made = {DIRECTORY / f"{name}.json": _json(vectors()) for name, vectors in DOCUMENTS.items()}
     index = {}
-    for name, mission in mission_vectors.MISSIONS.items():
+    for name, mission in _mission_vectors.MISSIONS.items():
         exchanges = mission().exchanges
         features = exchanges[0]["input"]["mission"]["features"]
         index[name] = {"what": mission.__doc__, "features": features, "lines": len(exchanges)}

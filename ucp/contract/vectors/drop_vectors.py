@@ -5,7 +5,7 @@ from typing import Any
 
 from ucp.agent import Agent
 from ucp.block import Block
-from ucp.contract.vectors.message_vectors import BLOCK_HASH, CHAIN_HASH
+from ucp.contract.vectors._message_vectors import BLOCK_HASH, CHAIN_HASH
 from ucp.messages import HEADER, MAGIC, MAX_DATAGRAM_BYTES, VERSION, CommitBlock, encode
 
 AGENT_ID = 7

@@ -4,11 +4,11 @@ An index is not asked for, nor `metadata.yaml`: a bag whose recorder was killed,
 What is behind a damaged place is used. Sizes that a file claims are believed up to a bound. What the messages mean is
 for the package rosbags to say (harness.field.adapters.rosbag_adapter).
 
-decompression.py      what is found in a bag: messages, and places that cannot be read
-version_1.py  version 1
-mcap_bag.py       version 2 in MCAP
-sqlite.py     version 2 in SQLite
-decompression.py     what is packed in any of them
+_decompression.py      what is found in a bag: messages, and places that cannot be read
+_version_1.py  version 1
+_mcap_bag.py       version 2 in MCAP
+_sqlite.py     version 2 in SQLite
+_decompression.py     what is packed in any of them
 """
 
 import mmap
@@ -19,10 +19,10 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from harness.archive.bounded_file import Opened
-from harness.field.adapters.bags import mcap_bag, sqlite, version_1
-from harness.field.adapters.bags.decompression import MAX_FILE_BYTES, ZSTD_MAGIC, Broken, Found, Item, unpacked_file
+from harness.field.adapters.bags import _mcap_bag, _sqlite, _version_1
+from harness.field.adapters.bags._decompression import MAX_FILE_BYTES, ZSTD_MAGIC, Broken, Found, Item, unpacked_file
 
-MAGICS = (version_1.MAGIC, mcap_bag.MAGIC, sqlite.MAGIC, ZSTD_MAGIC)
+MAGICS = (_version_1.MAGIC, _mcap_bag.MAGIC, _sqlite.MAGIC, ZSTD_MAGIC)
 """What a bag begins with."""
 
 
@@ -60,11 +60,11 @@ def _items(path: Path, scratch: Path) -> Iterator[Item]:
         packed, path = path, scratch / "unzstd"
         trouble = unpacked_file(packed, path)
     magic = _magic(path)
-    if magic == sqlite.MAGIC:
-        yield from sqlite.items(path, scratch)
-    elif magic in (version_1.MAGIC, mcap_bag.MAGIC):
+    if magic == _sqlite.MAGIC:
+        yield from _sqlite.items(path, scratch)
+    elif magic in (_version_1.MAGIC, _mcap_bag.MAGIC):
         with path.open("rb") as bag, mmap.mmap(bag.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            yield from (version_1 if magic == version_1.MAGIC else mcap_bag).items(content)
+            yield from (_version_1 if magic == _version_1.MAGIC else _mcap_bag).items(content)
     else:
         yield Broken("it is no ROS bag")
     if trouble:

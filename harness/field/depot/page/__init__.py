@@ -1,9 +1,9 @@
 """The page of a consolidated record: one file, which loads nothing and runs no script.
 
-depot_page.py      gathers it             page.html.j2, page.css   how it looks, with the parts of a run's report
-position_map.py     a map    time_chart.py   when    holdings.py   who holds what
+_depot_page.py      gathers it             page.html.j2, page.css   how it looks, with the parts of a run's report
+_position_map.py     a map    _time_chart.py   when    _holdings.py   who holds what
 """
 
-from harness.field.depot.page.depot_page import draw
+from harness.field.depot.page._depot_page import draw
 
 __all__ = ["draw"]

@@ -12,9 +12,9 @@ from itertools import zip_longest
 from typing import Any
 
 from harness.errors import VIOLATED, HarnessError
-from harness.play.simulation.foreign.answer import shown
-from harness.play.simulation.foreign.foreign_agent import LifeRecord
-from harness.play.simulation.foreign.virtual_program import NoAnswerError, Program
+from harness.play.simulation.foreign._answer import shown
+from harness.play.simulation.foreign._foreign_agent import LifeRecord
+from harness.play.simulation.foreign._virtual_program import NoAnswerError, Program
 
 OF_ITSELF = (
     "it reads a clock, draws random numbers, or has something else of its own, such as the order of a hash table"

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from harness.errors import FieldError
-from harness.field.bisection.live_replay import play_live, script_of
-from harness.field.bisection.scripted_peers import Lateness, what
+from harness.field.bisection._live_replay import play_live, script_of
+from harness.field.bisection._scripted_peers import Lateness, what
 from harness.field.replay import open_record
 from tests.harness.command import harness
 from ucp.messages import ChainContainQuery, encode

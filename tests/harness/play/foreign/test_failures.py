@@ -9,7 +9,7 @@ import pytest
 
 from harness.errors import HarnessError, UnsupportedError
 from harness.play.progress import Silent
-from harness.play.simulation.foreign import foreign_agent, virtual_program
+from harness.play.simulation.foreign import _foreign_agent, _virtual_program
 from harness.run.run import Run, run
 from harness.run.simulate import simulate
 from tests.harness.play.foreign.agents import EXPORT, living, played_by, small
@@ -22,8 +22,8 @@ EVENT = "if 'event_id' in given:\n    "
 
 @pytest.fixture(autouse=True)
 def narrow_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(virtual_program, "MAX_ANSWER_BYTES", 1 << 20)
-    monkeypatch.setattr(foreign_agent, "MAX_TIMERS_PER_S", 50)
+    monkeypatch.setattr(_virtual_program, "MAX_ANSWER_BYTES", 1 << 20)
+    monkeypatch.setattr(_foreign_agent, "MAX_TIMERS_PER_S", 50)
 
 
 def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
@@ -93,7 +93,7 @@ def test_what_goes_wrong_is_one_sentence_and_on_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, outcome: str, sentence: str
 ) -> None:
     if "sleep" in code:
-        monkeypatch.setattr(virtual_program, "ANSWER_LIMIT_S", 1.0)
+        monkeypatch.setattr(_virtual_program, "ANSWER_LIMIT_S", 1.0)
     finished = run_with(tmp_path, "import os, time\n" + code)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (sentence in record["outcome_detail"]) and "agent 2" in record["outcome_detail"], record["outcome_detail"]
@@ -124,7 +124,7 @@ def test_of_a_run_that_an_agent_ended_nobody_is_accused(tmp_path: Path) -> None:
 
 def test_a_storm_that_feeds_itself_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two agents that answer each datagram with two."""
-    monkeypatch.setattr(foreign_agent, "MAX_SENT_PER_S", 200)
+    monkeypatch.setattr(_foreign_agent, "MAX_SENT_PER_S", 200)
     code = EVENT + "said['sent'] = ['AA==']\nif 'datagram' in given:\n    said['sent'] = ['AA==', 'AA==']"
     one = played_by(small(tmp_path, code), **SHORT)
     with pytest.raises(HarnessError, match=r"agent \d sent more than 200 datagrams within mission second 1\d"):

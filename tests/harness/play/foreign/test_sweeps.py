@@ -11,10 +11,10 @@ import pytest
 import yaml
 
 from harness.errors import HarnessError
-from harness.play.simulation.foreign.virtual_program import Programs
+from harness.play.simulation.foreign._virtual_program import Programs
 from harness.run.simulate import simulate
-from harness.sweep.matrix.cell_play import Player
-from harness.sweep.matrix.matrix_file import Matrix
+from harness.sweep.matrix._cell_play import Player
+from harness.sweep.matrix._matrix_file import Matrix
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.play.foreign.agents import EXPORT, living, played_by, small
 

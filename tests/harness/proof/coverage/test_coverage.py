@@ -12,8 +12,8 @@ from harness.checker import gather
 from harness.proof import Bounds
 from harness.proof.coverage import Reached, existing, in_words, reached_in, to_json
 from harness.proof.coverage.reached import BRANCHES
-from harness.proof.model.shape import LEFT_OUT
-from harness.proof.model.snapshot import LEFT_OUT as OF_SNAPSHOTS
+from harness.proof.model._shape import LEFT_OUT
+from harness.proof.model._snapshot import LEFT_OUT as OF_SNAPSHOTS
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.harness.command import harness, sentences

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds
-from harness.proof.specification import second_opinion, tlc
+from harness.proof.specification import _tlc as tlc
+from harness.proof.specification import second_opinion
 from harness.scenario.agent_options import Stagger
 from tests.harness.command import harness, sentences
 from tests.machine import require_tlc

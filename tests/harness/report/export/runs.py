@@ -5,7 +5,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.tlog import TelemetryLog
+from sitl._tlog import TelemetryLog
 from tests.harness.command import harness, write_scenario
 
 ABOUT: dict[str, Any] = {

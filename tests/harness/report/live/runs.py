@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from harness.report.live.agent_course import Change
+from harness.report.live._agent_course import Change
 from harness.report.live.feed import Feed
 from tests.harness.field.flights import flown
 

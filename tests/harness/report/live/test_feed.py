@@ -11,7 +11,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.traces import SUFFIX
 from harness.errors import RunDirectoryError
 from harness.report.live import feed as feeds
-from harness.report.live.agent_course import KEY_LENGTH, Change
+from harness.report.live._agent_course import KEY_LENGTH, Change
 from harness.report.live.change_log import FAR_BEHIND_BYTES, Story
 from harness.report.live.feed import Feed
 from tests.harness.report.live.runs import film, of_kind, played

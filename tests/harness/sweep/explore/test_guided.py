@@ -20,11 +20,12 @@ from harness.proof.coverage import Reached
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import find
+from harness.sweep.explore._scenario_document import document_of, script
 from harness.sweep.explore.guided import Night, spend
-from harness.sweep.explore.guided.corpus import MOST_BYTES, opened
-from harness.sweep.explore.guided.finding_identity import identities
-from harness.sweep.explore.guided.hunt import Candidate, Hunt, Kept
-from harness.sweep.explore.guided.hunt_trial import (
+from harness.sweep.explore.guided._corpus import MOST_BYTES, opened
+from harness.sweep.explore.guided._finding_identity import identities
+from harness.sweep.explore.guided._hunt import Candidate, Hunt, Kept
+from harness.sweep.explore.guided._hunt_trial import (
     Tried,
     beginnings,
     found_in,
@@ -32,8 +33,7 @@ from harness.sweep.explore.guided.hunt_trial import (
     with_liveness_phase,
     without_liveness_phase,
 )
-from harness.sweep.explore.guided.mutation import changed
-from harness.sweep.explore.scenario_document import document_of, script
+from harness.sweep.explore.guided._mutation import changed
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 
 ORDINARY = {
@@ -104,7 +104,7 @@ def test_who_votes_in_vain_in_a_new_way_is_kept(monkeypatch: pytest.MonkeyPatch)
     limits, ((document, seed), *_) = beginnings(ordinary(), range(1))
     ways = iter((("voting", "phase one", "voting"),) * 2 + (("voting", "voting"),))
     monkeypatch.setattr(
-        "harness.sweep.explore.guided.hunt.tried", lambda scenario, seed: Tried(Reached(), (), in_vain=(next(ways),))
+        "harness.sweep.explore.guided._hunt.tried", lambda scenario, seed: Tried(Reached(), (), in_vain=(next(ways),))
     )
     hunt = Hunt(limits, Random(1))
     assert [kept for _, kept in hunt.begin([Candidate(document, seed)] * 3, 1)] == [True, False, True]
@@ -112,7 +112,7 @@ def test_who_votes_in_vain_in_a_new_way_is_kept(monkeypatch: pytest.MonkeyPatch)
 
 def test_what_came_near_a_livelock_is_changed_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
     limits, ((document, seed), *_) = beginnings(ordinary(), range(1))
-    monkeypatch.setattr("harness.sweep.explore.guided.hunt.tried", lambda scenario, seed: Tried(Reached(), ()))
+    monkeypatch.setattr("harness.sweep.explore.guided._hunt.tried", lambda scenario, seed: Tried(Reached(), ()))
     near = Kept(Candidate(document, seed), gave=1, steps=100, failed=3, timers_ended_s=())
     others = [dataclasses.replace(near, failed=0) for _ in range(100)]
     hunt = Hunt(limits, Random(1), kept=[near, *others])
@@ -189,7 +189,7 @@ def test_a_hunt_goes_on_to_learn_when_it_can_keep_no_more_local_states(monkeypat
         return hunt
 
     roomy = hunted()
-    for module in ("harness.proof.coverage.reached", "harness.sweep.explore.guided.hunt"):
+    for module in ("harness.proof.coverage.reached", "harness.sweep.explore.guided._hunt"):
         monkeypatch.setattr(f"{module}.MOST", 100)
     narrow = hunted()
     assert len(narrow.reached.states) < len(roomy.reached.states)
@@ -244,7 +244,7 @@ def test_nights_tell_new_ongoing_and_resolved(tmp_path: Path, monkeypatch: pytes
     assert again.keys() == {each.finding.identity for each in first.told}
     assert {*again.values()} <= {"ongoing", "rare"}
     monkeypatch.setattr(
-        "harness.sweep.explore.guided.hunt_trial.identities", lambda *found: ()
+        "harness.sweep.explore.guided._hunt_trial.identities", lambda *found: ()
     )  # the agents are mended
     mended = night(directory, wrong, runs=1)
     assert {each.status for each in mended.told} == {"resolved"}

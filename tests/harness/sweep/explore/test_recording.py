@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from harness.run.simulate import simulate
-from harness.sweep.explore.recording import record
-from harness.sweep.explore.scenario_document import document_of, with_agents
-from harness.sweep.explore.smaller import replays, scenario_of
+from harness.sweep.explore._recording import record
+from harness.sweep.explore._scenario_document import document_of, with_agents
+from harness.sweep.explore._smaller import replays, scenario_of
 from tests.harness.virtual import scenario
 
 APART = [

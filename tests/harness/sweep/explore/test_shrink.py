@@ -3,8 +3,8 @@
 import pytest
 
 from harness.scenario import Scenario
-from harness.sweep.explore.scenario_document import Document, document_of, moved, script, with_agents, with_key
-from harness.sweep.explore.shrink import BudgetSpentError, Shrinker
+from harness.sweep.explore._scenario_document import Document, document_of, moved, script, with_agents, with_key
+from harness.sweep.explore._shrink import BudgetSpentError, Shrinker
 from tests.harness.virtual import scenario
 
 START: Document = {

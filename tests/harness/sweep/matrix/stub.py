@@ -8,7 +8,7 @@ from harness.checker import Result
 from harness.checker.judgement import Judgement, Verdict
 from harness.scenario import Scenario
 from harness.sweep.matrix import Finished, Matrix, run_matrix
-from harness.sweep.matrix.cell_play import Judge
+from harness.sweep.matrix._cell_play import Judge
 from harness.sweep.matrix.matrix_run import on_cores
 from harness.sweep.matrix.results_file import opened
 

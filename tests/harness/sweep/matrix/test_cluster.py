@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from harness.errors import HarnessError, MachineError
-from harness.sweep.matrix import cluster as module
-from harness.sweep.matrix.cluster import cluster
+from harness.sweep.matrix import _cluster as module
+from harness.sweep.matrix._cluster import cluster
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 
 pytest.importorskip("distributed", reason="needs the extra `cluster`")

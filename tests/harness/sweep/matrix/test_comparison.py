@@ -10,9 +10,9 @@ from harness.checker import Result
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
 from harness.sweep.matrix import Finished, MatrixRecord, matrix_outputs
-from harness.sweep.matrix.cell import Cell
-from harness.sweep.matrix.comparison import compare
-from harness.sweep.matrix.estimate import BY_NAME, Estimate
+from harness.sweep.matrix._cell import Cell
+from harness.sweep.matrix._comparison import compare
+from harness.sweep.matrix._estimate import BY_NAME, Estimate
 from harness.sweep.matrix.matrix_run import compared
 from harness.sweep.matrix.nights import load_baseline
 from tests.harness.sweep.matrix.stub import judge, matrix, played

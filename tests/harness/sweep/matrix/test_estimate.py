@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from harness.sweep.matrix.estimate import Estimate, estimate_mean, estimate_share, student_quantile
+from harness.sweep.matrix._estimate import Estimate, estimate_mean, estimate_share, student_quantile
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import yaml
 
 from harness.errors import ScenarioError
 from harness.sweep.matrix import Matrix, load_matrix
-from harness.sweep.matrix.matrix_file import Point
+from harness.sweep.matrix._matrix_file import Point
 
 THESIS = Path(__file__).parents[4] / "scenarios" / "thesis_matrix.yaml"
 NIGHTLY = Path(__file__).parents[4] / "docs" / "matrix-nightly.md"

@@ -13,10 +13,10 @@ from harness.checker.judgement import Judgement
 from harness.scenario import Scenario
 from harness.scenario.verdict_names import Verdict
 from harness.sweep.matrix import Finished, matrix_outputs, matrix_table
+from harness.sweep.matrix._matrix_picture import PANELS, draw
 from harness.sweep.matrix.matrix_outputs import to_junit
-from harness.sweep.matrix.matrix_picture import PANELS, draw
 from harness.sweep.matrix.matrix_summary import to_markdown
-from harness.sweep.matrix.report.heatmap import known
+from harness.sweep.matrix.report._heatmap import known
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -11,13 +11,13 @@ import yaml
 from harness.checker import Result
 from harness.scenario import Scenario, load_scenario
 from harness.sweep.matrix import Finished, MatrixRecord
-from harness.sweep.matrix.cell import Run
-from harness.sweep.matrix.cell_play import directory_name
-from harness.sweep.matrix.cell_scenarios import scenario_file, write_scenarios
+from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._cell_play import directory_name
+from harness.sweep.matrix._cell_scenarios import scenario_file, write_scenarios
 from harness.sweep.matrix.matrix_run import compared
 from harness.sweep.matrix.nights import Nights
-from harness.sweep.matrix.report import drilldown, heatmap, to_html, trend
-from harness.sweep.matrix.report.heatmap import known
+from harness.sweep.matrix.report import _drilldown, _heatmap, _trend, to_html
+from harness.sweep.matrix.report._heatmap import known
 from tests.harness.command import harness
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
@@ -30,10 +30,10 @@ def breaks(scenario: Scenario, seed: int) -> Result:
     return judge(scenario, seed)
 
 
-def tiles(finished: Finished, name: str) -> dict[str, heatmap.Tile]:
+def tiles(finished: Finished, name: str) -> dict[str, _heatmap.Tile]:
     """Of one figure, by where their runs are."""
     (figure,) = [one for one in known(finished.record.cells) if one.metric.name == name]
-    grids = heatmap.heatmap(finished.record, figure).grids
+    grids = _heatmap.heatmap(finished.record, figure).grids
     return {str(tile.href): tile for grid in grids for _, row in grid.rows for tile in row}
 
 
@@ -88,7 +88,7 @@ def test_cells_that_were_not_played_are_empty_and_half_of_one_is_said() -> None:
 
 
 def test_the_runs_of_a_cell_begin_with_those_that_went_wrong() -> None:
-    well, bad = drilldown.drilldown(played(matrix(), 1, breaks), Path())
+    well, bad = _drilldown.drilldown(played(matrix(), 1, breaks), Path())
     assert [row.seed for row in well.rows] == [1, 2, 3, 4]
     assert [row.seed for row in bad.rows] == [3, 2, 1, 4]
     assert bad.rows[0].failed is not None and bad.rows[0].failed.startswith("RuntimeError: </title>")
@@ -104,14 +104,14 @@ def test_a_run_that_was_kept_leads_to_its_report(tmp_path: Path) -> None:
     kept = tmp_path / "runs" / directory_name(runs[1].task)
     kept.mkdir(parents=True)
     (kept / "report.html").touch()
-    cells = drilldown.drilldown(Finished(finished.record, runs), tmp_path)
+    cells = _drilldown.drilldown(Finished(finished.record, runs), tmp_path)
     assert [row.href for row in cells[0].rows] == [None, "runs/loss-0.0-agents-5-process-seed-2/report.html"]
 
 
 def test_more_runs_than_there_is_room_for_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drilldown, "MAX_ROWS", 4)
+    monkeypatch.setattr(_drilldown, "MAX_ROWS", 4)
     finished = played(matrix(), 1, breaks)
-    assert [(len(cell.rows), cell.left_out) for cell in drilldown.drilldown(finished, Path())] == [(2, 2), (2, 2)]
+    assert [(len(cell.rows), cell.left_out) for cell in _drilldown.drilldown(finished, Path())] == [(2, 2), (2, 2)]
     assert "And 2 more in runs.csv." in to_html(finished, Path())
 
 
@@ -136,7 +136,7 @@ def test_nights_differ_in_their_panel() -> None:
     nights[1] = nights[1].model_copy(
         update={"cells": [nights[1].cells[0], cell.model_copy(update={"estimates": busier})]}
     )
-    ((_, drawing),) = trend.trend(nights, finished.record, figure)
+    ((_, drawing),) = _trend.trend(nights, finished.record, figure)
     first, second = drawing.split('<g class="panel">')[1:]
     heights = [set(re.findall(r'cy="([\d.]+)"', panel)) for panel in (first, second)]
     assert [len(one) for one in heights] == [1, 2]
@@ -163,7 +163,7 @@ def test_absurd_nights_are_drawn_without_their_absurdity() -> None:
 
 def test_more_nights_than_a_page_can_hold_are_left_away_from_the_front(monkeypatch: pytest.MonkeyPatch) -> None:
     finished = played(matrix(), 1, judge)
-    monkeypatch.setattr(trend, "MAX_DOTS", 2 * 8 * 3)
+    monkeypatch.setattr(_trend, "MAX_DOTS", 2 * 8 * 3)
     page = to_html(finished, Path(), over(finished, 5))
     assert "3 nights, from 2026-01-03 to 2026-01-05" in page
 

@@ -16,7 +16,7 @@ from harness.checker import Result
 from harness.errors import MachineError
 from harness.scenario import Scenario
 from harness.sweep.matrix import MatrixRecord, matrix_outputs, matrix_table, results_file, run_matrix
-from harness.sweep.matrix.matrix_picture import PANELS, draw
+from harness.sweep.matrix._matrix_picture import PANELS, draw
 from harness.sweep.matrix.matrix_run import on_cores
 from harness.sweep.matrix.matrix_summary import to_markdown
 from tests.harness.sweep.matrix.stub import judge, matrix, played

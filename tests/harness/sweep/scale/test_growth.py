@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from harness.sweep.scale.growth import Variable, fit
+from harness.sweep.scale._growth import Variable, fit
 
 AGENTS: list[Variable] = ["agents"]
 BOTH: list[Variable] = ["agents", "blocks"]

@@ -15,7 +15,7 @@ from harness.checker import Result
 from harness.play.mission import RunOutcome
 from harness.scenario import Scenario
 from harness.sweep.scale import Scale, ScaleRecord, outputs, run_scale, table
-from harness.sweep.scale.picture import PANELS, draw
+from harness.sweep.scale._picture import PANELS, draw
 from tests.harness.sweep.scale.stub import judge, scale
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -1,0 +1,75 @@
+"""Characteristic 5: in a fully connected system every completed block is in every living agent's chain, eventually."""
+
+from harness.checker._agreement import had_a_chance, never, why_no_chance, why_unknown, without
+from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding, Judgement, agents, violated
+
+NAME = "all committed everywhere"
+
+
+def check(evidence: Evidence) -> Judgement:
+    """By the exports at the end. Blocks that only killed or switched off agents held are left out (Section 3.3).
+
+    `not applicable` where an export is missing, an agent was not idle, or those that lack a block had no chance.
+    """
+    if never_agrees := never(NAME, evidence):
+        return never_agrees
+    unknown = why_unknown(evidence)
+    if unknown:
+        return Judgement(NAME, "not applicable", unknown)
+    gone, completed = _gone_and_left(evidence)
+    lacking: dict[int, list[str]] = {}
+    for agent_id, export in evidence.present.items():
+        in_chain = set(export.chain_of_block_hashes)
+        missing = [block_hash for block_hash in completed if block_hash not in in_chain]
+        if missing:
+            lacking[agent_id] = missing
+    if not lacking and (untold := evidence.not_told_completed()):
+        why = evidence.unknown_word("operation", agent_id=min(untold))
+        return Judgement(NAME, "not applicable", f"nothing tells all that {agents(untold)} completed: {why}")
+    if not lacking:
+        but = f"; {gone} more were gone with the agents that {_left(evidence)}" if gone else ""
+        whole = f"all {len(completed)} completed blocks are in every chain"
+        return Judgement(NAME, "holds", whole + without(evidence) + but)
+    no_chance = why_no_chance(evidence, set(lacking))
+    if no_chance:
+        lack, first = sum(map(len, lacking.values())), lacking[min(lacking)][0]
+        return Judgement(
+            NAME,
+            "not applicable",
+            f"{agents(set(lacking))} lack{'s' if len(lacking) == 1 else ''} {lack} cop{'y' if lack == 1 else 'ies'} "
+            f"of completed blocks, {evidence.name(first)} the first; {no_chance}",
+        )
+    findings = [
+        Finding(
+            agent_id,
+            f"reconciled while fully connected, and still lacks block {evidence.name(block_hash)}",
+            evidence.name(block_hash),
+            block_hash,
+        )
+        for agent_id in sorted(had_a_chance(evidence, set(lacking)))
+        for block_hash in lacking[agent_id]
+    ]
+    return violated(NAME, "a completed block is not in the chain of an agent that could have it", findings)
+
+
+def _gone_and_left(evidence: Evidence) -> tuple[int, list[str]]:
+    """How many completed blocks nobody has who is there, and the others, which anybody can have.
+
+    Some were lost with killed agents (Section 3.3), and some are at home with one that was switched off.
+    """
+    completed = evidence.completed_blocks()
+    exports = evidence.present.values()
+    left = {block.block_hash for export in exports for block in export.blocks()}
+    left.update(block_hash for export in exports for block_hash in export.completed)
+    gone = {
+        block_hash
+        for block_hash, agent_id in completed.items()
+        if block_hash not in left
+        and (evidence.was_killed(agent_id) or evidence.was_restarted(agent_id) or agent_id in evidence.switched_off)
+    }
+    return len(gone), [block_hash for block_hash in completed if block_hash not in gone]
+
+
+def _left(evidence: Evidence) -> str:
+    return "were killed or switched off" if evidence.switched_off else "were killed"

@@ -1,0 +1,126 @@
+"""Characteristic 1: distributed, event driven and asynchronous.
+
+Every handler run has a local trigger or a message that its sender really sent, and no vote waits for anybody: it ends
+when its own timer does. Only traces can tell, and only in words that are known.
+"""
+
+from typing import Any
+
+from harness.archive.vocabulary import MESSAGES, TIMERS, TRIGGERS
+from harness.checker._waiting import waited_too_long
+from harness.checker.evidence import Evidence, Sendings
+from harness.checker.judgement import Finding, Judgement, agents, violated
+from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
+from ucp.trace import HandlerRun
+
+NAME = "distributed"
+
+_OF_MESSAGE = {message.NAME: handler.name for message, handler in ON_MESSAGE.items()}
+_OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
+_OF_EVENT = ON_LOCAL_EVENT["Build Data Block"].name
+_LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
+
+
+def check(evidence: Evidence) -> Judgement:
+    """By the traces, every line of them; `not applicable` where one is missing, damaged or incomplete."""
+    if not evidence.traces:
+        return Judgement(NAME, "not applicable", "no traces: exports do not show what triggered the handlers")
+    sent = evidence.sendings
+    findings: list[Finding] = []
+    untraced: set[int] = set()
+    sends_unknown = {agent_id for agent_id, words in evidence.unknown.items() if "message" in words}
+    runs = 0
+    for agent_id, trace in evidence.traces.items():
+        runs += len(trace.runs)
+        for life in trace.lives():
+            ran: set[str] = set()
+            for line, run in life:
+                ran.add(run.handler)
+                if _is_plainly_right(run, ran, sent):
+                    continue  # most runs are like this, and patterns take long
+                sender = run.trigger.get("from")
+                if isinstance(sender, int) and sender not in sent:
+                    untraced.add(sender)
+                    continue
+                if not _is_in_known_words(run) or sender in sends_unknown:
+                    continue
+                wrong = _wrong_trigger(run, ran, sent)
+                if wrong and sender in evidence.injected.heard_of:
+                    untraced.add(sender)
+                    continue
+                if wrong and not (isinstance(sender, int) and evidence.traces[sender].problem):
+                    findings.append(Finding(agent_id, f"trace line {line}, t={run.t:g} s: {run.handler} {wrong}"))
+    findings += waited_too_long(evidence)
+    if findings:
+        return violated(NAME, "a handler ran without a trigger of its own, or waited for another agent", findings)
+    if unknown := evidence.unknown_word("trigger", "handler", "timer", "message", "branch"):
+        return Judgement(NAME, "not applicable", unknown)
+    silent = sorted(set(evidence.roster or evidence.exports) - set(evidence.traces))
+    if untraced or silent:
+        return Judgement(
+            NAME,
+            "not applicable",
+            f"there is no trace of {agents(untraced | set(silent))}, so what they sent and did cannot be checked",
+        )
+    damaged = [agent_id for agent_id, trace in evidence.traces.items() if trace.problem]
+    if damaged:
+        return Judgement(NAME, "not applicable", f"the trace of {agents(damaged)} is incomplete")
+    return Judgement(NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent")
+
+
+def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
+    """Whether its own timer, an event, a handler that ran, or a message that its sender sent triggered the run."""
+    trigger, handler = run.trigger, run.handler
+    if "seq" in trigger:
+        name = trigger.get("message")
+        if _OF_MESSAGE.get(name) != handler:  # type: ignore[arg-type]
+            return False
+        return trigger["seq"] in sent.get(trigger.get("from"), {}).get(name, ())
+    if len(trigger) > 1:
+        return False
+    if "local" in trigger:
+        return handler in _LOCAL and trigger["local"] in ran
+    if "event" in trigger:
+        return handler == _OF_EVENT
+    return _OF_TIMER.get(trigger.get("timer")) == handler  # type: ignore[arg-type]
+
+
+def _is_in_known_words(run: HandlerRun) -> bool:
+    """Whether handler and trigger are named as CONTRACT.md names them, as far as they are named at all."""
+    trigger = run.trigger
+    if run.handler not in HANDLERS or (trigger and TRIGGERS.isdisjoint(trigger)):
+        return False
+    return (
+        trigger.get("message", "") in {"", *MESSAGES}
+        and trigger.get("timer", "") in {"", *TIMERS}
+        and trigger.get("local", "") in {"", *HANDLERS}
+    )
+
+
+def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
+    """What is wrong with the run's trigger, completing "the handler ..."; None if nothing is."""
+    trigger = run.trigger
+    match trigger:
+        case {"message": str(name), "from": int(sender), "seq": int(sequence)}:
+            if _OF_MESSAGE.get(name) != run.handler:
+                return f"was triggered by a {name}, which is another handler's"
+            if sequence not in sent[sender].get(name, ()):
+                return f"was triggered by {name} number {sequence}, which agent {sender} never sent"
+        case {"timer": str(timer)}:
+            if _OF_TIMER.get(timer) != run.handler:
+                return f"was triggered by the {timer} timer, which is another handler's"
+        case {"local": by}:
+            if run.handler not in _LOCAL or by not in ran:
+                return f"was triggered by {by}, which had not run"
+        case {"event": _}:
+            if run.handler != _OF_EVENT:
+                return "was triggered by a logged event, which is Build Data Block's"
+        case {"operator": _}:
+            if run.handler != "reconcile_begin":
+                return "was triggered by the operator, who can only begin a reconcile"
+        case {"boot": _}:
+            if run.handler != "reconcile_finalize" or len(ran) > 1:
+                return "was triggered by a boot, which only ends a reconcile, and before anything else"
+        case _:
+            return "has no trigger"
+    return None

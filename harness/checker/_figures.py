@@ -1,0 +1,82 @@
+"""Figures beyond the verdicts: how far the chains agree, and what it cost."""
+
+from collections import Counter
+
+from harness.checker.evidence import Evidence
+from harness.checker.records import cross_examine
+from harness.checker.uniform_chain import common_prefix
+
+
+def figures(evidence: Evidence) -> dict[str, float | int | None]:
+    """Counts of blocks and messages; None where nothing tells. `copies` are of each completed block, per agent.
+
+    `uniform_at_s` is when the chains became what they all are in the end, in mission seconds; None if they differ.
+    """
+    chains = [export.chain_of_block_hashes for export in evidence.exports.values()]
+    completed = evidence.completed_blocks()
+    all_known = not evidence.not_told_completed()
+    copies = Counter(block_hash for chain in chains for block_hash in chain)
+    per_block = [copies[block_hash] for block_hash in completed]
+    distinct = len(set(chains))
+    messages = _of_all_agents(evidence, "messages_sent")
+    result: dict[str, float | int | None] = {
+        "agents": len(chains),
+        "blocks": len(completed) if all_known else None,
+        "mutual_chain": common_prefix(chains),
+        "longest_chain": max(map(len, chains), default=0),
+        "distinct_chains": distinct,
+        "copies_min": min(per_block, default=None) if all_known else None,
+        "copies_mean": round(sum(per_block) / len(per_block), 3) if per_block and all_known else None,
+        "uniform_at_s": uniform_at_s(evidence),
+        "reconciles": _of_all_agents(evidence, "reconciles"),
+        "messages": messages,
+        "bytes": _of_all_agents(evidence, "bytes_sent"),
+        "messages_per_block": round(messages / len(completed), 1)
+        if completed and messages is not None and all_known
+        else None,
+    }
+    if evidence.before_final_reconcile:
+        before = [export.chain_of_block_hashes for export in evidence.before_final_reconcile.values()]
+        result["mutual_chain_before_final_reconcile"] = common_prefix(before)
+        result["distinct_chains_before_final_reconcile"] = len(set(before))
+    return result
+
+
+def _of_all_agents(evidence: Evidence, counter: str) -> int | None:
+    """The sum of a counter that the run's record has of every agent; else what whole traces have; else None."""
+    agents = evidence.record.agents.values() if evidence.record else ()
+    counts: list[int | None] = [getattr(agent, counter) for agent in agents]
+    known = [count for count in counts if count is not None]
+    if known and len(known) == len(counts):
+        return sum(known)
+    runs = [run for trace in evidence.traces.values() for run in trace.runs]
+    if not runs or evidence.once(cross_examine).short:
+        return None
+    match counter:
+        case "messages_sent":
+            return sum(len(run.sent) for run in runs)
+        case "reconciles" if evidence.unknown_word("handler", "branch") is None:
+            return sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in runs)
+    return None
+
+
+def uniform_at_s(evidence: Evidence) -> float | None:
+    """When the chains became what they all are in the end, in mission seconds; None if they differ, or nothing tells.
+
+    That is when the last of them changed last.
+    """
+    if len({export.chain_of_block_hashes for export in evidence.exports.values()}) != 1:
+        return None
+    recorded = evidence.record.agents if evidence.record else {}
+    last_s = 0.0
+    for agent_id in evidence.exports:
+        agent, trace = recorded.get(str(agent_id)), evidence.traces.get(agent_id)
+        if agent is not None and agent.chain_changed_at_s is not None:
+            last_s = max(last_s, agent.chain_changed_at_s)
+        elif evidence.unknown_word("operation", agent_id=agent_id):
+            return None
+        elif trace is not None and agent_id not in evidence.once(cross_examine).short:
+            last_s = max(last_s, round(trace.chain_changed_at(), 3))
+        else:
+            return None
+    return last_s

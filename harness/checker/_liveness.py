@@ -1,0 +1,92 @@
+"""Liveness: once no more events come the swarm becomes idle, having committed what it completed.
+
+One that does not either never will, which has to be shown, or needs more time than it had: how much more is said where
+blocks are still being committed, and so tell how fast.
+"""
+
+from harness.checker import recurring_cycles
+from harness.checker._agreement import without
+from harness.checker._figures import uniform_at_s
+from harness.checker.evidence import Evidence
+from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents
+
+NAME = "liveness"
+
+
+def check(evidence: Evidence) -> Judgement:
+    """`never finishes` if that is shown, `not finished` if the swarm was not idle; times are in mission seconds."""
+    unknown = _why_unknown(evidence)
+    if unknown:
+        return Judgement(NAME, "not applicable", unknown)
+    if not evidence.busy:
+        return Judgement(NAME, "finished", _finished(evidence))
+    cycle = evidence.once(recurring_cycles.cycle_of)
+    if cycle is not None:
+        return Judgement(NAME, "never finishes", recurring_cycles.in_words(cycle), recurring_cycles.findings(cycle))
+    findings = [Finding(agent_id, _left_to_do(evidence, agent_id)) for agent_id in evidence.busy]
+    return Judgement(NAME, "not finished", _not_finished(evidence), findings[:MAX_EVIDENCE])
+
+
+def _why_unknown(evidence: Evidence) -> str | None:
+    if evidence.record is None:
+        return "exports alone do not tell whether the run had come to its end"
+    if evidence.record.outcome != "completed":
+        return f"the run did not come to its end ({evidence.record.outcome})"
+    if not evidence.exports:
+        return "there is no export to look at"
+    if evidence.missing:
+        return f"there is no export of {agents(evidence.missing)}"
+    early = [agent_id for agent_id in evidence.switched_off if not evidence.exports[agent_id].idle]
+    if early and set(evidence.present) <= set(evidence.switched_off):
+        return f"{agents(early)} {'was' if len(early) == 1 else 'were'} switched off before the swarm was idle"
+    if evidence.paused_at_end and not evidence.busy:
+        return f"{agents(evidence.paused_at_end)} stood still to the end"
+    return None
+
+
+def _finished(evidence: Evidence) -> str:
+    there = evidence.present
+    idle = f"all {len(there)} agents were idle" if len(there) > 1 else "the agent was idle"
+    when = "" if evidence.ended_at_s is None else f" at {evidence.ended_at_s:.0f} s"
+    at = " when they were switched off" if set(there) <= set(evidence.switched_off) else when
+    chains = len({export.chain_of_block_hashes for export in there.values()})
+    uniform_s = uniform_at_s(evidence)
+    since = "" if uniform_s is None else f" since {uniform_s:.1f} s"
+    one = "one chain" if chains == 1 else f"{chains} distinct chains"
+    return f"{idle}{at}, with {one}{since}{without(evidence)}"
+
+
+def _not_finished(evidence: Evidence) -> str:
+    still = f"{recurring_cycles.named(evidence.busy)} {'were' if len(evidence.busy) > 1 else 'was'} not idle"
+    at = "" if evidence.ended_at_s is None else f" when the run ended at {evidence.ended_at_s:.0f} s"
+    connected = evidence.connected_since_s is not None
+    conditions = "" if connected else f", not fully connected ({evidence.network_at_end or 'conditions not on record'})"
+    return f"{still}{at}{conditions}; {_needed(evidence)}"
+
+
+def _needed(evidence: Evidence) -> str:
+    """How long it would still have taken, as far as anything tells: agents commit as fast as since the last block."""
+    waiting = sum(len(export.blocks_to_be_committed) for export in evidence.exports.values())
+    blocks = f"{waiting} block{'s' if waiting != 1 else ''} waited to be committed"
+    if not waiting:
+        return "no block waited any more, and nothing tells whether they would ever have been idle"
+    if not evidence.traces or evidence.ended_at_s is None:
+        return f"{blocks}, and without traces nothing tells how fast they were"
+    runs = [run for trace in evidence.traces.values() for run in trace.runs]
+    last_completed_s = max(
+        (run.t for run in runs if any(operation == "complete" for operation, _ in run.changes)), default=0.0
+    )
+    committed_at = [run.t for run in runs for operation, _ in run.changes if operation == "deque-"]
+    minutes = (evidence.ended_at_s - last_completed_s) / 60
+    if not any(at_s > evidence.ended_at_s - 30 * minutes for at_s in committed_at):
+        return f"{blocks}, and none was in the last {minutes / 2:.1f} minutes: nothing tells whether they ever would be"
+    rate = sum(at_s > last_completed_s for at_s in committed_at) / minutes
+    more = max(1, round(waiting / rate))
+    return f"{blocks}, at {rate:.2g} a minute: that would have taken {more} minute{'s' if more > 1 else ''} more"
+
+
+def _left_to_do(evidence: Evidence, agent_id: int) -> str:
+    export = evidence.exports[agent_id]
+    waiting, aside = len(export.blocks_to_be_committed), len(export.reconcile_stack)
+    doing = "in a reconcile" if export.reconcile_in_progress else "not in a reconcile"
+    return f"not idle at the end, {doing}; blocks to be committed: {waiting}, on the reconcile stack: {aside}"

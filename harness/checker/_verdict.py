@@ -1,0 +1,90 @@
+"""The whole verdict: six characteristics, what is judged beside them, and the figures."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from harness.checker import (
+    _all_committed,
+    _distributed,
+    _genuine,
+    _idle_committed,
+    _liveness,
+    _single_copy,
+    records,
+    steps,
+    uniform_chain,
+)
+from harness.checker._figures import figures
+from harness.checker.evidence import Evidence
+from harness.checker.judgement import Judgement
+from harness.checker.records import cross_examine
+from harness.checker.records._doubt import in_doubt
+from harness.scenario.verdict_names import JUDGED
+
+CHECKS = {
+    "1": _distributed.check,
+    "2": _idle_committed.check,
+    "3": _single_copy.check,
+    "4": _genuine.check,
+    "5": _all_committed.check,
+    "6": uniform_chain.check,
+}
+
+BESIDE: dict[str, Callable[[Evidence], Judgement]] = {
+    "steps": steps.check,
+    "records": records.check,
+    "liveness": _liveness.check,
+}
+"""Judgements that are not of the thesis, by their keys: see `harness.scenario.verdict_names`."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """`characteristics` by number; `beside` the judgements beside them, by key."""
+
+    characteristics: dict[str, Judgement]
+    figures: dict[str, float | int | None]
+    beside: dict[str, Judgement] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+    """A sentence for each file that could not be used, or not wholly."""
+    chains: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    """The hashes of the blocks in each agent's chain, the oldest first."""
+
+    @property
+    def judgements(self) -> dict[str, Judgement]:
+        """All of them, by number or key, in the order in which they are shown."""
+        return {**self.characteristics, **self.beside}
+
+    @property
+    def bad(self) -> tuple[str, ...]:
+        """Numbers and keys of what makes the exit status 1."""
+        return tuple(key for key, judgement in self.judgements.items() if judgement.kind == "bad")
+
+    def to_json(self) -> dict[str, Any]:
+        """The `characteristics`, `figures`, `errors` and judgements beside of `ucp-run/1`."""
+        return {
+            "characteristics": {
+                number: characteristic.to_json() for number, characteristic in self.characteristics.items()
+            },
+            **{key: judgement.to_json() for key, judgement in self.beside.items()},
+            "figures": self.figures,
+            "errors": self.errors,
+        }
+
+
+def check(evidence: Evidence) -> Result:
+    """Decide all six characteristics from the evidence, and what is judged beside them."""
+    chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}
+    if evidence.record is not None and evidence.record.outcome == "not supported":
+        reason = evidence.record.outcome_detail or "not supported by an agent"
+        unjudged = {key: Judgement(name, "not applicable", reason) for key, name in JUDGED.items()}
+        beside = {key: unjudged.pop(key) for key in BESIDE}
+        return Result(unjudged, figures(evidence), beside, evidence.errors, chains)
+    return Result(
+        {number: in_doubt(number, judge(evidence), evidence.once(cross_examine)) for number, judge in CHECKS.items()},
+        figures(evidence),
+        {key: judge(evidence) for key, judge in BESIDE.items()},
+        evidence.errors,
+        chains,
+    )

@@ -1,0 +1,110 @@
+"""Part of characteristic 1: nothing waits for anybody. A vote ends with its timer, as does each step of a reconcile.
+
+An agent that waits longer than its own timers say, waits for what will never happen.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from harness.archive.traces import Trace
+from harness.checker.evidence import Evidence
+from harness.checker.judgement import Finding
+from ucp.trace import HandlerRun
+
+SLACK_WALL_S = 1.0
+"""How late a loaded machine may run a timer before it counts as not run, in wall seconds."""
+
+RECONCILE_STEPS = frozenset(
+    (
+        "reconcile_begin",
+        "reconcile_phase_1",
+        "reconcile_phase_1_timer_expiration",
+        "reconcile_phase_2",
+        "reconcile_phase_2_timer_expiration",
+        "reconcile_phase_3",
+        "receive_response_block_for_hash",
+        "reconcile_phase_3_timer_expiration",
+        "reconcile_finalize",
+    )
+)
+NO_STEP = frozenset(("already in progress", "not in phase 3", "another block"))
+"""Branches of these handlers with which a reconcile does not go on."""
+
+
+def _goes_on(run: HandlerRun) -> bool:
+    return run.handler in RECONCILE_STEPS and run.branch not in NO_STEP
+
+
+VOTE_STEPS = frozenset(("process_next_deque_block", "vote_timer_expiration"))
+STEPS = RECONCILE_STEPS | VOTE_STEPS
+VOTE_TIMERS = ("vote_timeout_s",)
+RECONCILE_TIMERS = ("phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s")
+ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
+
+
+@dataclass(slots=True)
+class _Wait:
+    """What must go on within `longest` mission seconds, and since when, from which trace line on, it has not."""
+
+    what: str
+    longest: float
+    line: int = 0
+    since: float = math.inf
+    """Infinity while nothing waits."""
+
+    def finding(self, agent_id: int) -> Finding:
+        where = f"trace line {self.line}, t={self.since:g} s"
+        return Finding(agent_id, f"{where}: {self.what} within {self.longest:g} s")
+
+
+def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
+    """Every wait that lasted longer than the agent's own timers, while it was not paused."""
+    for agent_id, trace in evidence.traces.items():
+        if evidence.unknown_word("handler", "branch", agent_id=agent_id):
+            continue  # what goes on, and what waits, is told by these
+        vote_s, reconcile_s = longest(trace, VOTE_TIMERS), longest(trace, RECONCILE_TIMERS)
+        for life in trace.lives():
+            vote = _Wait("a vote began and did not end", vote_s)
+            reconcile = _Wait("a reconcile did not go on", reconcile_s)
+            yield from _in_life(evidence, agent_id, life, vote, reconcile)
+        whole = agent_id in evidence.exports and not trace.problem
+        if whole and (ended_at_s := evidence.end_of(agent_id)) is not None:
+            yield from _overdue(evidence, agent_id, ended_at_s, vote, reconcile)
+
+
+def _in_life(
+    evidence: Evidence, agent_id: int, life: Iterator[tuple[int, HandlerRun]], vote: _Wait, reconcile: _Wait
+) -> Iterator[Finding]:
+    for line, run in life:
+        step = run.handler in STEPS
+        if run.handler == "vote_timer_expiration":
+            vote.since = math.inf
+        elif step and _goes_on(run):
+            reconcile.since = math.inf
+        if run.t > vote.since + vote.longest or run.t > reconcile.since + reconcile.longest:
+            yield from _overdue(evidence, agent_id, run.t, vote, reconcile)
+        if run.branch == "proposed":
+            vote.line, vote.since = line, run.t
+        elif step and _goes_on(run) and run.state.reconciling:
+            reconcile.line, reconcile.since = line, run.t
+
+
+def _overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) -> Iterator[Finding]:
+    for wait in waits:
+        if now > wait.since + wait.longest:
+            if not evidence.was_paused(agent_id, wait.since, now):
+                yield wait.finding(agent_id)
+            wait.since = math.inf
+
+
+def longest(trace: Trace, timers: tuple[str, ...]) -> float:
+    """The longest of these timers in mission seconds, with slack for the machine; infinity if that is not known."""
+    settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
+    if not all(isinstance(setting, int | float) for setting in settings):
+        return math.inf
+    speedup, drift = trace.header.clock.get("speedup", 1), trace.header.clock.get("drift", 0)
+    if not isinstance(speedup, int | float) or not isinstance(drift, int | float) or drift <= -1:
+        return math.inf
+    return float(max(settings)) / (1 + drift) + SLACK_WALL_S * speedup

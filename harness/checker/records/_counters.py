@@ -1,0 +1,139 @@
+"""What run.json says of an agent against its trace: its lives, and what it counted itself."""
+
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from collections.abc import Iterator
+
+from harness.archive.run_record import AgentRecord, HandlerRuns
+from harness.archive.traces import Trace
+from harness.checker._trace_replay import Life
+from harness.checker.evidence import Evidence
+from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
+from ucp.messages import Datagram, datagram_bytes
+from ucp.secure.envelope import ADDED_BYTES
+from ucp.trace import Commanded, Dropped, Recorded
+
+ROUNDED_S = 5e-4
+"""run.json has milliseconds."""
+
+
+def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """What an agent counted is what its trace has, as far as it had been written by then."""
+    for agent_id, trace in evidence.traces.items():
+        recorded = evidence.recorded(agent_id)
+        if recorded is None or trace.problem:
+            continue
+        lives = evidence.lives[agent_id]
+        yield from _lives(agent_id, recorded, lives)
+        yield from _handler_runs(agent_id, recorded, trace, lives)
+        yield from _counted(evidence, agent_id, recorded, trace, lives)
+        export = evidence.exports.get(agent_id)
+        if export is not None and recorded.outcome == "exported" and recorded.idle not in (None, export.idle):
+            idle, not_idle = ("idle", "not idle") if recorded.idle else ("not idle", "idle")
+            yield of_agent(agent_id, f"by run.json it was {idle} at the end, and by its export {not_idle}")
+        yield from _dropped(agent_id, recorded, trace)
+        if trace.cut_off and recorded.outcome == "exported":
+            yield of_agent(agent_id, "its trace ends in half a line, and the agent ended by itself", short=True)
+
+
+def _lives(agent_id: int, recorded: AgentRecord, lives: list[Life]) -> Iterator[Contradiction]:
+    expected = 1 + recorded.restarts + recorded.reboots
+    if len(lives) != expected:
+        detail = f"its trace has {_count(len(lives), 'header')}, and by run.json it began {_count(expected, 'time')}"
+        yield of_agent(agent_id, detail, short=len(lives) < expected)
+
+
+def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]) -> Iterator[Contradiction]:
+    """As many as it counted have a line, of those that ran until it was asked."""
+    expected = 1 + recorded.restarts + recorded.reboots
+    if len(recorded.handler_runs) not in (0, expected):
+        counts = _count(len(recorded.handler_runs), "count")
+        yield of_agent(agent_id, f"run.json has {counts} of its handler runs, and it began {_count(expected, 'time')}")
+    if len(recorded.handler_runs) != len(lives):
+        return  # of agents that count none, and where lives are lacking anyway
+    for life, counted in zip(lives, recorded.handler_runs, strict=True):
+        if counted is None:
+            continue
+        at_least, at_most = _lines_by(life, counted)
+        if not at_least <= counted.counted <= at_most:
+            lines = at_most if counted.counted > at_most else at_least
+            detail = (
+                f"it had counted {_count(counted.counted, 'handler run')} at {counted.until_s:g} s, and its trace has "
+                f"{_count(lines, 'line')} of them"
+            )
+            yield of_agent(agent_id, detail, "1", short=counted.counted > at_most)
+
+
+def _lines_by(life: Life, counted: HandlerRuns) -> tuple[int, int]:
+    """How many lines there are, at least and at most, of what had run when the agent was asked."""
+    if in_virtual_time(life.trace):
+        return len(life.runs), len(life.runs)
+    slack = ROUNDED_S + (slack_s(life.trace) if counted.from_s < counted.until_s else 0.0)
+    return (
+        bisect_left(life.runs, counted.from_s - slack, key=lambda run: run.t),
+        bisect_right(life.runs, counted.until_s + slack, key=lambda run: run.t),
+    )
+
+
+def _counted(
+    evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]
+) -> Iterator[Contradiction]:
+    """What it counted itself over all its lives."""
+    sent = sum(life.sent for life in lives)
+    if recorded.messages_sent is not None and recorded.messages_sent != sent:
+        detail = f"by run.json it sent {_count(recorded.messages_sent, 'message')}, and by its trace {sent}"
+        yield of_agent(agent_id, detail, "1")
+    sent_bytes = _bytes_sent(trace) if trace.header.has_inputs else None
+    if sent_bytes is not None and recorded.bytes_sent is not None and recorded.bytes_sent > sent_bytes:
+        yield of_agent(agent_id, f"by run.json it sent {recorded.bytes_sent} bytes, and by its trace {sent_bytes}", "1")
+    if recorded.reconciles is not None and not evidence.unknown_word("handler", "branch", agent_id=agent_id):
+        begun = sum([run.handler == "reconcile_begin" and run.branch == "begun" for run in trace.runs])
+        if recorded.reconciles != begun:
+            detail = f"by run.json it began {_count(recorded.reconciles, 'reconcile')}, and by its trace {begun}"
+            yield of_agent(agent_id, detail)
+    if recorded.chain_changed_at_s is not None and not any(life.unknown for life in lives):
+        changed_at_s = _chain_changed_at(lives[-1])
+        if abs(recorded.chain_changed_at_s - changed_at_s) > ROUNDED_S + slack_s(trace):
+            detail = (
+                f"by run.json its chain changed last at {recorded.chain_changed_at_s:g} s, and by its trace at "
+                f"{changed_at_s:g} s"
+            )
+            yield of_agent(agent_id, detail)
+
+
+def _bytes_sent(trace: Trace) -> int | None:
+    """In datagrams as they were on the air; revocations, which an agent tells of beside the protocol, are not known."""
+    if any(isinstance(aside, Commanded) and aside.command == "revoke" for _, aside in trace.asides):
+        return None
+    added = ADDED_BYTES if trace.header.secured else {}
+    sent = [message for run in trace.runs for message in run.sent]
+    return sum([_bytes(message.datagram) + added.get(message.message, 0) for message in sent if message.datagram])
+
+
+def _bytes(datagram: Recorded) -> int:
+    """Of base64 four characters are three bytes."""
+    if isinstance(datagram.content, Datagram):
+        return datagram_bytes(datagram.content.message)
+    return len(datagram.text) // 4 * 3 - datagram.text.count("=", -2)
+
+
+def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Contradiction]:
+    """What it counted as dropped has a line; it may have dropped more since it was asked."""
+    if recorded.dropped is None or not trace.header.has_inputs:
+        return
+    traced = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, Dropped))
+    for reason, count in recorded.dropped.items():
+        if traced[reason] < count:
+            detail = f"by run.json it dropped {_count(count, 'datagram')} ({reason}), and by its trace {traced[reason]}"
+            yield of_agent(agent_id, detail, short=True)
+
+
+def _chain_changed_at(life: Life) -> float:
+    for run in reversed(life.runs):
+        if any(operation.startswith("chain") for operation, _ in run.changes):
+            return run.t
+    return 0.0
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if number != 1 else ''}"

@@ -1,0 +1,128 @@
+"""An export against its agent's trace: the trace must have led to it when it was made.
+
+An export says when that was. What a trace has until then ends in a state, whose top chain hash stands for all blocks of
+the chain and their order.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+from dataclasses import astuple
+
+from harness.archive.exports import Export
+from harness.archive.traces import Trace
+from harness.checker._trace_replay import Life
+from harness.checker.evidence import Evidence
+from harness.checker.records.contradiction import ROUNDED_S, Contradiction, mission_s, of_agent
+from ucp.trace import StateSummary
+
+FIELDS = {
+    "chain": "blocks in the chain",
+    "deque": "blocks to be committed",
+    "stack": "blocks on the reconcile stack",
+    "reconciling": "reconciling",
+    "idle": "idle",
+    "top": "top chain hash",
+}
+
+
+def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """An export is a state to which its trace has led, in all that it holds and in its order."""
+    for agent_id, export in evidence.exports.items():
+        trace = evidence.traces.get(agent_id)
+        if trace is None or trace.problem:
+            continue
+        state, lives = _state(export), evidence.lives[agent_id]
+        if lives[-1].runs and state == lives[-1].runs[-1].state:
+            yield from _contents(agent_id, export, lives[-1])
+        elif state not in _states_when(export, trace):
+            yield _otherwise(agent_id, "its export", state, _last_state(lives, export), short=True)
+    for agent_id, export in evidence.before_final_reconcile.items():
+        yield from _before_final_reconcile(evidence, agent_id, export)
+
+
+def _before_final_reconcile(evidence: Evidence, agent_id: int, export: Export) -> Iterator[Contradiction]:
+    what = "its export before the final reconcile"
+    if evidence.roster is not None and agent_id not in evidence.roster:
+        yield of_agent(agent_id, f"{what} is of no agent of this run")
+    trace = evidence.traces.get(agent_id)
+    if trace is None or trace.problem:
+        return
+    states = _states_when(export, trace)
+    if states and _state(export) not in states:
+        yield _otherwise(agent_id, what, _state(export), states[-1])
+    elif any(life.unknown for life in evidence.lives[agent_id]):
+        return
+    elif export.completed not in _completed_when(export, evidence.lives[agent_id]):
+        yield of_agent(agent_id, f"{what} names other blocks that it had completed than its trace", "5")
+
+
+def _state(export: Export) -> StateSummary:
+    return StateSummary(
+        len(export.chain),
+        len(export.blocks_to_be_committed),
+        len(export.reconcile_stack),
+        export.reconcile_in_progress,
+        export.idle,
+        export.top_chain_hash,
+    )
+
+
+def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
+    """The states that the agent may have been in when it was exported: more than one if runs fall into that instant."""
+    at_s = mission_s(export.exported_at_us, trace.header)
+    if at_s is None:
+        return []
+    first = bisect_left(trace.runs, at_s - ROUNDED_S, key=lambda run: run.t)
+    behind = bisect_right(trace.runs, at_s + ROUNDED_S, key=lambda run: run.t)
+    states = [run.state for run in trace.runs[max(0, first - 1) : behind]]
+    if first == 0 or any(first <= start <= behind for start in trace.starts):
+        states.insert(0, StateSummary(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash))
+    return states
+
+
+def _completed_when(export: Export, lives: list[Life]) -> list[list[str]]:
+    """What each life of the agent had completed when it was exported."""
+    at_s = mission_s(export.exported_at_us, lives[0].trace.header)
+    if at_s is None:
+        return [export.completed]
+    by_then = [[run for run in life.runs if run.changes and run.t <= at_s + ROUNDED_S] for life in lives]
+    return [[block for run in runs for operation, block in run.changes if operation == "complete"] for runs in by_then]
+
+
+def _last_state(lives: list[Life], export: Export) -> StateSummary:
+    runs = lives[-1].runs
+    return (
+        runs[-1].state if runs else StateSummary(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash)
+    )
+
+
+def _otherwise(
+    agent_id: int, what: str, exported: StateSummary, traced: StateSummary, *, short: bool = False
+) -> Contradiction:
+    differing = [
+        (name, f"{FIELDS[name]} {_value(ours)}, not {_value(theirs)}")
+        for name, ours, theirs in zip(FIELDS, astuple(exported), astuple(traced), strict=True)
+        if ours != theirs
+    ]
+    touches = "6" if {"chain", "top"} & {name for name, _ in differing} else "2"
+    detail = f"{what} is not what its trace has led to by then: {', '.join(text for _, text in differing)}"
+    return of_agent(agent_id, detail, touches, short=short)
+
+
+def _value(value: object) -> str:
+    return value[:12] if isinstance(value, str) else str(value).lower()
+
+
+def _contents(agent_id: int, export: Export, life: Life) -> Iterator[Contradiction]:
+    """The blocks of an export that the whole trace has led to, as far as its lengths and its top tell."""
+    if life.otherwise or life.another_top or life.impossible or life.unknown:
+        return
+    for place, exported, traced, touches in (
+        ("chain", export.chain, life.chain, "6"),
+        ("deque", export.blocks_to_be_committed, life.deque, "2"),
+        ("reconcile stack", export.reconcile_stack, life.stack, "2"),
+    ):
+        if [block.block_hash for block in exported] != traced:
+            yield of_agent(
+                agent_id, f"its export has other blocks in the {place} than its trace, or in another order", touches
+            )

@@ -1,0 +1,62 @@
+"""What an agent heard against what others sent: nothing is heard before it is sent, and a block comes as it went."""
+
+from collections.abc import Iterator
+
+from harness.checker._trace_replay import Sight
+from harness.checker.evidence import Evidence, Sending
+from harness.checker.records._trace_consistency import finding
+from harness.checker.records.contradiction import Contradiction, slack_s
+from ucp.messages import BlockResponse, CommitBlock
+from ucp.trace import HandlerRun, Recorded
+
+CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
+
+
+def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """What was heard of a message is what its sender sent, and after it was sent."""
+    slack = max(map(slack_s, evidence.traces.values()), default=0.0)
+    sendings = evidence.sendings
+    for agent_id, lives in evidence.lives.items():
+        for life in lives:
+            for line, run in life.numbered():
+                trigger = run.trigger
+                if "seq" not in trigger:
+                    continue
+                sent = sendings.get(trigger.get("from"), {}).get(trigger.get("message"), {}).get(trigger["seq"])
+                if sent is None:
+                    continue  # what nobody sent is characteristic 1's to say
+                first_s, message = sent[0]
+                told = message.datagram
+                as_it_went = told is not None and (run.input is told or run.input == told)
+                if as_it_went and run.t >= first_s - slack and not run.changes:
+                    continue  # most are like this
+                if not evidence.injected.may_be(trigger):
+                    for sight, touches in _unlike(line, run, sent, first_s - slack):
+                        yield Contradiction(finding(evidence, agent_id, sight), touches)
+
+
+def _unlike(line: int, run: HandlerRun, sent: Sending, earliest_s: float) -> Iterator[tuple[Sight, str]]:
+    """What was heard otherwise than it was sent, and the characteristic that it touches."""
+    if run.t < earliest_s:
+        yield Sight(line, run, f"heard {_named(run)}, which was sent at {sent[0][0]:g} s"), "1"
+    if run.input is not None and not _as_it_went(run.input, sent):
+        yield Sight(line, run, f"heard {_named(run)} with another content than it was sent with"), "1"
+    elif run.changes and (other := _another_block(run, sent)):
+        yield Sight(line, run, f"took this block from {_named(run)}, which carried another", other), "4"
+
+
+def _named(run: HandlerRun) -> str:
+    return "{message} number {seq} of agent {from}".format(**run.trigger)
+
+
+def _as_it_went(datagram: Recorded, sent: Sending) -> bool:
+    told = [message.datagram for _, message in sent]
+    return None in told or datagram in told
+
+
+def _another_block(run: HandlerRun, sent: Sending) -> str | None:
+    """The block that the agent took onto its chain from a message that did not carry it."""
+    if run.trigger["message"] not in CARRY_A_BLOCK:
+        return None
+    carried = {message.block for _, message in sent}
+    return next((block for operation, block in run.changes if operation == "chain+" and block not in carried), None)

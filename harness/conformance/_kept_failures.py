@@ -1,0 +1,111 @@
+"""Files kept of each failure, among them a scenario that gives the agent the same inputs.
+
+failure.txt       what was expected and what came
+vector.jsonl      the inputs and answers that lead there, as `COMMAND --virtual` reads and writes them
+scenario.yaml     the same as a scenario, for `ucp-harness run --backend sim`
+air.pcapng        what crossed the air, for Wireshark and `ucp-harness packets`
+
+It can be played in virtual time, and then has all that a run has: its report, its trace, each step judged.
+"""
+
+import base64
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from harness.conformance._observation import Exchange
+from harness.conformance._reference_model import AGENT, INITIAL_DATA, PEERS, ROSTER
+from harness.conformance._state_space import VARIANTS, Variant
+from harness.conformance._udp_lab import AGENTS, PEERS_ON
+from harness.conformance._virtual_lines import Writer
+from harness.conformance.results import Case
+from harness.conformance.results_table import lines_of
+from harness.errors import MachineError
+from harness.scenario.scenario_file import Document, to_yaml
+from netem.capture import begin_file
+from netem.frames import udp_broadcast
+from netem.pcapng import PcapngFile
+from ucp.messages import PORT, decode
+from ucp.settings import Settings
+
+COMMENT = (
+    "Play it with `ucp-harness run FILE --backend sim`, for an agent that has virtual time.",
+    "Its verdict on every step says where the agent did otherwise than Algorithms 1 to 20.",
+)
+
+
+def scenario_of(name: str, command: Sequence[str], variant: Variant, way: Sequence[str]) -> str:
+    """The file."""
+    script: list[Document] = []
+    datagrams: list[Document] = []
+    timeline: list[Document] = [{"at_s": 0, "kill": list(PEERS)}]
+    writer = Writer(variant)
+    for line in writer.lines(way):
+        match line.given:
+            case {"t": at_s, "datagram": datagram}:
+                source = decode(base64.b64decode(datagram)).sender
+                datagrams.append({"source": source, "datagram": datagram, "reaches": {AGENT: at_s}})
+            case {"t": at_s, "event_id": event_id, "data": data, "timestamp_us": timestamp_us}:
+                event = {"event_id": event_id, "data": data, "timestamp_us": timestamp_us}
+                script.append({"at_s": at_s, "agent": AGENT, **event})
+            case {"t": at_s, "command": asked}:
+                timeline.append({"at_s": at_s, asked: [AGENT]})
+    document: Document = {
+        "name": name,
+        "agents": list(ROSTER),
+        "agent_command": {AGENT: list(command)},
+        "duration_s": math.ceil(writer.now) + 1,
+        "initial_data": base64.b64encode(INITIAL_DATA).decode("ascii"),
+        "settings": _unusual(variant.settings.told()),
+        "timeline": timeline,
+        "events": {"source": "scripted"} | ({"script": script} if script else {}),
+        "datagrams": datagrams,
+    }
+    return to_yaml({key: value for key, value in document.items() if value not in ({}, [])}, COMMENT)
+
+
+def _unusual(settings: dict[str, Any]) -> dict[str, Any]:
+    usual = Settings().told()
+    return {name: value for name, value in settings.items() if name not in usual or usual[name] != value}
+
+
+EPOCH_US = 1_700_000_000_000_000
+"""Of the capture: mission second 0."""
+
+
+def keep(case: Case, command: Sequence[str], directory: Path) -> None:
+    """Raises MachineError if the disk refuses."""
+    try:
+        directory.mkdir(parents=True)
+        (directory / "failure.txt").write_text("\n".join(lines_of(case)) + "\n", encoding="utf-8")
+        if case.settings in VARIANTS:
+            _write_vector(case, directory / "vector.jsonl")
+            scenario = scenario_of(case.name, command, VARIANTS[case.settings], case.inputs)
+            (directory / "scenario.yaml").write_text(scenario, encoding="utf-8")
+        if case.exchanges:
+            _write_capture(case.exchanges, directory)
+    except OSError as error:
+        raise MachineError(f"{directory} cannot be written: {error.strerror}") from None
+
+
+def _write_vector(case: Case, path: Path) -> None:
+    writer = Writer(VARIANTS[case.settings])
+    with path.open("w", encoding="utf-8") as file:
+        file.write(json.dumps({"in": writer.first(), "out": {"sent": [], "timer": None}}) + "\n")
+        for line in writer.lines(case.inputs):
+            file.write(
+                json.dumps({"in": line.given, "out": line.answer, "says": line.says, "sends": line.sends}) + "\n"
+            )
+
+
+def _write_capture(exchanges: Sequence[Exchange], directory: Path) -> None:
+    path = directory / "air.pcapng"
+    begin_file(directory, AGENTS, EPOCH_US, 1.0).rename(path)
+    capture = PcapngFile(path)
+    for exchange in exchanges:
+        at_ns = EPOCH_US * 1000 + round(exchange.t * 1e9)
+        frame = udp_broadcast(AGENTS if exchange.sent else PEERS_ON, PORT, exchange.data)
+        capture.packet(at_ns, frame, outbound=exchange.sent)
+    capture.close()

@@ -1,0 +1,306 @@
+"""The air of conformance: one lab of two vehicles; on the first are the agents under test, the second is all peers.
+
+Each agent has a port of its own, on which nobody but the harness hears it, so that many can be tested side by side.
+"""
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import struct
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from harness.conformance import _ports
+from harness.conformance._state_space import Variant
+from harness.conformance._subject import NO_KEYS, mission
+from harness.errors import HarnessError, MachineError
+from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
+from netem.errors import LabUnavailable, NetemError, SpawnError
+from netem.lab import Lab, LabProcess
+
+AGENTS, PEERS_ON = 1, 2
+"""The lab's vehicles."""
+FIRST_PORT = 14600
+MAX_READ_BYTES = 65536
+START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
+LOOK_AGAIN_S = 0.01
+MAX_OUTPUT_BYTES = 16 * 1024 * 1024
+"""Of an agent that is not yet ready."""
+_SO_TIMESTAMPNS = 35
+"""Linux; Python has no name for it."""
+_TIMESPEC = struct.Struct("@qq")
+ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
+UNSUPPORTED = 127
+"""With this status ends an agent that lacks a feature that its mission needs."""
+
+
+class NoAgentError(HarnessError):
+    """The agent does not start at all: nothing can be said of it."""
+
+
+class UnsupportedError(Exception):
+    """The agent says that it lacks a feature of its mission: its sentence."""
+
+
+class AgentEndedError(Exception):
+    """The agent ended by itself, or does not answer: how."""
+
+
+class Air:
+    """Opened by `async with Air(place, command, jobs)`; hands out free ports."""
+
+    def __init__(self, place: Path, command: Sequence[str], count: int) -> None:
+        self.place = place
+        self.command = tuple(command)
+        self._ports = [FIRST_PORT + number for number in range(count)]
+        self._lab: Lab | None = None
+        self._sockets: dict[int, socket.socket] = {}
+        self._lives = 0
+
+    async def __aenter__(self) -> Self:
+        try:
+            self._lab = await Lab.open((AGENTS, PEERS_ON), log=self.place / "lab.log")
+            try:
+                self._sockets = dict(zip(self._ports, await self._open_sockets(), strict=True))
+            except BaseException:
+                await self._lab.close()
+                raise
+        except LabUnavailable as error:
+            raise MachineError(str(error)) from None
+        except NetemError as error:
+            raise MachineError(f"the lab failed: {error}") from None
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for air in self._sockets.values():
+            air.close()
+        await self.lab.close()
+
+    @property
+    def lab(self) -> Lab:
+        assert self._lab is not None, "it is open"
+        return self._lab
+
+    async def _open_sockets(self) -> list[socket.socket]:
+        name = "sockets"
+        directory = os.open(self.place, os.O_PATH)
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+                listener.bind(f"/proc/self/fd/{directory}/{name}")  # an address holds 107 bytes
+                listener.listen(1)
+                listener.setblocking(False)
+                helper = await self.lab.spawn(
+                    PEERS_ON,
+                    [sys.executable, "-P", "-m", _ports.__name__, name, *map(str, self._ports)],
+                    cwd=self.place,
+                    env=dict(os.environ),
+                    stdout=self.place / "ports.log",
+                    stderr=self.place / "ports.log",
+                )
+                loop = asyncio.get_running_loop()
+                accepting = asyncio.create_task(loop.sock_accept(listener))
+                ending = asyncio.create_task(helper.wait())
+                await asyncio.wait({accepting, ending}, return_when=asyncio.FIRST_COMPLETED)
+                ending.cancel()
+                if not accepting.done():
+                    accepting.cancel()
+                    raise MachineError(f"no sockets in the lab: {last_line(self.place / 'ports.log')}")
+                connection, _ = accepting.result()
+        finally:
+            os.close(directory)
+        with connection:
+            connection.setblocking(True)
+            descriptors: list[int] = []
+            while len(descriptors) < len(self._ports):
+                _, some, _, _ = socket.recv_fds(connection, 1, _ports.AT_ONCE)
+                if not some:
+                    raise MachineError(f"no sockets in the lab: {last_line(self.place / 'ports.log')}")
+                descriptors += some
+        sockets = [socket.socket(fileno=descriptor) for descriptor in descriptors]
+        for air in sockets:
+            air.setblocking(False)
+        return sockets
+
+    def mission(self, variant: Variant, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS) -> dict[str, Any]:
+        """The mission file of an agent on this port."""
+        address = self.lab.addresses[AGENTS]
+        return mission(variant, address=address, broadcast=self.lab.broadcast, port=port, speedup=speedup, keys=keys)
+
+    def take_port(self) -> int:
+        return self._ports.pop()
+
+    def give_back(self, port: int) -> None:
+        self._ports.append(port)
+
+    def new_directory(self) -> Path:
+        self._lives += 1
+        directory = self.place / f"life-{self._lives}"
+        directory.mkdir()
+        return directory
+
+    def socket_of(self, port: int) -> socket.socket:
+        return self._sockets[port]
+
+
+class Ear:
+    """What is heard on a port, as (when, datagram), and said there.
+
+    Seconds since the Unix epoch at which the kernel had it: however late the harness comes to read it.
+    """
+
+    def __init__(self, air: Air, port: int) -> None:
+        self._socket = air.socket_of(port)
+        self._broadcast = (air.lab.broadcast, port)
+        self._own_address = air.lab.addresses[PEERS_ON]
+        self._arrived = asyncio.Event()
+        self.heard: list[tuple[float, bytes]] = []
+        self.record: list[tuple[float, bool, bytes]] = []
+        """All that crossed the air: when, whether the agent sent it, what."""
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        with suppress(BlockingIOError):
+            while True:
+                self._socket.recv(MAX_READ_BYTES)  # of an earlier life
+        asyncio.get_running_loop().add_reader(self._socket, self.drain)
+
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._socket)
+
+    def drain(self) -> None:
+        """Take in what waits in the socket."""
+        with suppress(BlockingIOError):
+            while True:
+                data, ancillary, _, (address, _) = self._socket.recvmsg(MAX_READ_BYTES, ANCILLARY_BYTES)
+                if address != self._own_address:
+                    at_s = _stamped(ancillary)
+                    self.heard.append((at_s, data))
+                    self.record.append((at_s, True, data))
+                    self._arrived.set()
+
+    async def arrival(self, until: float) -> None:
+        """Wait until something more arrives, or it is `until`, in seconds since the Unix epoch."""
+        self._arrived.clear()
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._arrived.wait(), max(0.0, until - time.time()))
+
+    def take(self) -> list[tuple[float, bytes]]:
+        self.drain()
+        heard, self.heard = self.heard, []
+        return heard
+
+    def say(self, data: bytes) -> None:
+        self.record.append((time.time(), False, data))
+        with suppress(BlockingIOError):
+            self._socket.sendto(data, self._broadcast)
+
+
+class Process:
+    """An agent as a process, from its start to its end, with the files that it leaves."""
+
+    def __init__(self, air: Air, directory: Path, agent_id: int, process: LabProcess) -> None:
+        self._air = air
+        self.directory = directory
+        self.agent_id = agent_id
+        self.process = process
+        self.control = AgentControl(directory / f"{agent_id}.control")
+        self.output = directory / f"{agent_id}.out"
+
+    @classmethod
+    async def start(cls, air: Air, directory: Path, mission: dict[str, Any] | bytes, agent_id: int) -> "Process":
+        """It may not be ready yet. Raises NoAgentError if there is no such program."""
+        name = f"{agent_id}.mission.json"
+        text = mission if isinstance(mission, bytes) else json.dumps(mission).encode()
+        (directory / name).write_bytes(text)
+        output = directory / f"{agent_id}.out"
+        try:
+            process = await air.lab.spawn(
+                AGENTS,
+                [*air.command, name],
+                cwd=directory,
+                env=dict(os.environ),
+                stdout=output,
+                stderr=output,
+                role="agent",
+            )
+        except SpawnError as error:
+            raise NoAgentError(str(error)) from None
+        return cls(air, directory, agent_id, process)
+
+    async def ready(self) -> dict[str, Any]:
+        """Its first status. Raises UnsupportedError, AgentEndedError."""
+        deadline = time.monotonic() + START_LIMIT_S
+        while True:
+            try:
+                return await self.control.ask("status", timeout_s=ANSWER_LIMIT_S)
+            except AgentRefusedError as error:
+                raise AgentEndedError(f"it refuses the command status: {error}") from None
+            except AgentSilentError:
+                if self.process.returncode is not None:
+                    self.raise_end()
+                if time.monotonic() > deadline:
+                    reason = f"its control socket did not answer within {START_LIMIT_S:g} s"
+                    raise AgentEndedError(f"{reason}: {last_line(self.output)}") from None
+                if self.output.stat().st_size > MAX_OUTPUT_BYTES:
+                    raise AgentEndedError("it prints and prints, and does not answer its control socket") from None
+                await asyncio.sleep(LOOK_AGAIN_S)
+
+    def raise_end(self) -> None:
+        """Raises what its end means."""
+        if self.process.returncode == UNSUPPORTED:
+            raise UnsupportedError(last_line(self.output))
+        raise AgentEndedError(f"it ended with {self.process.end}: {last_line(self.output)}")
+
+    async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
+        """Raises AgentEndedError if it does not answer, AgentRefusedError if it refuses."""
+        try:
+            return await self.control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
+        except AgentSilentError as error:
+            if self.process.returncode is not None:
+                self.raise_end()
+            raise AgentEndedError(str(error)) from None
+
+    async def export(self) -> dict[str, Any]:
+        """Its chain export, made now. Raises AgentEndedError, AgentRefusedError."""
+        answer = await self.ask("export")
+        path = self.directory / f"{self.agent_id}.chain.json"
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise AgentEndedError(f"its export {answer.get('path')!r} cannot be read: {error}") from None
+        if not isinstance(document, dict):
+            raise AgentEndedError("its export is not a JSON object")
+        return document
+
+    async def kill(self) -> None:
+        self.control.close()
+        await self.process.send_signal(signal.SIGKILL)
+        await self.process.wait()
+
+    async def terminate(self) -> int:
+        self.control.close()
+        return await self.process.terminate(GRACE_S)
+
+
+def _stamped(ancillary: Sequence[tuple[int, int, bytes]]) -> float:
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
+            seconds, nanoseconds = _TIMESPEC.unpack_from(data)
+            return float(seconds + nanoseconds / 1e9)
+    return time.time()
+
+
+def last_line(path: Path) -> str:
+    if not path.exists():
+        return "it said nothing"
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - MAX_READ_BYTES))
+        lines = file.read().decode("utf-8", errors="replace").split("\n")
+    return next((line.strip()[:300] for line in reversed(lines) if line.strip()), "it said nothing")

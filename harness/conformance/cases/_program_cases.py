@@ -1,0 +1,200 @@
+"""The program: how it starts and ends, which missions it refuses, and its control socket."""
+
+import asyncio
+import json
+import os
+import signal
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
+
+from harness.conformance._reference_model import PEERS
+from harness.conformance._state_space import VARIANTS
+from harness.conformance._subject import NO_KEYS
+from harness.conformance._udp_lab import UNSUPPORTED, last_line
+from harness.conformance.cases._bench import INCEPTION, PATIENCE_S, SPEEDUP, Alone, Bench, WrongError, case, must
+from harness.play.agent_control import AgentRefusedError
+from ucp.messages import ChainContainQuery
+
+WRONG_MISSION = 2
+
+
+async def _refused(agent: Alone, command: str, why: str, **arguments: Any) -> None:
+    try:
+        await agent.process.ask(command, **arguments)
+    except AgentRefusedError:
+        return
+    raise WrongError(f"`ok` false to {command} {why}", "it said `ok` true")
+
+
+@case("before its mission starts an agent answers nobody, and refuses to log and to reconcile", "contract, The program")
+async def _not_started(bench: Bench) -> None:
+    async with bench.agent(started=False) as agent:
+        must((await agent.status()).get("started") is False, "`started` false", "not")
+        agent.say(PEERS[0], ChainContainQuery(INCEPTION))
+        await agent.hear_nothing("before its mission starts")
+        await _refused(agent, "log", "before the mission starts", event_id=1, data="")
+        await _refused(agent, "reconcile", "before the mission starts")
+        await agent.begin()
+        await agent.answers_only(INCEPTION, "the start")
+        await _refused(agent, "start", "once more", epoch_us=1)
+
+
+@case("an agent that joins a mission under way has its time", "contract, Time")
+async def _joins(bench: Bench) -> None:
+    async with bench.agent(started=False) as agent:
+        await agent.begin(ahead_s=-100.0)
+        status = await agent.status()
+        must(status.get("started") is True, "`started` true", status.get("started"))
+        shown = status.get("mission_s")
+        if shown is not None:
+            right = isinstance(shown, int | float) and 0 <= shown - 100.0 * SPEEDUP < PATIENCE_S * SPEEDUP
+            must(right, f"mission second {100 * SPEEDUP:g} or a little later", shown)
+        await agent.answers_only(INCEPTION, "a start long ago")
+
+
+@case("until its mission's second 0 has come the time is 0", "contract, Time")
+async def _ahead(bench: Bench) -> None:
+    async with bench.agent(started=False) as agent:
+        await agent.begin(ahead_s=30.0)
+        shown = (await agent.status()).get("mission_s")
+        must(shown in (None, 0), "mission second 0", shown)
+
+
+async def _ends(bench: Bench, number: int) -> None:
+    async with bench.agent() as agent:
+        await agent.log(b"event")
+        await agent.hear(1, "a Block Add Request")
+        await agent.process.process.send_signal(number)
+        returned = await agent.end()
+        must(returned == 0, "exit status 0", f"status {returned}")
+        path = agent.process.directory / f"{agent.agent_id}.chain.json"
+        must(path.exists(), "a chain export", "none")
+        export = json.loads(path.read_text(encoding="utf-8"))
+        must(len(export["completed"]) == 1, "one completed block in the export", len(export["completed"]))
+        socket = agent.process.directory / f"{agent.agent_id}.control"
+        must(not socket.exists(), "no control socket any more", "it is there")
+
+
+@case("SIGTERM exports the chain and ends with 0", "contract, The program")
+async def _sigterm(bench: Bench) -> None:
+    await _ends(bench, signal.SIGTERM)
+
+
+@case("SIGINT exports the chain and ends with 0", "contract, The program")
+async def _sigint(bench: Bench) -> None:
+    await _ends(bench, signal.SIGINT)
+
+
+async def _ends_with(
+    bench: Bench, status: int, what: str, keys: Mapping[str, Any] = NO_KEYS, text: bytes | None = None
+) -> None:
+    async with bench.program(keys, text=text) as agent:
+        returned = await agent.end()
+        must(returned == status, f"exit status {status} for {what}", f"status {returned}")
+        must(last_line(agent.process.output) != "it said nothing", f"a sentence on standard error for {what}", "none")
+
+
+_BROKEN: dict[str, bytes] = {
+    "a mission that is not JSON": b"{",
+    "an empty mission": b"",
+    "a list as mission": b"[]",
+    "a mission nested a hundred thousand deep": b"[" * 100_000,
+    "a mission that is not UTF-8": b"\xff\xfe{}",
+}
+_WRONG: dict[str, dict[str, Any]] = {
+    "another schema": {"schema": "ucp-mission/99"},
+    "an agent that is not on the roster": {"roster": [2, 3]},
+    "agent 0": {"agent_id": 0, "roster": [0, 2]},
+    "an empty roster": {"roster": []},
+    "initial data that is not base64": {"initial_data": "***"},
+    "a port that is none": {"network": {"address": "10.77.0.1", "broadcast": "10.79.255.255", "port": 70000}},
+    "a timer of no time": {"settings": {"vote_timeout_s": 0}},
+    "a speedup of 0": {"speedup": 0},
+    "an epoch that is a word": {"epoch_us": "now"},
+}
+
+
+@case("a wrong mission ends with 2, and a sentence", "contract, The mission file")
+async def _broken(bench: Bench) -> None:
+    for what, text in _BROKEN.items():
+        await _ends_with(bench, WRONG_MISSION, what, text=text)
+    for what, keys in _WRONG.items():
+        await _ends_with(bench, WRONG_MISSION, what, keys)
+
+
+@case("a mission that needs an unknown feature ends with 127, and a sentence", "contract, The mission file")
+async def _feature(bench: Bench) -> None:
+    await _ends_with(bench, UNSUPPORTED, "a feature that nobody has", {"features": ["a feature that nobody has"]})
+
+
+@case("keys that it does not know do not matter", "contract, The mission file")
+async def _unknown_keys(bench: Bench) -> None:
+    async with bench.agent({"something": {"else": [1, 2, 3]}}) as agent:
+        await agent.answers_only(INCEPTION, "a mission with a key that nobody knows")
+
+
+@case("a port in use ends with 2, and a sentence", "contract, The program")
+async def _port(bench: Bench) -> None:
+    port = bench.air.take_port()
+    try:
+        async with bench.agent(port=port):
+            document = bench.air.mission(VARIANTS["default"], port, SPEEDUP)
+            text = json.dumps(document).encode()
+            async with bench.program(text=text) as second:
+                returned = await second.end()
+                must(returned == WRONG_MISSION, "exit status 2 where the port is in use", f"status {returned}")
+    finally:
+        bench.air.give_back(port)
+
+
+async def _lines(agent: Alone, *requests: bytes) -> list[Any]:
+    """Answers to raw lines, on one connection."""
+    directory = os.open(agent.process.directory, os.O_PATH)
+    try:
+        path = f"/proc/self/fd/{directory}/{agent.agent_id}.control"
+        reader, writer = await asyncio.open_unix_connection(path, limit=2**20)
+    finally:
+        os.close(directory)
+    try:
+        answers = []
+        for request in requests:
+            writer.write(request + b"\n")
+            await writer.drain()
+            text = await asyncio.wait_for(reader.readline(), PATIENCE_S)
+            answers.append(json.loads(text) if text else None)
+        return answers
+    except (TimeoutError, OSError, ValueError) as error:
+        raise WrongError("an answer to each line on the control socket", f"came {error or 'none'}") from None
+    finally:
+        writer.close()
+
+
+@case("a control socket answers each line, also one that is no command", "contract, Control socket")
+async def _control(bench: Bench) -> None:
+    async with bench.agent() as agent:
+        wrong = (b"no JSON", b"[]", b"{}", b'{"command": "nothing of the kind"}', b'{"command": 7}', b'"status"')
+        answers = await _lines(agent, *wrong, b'{"command": "status"}')
+        for request, answer in zip(wrong, answers, strict=False):
+            refused = isinstance(answer, dict) and answer.get("ok") is False and bool(answer.get("error"))
+            must(refused, f"`ok` false and an `error` to {request.decode()}", answer)
+        must(isinstance(answers[-1], dict) and answers[-1].get("ok") is True, "a status after that", answers[-1])
+        await agent.answers_only(INCEPTION, "lines that are no commands")
+
+
+@case("two who ask at the same time are both answered", "contract, Control socket")
+async def _two_clients(bench: Bench) -> None:
+    async with bench.agent() as agent:
+        status = b'{"command": "status"}'
+        both = await asyncio.gather(_lines(agent, status, status), _lines(agent, status, status))
+        must(all(answer.get("ok") for answers in both for answer in answers), "four statuses", both)
+
+
+@case("after stop_events no more events are logged", "contract, Control socket", 1)
+async def _stop_events(bench: Bench) -> None:
+    async with bench.agent() as agent:
+        await agent.process.ask("stop_events")
+        with suppress(AgentRefusedError):
+            await agent.log(b"event")
+        await agent.hear_nothing("after stop_events")
+        must((await agent.status())["completed"] == 0, "no completed block", "one")

@@ -1,0 +1,167 @@
+"""The page: what is shown where. Whatever comes from the vehicles is text to the template, which escapes all of it."""
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from harness.archive.exports import Export
+from harness.field.depot.consolidation import Consolidation
+from harness.field.depot.depot_reconcile import Reconciliation
+from harness.field.depot.page import _holdings, _position_map, _time_chart
+from harness.field.depot.record_lines import Block
+from harness.field.depot.record_outputs import agents, fork_in_words, in_words, reconciled_in_words, tracks
+from harness.present import text as words
+from harness.present.colours import Ink, inks
+from harness.report import html
+from harness.report.chain_tree_svg import STYLE as TREE_STYLE
+from harness.report.chain_tree_svg import ChainTreePicture
+from harness.report.map_svg import STYLE as MAP_STYLE
+
+_TEMPLATE = Path(__file__).with_name("page.html.j2")
+_STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
+MAX_ROWS = 3_000
+MAX_TREE_BLOCKS = 10_000
+MAX_TITLE = 100
+
+
+def draw(record: Consolidation, reconciliation: Reconciliation | None = None) -> str:
+    """The page, as HTML."""
+    header = record.header
+    ink = inks(header.roster)
+    when = _time_chart.span(record)
+    flown = tracks(record)
+    rare = [block.line.name for block in record.blocks if len(block.line.holders) < 2]
+    lost: dict[int, list[int]] = {}
+    for each in record.lost_blocks:
+        lost.setdefault(each.agent_id, []).append(int((each.block or "").partition(".")[2]))
+    reconciled = reconciliation.line if reconciliation else None
+    return html.render(
+        _TEMPLATE,
+        styles=[TREE_STYLE + MAP_STYLE + html.PAGE_STYLE + _STYLE],
+        title=_title(record),
+        headline=_headline(record),
+        summary=_summary(record, when),
+        sentences=list(in_words(record)),
+        findings=[
+            ("Something is wrong with these exports. What is whole of them is used.", header.problems),
+            ("Not all files are used.", header.left_out),
+        ],
+        remarks=header.remarks,
+        figures=_figures(record, rare),
+        map=_position_map.draw(flown, rare, lost, ink) if flown else None,
+        when=when,
+        began=words.moment(when.first_us) if when else "",
+        ended=words.moment(when.last_us) if when else "",
+        along=_time_chart.draw(record, when, ink) if when else None,
+        shades=range(_time_chart.SHADES),
+        holdings=_holdings.draw(record),
+        places=_holdings.PLACES,
+        forks=[fork_in_words(fork) for fork in record.forks],
+        trees=_trees(record, reconciliation, ink),
+        lost=record.lost,
+        reconciled=list(reconciled_in_words(reconciled)) if reconciled else None,
+        gains=[(vehicle, ink[vehicle.agent_id]) for vehicle in reconciled.vehicles] if reconciled else [],
+        vehicles=_vehicles(record, ink),
+        blocks=[_row(block.line, ink) for block in record.blocks[:MAX_ROWS]],
+        blocks_left_out=max(0, len(record.blocks) - MAX_ROWS),
+    )
+
+
+def _title(record: Consolidation) -> str:
+    """What the inception block says, if it says anything to people."""
+    text = base64.b64decode(record.header.inception.block_data).decode("utf-8", errors="replace")
+    if text and text.isprintable() and "\ufffd" not in text:
+        return text if len(text) <= MAX_TITLE else f"{text[: MAX_TITLE - 1]}…"
+    return f"Mission {record.header.inception.block_hash[:12]}"
+
+
+def _headline(record: Consolidation) -> tuple[str, str]:
+    """In a few words, and what kind of news it is, for the style sheet."""
+    gone = []
+    if record.missing:
+        gone.append("1 vehicle" if len(record.missing) == 1 else f"{len(record.missing)} vehicles")
+    if record.lost_blocks:
+        gone.append("1 block" if len(record.lost_blocks) == 1 else f"{len(record.lost_blocks)} blocks")
+    if gone:
+        return f"{' and '.join(gone)} lost", "violated"
+    if record.header.problems or record.header.left_out:
+        return "something is wrong with the files", "violated"
+    return "nothing is known to be lost", "holds"
+
+
+def _summary(record: Consolidation, when: _time_chart.Span | None) -> list[str]:
+    header = record.header
+    parts = [f"inception block {header.inception.block_hash[:12]}"]
+    if when is not None:
+        parts.append(f"begun {words.moment(when.first_us)}")
+        parts.append(words.duration(round((when.last_us - when.first_us) / 1e6)))
+    return parts
+
+
+def _figures(record: Consolidation, rare: list[str]) -> list[tuple[str, str]]:
+    header = record.header
+    building = sum(block.line.events for block in record.unfinished)
+    figures: list[tuple[str, int | str]] = [
+        ("vehicles home", f"{len(record.home.latest)} of {len(header.roster)}"),
+        ("events", header.events),
+        ("blocks", header.blocks - len(record.unfinished)),
+        ("blocks in the mutual chain", header.mutual_chain),
+        ("distinct chains", header.distinct_chains),
+        ("blocks with one vehicle only", len(rare) - len(record.unfinished)),
+        ("events in blocks being built", building),
+        ("blocks lost", header.lost_blocks),
+    ]
+    return [(label, words.value(value)) for label, value in figures]
+
+
+def _trees(
+    record: Consolidation, reconciliation: Reconciliation | None, ink: Mapping[int, Ink]
+) -> list[tuple[str, Markup]] | None:
+    """The chains as they came home, and as the reconcile left them; None if nobody could look at so many."""
+    exports = record.home.exports
+    if len(record.blocks) > MAX_TREE_BLOCKS:
+        return None
+    drawn = [("As they came home" if reconciliation else "", _tree(exports, record, ink, "home"))]
+    if reconciliation is not None:
+        drawn.append(("After the final reconcile", _tree(reconciliation.exports, record, ink, "reconciled")))
+    return drawn
+
+
+def _tree(exports: Mapping[int, Export], record: Consolidation, ink: Mapping[int, Ink], key: str) -> Markup:
+    return ChainTreePicture(exports, ink, key, record.names).draw("abridged")
+
+
+def _vehicles(record: Consolidation, ink: Mapping[int, Ink]) -> list[dict[str, Any]]:
+    """A row for each export that was used, and for each vehicle that did not come home."""
+    rows: list[dict[str, Any]] = [
+        {
+            "agent_id": used.agent_id,
+            "ink": ink[used.agent_id],
+            "why": "",
+            "exported": words.moment(used.exported_at_us) + ("" if used.latest else ", earlier"),
+            "cells": (used.completed, used.chain, used.deque, used.stack, used.idle),
+            "file": used.file,
+        }
+        for used in record.header.exports
+    ]
+    absent = [{"agent_id": each.agent_id, "ink": ink[each.agent_id], "why": each.why} for each in record.missing]
+    return sorted(rows + absent, key=lambda row: row["agent_id"])
+
+
+def _row(block: Block, ink: Mapping[int, Ink]) -> dict[str, Any]:
+    places = []
+    for held in block.held:
+        position = "" if held.position is None else f" {held.position}"
+        places.append(f"{agents(held.agents)} {held.place}{position}")
+    return {
+        "number": block.number,
+        "name": block.name,
+        "ink": ink[block.agent_id],
+        "at": words.moment(block.timestamp_us),
+        "events": block.events,
+        "held": "; ".join(places),
+        "block_hash": block.block_hash or "",
+    }

@@ -1,0 +1,279 @@
+"""A step, a state and a difference, for people to read; a line each, 100 columns mostly."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import zip_longest
+
+from rich.table import Table
+from rich.text import Text
+
+from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.recorded_inputs import decoded
+from harness.field.replay._agent_record import Entry
+from harness.field.replay._player import Player
+from harness.field.replay.breakpoints import source_of
+from harness.field.replay.replay_names import SHOWN, Names
+from harness.present.text import shown
+from ucp.agent import HANDLERS
+from ucp.block import Block
+from ucp.events import MalformedEventsError, decode_events
+from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError, Message
+from ucp.trace import Dropped, HandlerRun, Recorded, Sent
+
+BLOCKS_SHOWN = 8
+
+
+class Words:
+    """How a player's record is put, `names` being those of its blocks."""
+
+    def __init__(self, player: Player, names: Names) -> None:
+        self._player = player
+        self._names = names
+
+    # A step
+
+    def line(self, number: int, entry: Entry) -> Text:
+        """The entry of this number, from 1: "  212   604.278 s  A18 receive_response_block_for_hash: committed"."""
+        where = f"{entry.line:>7} {entry.what.t:>10.3f} s  "
+        match entry.what:
+            case HandlerRun() as run:
+                words = f"A{run.algorithm:<3}{run.handler[:40]}: {run.branch[:40]}"
+            case Dropped() as aside:
+                words = f"    dropped a datagram: {aside.dropped[:60]}"
+            case aside:
+                words = f"    command {aside.command[:40]}"
+        differs = number in self._player.found.positions
+        return shown(f"{'✘' if differs else ' '}{where}{words}", style="red" if differs else "")
+
+    def step(self) -> Iterator[Text]:
+        """What was played last: why, what the algorithm says of it, what came of it, and where that is wrong."""
+        player = self._player
+        entry = player.entry
+        if entry is None:
+            yield shown(f"before line 1: agent {player.record.agent_id} as it begins", style="bold")
+            return
+        life = f", life {entry.life}" if player.record.lives > 1 and entry.life else ""
+        place = f"line {entry.line}{life}, t={entry.what.t:.3f} s"
+        if entry.gap is not None:
+            yield shown(f"before this {entry.gap}", style="yellow")
+        match entry.what:
+            case HandlerRun() as run:
+                yield from self._run(run, place)
+            case Dropped() as aside:
+                yield shown(f"{place}: dropped, {aside.dropped[:60]}", style="bold")
+                yield _row("came", self._datagram(aside.datagram))
+            case aside:
+                yield shown(f"{place}: command {aside.command[:60]}", style="bold")
+        for deviation in player.deviations_here():
+            yield self.deviation(deviation)
+        if player.lost is not None:
+            yield shown(f"  - {player.lost}", style="yellow")
+
+    def _run(self, run: HandlerRun, place: str) -> Iterator[Text]:
+        handler = HANDLERS.get(run.handler)
+        source = f"  {source_of(handler.name)}" if handler else ""
+        yield shown(f"{place}: Algorithm {run.algorithm}, {run.handler[:60]}", style="bold").append(
+            source, "not bold dim"
+        )
+        yield _row("because", self._trigger(run))
+        if handler:
+            yield _row("rule", _first_line(handler.run.__doc__), "dim")
+        yield _row("branch", run.branch[:80])
+        if run.changes:
+            changes = (f"{operation} {self._names.of(block)}" for operation, block in run.changes)
+            yield _row("changed", _some(changes, len(run.changes)))
+        for sent in run.sent[:BLOCKS_SHOWN]:
+            yield _row("sent", self.sent(sent))
+        if run.started:
+            yield _row("started", ", ".join(f"{timer[:40]} for {length:g} s" for timer, length in run.started.items()))
+        if run.tally:
+            yield _row("counted", ", ".join(self._counted(key, count) for key, count in run.tally.items()))
+
+    def deviation(self, deviation: Deviation) -> Text:
+        """Which step it is of is said where that is another than the one played last."""
+        entry = self._player.entry
+        own = entry is not None and entry.line == deviation.line and isinstance(entry.what, HandlerRun)
+        whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "
+        return shown(f"  ✘ {whose}{deviation.difference(self._names.of)}", style="bold red")
+
+    def beside(self, deviation: Deviation) -> Table | Text:
+        """The agent's own record of a step beside what the reference does; what differs is marked."""
+        if deviation.run is None or deviation.expected is None:
+            return self.deviation(deviation)
+        table = Table("", "the agent's record", "the reference", box=None, padding=(0, 2, 0, 0))
+        for label, own, right in self._sides(deviation.run, deviation.expected):
+            style = "" if own == right else "red"
+            table.add_row(label, shown(own, style), shown(right, style))
+        return table
+
+    def _sides(self, *runs: HandlerRun) -> Iterator[tuple[str, str, str]]:
+        own, right = runs
+        yield "branch", own.branch, right.branch
+        changes = ([f"{operation} {self._names.of(block)}" for operation, block in run.changes] for run in runs)
+        yield from _paired("changed", *changes)
+        yield from _paired("sent", *([self.sent(sent) for sent in run.sent] for run in runs))
+        yield from _paired(
+            "started", *([f"{timer} {s:g} s" for timer, s in (run.started or {}).items()] for run in runs)
+        )
+        counted = ([self._counted(key, count) for key, count in (run.tally or {}).items()] for run in runs)
+        yield from _paired("counted", *counted)
+        for what in ("chain", "deque", "stack", "reconciling", "idle"):
+            yield what, str(getattr(own.state, what)), str(getattr(right.state, what))
+        yield "top", own.state.top[:SHOWN], right.state.top[:SHOWN]
+
+    def _trigger(self, run: HandlerRun) -> str:
+        match run.trigger:
+            case {"message": name}:
+                sender, sequence = run.trigger.get("from"), run.trigger.get("seq")
+                return f"{str(name)[:60]} {sequence} of agent {sender}: {self._datagram(run.input)}"
+            case {"timer": name}:
+                return f"the {str(name)[:60]} timer ended"
+            case {"local": handler}:
+                return f"triggered by {str(handler)[:60]}"
+            case {"event": event_id}:
+                return f"the vehicle logged event {event_id}"
+            case {"operator": command}:
+                return f"the operator asked: {str(command)[:60]}"
+            case {"boot": blocks}:
+                return f"it began again, and found a chain of {blocks} blocks on its disk"
+        return "nothing that there is"
+
+    def _datagram(self, record: Recorded | None) -> str:
+        try:
+            return self._message(decoded(record).message)
+        except MalformedDatagramError as malformed:
+            return f"no message ({malformed.reason})"
+
+    def _message(self, message: Message) -> str:
+        if isinstance(message, CommitBlock | BlockResponse):
+            block = f"block {self._names.of(message.block.block_hash.hex())}"
+            return f"{block} for {self.chain(message.chain_hash)}" if isinstance(message, CommitBlock) else block
+        words = []
+        for field in type(message).WIRE:
+            value = getattr(message, field)
+            if field == "chain_hash":
+                words += [self.chain(value)] if value else []
+            elif field == "block_hash":
+                words.append(f"block {self._names.of(value.hex())}" if value else "Is Top Of Chain")
+            elif isinstance(value, bool):
+                words.append("yes" if value else "no")
+        return ", ".join(words)
+
+    def chain(self, chain_hash: bytes) -> str:
+        """A chain by its hash, and where it is in the agent's own, if it is."""
+        chain = self._player.state.chain
+        if chain_hash == chain.top_chain_hash:
+            own = "our top"
+        elif chain.contains_chain_hash(chain_hash):
+            own = "in our chain"
+        else:
+            own = "not in our chain"
+        return f"chain {chain_hash.hex()[:SHOWN]} ({own})"
+
+    def sent(self, sent: Sent) -> str:
+        return f"{sent.message[:60]} {sent.seq}: {self._datagram(sent.datagram)}"
+
+    def _counted(self, key: str, count: object) -> str:
+        if key in ("yes", "no"):
+            return f"{key} {count}"
+        number = count[0] if isinstance(count, list) and count else count
+        return f"{self._names.of(key) if key else 'Is Top Of Chain'}: {number}"
+
+    # The state
+
+    def in_short(self) -> Text:
+        """The state in a line."""
+        if self._player.lost is not None:
+            return shown("  what the agent holds now is not known", style="yellow")
+        state = self._player.state
+        held = (
+            f"chain {len(state.chain)}, deque {len(state.blocks_to_be_committed)}, stack {len(state.reconcile_stack)}"
+        )
+        doing = "reconciling" if state.reconcile_in_progress else "idle" if state.idle else "voting"
+        timers = "".join(f", {words}" for words in self._timers())
+        return shown(f"  {held}, {doing}{timers}", style="cyan")
+
+    def state(self) -> Iterator[Text]:
+        """All that the agent holds, asks and counts after the step."""
+        if self._player.lost is not None:
+            yield self.in_short()
+            return
+        state = self._player.state
+        yield _row(
+            "chain", f"{self._blocks(list(state.chain))}; top chain hash {state.chain.top_chain_hash.hex()[:SHOWN]}"
+        )
+        yield _row("deque", self._blocks(list(state.blocks_to_be_committed), last=False))
+        yield _row("stack", self._blocks(state.reconcile_stack))
+        yield _row("current", _events(bytes(state.current_block)))
+        yield _row("timers", ", ".join(self._timers()) or "none runs")
+        if state.candidate_block is not None:
+            votes = ", ".join(f"{vote} {count}" for vote, count in state.vote_count.items())
+            on = f"{self._names.of(state.candidate_block.block_hash.hex())} on "
+            on += self.chain(state.top_chain_hash_at_initiation)
+            whose = f"; counted agents {_ids(state.voters)} and itself" if state.voters else ""
+            yield _row("vote" if state.voting_timer.active else "last vote", f"{on}: {votes}{whose}")
+        if state.reconcile_in_progress:
+            votes = ", ".join(f"{vote} {count}" for vote, count in state.reconcile_vote_count.items())
+            yield _row("phase 1", votes)
+            candidates = (
+                f"{self._names.of(candidate.hex()) if candidate else 'Is Top Of Chain'} {counted[0]}"
+                for candidate, counted in state.reconcile_response_dictionary.items()
+            )
+            yield _row("phase 2", ", ".join(candidates) or "no candidate")
+            asked = state.majority_response_block_hash
+            yield _row("phase 3", f"block {self._names.of(asked.hex())}" if asked else "no block chosen")
+            if state.reconcile_responders:
+                yield _row("answered", f"agents {_ids(state.reconcile_responders)}")
+        for event, by in state.triggered:
+            yield _row("next", f"{event}, triggered by {by}")
+        flags = ["reconcile in progress"] if state.reconcile_in_progress else []
+        yield _row("flags", ", ".join([*flags, "idle" if state.idle else "not idle"]))
+
+    def _timers(self) -> Iterator[str]:
+        state = self._player.state
+        for timer in state.timers:
+            if timer.deadline is not None:
+                yield f"{timer.name} {timer.deadline - state.now:.3g} s left"
+            elif timer.active:
+                yield f"{timer.name} paused"
+
+    def _blocks(self, blocks: Sequence[Block], last: bool = True) -> str:
+        if not blocks:
+            return "none"
+        shown = blocks[-BLOCKS_SHOWN:] if last else blocks[:BLOCKS_SHOWN]
+        names = " ".join(self._names.of(block.block_hash.hex()) for block in shown)
+        if len(shown) == len(blocks):
+            return f"{len(blocks)}: {names}"
+        return f"{len(blocks)}: … {names}" if last else f"{len(blocks)}: {names} …"
+
+
+def _row(label: str, words: str, style: str = "") -> Text:
+    return shown(f"  {label:<10}", style="dim").append(
+        shown(words, style=f"not dim {style}" if style != "dim" else "dim")
+    )
+
+
+def _paired(label: str, own: list[str], right: list[str]) -> Iterator[tuple[str, str, str]]:
+    for number, (of_own, of_right) in enumerate(zip_longest(own, right, fillvalue="nothing")):
+        yield label if not number else "", of_own, of_right
+
+
+def _some(words: Iterable[str], count: int) -> str:
+    shown = [word for word, _ in zip(words, range(BLOCKS_SHOWN), strict=False)]
+    more = f" and {count - len(shown)} more" if count > len(shown) else ""
+    return ", ".join(shown) + more
+
+
+def _first_line(docstring: str | None) -> str:
+    return (docstring or "").strip().partition("\n")[0]
+
+
+def _events(current_block: bytes) -> str:
+    try:
+        count = len(decode_events(current_block))
+    except MalformedEventsError:
+        return f"{len(current_block)} bytes"
+    return f"{count} event{'s' if count != 1 else ''}, {len(current_block)} bytes"
+
+
+def _ids(agents: Iterable[int]) -> str:
+    return ", ".join(map(str, sorted(agents)))

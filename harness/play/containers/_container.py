@@ -1,0 +1,216 @@
+"""One container as a program of the lab, and the options it is created with."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import docker
+import docker.errors
+from docker.types import LogConfig, Mount
+
+from harness.play.containers._images import Image
+from harness.play.containers.docker_engine import Engine
+from harness.scenario.docker import Docker
+from netem.lab import in_words
+
+STDOUT, STDERR = 1, 2
+_FRAME = struct.Struct(">B3xI")
+_READ_BYTES = 1 << 16
+_LAST_WORDS_S = 1.0
+"""Wall time after a container's end in which the last of what it said arrives."""
+_KILLED_BY_SIGNAL = 128  # a shell's and docker-init's way to say which
+_NO_SUCH_PROGRAM = 127
+
+
+class Output:
+    """What a container says, read from the stream of `docker attach` and appended to files.
+
+    The stream has frames: which output, 3 bytes of nothing, length (u32, big-endian), the bytes (Docker Engine API,
+    "Attach to a container", stream format).
+    """
+
+    def __init__(self, stream: Any, stdout: Path, stderr: Path) -> None:
+        """`stream` is what the SDK's attach_socket returns. Raises OSError if a file cannot be had."""
+        self._stream = stream  # and with it the answer that owns the socket
+        self._socket: socket.socket = stream._sock
+        self._socket.setblocking(False)
+        self._files: dict[int, BinaryIO] = {STDOUT: stdout.open("ab"), STDERR: stderr.open("ab")}
+        self._unread = bytearray()
+        self._loop = asyncio.get_running_loop()
+        self.ended = asyncio.Event()
+        self._loop.add_reader(self._socket, self._read)
+
+    def _read(self) -> None:
+        try:
+            data = self._socket.recv(_READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+            return
+        self._unread += data
+        with contextlib.suppress(OSError):  # a disk that is full: the container must not wait for it
+            self._write()
+
+    def _write(self) -> None:
+        while len(self._unread) >= _FRAME.size:
+            output, length = _FRAME.unpack_from(self._unread)
+            end = _FRAME.size + length
+            if len(self._unread) < end:
+                return
+            content = bytes(self._unread[_FRAME.size : end])
+            del self._unread[:end]
+            file = self._files[STDERR if output == STDERR else STDOUT]
+            file.write(content)
+            file.flush()
+
+    def close(self) -> None:
+        if self.ended.is_set():
+            return
+        self._loop.remove_reader(self._socket)
+        self._stream.close()
+        for file in self._files.values():
+            with contextlib.suppress(OSError):
+                file.close()
+        self.ended.set()
+
+
+class Container:
+    """A `Program`. Its lab tells it of its end (`has_ended`)."""
+
+    def __init__(self, engine: Engine, identity: str, name: str, output: Output, memory_mib: int | None) -> None:
+        self._engine = engine
+        self.identity = identity
+        self.name = name
+        self._output = output
+        self._memory_mib = memory_mib
+        self._ended: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        self._paused = False
+        self._out_of_memory = False
+        self._ending: asyncio.Task[None] | None = None
+
+    @property
+    def returncode(self) -> int | None:
+        return self._ended.result() if self._ended.done() else None
+
+    @property
+    def end(self) -> str:
+        returncode = self._ended.result()
+        if self._out_of_memory:
+            limit = f": it may use {self._memory_mib} MiB (`docker.memory_mib`)" if self._memory_mib else ""
+            return f"{in_words(returncode)}, out of memory{limit}"
+        if returncode == _NO_SUCH_PROGRAM:
+            return f"{in_words(returncode)}: there is no such program in its image"
+        return in_words(returncode)
+
+    async def wait(self) -> int:
+        return await asyncio.shield(self._ended)
+
+    async def send_signal(self, number: int) -> None:
+        if number == signal.SIGKILL and self._paused:
+            await self.resume()  # the engine kills none that stands still
+        await self._tell("signal", self._engine.api.kill, signal.Signals(number).name)
+
+    async def pause(self) -> None:
+        await self._tell("pause", self._engine.api.pause)
+        self._paused = True
+
+    async def resume(self) -> None:
+        if self._paused:
+            await self._tell("resume", self._engine.api.unpause)
+            self._paused = False
+
+    async def terminate(self, grace_s: float) -> int:
+        await self.resume()
+        await self.send_signal(signal.SIGTERM)
+        try:
+            return await asyncio.wait_for(self.wait(), grace_s)
+        except TimeoutError:
+            await self.send_signal(signal.SIGKILL)
+            return await self.wait()
+
+    async def _tell(self, what: str, call: Any, *arguments: Any) -> None:
+        if self._ended.done():
+            return
+        try:
+            await self._engine.ask(f"{what} {self.name}", call, self.identity, *arguments)
+        except docker.errors.APIError as error:
+            if error.status_code not in (404, 409):  # it has ended a moment ago
+                raise
+
+    # What its lab hears of it
+
+    def ran_out_of_memory(self) -> None:
+        self._out_of_memory = True
+
+    def has_ended(self, status: int) -> None:
+        returncode = _KILLED_BY_SIGNAL - status if _is_signal(status - _KILLED_BY_SIGNAL) else status
+        self._ending = asyncio.get_running_loop().create_task(self._end(returncode))
+
+    async def _end(self, returncode: int) -> None:
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._output.ended.wait(), _LAST_WORDS_S)
+        self.close(returncode)
+
+    def close(self, returncode: int = -signal.SIGKILL) -> None:
+        """It has ended, or is of no interest any more."""
+        self._output.close()
+        if not self._ended.done():
+            self._ended.set_result(returncode)
+
+
+def _is_signal(number: int) -> bool:
+    return number in set(signal.Signals)
+
+
+MEBIBYTE = 1 << 20
+INIT = 1
+"""Processes of a container that are not the program's: docker-init, which passes signals on."""
+
+
+def recipe(
+    api: docker.APIClient, image: Image, argv: Sequence[str], kept: Sequence[Path], network_mode: str, limits: Docker
+) -> dict[str, Any]:
+    """Keywords for the SDK's create_container: no capability, no way to write but into /tmp and what is `kept`.
+
+    That is the run directory, and where the vehicle has its keys, if it has any.
+    """
+    command = image.command(argv)
+    shared = [Mount(str(path), str(path), type="bind", read_only=True) for path in image.shared(argv)]
+    host_config = api.create_host_config(
+        network_mode=network_mode,
+        mounts=[*shared, *(Mount(str(path), str(path), type="bind") for path in kept)],
+        tmpfs={"/tmp": ""},  # noqa: S108  (the container's own)
+        read_only=True,
+        init=True,
+        cap_drop=["ALL"],
+        security_opt=["no-new-privileges"],
+        log_config=LogConfig(type=LogConfig.types.NONE),
+        **_limits(limits),
+    )
+    return {
+        "image": image.name,
+        "entrypoint": command[:1],
+        "command": command[1:],
+        "user": f"{os.getuid()}:{os.getgid()}",
+        "host_config": host_config,
+    }
+
+
+def _limits(asked: Docker) -> dict[str, Any]:
+    limits: dict[str, Any] = {}
+    if asked.memory_mib is not None:
+        limits["mem_limit"] = limits["memswap_limit"] = asked.memory_mib * MEBIBYTE
+    if asked.cpus is not None:
+        limits["nano_cpus"] = round(asked.cpus * 1e9)
+    if asked.pids is not None:
+        limits["pids_limit"] = asked.pids + INIT
+    return limits

@@ -1,0 +1,43 @@
+"""The backend of containers: as that of processes, but every vehicle and every agent is in a container of its own.
+
+The docker SDK takes its time to import, which who plays no containers need not wait for.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
+
+from harness.archive.directory import RunDirectory
+from harness.backend_names import BackendName
+from harness.play.process._process_backend import Processes
+from harness.scenario import Scenario
+
+if TYPE_CHECKING:
+    from harness.play.process._run_lab import MissionLab
+
+
+class Containers(Processes):
+    name: ClassVar[BackendName] = "docker"
+    not_in_uml = "there is no Docker engine in User Mode Linux: leave out --kernel uml, or --backend docker"
+
+    def refuse(self, scenario: Scenario) -> None:
+        from harness.play.containers._container_preflight import (
+            refuse_debuggers_that_are_not_in_the_image,
+            refuse_what_docker_cannot,
+        )
+        from harness.play.process.process_preflight import refuse_what_programs_cannot
+
+        refuse_debuggers_that_are_not_in_the_image(scenario)
+        refuse_what_programs_cannot(scenario)
+        refuse_what_docker_cannot(scenario)
+        self.agent_commands(scenario)
+
+    def agent_command(self, scenario: Scenario, agent_id: int) -> list[str]:
+        command = scenario.command_of(agent_id)
+        if scenario.docker.image is not None and command is not None:
+            return list(command)  # a program in the image
+        return super().agent_command(scenario, agent_id)
+
+    async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "MissionLab":
+        from harness.play.containers._container_lab import ContainerLab
+
+        return await ContainerLab.open(scenario, rundir, say)

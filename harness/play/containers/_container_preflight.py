@@ -1,0 +1,43 @@
+"""What containers on this machine cannot do, found out before anything starts."""
+
+import os
+import shutil
+from pathlib import Path
+
+from harness.play.containers import _images
+from harness.play.containers.docker_engine import DockerError, Engine
+from harness.scenario import Scenario
+
+
+def refuse_what_docker_cannot(scenario: Scenario) -> None:
+    """Raises DockerError if there is no engine here that we may use, or not the image that is asked for."""
+    engine = Engine.connect()
+    try:
+        require_root()
+        if scenario.docker.image is not None:
+            _images.named(engine, scenario.docker.image)
+    finally:
+        engine.close()
+
+
+def refuse_debuggers_that_are_not_in_the_image(scenario: Scenario) -> None:
+    """Raises DockerError. Vehicles are in the project's image, which has none, or share this machine's directories."""
+    setups = (scenario.vehicles.setup_of(vehicle) for vehicle in scenario.roster)
+    for debugger in sorted({setup.debugger for setup in setups if setup.debugger is not None}):
+        if not scenario.docker.image_from_host:
+            raise DockerError(
+                f"the project's image has no {debugger}: use this machine's files (--image-from-host, "
+                "`docker.image_from_host`), or leave out `debugger`"
+            )
+        here = shutil.which(debugger)
+        if here is not None and not _images.is_shared(Path(here)):
+            raise DockerError(
+                f"{here} is in no directory that containers share with this machine: install {debugger} with this "
+                "machine's packages, or leave out `debugger`"
+            )
+
+
+def require_root() -> None:
+    """Raises DockerError."""
+    if os.geteuid() != 0:
+        raise DockerError("the Docker backend puts network cables into containers, for which it must be root: use sudo")

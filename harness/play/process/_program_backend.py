@@ -1,0 +1,465 @@
+"""A scenario played by real programs in a real, private network: as processes, or in containers.
+
+Build the lab, start vehicles and agents and the mission's clock, play the mission while watching everybody, export,
+stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and still exports what there is.
+"""
+
+import asyncio
+import base64
+import time
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import Any, Self
+
+from harness.archive.directory import RunDirectory
+from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
+from harness.play._radio_range import TRACK_S, RadioRange
+from harness.play._vehicle_keys import Handed, handed_out
+from harness.play.agent_control import AgentRefusedError, Status
+from harness.play.mission import RunOutcome, Sought
+from harness.play.process._agent_process import AgentProcess, reboots_with_disk
+from harness.play.process._rogue_process import RogueProcess
+from harness.play.process._run_lab import MissionLab, OpenLab
+from harness.play.process._watchers import Watchers, unless_interrupted
+from harness.play.process.fleet import Fleet
+from harness.play.process.process_preflight import on_the_air
+from harness.play.progress import Progress, Snapshot
+from harness.scenario import Scenario
+from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
+from harness.scenario.fates import Fate
+from harness.scenario.faults import Fault
+from netem.capture import LiveCapture
+from netem.conditions import NetworkConditions
+from netem.engine import Applied
+from netem.errors import CaptureError, LabUnavailable, NetemError
+from sitl.circumstances import Circumstance
+from sitl.vehicle import VehicleKind
+from ucp.clock import MICROSECONDS, MissionClock
+
+POLL_S = 0.25
+QUIET_POLL_S = 0.1
+START_DELAY_S = 0.05
+FOLLOW_S = 0.1
+"""Wall time between two looks at where the vehicles are, at least."""
+
+
+class ProcessRun:
+    """One run; open it once. `kinds` of vehicles, none: no vehicles. `interrupted` ends the mission early.
+
+    `open_lab` says what vehicles and agents are made of, `agent_commands` what starts each agent there.
+    With `keeps_disks` every agent has a disk that it can be rebooted with, else those that the scenario reboots so.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        kinds: Mapping[int, VehicleKind],
+        initial_data: bytes,
+        rundir: RunDirectory,
+        progress: Progress,
+        interrupted: asyncio.Event,
+        *,
+        agent_commands: Mapping[int, Sequence[str]],
+        open_lab: OpenLab,
+        keeps_disks: bool,
+    ) -> None:
+        self.scenario = scenario
+        self.seed = seed
+        self.initial_data = initial_data
+        self.rundir = rundir
+        self.progress = progress
+        self.interrupted = interrupted
+        self.played = RunOutcome()
+        self._open_lab = open_lab
+        self._keeps_disks = keeps_disks
+        self._rogue = RogueProcess(scenario.rogue, scenario, seed, rundir) if scenario.rogue else None
+        self.stage = "building the lab"
+        self.network = describe(NetworkConditions())
+        self.clock = MissionClock(scenario.speedup)
+        self.agents = [
+            AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now) for agent_id in scenario.roster
+        ]
+        self._keys: Handed
+        self._capture: LiveCapture | None = None
+        self._reach = RadioRange(scenario)
+        self._changing_network = asyncio.Lock()
+        self._watchers = Watchers()
+        self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers)
+        self._injected: list[Injected] = []
+        """What the rogue node was told."""
+        self._passed_s = 0.0
+        """When it had last gone on for as long as it was asked to."""
+        self._starting: dict[int, asyncio.Task[None]] = {}
+        """Agents that begin again and do not answer yet."""
+
+    @asynccontextmanager
+    async def opened(self) -> AsyncIterator[Self]:
+        """The mission is inside. Raises HarnessError if there is no lab, MachineError if this machine cannot build it.
+
+        All else that goes wrong is in `played`.
+        """
+        with handed_out(self.scenario) as self._keys:
+            self.rundir.keys = self._keys.directories
+            if (keys := self._keys.keys) is not None:
+                self.rundir.write_public_keys(keys.public)
+                self.initial_data = keys.sealed_to_depot(self.initial_data)
+            async with self._in_lab():
+                yield self
+
+    @asynccontextmanager
+    async def _in_lab(self) -> AsyncIterator[None]:
+        try:
+            lab = await unless_interrupted(self._open_lab(self.scenario, self.rundir, self._show), self.interrupted)
+        except HarnessError:
+            raise
+        except LabUnavailable as error:
+            raise MachineError(str(error)) from None
+        except NetemError as error:
+            raise MachineError(f"the lab could not be built: {error}; see {self.rundir.lab_log}") from None
+        async with lab:
+            self._lab = lab
+            self.played.engine = lab.engine
+            try:
+                async with self._watchers.guard(self._watch_for_interruption(), lab.watch()):
+                    yield
+            except HarnessError as error:
+                self._ended_early(error)
+            except CaptureError as error:
+                self._ended_early(MachineError(str(error)))
+            except NetemError as error:
+                self._ended_early(MachineError(f"the lab failed: {error}"))
+            except OSError as error:
+                self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
+            await self._wind_up(lab)
+
+    async def _watch_for_interruption(self) -> None:
+        await self.interrupted.wait()
+        raise InterruptedRunError(f"the run was interrupted at mission second {self.clock.now():.0f}")
+
+    # The story, as harness.play.mission tells it
+
+    def now(self) -> float:
+        return self.clock.now()
+
+    def enter(self, stage: str) -> None:
+        self.stage = stage
+
+    async def begin(self, first: Change) -> None:
+        await self._fleet.start(self._lab, self._show)
+        await self._start_agents(self._lab)
+        await self.apply(first)
+        if self.scenario.capture:
+            self._capture = await LiveCapture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
+            self._watchers.start(self._capture.watch())
+        await self._start_clock()
+        self._watchers.start(self._poll_agents())
+        self._watchers.start(self._log_script(), of="script")
+        if self._fleet:
+            self._watchers.start(self._follow_flight())
+            self._fleet.take_off()
+
+    async def _log_script(self) -> None:
+        """Have the agents that run log what the scenario's script says."""
+        for event in sorted(self.scenario.events.script, key=lambda event: event.at_s):
+            await self.until(event.at_s)
+            agent = self._agent(event.agent)
+            if agent.awake:
+                data = base64.b64encode(event.event_data).decode("ascii")
+                try:
+                    await agent.ask("log", event_id=event.event_id, data=data)
+                except AgentRefusedError as error:
+                    raise AgentRefusedError(
+                        f"{error}; scripted events need that command (ucp/contract/CONTRACT.md)"
+                    ) from None
+
+    async def _start_agents(self, lab: MissionLab) -> None:
+        self._show("starting agents")
+        await asyncio.gather(*(self._start_agent(agent, lab) for agent in self.agents))
+        if self._rogue is not None:
+            await self._rogue.start(lab.network)
+            self._watchers.start(self._rogue.watch(), of="rogue")
+
+    async def _start_agent(self, agent: AgentProcess, lab: MissionLab) -> None:
+        """Start it, into the mission if that is under way."""
+        with_vehicle = bool(self._fleet)
+        keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
+        epoch_us = self.clock.epoch_us
+        await agent.start(
+            lab, self.scenario, self.seed, self.initial_data, with_vehicle, keeps_disk, epoch_us, self._keys
+        )
+        self._watchers.start(agent.watch(), of=f"agent {agent.agent_id}")
+
+    async def _start_clock(self) -> None:
+        epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
+        if self._capture:
+            await self._capture.begin(epoch_us, self.scenario.speedup)
+        await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
+        if self._rogue is not None:
+            captured = self.scenario.security.captured if self.scenario.security else None
+            await self._rogue.begin(epoch_us, None if captured is None else self._keys.hand(captured, kept=True))
+        self.clock.start(epoch_us)
+
+    async def apply(self, change: Change) -> None:
+        if isinstance(change, NetworkChange):
+            await self._put_into_force(self._reach.ask(change), asked=change.conditions)
+            return
+        if isinstance(change, Injected):
+            if self._rogue is None:
+                raise ScenarioError(
+                    f"`{change.what}` needs a rogue node, which real processes have if the timeline that the mission "
+                    "begins with injects something: use --backend sim"
+                )
+            self._injected.append(change)
+            self.played.record(change.to_json(round(max(change.at_s, self.clock.now()), 3)))
+            await self._rogue.inject(change)
+            return
+        await self._strike_all(change)
+        record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
+        self.played.record(record)
+        self.rundir.append_network(record)
+
+    async def _strike_all(self, fault: Fault) -> None:
+        """Raises ScenarioError if it can happen to none of them; to whom it could not is on record otherwise."""
+        strikes = [self._strike(fault, agent_id) for agent_id in fault.agents]
+        problems = [problem for problem in await asyncio.gather(*strikes, return_exceptions=True) if problem]
+        for problem in problems:
+            if not isinstance(problem, ScenarioError) or len(problems) == len(strikes):
+                raise problem
+        self.played.unmatched_fates += map(str, problems)
+
+    async def _strike(self, fault: Fault, agent_id: int) -> None:
+        if agent_id in self._starting:
+            await self._starting.pop(agent_id)
+        await fault.strike(self, agent_id)
+
+    # What faults do to an agent, and to its vehicle if it has one: harness.scenario.faults.Lives
+
+    async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
+        shot_down = [self._fleet.shoot_down(agent_id)] if with_vehicle else []
+        await asyncio.gather(self._kill(self._agent(agent_id), disk_kept=disk_kept), *shot_down)
+
+    async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
+        agent = self._agent(agent_id)
+        start = self._start_again(agent) if new_vehicle else self._start_agent(agent, self._lab)
+        self._starting[agent_id] = self._watchers.task(start)
+
+    async def fall(self, agent_id: int) -> None:
+        self._fleet.fall(agent_id)
+
+    async def pause(self, agent_id: int) -> None:
+        await self._agent(agent_id).pause()
+
+    async def resume(self, agent_id: int) -> None:
+        await self._agent(agent_id).resume()
+
+    async def stop_logging(self, agent_id: int) -> None:
+        await self._agent(agent_id).ask("stop_events")
+
+    async def switch_off(self, agent_id: int) -> None:
+        self._watchers.stop(f"agent {agent_id}")
+        await asyncio.gather(self._agent(agent_id).switch_off(), self._fleet.shoot_down(agent_id))
+
+    async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
+        assert self._keys.keys is not None, "was refused"
+        revocation = base64.b64encode(self._keys.keys.revoke(agent_id)).decode("ascii")
+        hearers = [agent for agent in self.agents if agent.agent_id in heard_by and agent.awake]
+        await asyncio.gather(*(agent.ask("revoke", revocation=revocation) for agent in hearers))
+
+    async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
+        if not self._fleet:
+            raise ScenarioError(f"`{what}` needs vehicles, and this run has none")
+        at_s = round(self.clock.now(), 3)
+        if not by_hand:
+            self._watchers.task(self._befall(agent_id, what, circumstance, at_s))
+        elif problem := await self._fleet.befall(agent_id, what, circumstance, at_s):
+            raise ScenarioError(problem)  # whoever asked for it waits for an answer
+
+    async def _befall(self, agent_id: int, what: str, circumstance: Circumstance, at_s: float) -> None:
+        if problem := await self._fleet.befall(agent_id, what, circumstance, at_s):
+            self.played.unmatched_fates.append(problem)
+
+    def _agent(self, agent_id: int) -> AgentProcess:
+        return self.agents[self.scenario.roster.index(agent_id)]
+
+    async def _kill(self, agent: AgentProcess, *, disk_kept: bool = False) -> None:
+        self._watchers.stop(f"agent {agent.agent_id}")
+        await agent.kill(disk_kept=disk_kept)
+
+    async def _start_again(self, agent: AgentProcess) -> None:
+        """A new agent, on a new vehicle in the place of the one that was lost."""
+        await self._fleet.replace(agent.agent_id, self._lab, life=agent.lives + 1)
+        await self._start_agent(agent, self._lab)
+
+    async def _put_into_force(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
+        """`asked` by the timeline, not by flight, of which it is on record what changed."""
+        async with self._changing_network:  # in the order in which they were asked for
+            conditions = on_the_air(change.conditions, self.scenario)
+            applied = await self._lab.apply(conditions.at_speed(self.scenario.speedup))
+        self.network = change.detail
+        record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
+        self.played.record(record)
+        if asked is not None:
+            record |= {"asked": asked.to_json(), "applied": self._of_the_swarm(applied)}
+        self.rundir.append_network(record)
+
+    def _of_the_swarm(self, applied: Applied) -> dict[str, Any]:
+        """What the kernel holds and has counted for receivers that are vehicles."""
+        figures = applied.to_json()
+        if self._rogue is not None:
+            figures["receivers"].pop(str(self._rogue.vehicle), None)
+        return figures
+
+    async def _follow_flight(self) -> None:
+        """Write down where the vehicles are, and have the network follow them."""
+        radio = self.scenario.network.radio
+        every_s = max(FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
+        while True:
+            places = self._fleet.places()
+            self.rundir.append_tracks(self.clock.now(), places)
+            if change := self._reach.move(self.clock.now(), places):
+                await self._put_into_force(change)
+            await asyncio.sleep(every_s)
+
+    async def until(self, mission_s: float) -> None:
+        while (left_s := mission_s - self.clock.now()) > 0:  # a clock that is about to start stands at 0
+            await asyncio.sleep(self.clock.wall_s(left_s))
+            self._passed_s = self.clock.now()
+
+    async def until_run(self, sought: Sought, mission_s: float) -> int | None:
+        while True:
+            over = self.clock.now() >= mission_s
+            for agent in self.agents:
+                for run in agent.runs_since(self._passed_s, sought.handler):
+                    if sought.is_met_by(agent.agent_id, run):
+                        self._passed_s = run.t
+                        return agent.agent_id
+            if over:
+                self._passed_s = self.clock.now()
+                return None
+            await asyncio.sleep(QUIET_POLL_S)
+
+    async def hold(self, fate: Fate) -> int:
+        raise ScenarioError("`hold` needs virtual time: use --backend sim")
+
+    async def release(self, number: int, fate: Fate) -> None:
+        raise AssertionError("nothing was held")
+
+    async def stop_events(self) -> None:
+        self._watchers.stop("script")
+        await asyncio.gather(*self._starting.values())
+        await asyncio.gather(*(agent.ask("stop_events") for agent in self._awake()))
+
+    async def until_idle(self, limit_s: float) -> bool:
+        deadline_s = self.clock.now() + limit_s
+        handled: list[int] | None = None
+        while self.clock.now() < deadline_s:
+            statuses = (await self._statuses()).values()
+            before, handled = handled, [status.handled for status in statuses]
+            if all(status.idle for status in statuses) and handled == before:
+                return not any(agent.outcome == "paused" for agent in self.agents)
+            await asyncio.sleep(QUIET_POLL_S)
+        return False
+
+    async def keep_chains(self) -> None:
+        await asyncio.gather(*(agent.export() for agent in self._awake()))
+        self.rundir.keep_exports_before_final_reconcile()
+
+    async def reconcile(self, agent_id: int) -> None:
+        await self._agent(agent_id).ask("reconcile")
+
+    async def top_chain_hashes(self) -> dict[int, str]:
+        return {agent_id: status.top_chain_hash for agent_id, status in (await self._statuses()).items()}
+
+    async def completed(self) -> dict[int, int]:
+        return {agent_id: status.completed for agent_id, status in (await self._statuses()).items()}
+
+    async def snapshot(self) -> RunOutcome:
+        await asyncio.gather(*(agent.export() for agent in self._awake()))
+        for agent in self.agents:
+            agent.put_together()
+        agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+        return replace(self.played, mission_s=round(self.clock.now(), 1), agents=agents)
+
+    def _awake(self) -> list[AgentProcess]:
+        """The agents that are neither dead nor paused."""
+        return [agent for agent in self.agents if agent.awake]
+
+    async def _statuses(self) -> dict[int, Status]:
+        """The status of each agent that is neither dead nor paused."""
+        polled = await asyncio.gather(*(agent.poll() for agent in self.agents))
+        return {agent.agent_id: status for agent, status in zip(self.agents, polled, strict=True) if status}
+
+    async def _poll_agents(self) -> None:
+        while True:
+            await self._statuses()
+            self._show(self.stage)
+            await asyncio.sleep(POLL_S)
+
+    # The end
+
+    def _ended_early(self, error: HarnessError) -> None:
+        self.played.end_early("interrupted" if isinstance(error, InterruptedRunError) else "failed", error)
+
+    async def _wind_up(self, lab: MissionLab) -> None:
+        """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""
+        self._show("exporting")
+        self.played.mission_s = round(self.clock.now(), 1)
+        exported = await asyncio.gather(*(agent.export_finally() for agent in self.agents), return_exceptions=True)
+        for error in exported:
+            if error is not None and not isinstance(error, HarnessError):
+                raise error
+            if error is not None and self.played.outcome == "completed":
+                self._ended_early(error)
+        self.played.vehicles = self._fleet.to_json()
+        self.played.ground_station = self._fleet.close_station()
+        try:
+            if self._rogue is not None:
+                await self._stop_rogue(self._rogue)
+            self.played.counters = self._of_the_swarm(await lab.read())
+            self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
+            await asyncio.gather(*(agent.stop() for agent in self.agents), self._fleet.stop())
+            for agent in self.agents:
+                agent.put_together()
+        except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed
+            self._ended_early(MachineError(str(error)))
+        except OSError as error:
+            self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
+        await self._end_capture()
+        try:
+            await lab.close()
+        except NetemError as error:
+            self._ended_early(MachineError(str(error)))
+        self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+
+    async def _end_capture(self) -> None:
+        if self._capture is None:
+            return
+        try:
+            counted = await self._capture.stop()
+        except CaptureError as error:
+            if self.played.outcome == "completed":
+                self._ended_early(MachineError(str(error)))
+            return
+        self.played.capture = {str(vehicle): frames for vehicle, frames in counted.items()}
+
+    async def _stop_rogue(self, rogue: RogueProcess) -> None:
+        try:
+            await rogue.stop()
+        except MachineError as error:
+            if self.played.outcome == "completed":
+                self._ended_early(error)
+        self.played.unmatched_fates += injected_nothing(self._injected, rogue.sent)
+
+    def _show(self, stage: str) -> None:
+        self.stage = stage
+        self.progress.show(
+            Snapshot(
+                stage,
+                self.clock.now(),
+                self.scenario.duration_s,
+                self.network,
+                {agent.agent_id: agent.status for agent in self.agents},
+            )
+        )

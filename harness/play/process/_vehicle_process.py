@@ -1,0 +1,246 @@
+"""One vehicle as a program in its own namespace, and the pilot that flies it."""
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+from harness.archive.directory import RunDirectory
+from harness.errors import HarnessError
+from harness.play.process._run_lab import MissionLab, Program
+from harness.scenario.vehicles import Flight
+from netem.radio import Place
+from sitl.circumstances import Circumstance
+from sitl.ground_station import GroundStation
+from sitl.modes import mav_type
+from sitl.parameters import in_lines
+from sitl.pilot import Pilot
+from sitl.procedure import Procedure
+from sitl.vehicle import STATION_PORT, Home, Launch, VehicleError, VehicleKind
+
+LISTEN_LIMIT_S = 20.0
+CONNECT_LIMIT_S = 2.0
+ASK_AGAIN_S = 0.05
+STOP_GRACE_S = 3.0
+ENDING_S = 0.5
+LAST_WORDS = 3
+PARAMETERS = "parameters.parm"
+
+
+class VehicleFailedError(HarnessError):
+    """A vehicle could not be started or flown, or ended by itself."""
+
+
+class VehicleProcess:
+    """One vehicle, with `sysid` its MAVLink system ID; one that takes the place of a lost one has another `life`."""
+
+    def __init__(self, vehicle_id: int, sysid: int, kind: VehicleKind, rundir: RunDirectory, life: int = 1) -> None:
+        self.vehicle_id = vehicle_id
+        self.sysid = sysid
+        self.kind = kind
+        self._given_up = self._introduced = False
+        self.pilot: Pilot | None = None
+        self._directory = rundir.vehicle(vehicle_id, life)
+        self._process: Program | None = None
+        self._flight: Procedure | None = None
+        self._befallen: list[dict[str, Any]] = []
+        self._station_port = STATION_PORT
+
+    @property
+    def _output(self) -> Path:
+        return self._directory / "output.log"
+
+    async def start(self, lab: MissionLab, home: Home, speedup: float) -> None:
+        """Start the vehicle and connect its pilot. Raises VehicleFailedError."""
+        self._home = home
+        try:
+            launch = self.kind.launch(self.sysid, home, speedup, self._directory)
+        except VehicleError as error:
+            raise VehicleFailedError(str(error)) from None
+        self._process = await lab.spawn(
+            self.vehicle_id,
+            launch.argv,
+            cwd=self._directory,
+            env={**os.environ, **launch.env},
+            stdout=self._output,
+            stderr=self._output,
+            role="vehicle",
+        )
+        await self._connect(lab, launch, speedup)
+
+    async def _connect(self, lab: MissionLab, launch: Launch, speedup: float) -> None:
+        assert self._process is not None
+        self._station_port = launch.station_port
+        deadline = asyncio.get_running_loop().time() + LISTEN_LIMIT_S
+        while True:
+            try:
+                sock = await lab.connect(self.vehicle_id, launch.pilot_port, timeout_s=CONNECT_LIMIT_S)
+                break
+            except (ConnectionError, TimeoutError):
+                if self._process.returncode is not None:
+                    raise self._ended(self._process) from None
+                if asyncio.get_running_loop().time() > deadline:
+                    raise VehicleFailedError(
+                        f"vehicle {self.vehicle_id} ({self.kind.name}) does not listen on port {launch.pilot_port} "
+                        f"after {LISTEN_LIMIT_S:g} s{self._last_words()}"
+                    ) from None
+                await asyncio.sleep(ASK_AGAIN_S)
+        tlog = self._directory / "telemetry.tlog"
+        self.pilot = Pilot(self.sysid, sock, tlog, speedup, self._home, self.kind.vehicle_type, self.vehicle_id)
+        await self.pilot.start()
+
+    async def join(self, station: GroundStation, lab: MissionLab) -> None:
+        """Be seen at a ground station, and listen to it. Raises VehicleFailedError."""
+        try:
+            sock = await lab.connect(self.vehicle_id, self._station_port, timeout_s=CONNECT_LIMIT_S)
+        except (ConnectionError, TimeoutError):
+            raise VehicleFailedError(
+                f"vehicle {self.vehicle_id} ({self.kind.name}) does not listen on port {self._station_port} for a "
+                "ground station: leave out --gcs"
+            ) from None
+        await station.attach(self.vehicle_id, self.sysid, sock)
+
+    def hand_over(self) -> None:
+        """An operator flies it from now on."""
+        assert self.pilot is not None
+        self.pilot.hand_over()
+
+    def place(self, field: Home) -> Place:
+        """Where it last said that it is, as seen from the middle of the field; at its home until it knows."""
+        position = self.pilot.state.position if self.pilot else None
+        if position is None:
+            return Place(*field.metres_to(self._home.lat_deg, self._home.lon_deg, self._home.alt_m))
+        return Place(*field.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
+
+    def prepare(self, flight: Flight | None, altitude_m: float) -> None:
+        """What it is to fly: a plan, or without one up to `altitude_m`."""
+        assert self.pilot is not None
+        self._flight = self.pilot.flight(flight.planned(), flight.by) if flight else self.pilot.ascent(altitude_m)
+
+    async def _introduce(self) -> None:
+        """Take down what it says of itself, once. Raises VehicleFailedError, having killed it."""
+        assert self.pilot is not None
+        if self._introduced:
+            return
+        self._introduced = True
+        await self._piloted(self.pilot.introduce(self.kind.parameters))
+        known = self.pilot.link.parameters
+        if known:
+            (self._directory / PARAMETERS).write_text(in_lines(known), encoding="utf-8")
+
+    async def get_ready(self) -> None:
+        """Up to arming. Raises VehicleFailedError, having killed it."""
+        assert self.pilot is not None and self._flight is not None
+        await self._introduce()
+        await self._piloted(self.pilot.get_ready(self._flight))
+
+    async def fly(self) -> None:
+        """And stay in touch with it as long as the mission takes. Raises VehicleFailedError, having killed it."""
+        assert self.pilot is not None and self._flight is not None
+        await self._introduce()
+        await self._piloted(self.pilot.fly(self._flight))
+        await self._piloted(self.pilot.stay_in_touch())
+
+    async def _piloted(self, flight: Coroutine[Any, Any, None]) -> None:
+        try:
+            await flight
+        except VehicleError as error:
+            assert self._process is not None
+            with contextlib.suppress(TimeoutError):  # a connection ends just before its process does
+                await asyncio.wait_for(self._process.wait(), ENDING_S)
+                raise self._ended(self._process) from None
+            self._given_up = True
+            await self._process.send_signal(signal.SIGKILL)  # it may spin, or fly on who knows where
+            raise VehicleFailedError("; ".join(filter(None, (str(error), self.kind.lack)))) from None
+
+    async def watch(self) -> None:
+        """Raises VehicleFailedError when the process ends by itself."""
+        assert self._process is not None
+        await self._process.wait()
+        if not self._given_up:
+            raise self._ended(self._process)
+
+    async def kill(self) -> None:
+        """It is shot down: SIGKILL. Neither watch nor fly it any more before."""
+        assert self._process is not None
+        await self._process.send_signal(signal.SIGKILL)
+        await self._process.wait()
+        if self.pilot is not None:
+            await self.pilot.close()
+
+    async def fall(self) -> None:
+        """Its motors stop, what it was flying ends, and it falls to the ground. Raises VehicleFailedError."""
+        assert self.pilot is not None
+        await self._piloted(self.pilot.terminate_flight())
+
+    async def befall(self, what: str, circumstance: Circumstance, at_s: float) -> str | None:
+        """Have it simulate this; returns why it does not, in a sentence, if so. Raises nothing."""
+        assert self.pilot is not None
+        told: dict[str, Any] = {"at_s": at_s, "what": what, "parameters": {}}
+        self._befallen.append(told)
+        try:
+            told["parameters"] = dict(await self.pilot.befall(circumstance))
+        except VehicleError as error:
+            return (
+                f"{what} at {at_s:g} s: vehicle {self.vehicle_id} ({self.kind.name} {self.kind.vehicle_type}) {error}"
+            )
+        return None
+
+    async def stop(self) -> None:
+        if self.pilot is not None:
+            await self.pilot.close()
+        if self._process is not None and self._process.returncode is None:
+            await self._process.terminate(STOP_GRACE_S)
+
+    def to_json(self) -> dict[str, Any]:
+        record: dict[str, Any] = {"kind": self.kind.name, "type": self.kind.vehicle_type, "sysid": self.sysid}
+        record |= self._what_flew()
+        if self.pilot is not None:
+            state, factor = self.pilot.state, self.pilot.real_time_factor
+            record["mode"] = state.mode
+            record["armed"] = state.armed
+            record["real_time_factor"] = None if factor is None else round(factor, 4)
+            if state.position is not None:
+                record["altitude_m"] = round(state.position.relative_alt_m, 1)
+            if state.garbage:
+                record["garbage"] = state.garbage
+            if state.log_error is not None:
+                record["telemetry_log_error"] = state.log_error
+            if self._befallen:
+                record["befallen"] = self._befallen
+            if state.texts:
+                record["last_text"] = state.texts[-1]
+        return record
+
+    def _what_flew(self) -> dict[str, Any]:
+        """As far as it has said; files from the run's directory on."""
+        given: dict[str, Any] = {"frame": self.kind.frame, "binary_sha256": self.kind.sha256}
+        if self.pilot is not None:
+            state, parameters = self.pilot.state, self.pilot.link.parameters
+            if state.mav_type is not None:
+                given["mav_type"] = mav_type(state.mav_type)
+            if state.version is not None:
+                given |= {"version": state.version.number, "commit": state.version.commit}
+            if (self._directory / PARAMETERS).exists():
+                file = f"vehicles/{self._directory.name}/{PARAMETERS}"
+                given |= {"parameters": len(parameters), "parameters_file": file}
+        if self.kind.parameters:
+            given["parameters_given"] = dict(self.kind.parameters)
+        return {key: value for key, value in given.items() if value is not None}
+
+    def _ended(self, process: Program) -> VehicleFailedError:
+        return VehicleFailedError(
+            f"vehicle {self.vehicle_id} ({self.kind.name}) ended by itself with {process.end}{self._last_words()}"
+        )
+
+    def _last_words(self) -> str:
+        try:
+            lines = self._output.read_text(encoding="utf-8", errors="replace").splitlines()[-LAST_WORDS:]
+        except OSError:
+            lines = []
+        words = " / ".join(line.strip() for line in lines if line.strip())
+        where = f"vehicles/{self._directory.name}/{self._output.name}"
+        return f"; its last words ({where}): {words}" if words else f"; it said nothing ({where})"

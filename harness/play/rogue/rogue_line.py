@@ -1,0 +1,51 @@
+"""A line of the rogue node's journal, and the sequence numbers that identify an injection."""
+
+from typing import Any
+
+from ucp.messages import MalformedDatagramError, block_named, decode
+from ucp.secure.envelope import NAMES, read_clear
+from ucp.secure.envelope import VERSION as SECURED
+
+OF_NO_INJECTION = -1
+"""The number of the injection of a datagram that the scenario itself has (`harness.scenario.injection`)."""
+
+
+def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:
+    """The record of a datagram, sent at `at_s`; `refused` is why no agent would take it for a message."""
+    record = {"at_s": round(at_s, 6), "injection": injection, "what": what, "source": source}
+    if datagram[2:3] == bytes([SECURED]):
+        return {**record, "bytes": len(datagram), **_secured(datagram)}
+    try:
+        sender, sequence, message = decode(datagram)
+    except MalformedDatagramError as malformed:
+        return {**record, "bytes": len(datagram), "refused": malformed.reason}
+    block = block_named(message)
+    decoded = {"message": message.NAME, "sender": sender, "sequence": sequence}
+    return {**record, **decoded, "block": block.hex() if block else None, "bytes": len(datagram)}
+
+
+def _secured(datagram: bytes) -> dict[str, Any]:
+    """What is in clear of a sealed datagram."""
+    try:
+        clear = read_clear(datagram)
+    except MalformedDatagramError as malformed:
+        return {"refused": malformed.reason}
+    if clear.type not in NAMES:
+        return {"refused": "a revocation"}
+    return {"message": NAMES[clear.type], "sender": clear.sender, "sequence": clear.sequence, "block": None}
+
+
+FORGED_FROM = 1 << 31
+"""No agent counts its datagrams up to this; from here on they are the rogue's."""
+_EACH = 1 << 17
+"""Of one injection: more than a flood has datagrams."""
+
+
+def forged_sequence(injection: int, count: int) -> int:
+    """That of the datagram with this count, from 0, of the injection with this number, from 1."""
+    return FORGED_FROM + (injection - 1) * _EACH + count % _EACH
+
+
+def injection_of(sequence: int) -> int | None:
+    """The number of the injection that forged the datagram; None if an agent sent it."""
+    return (sequence - FORGED_FROM) // _EACH + 1 if sequence >= FORGED_FROM else None

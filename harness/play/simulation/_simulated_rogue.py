@@ -1,0 +1,79 @@
+"""The rogue node in virtual time: it hears every datagram when it is sent, and is heard a moment later.
+
+What it sends reaches every living agent but the one that it imitates, which would take it for an echo of its own.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from harness.play.rogue._journal import Journal
+from harness.play.rogue._rogue import Rogue
+from harness.play.simulation.air import StrayDatagram, VirtualAir
+from harness.scenario.changes import Injected
+from netem.medium import LATENCY
+from ucp.messages import Message, encode
+
+if TYPE_CHECKING:
+    from harness.play.rogue._crafted import CapturedKeys
+
+MOMENT_S = LATENCY.mean_s
+
+
+class VirtualRogue:
+    """`number` is its own on the air, where agents are numbered in the roster's order."""
+
+    def __init__(
+        self,
+        roster: Sequence[int],
+        seed: int,
+        air: VirtualAir,
+        number: int,
+        write: Callable[[dict[str, Any]], None],
+        captured: "CapturedKeys | None" = None,
+        initial_data: bytes = b"",
+    ) -> None:
+        self._rogue = Rogue(roster, seed, captured=captured, initial_data=initial_data)
+        self._roster = roster
+        self._air = air
+        self._number = number
+        self._wakes_at: float | None = None
+        self._journal = Journal(write)
+
+    @property
+    def sent(self) -> dict[int, int]:
+        """How many datagrams each injection that has begun has made."""
+        return dict(self._rogue.sent)
+
+    def hears(self, sender: int, sequence: int, message: Message, now: float) -> None:
+        self.hears_datagram(encode(sender, sequence, message), now)
+
+    def hears_datagram(self, datagram: bytes, now: float) -> None:
+        self._rogue.hears(datagram, now)
+        self._send(now)
+
+    def begin(self, injected: Injected, now: float) -> None:
+        self._rogue.begin(injected.number, injected.injection, now)
+        self._send(now)
+
+    def wake(self, now: float) -> None:
+        """Something that it waits for is due."""
+        self._wakes_at = None
+        self._rogue.handle_timer(now)
+        self._send(now)
+
+    def close(self) -> None:
+        self._journal.close()
+
+    def _send(self, now: float) -> None:
+        for injected in self._rogue.to_send():
+            hearing = [
+                number
+                for number, agent in enumerate(self._roster)
+                if agent != injected.source and (injected.receivers is None or agent in injected.receivers)
+            ]
+            self._air.inject(now + MOMENT_S, StrayDatagram(injected.source, injected.datagram), hearing)
+            self._journal.add(injected, now)
+        soonest = self._rogue.next_timer()
+        if soonest is not None and (self._wakes_at is None or soonest < self._wakes_at):
+            self._wakes_at = soonest
+            self._air.expect(soonest, self._number, None)

@@ -1,0 +1,298 @@
+"""From bounds to what holds within them: explore, look at the whole, and write what was found as scenarios."""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from harness.archive.directory import default_path
+from harness.errors import INTERRUPTED, VIOLATED, HarnessError
+from harness.proof._progress_bar import Budget, Ended, Figures, GivenUpError, Progress
+from harness.proof.bounds import Bounds, BoundsError
+from harness.proof.examples._example import Example, keep, play
+from harness.proof.examples._path_script import NO_CLOCKS, Script
+from harness.proof.graph._exploration import Graph, explore
+from harness.proof.graph._workers import Crew
+from harness.proof.model._any_sender import collect
+from harness.proof.model._flaws import Flaw
+from harness.proof.model._global_states import AGENTS, ZONE, Swarm
+from harness.proof.model._reduction import ReductionError
+from harness.proof.questions import _convergence as liveness
+from harness.proof.questions import _livelock
+from harness.proof.questions._convergence import Liveness
+from harness.proof.questions._graph_cycles import cycles
+from harness.proof.questions._livelock import Livelock
+from harness.run.finding import claim
+
+INCOMPLETE = 4
+"""Exit status: a bound was reached before everything had been looked at."""
+CLAIMS = {
+    "2": "an idle agent has committed every block that it completed",
+    "3": "no agent holds a block twice",
+    "4": "every block is genuine",
+    "hang": "no agent reconciles without a timer that would end it",
+    "crash": "no handler ends by an error",
+    "steps": "every step is that of a right agent",
+}
+"""What is looked at in every state; "steps" where it is asked for."""
+OF_CAPTORS = {
+    "1": "every message that is believed was sent by the vehicle that it names",
+    "4": "every block is genuine",
+}
+"""What a captor may violate though no agent does anything wrong: looked at where somebody is captured."""
+SHOWN = {
+    "1": "an agent believes what the captured vehicle never sent",
+    "4": "an agent holds a block in the captured vehicle's name that it never completed",
+}
+OF_OTHERS = {
+    "honest": "every block in the name of another than the captured vehicle is genuine",
+    "name": "nothing is heard in another's name, and no block that its maker did not sign",
+    "revoked": "nothing is heard of the captured vehicle by who knows that it is revoked",
+}
+"""What it must not, whatever it says."""
+RUN_LOOKED_FOR_S = 60.0
+"""For so long, at most, a run is looked for that has the flaw that an agent by itself has."""
+PLAYED = {
+    "honest": "4",
+    "name": "1",
+    "revoked": "1",
+    "2": "2",
+    "3": "3",
+    "4": "4",
+    "hang": "liveness",
+    "crash": "liveness",
+    "steps": "steps",
+}
+"""Kinds of flaws, and by what a simulated run shows them."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When to give up: memory of all processes, and time; and on how many cores to look."""
+
+    most_bytes: float = 4e9
+    most_s: float = float("inf")
+    cores: int = 1
+
+    def __post_init__(self) -> None:
+        if self.cores < 1:
+            raise BoundsError(f"--cores must be 1 or more, not {self.cores}")
+
+    @property
+    def of_exploring(self) -> dict[str, Any]:
+        return {"most_bytes": self.most_bytes, "most_s": self.most_s}
+
+
+@dataclass
+class Proof:
+    """What came out. `liveness` is None if it was not looked at: not all states are known, or the network is `any`.
+
+    `whole_ended` is how looking at the whole graph ended, if that was begun.
+
+    `way` is what an agent did that has a flaw in the network `any`, where nothing shows that all of it fits together.
+    """
+
+    bounds: Bounds
+    figures: Figures
+    ended: Ended
+    flaw: Flaw | None
+    liveness: Liveness | None = None
+    whole_ended: Ended = "complete"
+    example: Example | None = None
+    fork: Example | None = None
+    """The nearest state at rest with several chains: nothing is violated, and it stays so until somebody votes."""
+    reluctant: Example | None = None
+    """The nearest state for which one more vote is not enough, if more votes are."""
+    livelocks: list[Livelock] = field(default_factory=list)
+    """The first of each form, those that were played; also of what was looked at where that is not all."""
+    way: list[str] = field(default_factory=list)
+    shown: dict[str, Example | None] = field(default_factory=dict)
+    """By characteristic of `OF_CAPTORS`: the nearest of what a captor does; None in the network `any`."""
+
+    @property
+    def claims(self) -> dict[str, str]:
+        """What is looked at in every state."""
+        claims = CLAIMS if self.bounds.steps else {kind: claim for kind, claim in CLAIMS.items() if kind != "steps"}
+        if self.bounds.captured is None:
+            return claims
+        return {**dict(sorted({**claims, **OF_CAPTORS}.items())), **OF_OTHERS}
+
+    @property
+    def complete(self) -> bool:
+        return self.ended == "complete"
+
+    @property
+    def exit_status(self) -> int:
+        live = self.liveness
+        if self.flaw or self.shown or self.livelocks or (live is not None and (live.cycles or live.lost is not None)):
+            return VIOLATED
+        if "interrupted" in (self.ended, self.whole_ended):
+            return INTERRUPTED
+        whole = self.whole_ended == "complete" and (live is None or live.decided)
+        return 0 if self.complete and whole else INCOMPLETE
+
+    def to_json(self) -> dict[str, Any]:
+        bounds, live, flaw = self.bounds, self.liveness, self.flaw
+        return {
+            "schema": "ucp-proof/1",
+            "agents": bounds.agents,
+            "blocks": bounds.blocks,
+            "network": bounds.network,
+            "faults": list(bounds.faults),
+            "timers": "any" if bounds.timers_any else "duration",
+            "coincidences": bounds.coincidences,
+            "clocks": "any" if bounds.clocks_any else "agreed",
+            "losses": bounds.losses,
+            "crossing": bounds.crossing,
+            "settings": dict(bounds.settings),
+            "stagger": dict(bounds.stagger),
+            **(self._captors_json() if bounds.captured is not None else {}),
+            "quirks": dict(bounds.quirks),
+            "reduced": bounds.reduced,
+            "steps_judged": bounds.steps,
+            "complete": self.complete,
+            "ended": self.ended,
+            "whole_ended": self.whole_ended,
+            **asdict(self.figures),
+            "flaw": None if flaw is None else asdict(flaw),
+            "way": self.way,
+            "forks_at_rest": None if live is None else live.forks,
+            "fork": None if self.fork is None else self.fork.to_json(),
+            "reluctant": None if self.reluctant is None else self.reluctant.to_json(),
+            "without_a_way_to_one_chain": None if live is None else live.astray,
+            "livelocks": sum(each.ways for each in self.livelocks) or None if live is None else len(live.cycles),
+            "livelock_forms": [each.to_json() for each in self.livelocks],
+            "example": None if self.example is None else self.example.to_json(),
+        }
+
+    def _captors_json(self) -> dict[str, Any]:
+        return {
+            "captured": self.bounds.captured,
+            "lies": None if self.bounds.network == "any" else self.bounds.lies,
+            "shown": {key: None if example is None else example.to_json() for key, example in self.shown.items()},
+        }
+
+
+def prove(
+    bounds: Bounds,
+    limits: Limits = Limits(),
+    out: Path | None = None,
+    *,
+    watch: Callable[[Progress], None] = lambda progress: None,
+) -> Proof:
+    """Look at everything within `bounds`; what is found is written to `out`, or to a new file under `runs`.
+
+    Raises HarnessError if nothing can be written, or if the agent does what a reduction must not meet.
+    """
+    try:
+        if bounds.network == "any":
+            return _alone(bounds, limits, out, watch)
+        return _together(bounds, limits, out, watch)
+    except ReductionError as error:
+        raise HarnessError(f"{error}") from None
+
+
+def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:
+    name, path = _claimed(bounds, out)
+    began_s = time.process_time()
+    found = collect(bounds, most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
+    figures = Figures(
+        found.states,
+        found.looked_at,
+        found.transitions,
+        found.local_states,
+        found.steps,
+        found.zones,
+        None,
+        round(found.seconds, 3),
+        round(time.process_time() - began_s, 3),
+    )
+    proof = Proof(bounds, figures, found.ended, found.flaw, way=found.way, shown=dict.fromkeys(sorted(found.shown)))
+    if found.flaw is not None:
+        limits = replace(limits, most_s=min(RUN_LOOKED_FOR_S, limits.most_s - found.seconds))
+        swarm = Swarm(_with_instants(bounds))
+        with Crew(swarm, limits.cores) as crew:
+            graph = explore(swarm, **limits.of_exploring, crew=crew, watch=watch)
+        if graph.flawed is not None and graph.flaw is not None and graph.flaw.kind == found.flaw.kind:
+            proof.example = _example(graph, graph.flawed, graph.flaw.sentence, path, name)
+    return proof
+
+
+def _with_instants(bounds: Bounds) -> Bounds:
+    """Where messages are lost and heard twice, each in its instant: what is found there is a run."""
+    return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
+
+
+def _claimed(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
+    """Name and file of a scenario."""
+    name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
+    return name, claim(out or default_path(name).with_suffix(".yaml"), name)
+
+
+def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:
+    name, path = _claimed(bounds, out)
+    began_s = time.process_time()
+    swarm = Swarm(bounds)
+    with Crew(swarm, limits.cores) as crew:
+        graph = explore(swarm, **limits.of_exploring, crew=crew, watch=watch)
+        figures = Figures(
+            len(graph.states),
+            graph.looked_at,
+            graph.transitions,
+            len({local for state in graph.states for local in state[AGENTS:]}),
+            swarm.local.steps + graph.crew_steps,
+            len({state[ZONE] for state in graph.states}),
+            graph.depth,
+            round(graph.seconds, 3),
+            round(time.process_time() - began_s + graph.crew_s, 3),
+        )
+        proof = Proof(bounds, figures, graph.ended, graph.flaw)
+        if proof.complete:
+            budget = Budget(limits.most_bytes, limits.most_s - graph.seconds)
+
+            def asked_now(asked: str) -> None:
+                if budget.check(crew.memory_bytes):
+                    watch(graph.progress(graph.seconds + budget.seconds, asked))
+
+            try:
+                proof.liveness = liveness.look(graph, asked_now, crew)
+            except GivenUpError as given_up:
+                proof.whole_ended = given_up.ended
+            except KeyboardInterrupt:
+                proof.whole_ended = "interrupted"
+    _show(proof, graph, path, name)
+    return proof
+
+
+def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
+    """Write what was found as scenarios: the first to `path`."""
+    live = proof.liveness
+    ways_round = live.cycles if live is not None else cycles(graph) if proof.ended in ("memory", "time") else []
+    for key, number in graph.shown.items():
+        beside = path.with_stem(f"{path.stem}_characteristic_{key}")
+        proof.shown[key] = _example(graph, number, SHOWN[key], beside, f"{name} characteristic {key}")
+    if proof.flaw is not None and graph.flawed is not None:
+        proof.example = _example(graph, graph.flawed, proof.flaw.sentence, path, name)
+    elif ways_round:
+        proof.livelocks = list(_livelock.show(graph, ways_round, path, name))
+        proof.example = proof.livelocks[0].example
+    elif live is not None and live.lost is not None:
+        proof.example = _example(graph, live.lost, "no way was found from here to rest with one chain", path, name)
+    if live is not None and live.fork is not None:
+        beside = path.with_stem(f"{path.stem}_fork")
+        sentence = "all are at rest, and chains differ: they will until somebody votes"
+        proof.fork = _example(graph, live.fork, sentence, beside, f"{name} fork")
+    if live is not None and live.reluctant is not None and live.lost is None and live.decided:
+        beside = path.with_stem(f"{path.stem}_votes")
+        sentence = "one more vote does not lead from here to one chain"
+        proof.reluctant = _example(graph, live.reluctant, sentence, beside, f"{name} votes")
+
+
+def _example(graph: Graph, number: int, sentence: str, path: Path, name: str) -> Example:
+    way = graph.path(number)
+    script = Script(graph, way)
+    played = play(script.document(name))
+    said = [f"{sentence.capitalize()}: {len(way) - 1} instants after the beginning."]
+    said += [f"On this way it comes to that only {NO_CLOCKS}."] if script.contradictory else []
+    return keep(played, path, graph.swarm.bounds, len(way) - 1, said)

@@ -1,0 +1,125 @@
+"""What was proven, for people; nothing "holds" of which not everything was looked at."""
+
+from collections.abc import Iterator
+
+from harness.proof._proof import PLAYED, Proof
+from harness.proof.bounds import Bounds
+from harness.proof.examples._example import Example
+
+WHY = {
+    "flaw": "it ends where the first flaw is",
+    "memory": "the bound of --memory was reached",
+    "time": "the bound of --for was reached",
+    "interrupted": "it was interrupted",
+}
+
+
+def in_words(proof: Proof) -> Iterator[str]:
+    figures = proof.figures
+    ended = "complete" if proof.complete else f"not complete: {WHY[proof.ended]}"
+    yield f"{proof.bounds.in_words()}: {ended}"
+    left = "" if proof.complete else f", of which {figures.looked_at:,} were looked at"
+    instants = "of agents by themselves" if figures.depth is None else f"up to {figures.depth} instants"
+    yield (
+        f"  {figures.states:,} states{left}, {figures.transitions:,} transitions, {figures.local_states:,} "
+        f"local states, {figures.zones:,} zones, {instants}, in {figures.seconds:.1f} s"
+    )
+    if proof.ended in ("memory", "time") and (tighter := _tighter(proof.bounds)):
+        yield f"  what comes to an end sooner: the same with {' or '.join(tighter)}"
+    for kind, claim in proof.claims.items():
+        yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
+        if (shown := proof.shown.get(kind)) is not None:
+            yield f"    the nearest, {shown.instants} instants: {shown.replay}"
+            yield from _played(shown)
+    if proof.flaw is not None:
+        yield f"    {proof.flaw.sentence}"
+    yield from _of_the_whole(proof)
+    if proof.way:
+        yield f"  an agent may, if all that it hears can be sent in one run: {'; '.join(proof.way)}"
+    for livelock in proof.livelocks:
+        ways = f"{livelock.ways} way{'s' if livelock.ways > 1 else ''}"
+        yield f"  {ways} of one form, {livelock.in_words()}: {livelock.example.replay}"
+        yield from _played(livelock.example)
+    live = proof.liveness
+    if live is not None and (more := len(live.cycles) - sum(livelock.ways for livelock in proof.livelocks)):
+        yield f"  {more} more, of other forms, {'was' if more == 1 else 'were'} not played"
+    example = proof.example
+    if example is not None and not proof.livelocks:
+        yield f"  a shortest way there, {example.instants} instants: {example.replay}"
+        if proof.flaw is not None and PLAYED[proof.flaw.kind] not in example.judged:
+            yield "    not shown by playing: the simulation goes another way"
+        yield from _played(example)
+
+
+def _tighter(bounds: Bounds) -> list[str]:
+    """Options that leave less to look at."""
+    if bounds.network == "any" or bounds.timers_any:
+        return []
+    options = ["--losses 1"] if bounds.network == "lossy" and bounds.losses is None else []
+    options += ["--coincidences 0"] if bounds.coincidences is None else []
+    options += ["--no-crossing"] if bounds.crossing else []
+    if bounds.nameless and not bounds.clocks_any:
+        options.append("--clocks any")
+    return options
+
+
+def _played(example: Example) -> Iterator[str]:
+    for key, judgement in example.judged.items():
+        yield f"    played: {key} {judgement.verdict}, {judgement.reason}"
+    if not example.judged:
+        yield "    played: the simulation goes another way in the end, and nothing is bad about it"
+
+
+def _name(kind: str) -> str:
+    return f"characteristic {kind}" if kind.isdecimal() else kind
+
+
+def _mark(proof: Proof, kind: str) -> str:
+    if kind in proof.shown:
+        return "✘ violated,"
+    if proof.flaw is not None and proof.flaw.kind == kind:
+        return "✘ not shown," if proof.bounds.network == "any" and proof.example is None else "✘ violated,"
+    return "✔ holds," if proof.complete else "- not decided,"
+
+
+def _of_the_whole(proof: Proof) -> Iterator[str]:
+    live = proof.liveness
+    if proof.bounds.network == "any":
+        yield "- not looked at, one chain, livelock: they are about all agents together; see the network lossy"
+        return
+    if live is None:
+        if proof.whole_ended != "complete":
+            yield f"  of the whole graph: {WHY[proof.whole_ended]}"
+        yield "- not decided, one chain: from every state some way without losses leads to rest with one chain"
+        if proof.livelocks:
+            yield "✘ violated, livelock: what was looked at has ways to go round for ever, though nothing is lost"
+        else:
+            yield "- not decided, livelock: the swarm cannot go round for ever"
+        return
+    votes = len(live.astray) - 1
+    after = (
+        "without another vote" if not votes else "after one more vote" if votes == 1 else f"after {votes} more votes"
+    )
+    if not live.decided:
+        yield "- not decided, one chain: what may follow more votes is more than is looked at"
+    elif live.lost is None:
+        yield f"✔ holds, one chain: from every state some way without losses leads to rest with one chain, {after}"
+    else:
+        states = f"{live.astray[-1]:,} states"
+        yield f"✘ not shown, one chain: from {states} no way without losses leads to rest with one chain, even {after}"
+    if votes and live.decided:
+        counts = ", ".join(f"{count:,} with {number}" for number, count in enumerate(live.astray[:-1]))
+        yield f"    states that cannot yet, by how many more votes there are: {counts}"
+    if proof.reluctant is not None:
+        nearest = proof.reluctant
+        yield f"    the nearest that needs more than one vote, {nearest.instants} instants: {nearest.replay}"
+    yield f"    {live.forks:,} states are at rest with several chains, and stay so until somebody votes"
+    if proof.fork is not None:
+        fork = proof.fork
+        yield f"    the nearest of them, {fork.instants} instants, {fork.chains} chains when played: {fork.replay}"
+    if live.cycles:
+        count = len(live.cycles)
+        ways = "is 1 way" if count == 1 else f"are {count} ways"
+        yield f"✘ violated, livelock: there {ways} to go round for ever, though nothing is lost"
+    else:
+        yield "✔ holds, livelock: the swarm cannot go round for ever if nothing is lost and no new block comes"

@@ -1,0 +1,80 @@
+"""A way through the graph, played by the simulation and written as a scenario."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness.archive.run_record import Cycle
+from harness.checker import Result
+from harness.checker.judgement import Judgement
+from harness.checker.recurring_cycles import cycle_of
+from harness.play.simulation.foreign.failure import AgentFailedError
+from harness.proof.bounds import Bounds
+from harness.run.finding import ended_by, evidence_lines, write
+from harness.run.simulate import simulate
+from harness.scenario.load import parse
+from harness.scenario.scenario_file import to_yaml
+
+SEED = 1
+
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Example:
+    """A way to something that was found, as a scenario in `path`; `judged` is what is bad about its simulated run."""
+
+    path: Path
+    instants: int
+    judged: dict[str, Judgement]
+    chains: int
+    """How many there were in the end."""
+
+    @property
+    def replay(self) -> str:
+        return f"ucp-harness run {self.path} --backend sim --seed {SEED}"
+
+    def to_json(self) -> dict[str, Any]:
+        judged = {key: judgement.verdict for key, judgement in self.judged.items()}
+        return {
+            "path": str(self.path),
+            "instants": self.instants,
+            "replay": self.replay,
+            "judged": judged,
+            "chains": self.chains,
+        }
+
+
+@dataclass(frozen=True)
+class Played:
+    """A simulated run: what is bad about it, and the cycle that it ends in, if it does."""
+
+    document: Document
+    judged: dict[str, Judgement]
+    cycle: Cycle | None
+    chains: int
+
+
+def play(document: Document) -> Played:
+    try:
+        simulated = simulate(parse(document), SEED, tracing=True)
+        result, cycle = simulated.result, simulated.evidence.once(cycle_of)
+    except AgentFailedError as error:
+        result, cycle = ended_by(error), None
+    return Played(document, _bad(result), cycle, len({*result.chains.values()}))
+
+
+def _bad(result: Result) -> dict[str, Judgement]:
+    return {key: result.judgements[key] for key in result.bad}
+
+
+def keep(played: Played, path: Path, bounds: Bounds, instants: int, sentences: Sequence[str]) -> Example:
+    """Write it to `path`; `sentences` say what it is."""
+    comment = [
+        *sentences,
+        f"A shortest way within {bounds.in_words()}.",
+        *evidence_lines(played.judged),
+        f"  ucp-harness run {path} --backend sim --seed {SEED}",
+    ]
+    return Example(write(path, to_yaml(played.document, comment)), instants, played.judged, played.chains)

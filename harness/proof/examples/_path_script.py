@@ -1,0 +1,312 @@
+"""A way through the graph as a scenario: scripted events, fates and lateness that make the simulation go the same way.
+
+A message takes LATENCY_S, or as long as it must so that everything reaches everybody in the order of the way, and
+before what follows at once; what is lost there has a fate here. A timer ends when it should, unless it has to wait for
+what was heard before.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import inf
+from typing import Any, NamedTuple
+
+from harness.proof.attacker._timeline_entries import Wording
+from harness.proof.bounds import EVENT_FILLS_BLOCK
+from harness.proof.examples._path_times import Ages, Run, instants_s, windows_s
+from harness.proof.graph._exploration import Graph
+from harness.proof.model._global_states import AGENTS, Move
+from harness.proof.model._instant import Action, Wave
+from harness.proof.model._known_states import DEAD
+from harness.proof.model._snapshot import Step
+from harness.scenario.strict_model import in_text
+from netem.medium import LATENCY
+
+LATENCY_S = 0.02
+HEARD_AFTER_S = LATENCY.mean_s
+"""What a rogue node sends is heard so much later."""
+MOMENT_S = 0.001
+"""Between two things of which one has to be the first."""
+SOON_S = 0.1
+"""When the next instant follows sooner, messages take a MOMENT_S, so that what begins then begins with the rest."""
+SETTLES_S = 60
+NO_CLOCKS = "if ties of phase 2 go as no clocks make them go"
+"""Of two blocks now the one has to be the older and then the other, or an agent's clock has to go back."""
+
+Document = dict[str, Any]
+
+
+@dataclass(eq=False)
+class _Flight:
+    """One broadcast: what it says, by which of the agents, when, and which of its kind it is."""
+
+    sender: int
+    message: int
+    name: str
+    count: int
+    sent_s: float
+    lost_by: list[int] = field(default_factory=list)
+
+
+@dataclass
+class _Agent:
+    """An agent on the way: what it is, and the timers that it runs, with number and end."""
+
+    agent_id: int
+    local: int
+    timers: dict[int, tuple[int, float]] = field(default_factory=dict)
+    started: int = 0
+
+
+class Completion(NamedTuple):
+    """When an agent may complete a block for the way to be gone: seconds after the first instant of the way."""
+
+    agent: int
+    earliest_s: float
+    latest_s: float
+
+
+class Script:
+    """Follows a way, step by step, and takes down what is to be scripted."""
+
+    def __init__(self, graph: Graph, way: Sequence[int]) -> None:
+        self._graph = graph
+        self._swarm = graph.swarm
+        self._moves = [self._move(before, after) for before, after in pairwise(way)]
+        self.coincidences = sum(
+            self._swarm.coincidences(graph.states[number], move.actions)
+            for number, move in zip(way, self._moves, strict=False)
+        )
+        """So many moments on the way have to be the same by chance."""
+        begin = graph.states[way[0]]
+        self._agents = [_Agent(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
+        self._sent: Counter[tuple[int, str]] = Counter()
+        self._events: list[Document] = []
+        self._ages = Ages()
+        self.contradictory = False
+        """Whether ties go as no clocks make them go: known with the document."""
+        self.losses = 0
+        """So many messages are lost by somebody on the way: known with the document, too."""
+        self._timeline: list[Document] = []
+        self._fates: list[Document] = []
+        self._late: dict[int, dict[int, float]] = defaultdict(dict)
+        self._end_s = 0.0
+        self._latency_s = LATENCY_S
+        captor = self._swarm.captor
+        self._wording = None if captor is None else Wording(self._swarm.local, captor.captured, captor.made)
+
+    def document(self, name: str) -> Document:
+        """The scenario."""
+        instants = instants_s(len(self._moves), list(self._runs()))
+        for move, at_s, next_s in zip(self._moves, instants, [*instants[1:], inf], strict=True):
+            self._latency_s = LATENCY_S if next_s - at_s > SOON_S else MOMENT_S
+            self._play(move, at_s)
+        self._let_nothing_end_before_the_end()
+        self.contradictory = not self._ages.date(self._events)
+        if self._wording is not None:
+            self._wording.word()
+        bounds = self._swarm.bounds
+        lateness = {
+            agent_id: in_text(sorted(late.items()), "+") for agent_id, late in sorted(self._late.items()) if late
+        }
+        return {
+            "name": name,
+            "agents": bounds.agents,
+            "duration_s": float(round(self._end_s) + SETTLES_S),
+            "network": {"delay": LATENCY_S},
+            "settings": {**EVENT_FILLS_BLOCK, **bounds.settings},
+            **({"security": {"captured": bounds.captured}} if bounds.captured else {}),
+            **({"stagger": dict(bounds.stagger)} if bounds.stagger else {}),
+            **({"quirks": dict(bounds.quirks)} if bounds.quirks else {}),
+            **({"timeline": self._timeline} if self._timeline else {}),
+            "events": {"source": "scripted", **({"script": self._events} if self._events else {})},
+            **({"fates": self._fates} if self._fates else {}),
+            **({"lateness": lateness} if lateness else {}),
+        }
+
+    def completions(self) -> Iterator[Completion]:
+        """When blocks are completed on the way, if nothing but the durations of timers binds them."""
+        agents = [agent.agent_id for agent in self._agents]
+        for move, (earliest_s, latest_s) in zip(
+            self._moves, windows_s(len(self._moves), list(self._runs())), strict=True
+        ):
+            for action in move.actions:
+                if action.what == "complete":
+                    yield Completion(agents[action.place], earliest_s, latest_s)
+            agents = [agents[old] for old in move.places]
+
+    def _move(self, before: int, after: int) -> Move:
+        """How the one state followed from the other, losing nothing if that is possible."""
+        state, wanted = self._graph.states[before], self._graph.states[after]
+        for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
+            for actions in self._swarm.actions(state):
+                if wanted in self._swarm.after(state, actions, lossy):
+                    return next(move for move in self._swarm.moves(state, actions, lossy) if move.state == wanted)
+        raise AssertionError("a state on the way follows from the one before")
+
+    # When
+
+    def _runs(self) -> list[Run]:
+        """All timers that run on the way."""
+        running: dict[tuple[int, int], tuple[int, float]] = {}
+        runs = []
+        for instant, move in enumerate(self._moves):
+            for action in move.actions:
+                if action.what == "timer":
+                    began, duration_s = running.pop((action.place, action.number))
+                    runs.append(Run(began, duration_s, instant, True))
+            runs += [Run(began, duration_s, instant, False) for began, duration_s in running.values()]
+            after: dict[tuple[int, int], tuple[int, float]] = {}
+            for new, old in enumerate(move.places):
+                local = move.state[AGENTS + new]
+                for timer in self._swarm.local.known[local].running if local != DEAD else ():
+                    before = running.get((old, timer))
+                    started = dict(move.started[old]).get(timer)
+                    if before is None or started is not None:
+                        us = self._swarm.local.durations_us[timer] if started is None else started
+                        before = instant, us / 1e6
+                    after[new, timer] = before
+            running = after
+        return runs
+
+    # What
+
+    def _play(self, move: Move, at_s: float) -> None:
+        """One instant: what agents do of their own, then all that is heard."""
+        earliest = self._end_s + MOMENT_S if self._end_s else 0.0
+        ends = [
+            max(self._agents[action.place].timers[action.number][1], earliest)
+            for action in move.actions
+            if action.what == "timer"
+        ]
+        if any(action.what == "lie" for action in move.actions):
+            earliest += HEARD_AFTER_S
+        other_s = round(max([at_s, earliest, *ends]), 3)
+        air: list[_Flight] = []
+        acted_s = other_s if not ends else max(ends)
+        for action in move.actions:
+            agent = self._agents[action.place]
+            if action.what == "timer":
+                number, nominal_s = agent.timers[action.number]
+                now = max(nominal_s, earliest)
+                if now > nominal_s + 1e-9:
+                    self._late[agent.agent_id][number] = now - nominal_s
+                self._ages.asked(*self._swarm.local.older(agent.local, action.number, action.way))
+                step = self._swarm.local.end_timer(agent.local, action.number, action.way)
+            else:
+                now = other_s
+                if action.what != "lie":  # all hear it at once
+                    other_s = round(other_s + MOMENT_S, 3)
+                step = self._other(agent, action, now)
+            acted_s = max(acted_s, now)
+            air += self._done(agent, step, now)
+        self._end_s = max(self._end_s, acted_s)
+        for wave in _in_order(move.wave):
+            air = self._hear(wave, self._as_in(wave, air), acted_s)
+        self._ages.renumber(move.blocks)
+        self._agents = [self._agents[old] for old in move.places]
+        for agent, local in zip(self._agents, move.state[AGENTS:], strict=True):
+            agent.local = local
+
+    def _other(self, agent: _Agent, action: Action, now: float) -> Step:
+        if action.what == "complete":
+            self._events.append({"at_s": now, "agent": agent.agent_id})
+            self._ages.completed(action.number)
+            step = self._swarm.local.complete(agent.local, action.number)
+            if self._wording is not None:
+                self._wording.completed(agent.agent_id, action.number, now)
+            return step
+        if action.what == "lie" and self._wording is not None:
+            self._timeline += self._wording.lie(agent.agent_id, action.number, round(now - HEARD_AFTER_S, 6))
+            return self._swarm.local.lie(agent.local, action.number)
+        agent.timers = {}
+        if action.what == "reboot":
+            self._timeline.append({"at_s": now, "reboot": [agent.agent_id], "down_s": MOMENT_S, "disk": "kept"})
+            return self._swarm.local.reboot(agent.local)
+        self._timeline.append({"at_s": now, "kill": [agent.agent_id]})
+        return Step(DEAD, (), ())
+
+    def _done(self, agent: _Agent, step: Step, now: float) -> list[_Flight]:
+        """The agent has done this: its timers, and what it sends."""
+        agent.local = step.local
+        if self._wording is not None and step.local != DEAD:
+            self._wording.sees(step.local)
+        running = self._swarm.local.known[step.local].running if step.local != DEAD else ()
+        agent.timers = {timer: run for timer, run in agent.timers.items() if timer in running}
+        started = dict(step.started)
+        for timer in running:
+            if timer in started or timer not in agent.timers:
+                us = started.get(timer, self._swarm.local.durations_us[timer])
+                agent.timers[timer] = agent.started, now + us / 1e6
+                agent.started += 1
+        flights = []
+        for message in step.sent:
+            name = self._swarm.local.messages[message].NAME
+            self._sent[agent.agent_id, name] += 1
+            flights.append(_Flight(agent.agent_id, message, name, self._sent[agent.agent_id, name], now))
+        return flights
+
+    def _as_in(self, wave: Wave, flights: Sequence[_Flight]) -> list[_Flight]:
+        """These flights in the order in which the wave has them."""
+        left, ordered = list(flights), []
+        for place, message in wave.air:
+            sender = self._agents[place].agent_id
+            flight = next(flight for flight in left if (flight.sender, flight.message) == (sender, message))
+            left.remove(flight)
+            ordered.append(flight)
+        return ordered
+
+    def _hear(self, wave: Wave, air: Sequence[_Flight], acted_s: float) -> list[_Flight]:
+        """Everybody hears what it does of what is on the air; what they answer."""
+        answers: dict[int, list[_Flight]] = {}
+        heard_by_anybody: set[int] = set()
+        for place, heard in enumerate(wave.heard):
+            agent = self._agents[place]
+            answers[place] = []
+            if agent.local == DEAD:
+                continue
+            for number, flight in enumerate(air):
+                if flight.sender != agent.agent_id and number not in heard:
+                    flight.lost_by.append(agent.agent_id)
+                    self.losses += 1
+            last_s = acted_s
+            for number in heard:
+                heard_by_anybody.add(number)
+                flight = air[number]
+                arrives_s = flight.sent_s + self._latency_s
+                hurried = self._latency_s < LATENCY_S
+                if arrives_s <= last_s:
+                    arrives_s = last_s + MOMENT_S
+                    hurried = hurried or self._swarm.order_matters(agent.local, place, wave, heard)
+                if hurried:
+                    self._fate(flight, agent.agent_id, delay_s=round(arrives_s - flight.sent_s, 6))
+                last_s = arrives_s
+                self._end_s = max(self._end_s, arrives_s)
+                sender = self._swarm.name_of(wave.air[number][0], place)
+                answers[place] += self._done(agent, self._swarm.local.hear(agent.local, sender, flight.message), last_s)
+        for number, flight in enumerate(air):
+            if number not in heard_by_anybody and len(flight.lost_by) > 1:
+                self._fate(flight, None, drop=True)
+            else:
+                for agent_id in flight.lost_by:
+                    self._fate(flight, agent_id, drop=True)
+        return [flight for place in range(len(wave.heard)) for flight in answers[place]]
+
+    def _fate(self, flight: _Flight, receiver: int | None, **what: Any) -> None:
+        whom = {} if receiver is None else {"receiver": receiver}
+        self._fates.append({"message": flight.name, "sender": flight.sender, **whom, "count": flight.count, **what})
+
+    def _let_nothing_end_before_the_end(self) -> None:
+        for agent in self._agents:
+            for number, ends_s in agent.timers.values():
+                if ends_s <= self._end_s:
+                    self._late[agent.agent_id][number] = self._end_s + MOMENT_S - ends_s
+
+
+def _in_order(last: Wave | None) -> list[Wave]:
+    waves = []
+    while last is not None:
+        waves.append(last)
+        last = last.before
+    return waves[::-1]

@@ -1,0 +1,209 @@
+"""Of all orders of the agents one that stands for all: agents that are alike change places freely, and blocks numbers.
+
+It is chosen by what the agents are and how their timers stand to each other, never by the numbers that states and zones
+have got: so it is the same on any machine, and in whatever order states were come upon.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain, groupby, islice, permutations, product
+from typing import Any, NamedTuple
+
+from harness.proof.model._block_renaming import Ordinals
+from harness.proof.model._known_states import DEAD
+from harness.proof.model._local_steps import LocalStates
+from harness.proof.model._snapshot import NAMES_OF_OTHERS
+from harness.proof.model._zones import Zones
+
+Places = tuple[int, ...]
+"""For each place of a state the place at which its agent stood before."""
+
+
+class Ordered(NamedTuple):
+    """Agents in order, the zone with their timers in that order, and where each of them stood.
+
+    `blocks` has for each block that they are about, from 1, which it was before; none if it still is what it was.
+    """
+
+    agents: tuple[int, ...]
+    zone: int
+    places: Places
+    blocks: Ordinals = ()
+
+
+MOST_KNOWN = 200_000
+"""So many orders are remembered; then they are chosen again."""
+MOST_ORDERS = 120
+"""So many orders of agents that look alike are compared; of more, states that are alike may count as several."""
+
+
+class Order:
+    """Puts agents in order. `name_of` is what the agent at a place calls the one at another."""
+
+    def __init__(self, local: LocalStates, zones: Zones, name_of: Callable[[int, int], int]) -> None:
+        self._as_they_are = tuple(range(local.bounds.agents))
+        self._local = local
+        self._zones = zones
+        self._name_of = name_of
+        self._known: dict[tuple[tuple[int, ...], int], Ordered] = {}
+
+    def of(self, locals_: tuple[int, ...], zone: int) -> Ordered:
+        key = locals_, zone
+        ordered = self._known.get(key)
+        if ordered is None:
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
+            ordered = self._known[key] = self._put_in_order(locals_, zone)
+        return ordered
+
+    def _put_in_order(self, locals_: tuple[int, ...], zone: int) -> Ordered:
+        timers = self._timers(locals_)
+        orders = [self._as_they_are]
+        if self._local.bounds.alike:
+            orders = list(islice(self._orders(locals_, zone, timers), MOST_ORDERS))
+        places = orders[0]
+        if len(orders) > 1:
+            places = min(orders, key=lambda places: self._looks(locals_, zone, timers, places))
+        if places != self._as_they_are:
+            agents = tuple([self._renamed(locals_[old], new, places) for new, old in enumerate(places)])
+            if zone:
+                zone = self._zones.permuted(zone, tuple([timer for place in places for timer in timers[place]]))
+        else:
+            agents = locals_
+        blocks = self._blocks(agents)
+        if blocks == tuple(range(1, len(blocks) + 1)):
+            return Ordered(agents, zone, places)
+        number = {block: new for new, block in enumerate(blocks, 1)}
+        about, exchanged = self._local.about, self._local.exchanged
+        agents = tuple([exchanged(local, tuple([number[block] for block in about(local)])) for local in agents])
+        return Ordered(agents, zone, places, blocks)
+
+    def _blocks(self, agents: Sequence[int]) -> Ordinals:
+        """The blocks that these agents are about, as one comes upon them; none if blocks keep their numbers."""
+        if not self._local.bounds.blocks_alike:
+            return ()
+        return tuple(dict.fromkeys(chain.from_iterable(map(self._local.about, agents))))
+
+    def _timers(self, locals_: Sequence[int]) -> list[range]:
+        """For each place which of the zone's timers are its agent's."""
+        timers, first = [], 1
+        for local in locals_:
+            end = first if local == DEAD else first + len(self._local.known[local].running)
+            timers.append(range(first, end))
+            first = end
+        return timers
+
+    def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
+        """All orders of the agents by what can be said of each; those of whom the same can be said in any."""
+        known, pattern = self._local.known, self._local.pattern
+        bounds = self._zones.bounds(zone) if zone else [()]
+        looks: list[tuple[Any, ...]] = [
+            (DEAD,) if local == DEAD else (known[pattern(local)].anonymous, *bounds[own.start : own.stop])
+            for local, own in zip(locals_, timers, strict=True)
+        ]
+        groups = _groups(looks)
+        some_named = any(local != DEAD and known[local].names_others for local in locals_)
+        if all(len(group) == 1 or (not some_named and self._are_one(group, locals_, timers)) for group in groups):
+            yield tuple(chain.from_iterable(groups))
+            return
+        if self._local.bounds.blocks_alike:
+            looks = self._with_blocks(locals_, looks)
+        named: list[list[set[int]]] = []
+        if some_named:
+            named = [self._named(local, place) for place, local in enumerate(locals_)]
+            looks = [
+                (
+                    looks[place],
+                    *sorted(
+                        (looks[other], *(place in part for part in named[other]), *(other in part for part in here))
+                        for other in range(len(locals_))
+                        if other != place
+                    ),
+                )
+                for place, here in enumerate(named)
+            ]
+        orders = [
+            _unlike(group, locals_) if self._change_places_freely(group, timers, named) else permutations(group)
+            for group in _groups(looks)
+        ]
+        for chosen in product(*orders):
+            yield tuple(place for group in chosen for place in group)
+
+    def _are_one(self, group: Sequence[int], locals_: Sequence[int], timers: Sequence[range]) -> bool:
+        """Whether agents are in one local state, without timers."""
+        return not timers[group[0]] and len({locals_[place] for place in group}) == 1
+
+    def _with_blocks(self, locals_: Sequence[int], looks: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """How agents look, and which others have the blocks that they are about, and where."""
+        ranks = {look: rank for rank, look in enumerate(sorted(set(looks)))}
+        where: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        for local, look in zip(locals_, looks, strict=True):
+            for position, block in enumerate(self._local.about(local)):
+                where[block].append((ranks[look], position))
+        return [
+            (look, *[tuple(sorted(where[block])) for block in self._local.about(local)])
+            for local, look in zip(locals_, looks, strict=True)
+        ]
+
+    def _change_places_freely(
+        self, group: Sequence[int], timers: Sequence[range], named: Sequence[Sequence[set[int]]]
+    ) -> bool:
+        """Whether agents that look alike are one as the other but for their blocks: without timers, and in nobody's
+        tally or in the same."""
+        if timers[group[0]]:
+            return False
+        return all(
+            not part if place in group else part.issuperset(group) or part.isdisjoint(group)
+            for place, parts in enumerate(named)
+            for part in parts
+        )
+
+    def _named(self, local: int, place: int) -> list[set[int]]:
+        """For each kind of tally whom the agent at `place` has in it, by their places."""
+        if local == DEAD:
+            return [set() for _ in NAMES_OF_OTHERS]
+        snapshot = self._local.known[local].snapshot
+        return [{self._place_of(other, place) for other in snapshot[name]} for name in NAMES_OF_OTHERS]
+
+    def _place_of(self, name: int, place: int) -> int:
+        """Whom the agent at `place` calls so."""
+        return name - 2 if name - 2 < place else name - 1
+
+    def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
+        """What tells this order from others."""
+        new_place = {old: new for new, old in enumerate(places)}
+        named = [
+            [sorted(new_place[other] for other in part) for part in self._named(locals_[old], old)] for old in places
+        ]
+        matrix = self._zones.matrix(zone)
+        order = (0, *(timer for place in places for timer in timers[place])) if zone else ()
+        number = {block: new for new, block in enumerate(self._blocks([locals_[old] for old in places]))}
+        about = [[number[block] for block in self._local.about(locals_[old])] for old in places] if number else []
+        return named, about, [[matrix[i][j] for j in order] for i in order]
+
+    def _renamed(self, local: int, new: int, places: Places) -> int:
+        """The agent at its new place, calling the others by theirs."""
+        if local == DEAD:
+            return local
+        if not self._local.known[local].names_others:
+            return local
+        names = [0] * (len(places) - 1)
+        for other_new, other_old in enumerate(places):
+            if other_new != new:
+                names[self._name_of(other_old, places[new]) - 2] = self._name_of(other_new, new)
+        return self._local.renamed(local, tuple(names))
+
+
+def _groups(looks: Sequence[Any]) -> list[list[int]]:
+    """The places of those that look alike, in the order of their looks."""
+    in_order = sorted(range(len(looks)), key=looks.__getitem__)
+    return [list(group) for _, group in groupby(in_order, looks.__getitem__)]
+
+
+def _unlike(group: Sequence[int], locals_: Sequence[int]) -> Iterator[Places]:
+    """All orders of these places that differ in the local states there."""
+    if not group:
+        yield ()
+    for first in {locals_[place]: place for place in reversed(group)}.values():
+        rest = [place for place in group if place != first]
+        yield from ((first, *others) for others in _unlike(rest, locals_))

@@ -1,0 +1,379 @@
+"""What an instant makes of the agents: timers end and blocks are completed, and then all that is said of it is heard.
+
+Some agents act, none having heard of the others yet: so their messages cross. What they send is heard, in any order
+between different senders; then what was answered to it, and so on until nobody says anything. Who loses messages may
+lose any of them. Of what an agent says of its own in one go the first is heard first; answers overtake each other.
+
+For each agent the outcomes of all orders, and of all losses, are worked out once and are mostly one or two.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import chain, product
+from typing import NamedTuple, TypeVar
+
+from harness.proof.bounds import Bounds
+from harness.proof.model._known_states import DEAD
+from harness.proof.model._local_steps import LocalStates
+from harness.proof.model._snapshot import Started, Step
+
+Heard = tuple[tuple[int, int], ...]
+"""What reaches an agent in one go: (sender, as the agent knows it, and message), in the order of the senders."""
+
+
+ANSWERED = 2
+"""In the first round of an instant questions are heard, in the second what is answered."""
+
+
+MOST_KNOWN = 200_000
+"""So much of what may become of agents is remembered; then it is worked out again."""
+MOST_SEEN = 500
+"""An agent comes to fewer states by hearing what is said in one round of an instant, unless it counts for ever."""
+
+
+class Action(NamedTuple):
+    """What an agent does of its own: "timer" and its number, "complete" and the block's ordinal, or a fault.
+
+    Or what befalls it: it is "captured", or hears a "lie", a message with this number. A timer that may end in several
+    ways, as any block may be the older, ends in this `way`.
+    """
+
+    place: int
+    what: str
+    number: int = 0
+    way: int = 0
+
+
+Actions = tuple[Action, ...]
+"""What happens in one instant."""
+
+
+class Agents(NamedTuple):
+    """The agents, and the timers that each has started in this instant."""
+
+    locals: tuple[int, ...]
+    started: tuple[Started, ...]
+
+
+class Wave(NamedTuple):
+    """One round of hearing: what was on the air as (place of the sender, message), and what each heard of it.
+
+    `heard` has for each place the numbers of what it heard in `air`, in order.
+    """
+
+    before: "Wave | None"
+    air: tuple[tuple[int, int], ...]
+    heard: tuple[tuple[int, ...], ...]
+
+
+class Way(NamedTuple):
+    """How agents came to be what they are in an instant: its last round of hearing.
+
+    `lost`: so many messages, of each that hears of it for itself, were not heard on it; 0 where that is not counted.
+    """
+
+    lost: int
+    wave: Wave | None
+
+
+_Said = tuple[tuple[int, int], ...]
+"""What is on the air: (place of the sender, message)."""
+_Agent = tuple[int, int, Started]
+"""One agent: its place, its local state, and the timers that it has started in this instant."""
+_Choice = tuple[int, Started, _Said, tuple[int, ...], int]
+"""Of one agent: its local state, what it has started, what it says, what it has heard, in order, and how much not."""
+
+
+_Key = TypeVar("_Key")
+_Outcome = tuple[Step, tuple[int, ...]]
+"""What becomes of an agent, and an order in which it hears what it does: positions in what reaches it."""
+
+
+class Instants:
+    """What instants make of agents."""
+
+    def __init__(self, local: LocalStates, bounds: Bounds, *, every_order: bool = False) -> None:
+        self._local = local
+        self._bounds = bounds
+        self._twice = "duplicate" in bounds.faults
+        self._counts_losses = bounds.losses is not None
+        self._any_order_of_counting = bounds.reduced and not self._twice and not every_order
+        self._outcomes: dict[tuple[int, Heard, bool, bool], list[_Outcome]] = {}
+        self._choices_of: dict[tuple[_Said, bool, bool], dict[_Agent, list[_Choice]]] = {}
+        self._choices_known = 0
+        self._places = range(bounds.agents)
+        self._names = [
+            [other + 2 if bounds.nameless and other < place else other + 1 for other in self._places]
+            for place in self._places
+        ]
+
+    def name_of(self, other: int, place: int) -> int:
+        """What the agent at `place` calls the one at `other`."""
+        return self._names[place][other]
+
+    def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
+        """Whether it makes a difference to the agent at `place` in which order it hears what it heard of the wave."""
+        reached = tuple((self.name_of(wave.air[number][0], place), wave.air[number][1]) for number in sorted(heard))
+        return len(self._outcomes_of(local, reached, lossy=False, answered=wave.before is not None)) > 1
+
+    def outcomes(
+        self, locals_: tuple[int, ...], actions: Sequence[Action], most_lost: int, *, tell: bool
+    ) -> dict[Agents, Way]:
+        """All that may come of it, each in the way on which least is lost; with its rounds, if that is to be told."""
+        agents, started = list(locals_), [()] * len(locals_)  # type: list[int], list[Started]
+        air: list[tuple[int, int]] = []
+        for action in actions:
+            place = action.place
+            step = self._act(agents[place], action)
+            agents[place] = step.local
+            if action.what in ("death", "reboot", "captured"):
+                started[place] = ()
+            started[place] = self._still(started[place], step)
+            air += [(place, message) for message in step.sent]
+        waiting: dict[tuple[Agents, _Said], Way]
+        waiting = {(Agents(tuple(agents), tuple(started)), tuple(air)): Way(0, None)}
+        silent: dict[Agents, Way] = {}
+        flawed = self._local.flawed
+        rounds = 0
+        while waiting:
+            rounds += 1
+            after: dict[tuple[Agents, _Said], Way] = {}
+            for (there, said), way in waiting.items():
+                if not said or not flawed.isdisjoint(there.locals):
+                    _keep(silent, there, way)
+                    continue
+                for heard, answers, orders, lost in self._hear(there, said, most_lost - way.lost, rounds):
+                    known = after.get((heard, answers))
+                    if known is None or way.lost + lost < known.lost:
+                        wave = Wave(way.wave, said, orders) if tell else None
+                        after[heard, answers] = Way(way.lost + lost, wave)
+            waiting = after
+        if not self._bounds.settles:
+            return silent
+        settled: dict[Agents, Way] = {}
+        for there, way in silent.items():
+            _keep(settled, Agents(tuple(map(self._local.settled, there.locals)), there.started), way)
+        return settled
+
+    def _act(self, local: int, action: Action) -> Step:
+        if action.what == "timer":
+            return self._local.end_timer(local, action.number, action.way)
+        if action.what == "complete":
+            return self._local.complete(local, action.number)
+        if action.what == "reboot":
+            return self._local.reboot(local)
+        if action.what == "lie":
+            return self._local.lie(local, action.number)
+        return Step(DEAD, (), ())
+
+    def _hear(
+        self, there: Agents, said: _Said, most_lost: int, rounds: int
+    ) -> Iterator[tuple[Agents, _Said, tuple[tuple[int, ...], ...], int]]:
+        answered, lossy = rounds >= ANSWERED, most_lost > 0
+        if self._choices_known >= MOST_KNOWN:
+            self._choices_of.clear()
+            self._choices_known = 0
+        known = self._choices_of.setdefault((said, lossy, answered), {})
+        choices = [
+            known.get(agent) or self._choices(known, agent, said, lossy, answered)
+            for agent in zip(self._places, there.locals, there.started, strict=True)
+        ]
+        for chosen in _within(choices, most_lost) if lossy and self._counts_losses else product(*choices):
+            locals_, started, answers, orders, lost = zip(*chosen, strict=True)
+            yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders, sum(lost)
+
+    def _choices(
+        self, known: dict[_Agent, list[_Choice]], agent: _Agent, said: _Said, lossy: bool, answered: bool
+    ) -> list[_Choice]:
+        """What may become of this agent, from now on `known`."""
+        place, local, before = agent
+        if local == DEAD:
+            return [(DEAD, (), (), (), 0)]
+        mine = [number for number, (sender, _) in enumerate(said) if sender != place]
+        heard = tuple((self.name_of(said[number][0], place), said[number][1]) for number in mine)
+        self._choices_known += 1
+        choices = known[agent] = [
+            (
+                step.local,
+                self._still(before, step),
+                tuple((place, message) for message in step.sent),
+                tuple(mine[position] for position in order),
+                len(mine) - len(set(order)) if lossy and self._counts_losses else 0,
+            )
+            for step, order in self._outcomes_of(local, heard, lossy, answered)
+        ]
+        return choices
+
+    def _still(self, before: Started, step: Step) -> Started:
+        """What an agent has started in this instant and still runs."""
+        if not before and not step.started:
+            return ()
+        if step.local == DEAD:
+            return ()
+        started = step.started or before
+        if before and step.started:
+            started = tuple(sorted({**dict(before), **dict(step.started)}.items()))
+        running = self._local.known[step.local].running
+        return tuple([item for item in started if item[0] in running])
+
+    def _outcomes_of(self, local: int, heard: Heard, lossy: bool, answered: bool) -> list[_Outcome]:
+        """What can become of an agent that hears these, each with an order in which it does: positions in `heard`."""
+        key = local, heard, lossy, answered
+        outcomes = self._outcomes.get(key)
+        if outcomes is None:
+            names = self._local.first_names(local, [sender for sender, _ in heard])
+            if names is None:
+                counted = self._when_counting(local, heard, lossy)
+                outcomes = list(self._in_any_order(local, heard, lossy, not answered)) if counted is None else counted
+            else:
+                called = tuple((names[sender - 2], message) for sender, message in heard)
+                outcomes = [
+                    (step._replace(local=self._local.renamed_back(step.local, names)), order)
+                    for step, order in self._outcomes_of(local, called, lossy, answered)
+                ]
+                self._outcomes[key] = outcomes
+                return outcomes
+            if self._bounds.reduced:
+                if answered and self._bounds.settles:
+                    settled: dict[Step, tuple[int, ...]] = {}
+                    for step, way in reversed(outcomes):
+                        _keep_fullest(settled, step._replace(local=self._local.settled(step.local)), way)
+                    outcomes = list(settled.items())
+                if lossy and not self._counts_losses:  # to lose what it says more may be several losses
+                    outcomes = [outcome for outcome in outcomes if not _is_covered(outcome[0], outcomes)]
+            if len(self._outcomes) >= MOST_KNOWN:
+                self._outcomes.clear()
+            self._outcomes[key] = outcomes
+        return outcomes
+
+    def _when_counting(self, local: int, heard: Heard, lossy: bool) -> list[_Outcome] | None:
+        """If the agent only counts what it hears, each of another sender: in which order makes no difference then.
+
+        None if it does more. Whether an answer is counted depends on what is no tally, and on whether its sender is in
+        the tally already (docs/proof.md).
+        """
+        hear, only_counts, lets_be = self._local.hear, self._local.only_counts, self._local.lets_be
+        matter, others = [], []
+        for position, (sender, message) in enumerate(heard):
+            if lets_be(local, sender, message):
+                others.append(position)
+            elif self._any_order_of_counting and only_counts(local, sender, message):
+                matter.append(position)
+            else:
+                return None
+        if len({heard[position][0] for position in matter}) < len(matter):
+            return None
+        ways: dict[int, tuple[int, ...]] = {local: ()}
+        for position in matter:
+            sender, message = heard[position]
+            if not all(only_counts(at, sender, message) for at in ways):
+                return None
+            after = dict(ways) if lossy else {}
+            for at, way in ways.items():
+                _keep_fullest(after, hear(at, sender, message).local, (*way, position))
+            ways = after
+        return [(Step(at, (), ()), (*way, *others)) for at, way in ways.items()]
+
+    def _in_any_order(self, local: int, heard: Heard, lossy: bool, in_order: bool) -> Iterator[_Outcome]:
+        matter = self._that_matter(local, heard)
+        copies = 2 if self._twice else 1
+        earlier = {  # of the same sender
+            position: [
+                other for other in matter if in_order and other < position and heard[other][0] == heard[position][0]
+            ]
+            for position in matter
+        }
+        begin = (Step(local, (), ()), tuple(copies if position in matter else 0 for position in range(len(heard))))
+        ways: dict[tuple[Step, tuple[int, ...]], tuple[int, ...]] = {begin: ()}
+        waiting = [begin]
+        while waiting:
+            node = waiting.pop()
+            (at, sent, started), left = node
+            for position in matter:
+                if not left[position]:
+                    continue
+                if not lossy and any(left[other] == copies for other in earlier[position]):
+                    continue  # the one before has not been heard
+                step = self._local.hear(at, *heard[position])
+                still = list(left)
+                still[position] -= 1
+                for other in earlier[position]:
+                    still[other] = 0
+                after = (
+                    Step(step.local, tuple(sorted(sent + step.sent)), self._still(started, step)),
+                    tuple(still),
+                )
+                if after not in ways:
+                    ways[after] = (*ways[node], position)
+                    waiting.append(after)
+        outcomes: dict[Step, tuple[int, ...]] = {}
+        for (step, left), way in ways.items():
+            ends_here = lossy or step.local in self._local.flawed or all(left[position] < copies for position in matter)
+            if ends_here:
+                _keep_fullest(outcomes, step, way)
+        others = [position for position in range(len(heard)) if position not in matter]
+        for step, way in outcomes.items():
+            yield step, (*way, *others)
+
+    def _that_matter(self, local: int, heard: Heard) -> list[int]:
+        """Positions of what may change the agent or make it answer, whatever of the rest it has heard before.
+
+        All of them, if a wrong agent comes to ever more states by hearing the same again and again.
+        """
+        seen, waiting = {local}, [local]
+        matter: set[int] = set()
+        while waiting:
+            if len(seen) > MOST_SEEN:
+                return list(range(len(heard)))
+            at = waiting.pop()
+            for position, (sender, message) in enumerate(heard):
+                step = self._local.hear(at, sender, message)
+                if step.local != at or step.sent or step.started:
+                    matter.add(position)
+                    if step.local not in seen:
+                        seen.add(step.local)
+                        waiting.append(step.local)
+        return sorted(matter)
+
+
+def _keep(ways: dict[Agents, Way], there: Agents, way: Way) -> None:
+    """The way there on which less is lost."""
+    known = ways.get(there)
+    if known is None or way.lost < known.lost:
+        ways[there] = way
+
+
+def _keep_fullest(ways: dict[_Key, tuple[int, ...]], there: _Key, way: tuple[int, ...]) -> None:
+    """The way there on which more is heard, be it once or twice."""
+    known = ways.get(there)
+    if known is None or len(set(way)) > len(set(known)):
+        ways[there] = way
+
+
+def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[_Choice, ...]]:
+    """All combinations in which no more is lost than that."""
+    combined: list[tuple[int, tuple[_Choice, ...]]] = [(0, ())]
+    for of_one in choices:
+        combined = [
+            (lost + choice[-1], (*chosen, choice))
+            for lost, chosen in combined
+            for choice in of_one
+            if lost + choice[-1] <= most_lost
+        ]
+    return [chosen for _, chosen in combined]
+
+
+def _is_covered(step: Step, outcomes: Sequence[_Outcome]) -> bool:
+    """Whether another outcome is the same but for saying more: what it says more may be lost by everybody."""
+    return any(
+        other.local == step.local
+        and other.started == step.started
+        and len(other.sent) > len(step.sent)
+        and _is_part(step.sent, other.sent)
+        for other, _ in outcomes
+    )
+
+
+def _is_part(some: tuple[int, ...], of: tuple[int, ...]) -> bool:
+    """Whether `of` has all of `some`, in order."""
+    rest = iter(of)
+    return all(message in rest for message in some)

@@ -1,0 +1,161 @@
+"""Local states by number. Every state that an agent comes to is looked at once, when it gets its number.
+
+A local state is all that `ucp.agent.Agent` holds (`_snapshot.py`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from harness.proof.bounds import Bounds
+from harness.proof.model._block_renaming import Blocks
+from harness.proof.model._flaws import Flaw, flaw_of, is_deceived
+from harness.proof.model._snapshot import NAMES_OF_OTHERS, Parts, Snapshot, dead
+from ucp.state import AgentState
+
+DEAD = -1
+"""The local state of an agent that is gone."""
+
+FIRST, FIRST_OTHER = 1, 2
+"""What an agent calls itself, and the first of the others, where it makes no difference who is who."""
+
+Names = tuple[int, ...]
+"""What an agent is to call the others, from `FIRST_OTHER` on."""
+
+WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us": -1}
+"""Parts of the state that no handler needs where nothing is ever lost, as they are at the beginning."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """A local state of the agent with this ID on the roster. `waits` says whether it reconciles, `chain` numbers its
+    chain's blocks.
+
+    `deceived`: it holds a block in the captured vehicle's name which that never completed.
+    """
+
+    agent_id: int
+    snapshot: Snapshot
+    running: tuple[int, ...]
+    idle: bool
+    waits: bool
+    chain: tuple[int, ...]
+    flaw: Flaw | None
+    anonymous: int
+    """The same for states that differ only in who has voted and answered; the same number on any machine."""
+    names_others: bool
+    deceived: bool
+
+
+class KnownStates:
+    """All local states that were come upon.
+
+    When `bounds.reduced`, what no handler will read before it is written anew is as at the beginning; docs/proof.md
+    says why that is sound.
+    """
+
+    def __init__(self, bounds: Bounds, blocks: Blocks) -> None:
+        self.bounds = bounds
+        self.blocks = blocks
+        self.others = tuple(range(FIRST_OTHER, bounds.agents + 1))
+        self.known: list[Known] = []
+        self.flawed: set[int] = set()
+        """Those that must never be."""
+        self._nameless = bounds.nameless
+        self._parts = Parts()
+        self._numbers: dict[tuple[Any, ...], int] = {}
+        self._renamed: dict[tuple[int, Names], int] = {}
+
+    def number(self, agent_id: int, state: AgentState, taken: Snapshot, flaw: Flaw | None) -> int:
+        """The number of the state that an agent is in, which was `taken`, in parts that there are."""
+        snapshot = taken
+        if self.bounds.reduced:
+            forgotten = WHAT_ONLY_CHECKS_READ | dead(state)
+            snapshot = snapshot | {
+                name: self._parts.part(name, value) for name, value in forgotten.items() if snapshot[name] != value
+            }
+        key = self._parts.key(agent_id, flaw, snapshot)
+        number = self._numbers.setdefault(key, len(self.known))
+        if number == len(self.known):
+            self.blocks.learn_chain(state.chain)
+            self.known.append(
+                Known(
+                    agent_id,
+                    snapshot,
+                    tuple(index for index, timer in enumerate(state.timers) if timer.deadline is not None),
+                    state.idle,
+                    state.reconcile_in_progress,
+                    tuple(self._parts.name(block.block_hash) for block in state.chain),
+                    flaw or flaw_of(state, self.blocks.makers, self.bounds.captured),
+                    self._parts.anonymous(agent_id, flaw, snapshot),
+                    self._names_others(snapshot),
+                    is_deceived(state, self.blocks.makers, self.bounds.captured),
+                )
+            )
+            if self.known[number].flaw is not None:
+                self.flawed.add(number)
+        return number
+
+    def with_tallies(self, local: int, tallies: Snapshot) -> int:
+        """The same agent but for what is in these tallies."""
+        known = self.known[local]
+        snapshot = known.snapshot | {name: self._parts.part(name, value) for name, value in tallies.items()}
+        key = self._parts.key(known.agent_id, known.flaw, snapshot)
+        number = self._numbers.setdefault(key, len(self.known))
+        if number == len(self.known):
+            anonymous = self._parts.anonymous(known.agent_id, known.flaw, snapshot)
+            names_others = self._names_others(snapshot)
+            self.known.append(replace(known, snapshot=snapshot, anonymous=anonymous, names_others=names_others))
+        return number
+
+    # Who is who
+
+    def renamed(self, local: int, names: Names) -> int:
+        """The same agent when the others are called otherwise."""
+        if not self.known[local].names_others or self.known[local].flaw is not None:
+            return local
+        key = local, names
+        number = self._renamed.get(key)
+        if number is None:
+            snapshot = self.known[local].snapshot
+            new = dict(zip(self.others, names, strict=True))
+            tallies = {name: {new[other] for other in snapshot[name]} for name in NAMES_OF_OTHERS}
+            number = self._renamed[key] = self.with_tallies(local, tallies)
+        return number
+
+    def renamed_back(self, local: int, names: Names) -> int:
+        """The agent that was `renamed` by these names as it was."""
+        return self.renamed(local, _back(names))
+
+    def names_in_order(self, local: int, sender: int) -> Names | None:
+        """Names by which the others are in order: those in tallies first, then the sender; None if they are.
+
+        Where IDs make no difference, what an agent does is the same but for these names (docs/proof.md).
+        """
+        known = self.known[local]
+        if not self._nameless or known.flaw is not None:
+            return None
+        tallies = [known.snapshot[name] for name in NAMES_OF_OTHERS]
+        in_order = sorted(self.others, key=lambda other: (*(other not in tally for tally in tallies), other != sender))
+        return None if tuple(in_order) == self.others else _back(tuple(in_order))
+
+    def first_names(self, local: int, senders: Sequence[int]) -> Names | None:
+        """Names by which those who are heard are the first of the others, in their order; None if they are.
+
+        Or if they have other names to the agent, as it has heard of somebody before.
+        """
+        known = self.known[local]
+        if not self._nameless or known.names_others or known.flaw is not None:
+            return None
+        in_order = tuple(dict.fromkeys((*senders, *self.others)))
+        return None if in_order == self.others else _back(in_order)
+
+    def _names_others(self, snapshot: Snapshot) -> bool:
+        """Whether it tells some of the others from the rest."""
+        return any(0 < len(snapshot[name]) < len(self.others) for name in NAMES_OF_OTHERS)
+
+
+def _back(names: Names) -> Names:
+    """The names by which everybody has the name again that he had."""
+    before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
+    return tuple(before[name] for name in sorted(names))

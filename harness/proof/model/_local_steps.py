@@ -1,0 +1,343 @@
+"""What the real agent makes of each input in each local state: computed once, and then looked up.
+
+To compute a step the agent is put into the state, given the input, and its state is taken: no line of the protocol is
+written here.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+
+from harness.proof.bounds import Bounds
+from harness.proof.model._block_renaming import Blocks, Ordinals
+from harness.proof.model._flaws import FLAWS_OF_STEPS, Flaw
+from harness.proof.model._known_states import DEAD, FIRST, FIRST_OTHER, KnownStates
+from harness.proof.model._real_agents import Agents, end_at_once, end_timer, is_heard, log
+from harness.proof.model._reduction import ReductionError, check_that_nothing_is_lost
+from harness.proof.model._reference_step import Give, Reference
+from harness.proof.model._snapshot import NOW_S, RUNNING_S, End, Snapshot, Step, put_back, take
+from harness.proof.model._tallies import TALLIES, Tallies
+from ucp.agent import Agent
+from ucp.clock import MICROSECONDS
+from ucp.messages import CARRY_A_BLOCK, Message
+from ucp.state import AgentState
+from ucp.store import StoredState
+
+Content = tuple[int, Snapshot, "Flaw | None", Ordinals]
+"""What another process needs to know of a local state."""
+
+
+class LocalStates(KnownStates):
+    """All local states that were come upon, and all steps between them."""
+
+    def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
+        self.agents = Agents(bounds)
+        first = self.agents.by_id[FIRST].state
+        super().__init__(bounds, Blocks(first.chain.inception, self.agents.made))
+        self.steps = 0
+        """How many the real agent has computed."""
+        self._reference = Reference(self.agents.new) if bounds.steps else None
+        self.timers = [timer.name for timer in first.timers]
+        self.settings = settings = bounds.agent_settings()
+        durations = (
+            settings.vote_timeout_s,
+            settings.phase1_timeout_s,
+            settings.phase2_timeout_s,
+            settings.phase3_timeout_s,
+            settings.finalize_gap_s,
+        )
+        self.durations_us = [round(duration * MICROSECONDS) for duration in durations]
+        """By timer."""
+        self._tallies = Tallies(self, self.timers, self.ends, every_count=every_count)
+        self._about: dict[int, Ordinals] = {}
+        self._patterns: dict[int, int] = {}
+        self._of_pattern: dict[tuple[int, Ordinals], int] = {}
+        self.messages: list[Message] = []
+        self._message_numbers: dict[Message, int] = {}
+        self._steps: dict[tuple[int, int, int], Step] = {}
+        self._ends: dict[tuple[int, int], list[End]] = {}
+        self._lets_be: dict[tuple[int, int, int], bool] = {}
+        self._counts: dict[tuple[int, int, int], bool] = {}
+        self.initial = {
+            agent_id: self._intern(agent_id, agent, take(agent)) for agent_id, agent in self.agents.by_id.items()
+        }
+
+    # Steps
+
+    def hear(self, local: int, sender: int, message: int) -> Step:
+        """The agent hears a message from another, who is `sender` to it."""
+        key = local, sender, message
+        step = self._steps.get(key)
+        if step is None:
+            names = self.names_in_order(local, sender)
+            if names is None:
+                heard = self.messages[message]
+                step = self._computed(local, lambda agent: agent.receive_message(sender, 0, heard, NOW_S), hears=True)
+            else:
+                step = self.hear(self.renamed(local, names), names[sender - FIRST_OTHER], message)
+                step = step._replace(local=self.renamed_back(step.local, names))
+            self._steps[key] = step
+        return step
+
+    def lets_be(self, local: int, sender: int, message: int) -> bool:
+        """Whether it makes no difference at all that the agent hears this."""
+        if self._nameless and not self.known[local].names_others:
+            sender = FIRST_OTHER  # it is one to the agent who says it
+        key = local, sender, message
+        lets_be = self._lets_be.get(key)
+        if lets_be is None:
+            step = self.hear(local, sender, message)
+            lets_be = self._lets_be[key] = step.local == local and not step.sent and not step.started
+        return lets_be
+
+    def only_counts(self, local: int, sender: int, message: int) -> bool:
+        """Whether all that the agent does when it hears this is to count it, or to let it be."""
+        key = local, sender, message
+        counts = self._counts.get(key)
+        if counts is None:
+            step = self.hear(local, sender, message)
+            before, after = self.known[local], self.known[step.local]
+            counts = self._counts[key] = (
+                not step.sent
+                and not step.started
+                and after.flaw is None
+                and all(after.snapshot[name] is part or name in TALLIES for name, part in before.snapshot.items())
+            )
+        return counts
+
+    def end_timer(self, local: int, timer: int, way: int = 0) -> Step:
+        """A timer of the agent ends, in one of the `ends` that this may have."""
+        return self.ends(local, timer)[way].step
+
+    def ends(self, local: int, timer: int) -> list[End]:
+        """All that may come of it when this timer ends: more than one only if the agent asks which block is older, and
+        any may be."""
+        key = local, timer
+        ends = self._ends.get(key)
+        if ends is None:
+            oldest: list[bytes | None] = [None]
+            if self.bounds.clocks_any and self.timers[timer] == "phase two":
+                candidates = self.known[local].snapshot["reconcile_response_dictionary"]
+                oldest = sorted(candidates, key=lambda candidate: candidates[candidate][1]) or oldest
+            steps: dict[Step, bytes | None] = {}
+            for candidate in oldest:
+                steps.setdefault(self._computed(local, partial(end_timer, timer, candidate)), candidate)
+            ends = self._ends[key] = [End(step, candidate) for step, candidate in steps.items()]
+        return ends
+
+    def older(self, local: int, timer: int, way: int) -> tuple[int, frozenset[int]]:
+        """Which block has to be older than which for a timer to end in this way: 0 is the inception block's number.
+
+        It is older than none where nothing is asked of it.
+        """
+        ends = self.ends(local, timer)
+        oldest = ends[way].oldest
+        if oldest is None or len(ends) == 1:
+            return 0, frozenset()
+        snapshot = self.known[local].snapshot
+        top = [0, *self.blocks.named(snapshot["chain"].parts["top_chain_hash"])][-1]
+        asked = {
+            candidate: self.blocks.numbers[candidate] if candidate else top
+            for candidate in snapshot["reconcile_response_dictionary"]
+        }
+        return asked[oldest], frozenset(asked.values()) - {asked[oldest]}
+
+    def complete(self, local: int, ordinal: int) -> Step:
+        """The agent completes a block, the `ordinal`th of all."""
+        key = local, -2, ordinal
+        step = self._steps.get(key)
+        if step is None:
+            step = self._steps[key] = self._computed(local, lambda agent: log(agent, ordinal), completes=ordinal)
+        return step
+
+    def reboot(self, local: int) -> Step:
+        """The agent's computer browns out and goes on from what was on its disk."""
+        key = local, -3, 0
+        step = self._steps.get(key)
+        if step is None:
+            stored = StoredState.of(self._restored(local).state)
+            step = self._steps[key] = self._computed(local, lambda agent: agent.boot(stored, NOW_S), boots=True)
+        return step
+
+    def lie(self, local: int, message: int) -> Step:
+        """The agent hears a datagram that is sealed with the captured vehicle's keys, which the real gate opens."""
+        key = local, -4, message
+        step = self._steps.get(key)
+        if step is None:
+            flaw = self._got_in(local, message)
+            step = self._steps[key] = self._computed(
+                local, lambda agent: agent.receive_datagram(self._sealed(message), NOW_S), hears=True, flaw=flaw
+            )
+        return step
+
+    def _got_in(self, local: int, message: int) -> Flaw | None:
+        """What must not: the same of a vehicle known to be revoked, in another's name, or with another's block."""
+        known, said = self.known[local], self.messages[message]
+        revoked = self.agents.revoked[known.agent_id]
+        put_back(revoked, known.snapshot)
+        if is_heard(revoked, self._sealed(message), known.snapshot):
+            return Flaw("revoked", f"a {said.NAME} of a vehicle that is known to be revoked is heard")
+        for datagram in self.agents.gate.forged(said, known.agent_id, NOW_S):
+            agent = self._restored(local)
+            if is_heard(agent, datagram, known.snapshot):
+                return Flaw("name", f"a {said.NAME} is heard that only another vehicle could have signed")
+            self.agents.leave_in(known.agent_id, known.snapshot)
+        return None
+
+    def _sealed(self, message: int) -> bytes:
+        """A new datagram of the captor's that says this."""
+        said = self.messages[message]
+        genuine = type(said) in CARRY_A_BLOCK and said.block.block_hash in self.blocks.makers  # type: ignore[union-attr]
+        return self.agents.gate.sealed(said, NOW_S, genuine=genuine)
+
+    def state(self, local: int) -> AgentState:
+        """The whole of a local state, to look at before the next step is computed."""
+        return self._restored(local).state
+
+    def inputs(self) -> Iterator[tuple[int, Message | str | None, Step]]:
+        """Each local state with each input that was given there: what was heard, the timer that ended; None: a block.
+
+        And what came of it.
+        """
+        for (local, timer), ends in self._ends.items():
+            yield from ((local, self.timers[timer], end.step) for end in ends)
+        for (local, kind, number), step in self._steps.items():
+            if kind != -3:
+                yield local, None if kind == -2 else self.messages[number], step
+
+    def _restored(self, local: int) -> Agent:
+        known = self.known[local]
+        return self.agents.put_into(known.agent_id, known.snapshot)
+
+    def _computed(
+        self,
+        local: int,
+        give: Give,
+        *,
+        hears: bool = False,
+        boots: bool = False,
+        completes: int | None = None,
+        flaw: Flaw | None = None,
+    ) -> Step:
+        self.steps += 1
+        before = self.known[local]
+        agent = self.agents.new(before.agent_id) if boots else self._restored(local)
+        completed = len(agent.state.completed)
+        crashed = wrong = None
+        try:
+            give(agent)
+        except Exception as error:  # whatever a handler raises is what we look for
+            crashed = f"{type(error).__name__}: {error}"
+        if completes is not None:
+            made = agent.state.completed[completed:]
+            self.blocks.note_completed((digest, agent.agent_id, completes) for digest in made)
+        if self._reference is not None:
+            snapshot = None if boots else before.snapshot
+            wrong = self._reference.deviation(before.agent_id, agent, crashed, snapshot, give, self.blocks.in_words)
+        if crashed is None:
+            crashed = end_at_once(agent)
+        if crashed is not None:
+            flaw = Flaw("crash", f"a handler ended by {crashed}")
+        if wrong is not None:
+            handler, sentence = wrong
+            flaw = Flaw("steps", sentence, handler)
+        sent = tuple(self.message(message) for _, message in agent.messages_to_send())
+        started = tuple(
+            (number, round((timer.deadline - NOW_S) * MICROSECONDS))
+            for number, timer in enumerate(agent.state.timers)
+            if timer.deadline is not None and timer.deadline < RUNNING_S
+        )
+        for number, _ in started:
+            agent.state.timers[number].start(RUNNING_S, 0.0)
+        after = take(agent, {} if boots else before.snapshot)
+        if flaw is None and all(after[name] is part for name, part in before.snapshot.items()):
+            self.agents.leave_in(before.agent_id, after)
+            return Step(local, sent, started)
+        if self.bounds.reduced:
+            if hears and any(self.timers[timer] == "voting" for timer, _ in started):
+                raise ReductionError("an agent begins a vote because of a message: try again with --whole")
+            check_that_nothing_is_lost(before.snapshot, agent.state)
+        local = self._intern(before.agent_id, agent, after, before.snapshot, flaw, keep=not boots)
+        return Step(local, sent, started)
+
+    def message(self, message: Message) -> int:
+        """Its number."""
+        number = self._message_numbers.setdefault(message, len(self.messages))
+        if number == len(self.messages):
+            self.messages.append(message)
+        return number
+
+    # Blocks
+
+    def pattern(self, local: int) -> int:
+        """One local state for all that differ only in which block is which, where that makes no difference."""
+        if not self.bounds.blocks_alike or local == DEAD:
+            return local
+        pattern = self._patterns.get(local)
+        if pattern is None:
+            pattern = self._patterns[local] = self._exchanged(local, tuple(range(1, len(self.about(local)) + 1)))
+        return pattern
+
+    def about(self, local: int) -> Ordinals:
+        """The blocks that it is about, each once, in an order that is the same for all of one pattern."""
+        about = self._about.get(local)
+        if about is None:
+            nothing = local == DEAD or self.known[local].flaw is not None
+            about = self._about[local] = () if nothing else self.blocks.of(self.known[local].snapshot)
+        return about
+
+    def exchanged(self, local: int, blocks: Ordinals) -> int:
+        """The same agent with these blocks in the place of those that it is `about`."""
+        if blocks == self.about(local):
+            return local
+        key = self.pattern(local), blocks
+        number = self._of_pattern.get(key)
+        if number is None:
+            number = self._of_pattern[key] = self._exchanged(local, blocks)
+        return number
+
+    def _exchanged(self, local: int, blocks: Ordinals) -> int:
+        known, about = self.known[local], self.about(local)
+        if blocks == about:
+            return local
+        exchanged = self.blocks.exchanged(known.snapshot, dict(zip(about, blocks, strict=True)))
+        agent = self.agents.put_into(known.agent_id, exchanged)
+        return self._intern(known.agent_id, agent, take(agent))
+
+    # States
+
+    def settled(self, local: int) -> int:
+        """The same agent when all answers to what was asked have come, or are lost: who voted matters no more."""
+        return self._tallies.settled(local)
+
+    def _intern(
+        self,
+        agent_id: int,
+        agent: Agent,
+        taken: Snapshot,
+        before: Snapshot | None = None,
+        flaw: Flaw | None = None,
+        *,
+        keep: bool = True,
+    ) -> int:
+        """The number of the state that this agent is in, as it was `taken`; it was in `before`.
+
+        `keep`: it will be given more inputs.
+        """
+        snapshot = self._parts.of(taken, before or {})
+        if keep:
+            self.agents.leave_in(agent_id, snapshot)
+        return self.number(agent_id, agent.state, snapshot, flaw)
+
+    def content(self, local: int) -> Content:
+        """What another process needs to know of it."""
+        known = self.known[local]
+        flaw = known.flaw if known.flaw is not None and known.flaw.kind in FLAWS_OF_STEPS else None
+        initiated = self.blocks.named(known.snapshot["top_chain_hash_at_initiation"])
+        return known.agent_id, known.snapshot, flaw, initiated
+
+    def adopt(self, content: Content) -> int:
+        """The number of a state that another process has come upon."""
+        agent_id, snapshot, flaw, initiated = content
+        self.blocks.learn_chain_hash(snapshot["top_chain_hash_at_initiation"], initiated)
+        agent = self.agents.put_into(agent_id, snapshot)
+        return self._intern(agent_id, agent, take(agent), None, flaw)

@@ -1,0 +1,129 @@
+"""The real agents, each put into whatever state is looked at, and what is done to them there."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from random import Random
+from typing import Any
+
+from harness.proof.attacker._security_gate import Gate
+from harness.proof.bounds import Bounds
+from harness.proof.model._known_states import FIRST
+from harness.proof.model._reduction import ReductionError
+from harness.proof.model._snapshot import NOW_S, Snapshot, put_back, take
+from ucp.agent import HANDLERS, Agent
+from ucp.block import Block
+from ucp.clock import MICROSECONDS
+from ucp.events import LoggableEvent
+from ucp.handler import EventHandler
+from ucp.quirks import wrong_handlers
+
+INITIAL_DATA = b"proof"
+AT_ONCE_S = 0.05
+"""A timer that is shorter ends before any answer can come (a message takes 2 to 50 ms)."""
+MOST_AT_ONCE = 100
+
+
+class Agents:
+    """One of each on the roster; if a vehicle is captured they are behind the real gate.
+
+    Where they are `nameless` each has its own settings, but the first's ID.
+    """
+
+    def __init__(self, bounds: Bounds) -> None:
+        self._bounds = bounds
+        self._roster = range(1, bounds.agents + 1)
+        self._gate = None if bounds.captured is None else Gate(self._roster, bounds.captured)
+        self.by_id = {agent_id: self.new(agent_id) for agent_id in self._roster}
+        self._left_in: dict[int, Snapshot] = {}
+        """In what state each of them is, while that is known."""
+        self.revoked = {
+            agent_id: self.new(agent_id, revoked=True) for agent_id in self._roster if self._gate is not None
+        }
+        """Others, to whom the captured vehicle is revoked."""
+
+    @property
+    def gate(self) -> Gate:
+        """What opens datagrams, where a vehicle is captured."""
+        assert self._gate is not None, "a vehicle is captured"
+        return self._gate
+
+    def new(
+        self, agent_id: int, right: bool = False, after_each: Callable[[], None] | None = None, *, revoked: bool = False
+    ) -> Agent:
+        """A new one; it traces its handler runs if `after_each` is to be called after each."""
+        handlers = [] if right else wrong_handlers(self._bounds.quirks, Random(0))
+        if after_each is not None:
+            handlers = [_calling(handler, after_each) for handler in handlers or HANDLERS.values()]
+        settings, tracing = self._bounds.agent_settings(agent_id), after_each is not None
+        make = Agent if self._gate is None else partial(self._gate.agent, revoked=revoked)
+        own_id = FIRST if self._bounds.nameless else agent_id
+        return make(own_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
+
+    def put_into(self, agent_id: int, snapshot: Snapshot) -> Agent:
+        """The agent, which is in this state now."""
+        agent = self.by_id[agent_id]
+        put_back(agent, snapshot, self._left_in.pop(agent_id, None))
+        return agent
+
+    def leave_in(self, agent_id: int, snapshot: Snapshot) -> None:
+        """Note that the agent is in this state, until it is put into another."""
+        self._left_in[agent_id] = snapshot
+
+    def made(self, ordinal: int) -> Block:
+        """The block that an agent completes if it is the `ordinal`th of all."""
+        agent = self.new(FIRST)
+        log(agent, ordinal)
+        if agent.state.current_block:
+            raise ReductionError("an event is left over where a block is completed: try again with --whole")
+        (block,) = agent.state.blocks_to_be_committed
+        return block
+
+
+def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:
+    """The handler, after which `after` is called."""
+
+    def run(*inputs: Any) -> str:
+        branch = handler.run(*inputs)
+        after()
+        return branch
+
+    return replace(handler, run=run)
+
+
+def log(agent: Agent, ordinal: int) -> None:
+    """Log events until a block is complete: the `ordinal`th of all."""
+    completed = len(agent.state.completed)
+    for number in range(MOST_AT_ONCE):
+        if len(agent.state.completed) > completed:
+            return
+        agent.add_event(LoggableEvent(ordinal * MICROSECONDS + number, 1, bytes(256)), NOW_S)
+
+
+def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
+    """End a timer; of the candidates of phase 2 this one is the oldest, unless it is the inception block."""
+    if oldest is not None:
+        counted = agent.state.reconcile_response_dictionary[oldest]
+        counted[1] = min(counted[1], 1)
+    agent.end_timer(agent.state.timers[timer], NOW_S)
+
+
+def end_at_once(agent: Agent) -> str | None:
+    """End the timers that end before anything can be heard; what a handler raised, if one did."""
+    try:
+        for _ in range(MOST_AT_ONCE):
+            soon = [t for t in agent.state.timers if t.deadline is not None and t.deadline <= NOW_S + AT_ONCE_S]
+            if not soon:
+                return None
+            agent.end_timer(min(soon, key=lambda timer: timer.deadline or 0.0), NOW_S)
+    except Exception as error:  # whatever a handler raises is what we look for
+        return f"{type(error).__name__}: {error}"
+    return "its timers end at once again and again"
+
+
+def is_heard(agent: Agent, datagram: bytes, before: Snapshot) -> bool:
+    """Whether anything comes of a datagram that the agent is given in this state: it should drop it."""
+    dropped = agent.dropped.total()
+    agent.receive_datagram(datagram, NOW_S)
+    unchanged = all(value is before[name] for name, value in take(agent, before).items())
+    return not (unchanged and agent.dropped.total() == dropped + 1 and not vars(agent.state)["outbox"])

@@ -1,0 +1,125 @@
+"""The shape of a local state: the same for all states that differ only in which blocks and which agents they are about.
+
+A local state is what `_snapshot.py` says. Its shape calls blocks by their order: by timestamp, and if that is equal by
+hash, among those that the agent knows of in this state. Others it only counts. What `_local_steps.py` may forget it
+leaves
+out, too: what is dead, and of a vote all but whether more approve than not. Besides it leaves out the block that is
+being built, since within bounds an event fills a block. So it compares what an agent was in in any run, of whatever
+mission, with what it can be in within bounds.
+"""
+
+from bisect import bisect_left
+from hashlib import blake2b
+from itertools import chain
+from typing import Any
+
+from ucp.block import Block, next_chain_hash
+from ucp.messages import Message
+from ucp.state import AgentState
+
+Shape = tuple[Any, ...]
+
+LEFT_OUT = frozenset(("current_block", "completed", "newest_block_timestamp_us", "voters", "reconcile_responders"))
+"""Beside what a snapshot leaves out: what is only looked at to make blocks, and whoever is in a tally."""
+
+ELSEWHERE = -1
+"""A hash of what the agent does not have."""
+ON_TOP = "on top"
+"""The chain hash of the agent's chain with the block on top that the message is about."""
+
+
+class Held:
+    """The blocks that an agent holds, by their order, and its chain. It does not change."""
+
+    __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
+
+    def __init__(self, state: AgentState) -> None:
+        held = {
+            block.block_hash: block.timestamp_us
+            for block in chain(state.chain, state.blocks_to_be_committed, state.reconcile_stack)
+        }
+        self._blocks = sorted((timestamp_us, block_hash) for block_hash, timestamp_us in held.items())
+        self._ordinals = ordinals = {block_hash: ordinal for ordinal, (_, block_hash) in enumerate(self._blocks)}
+        self._heights = {
+            chain_hash: height for height, (_, chain_hash) in enumerate(state.chain.with_chain_hashes(), 1)
+        }
+        self._heights[state.chain.inception.chain_hash] = 0
+        self._top = state.chain.top_chain_hash
+        self._numbers: dict[Shape, int] = {}
+        self._shape = tuple(
+            tuple([ordinals[block.block_hash] for block in place])
+            for place in (state.chain, state.blocks_to_be_committed, state.reconcile_stack)
+        )
+
+    def number(self, shape: Shape) -> int:
+        """The same number for the same shape on any machine, of 64 bits: no two that there are have the same.
+
+        Of a state that holds this, and of which this is the rest; or of such a state and an input.
+        """
+        number = self._numbers.get(shape)
+        if number is None:
+            digest = blake2b(repr((self._shape, shape)).encode(), digest_size=8).digest()
+            number = self._numbers[shape] = int.from_bytes(digest, "big")
+        return number
+
+    def height(self, chain_hash: bytes) -> int:
+        """How many blocks of the chain are below this chain hash."""
+        return self._heights.get(chain_hash, ELSEWHERE)
+
+    def ordinal(self, block_hash: bytes) -> int:
+        """Which of the blocks held it is."""
+        return self._ordinals.get(block_hash, ELSEWHERE)
+
+    def between(self, timestamp_us: int, block_hash: bytes = b"") -> int:
+        """How many of the blocks held are older than a block of that time."""
+        return bisect_left(self._blocks, (timestamp_us, block_hash))
+
+    def input_shape(self, message: Message) -> Shape:
+        """The message, as it is to this agent: whoever sent it, it names what the agent holds, or other things."""
+        values = [getattr(message, name) for name in type(message).__slots__]
+        about = next((value for value in values if isinstance(value, bytes | Block)), b"")
+        if isinstance(about, Block):
+            about = about.block_hash
+        return (type(message).NAME, *[self._named(value, about) for value in values])
+
+    def _named(self, value: Any, about: bytes) -> Any:
+        if isinstance(value, Block):
+            ordinal = self.ordinal(value.block_hash)
+            new = ordinal == ELSEWHERE
+            return ("new", self.between(value.timestamp_us, value.block_hash)) if new else ("block", ordinal)
+        if isinstance(value, bytes):
+            if (ordinal := self.ordinal(value)) != ELSEWHERE:
+                return "block", ordinal
+            if (height := self.height(value)) != ELSEWHERE:
+                return "chain", height
+            return ON_TOP if value == next_chain_hash(self._top, about) else ELSEWHERE
+        if value is None or isinstance(value, bool):
+            return value
+        return self.between(value)
+
+
+def shape_of(state: AgentState, held: Held) -> Shape:
+    """The shape of `state` but for what it holds, which is `held`; their numbers tell states apart."""
+    shape: list[Any] = [state.reconcile_in_progress]
+    for timer in state.timers:
+        shape.append(1 if timer.deadline is not None else 2 if timer.active else 0)
+    if state.voting_timer.active:
+        candidate = state.candidate_block
+        shape.append(ELSEWHERE if candidate is None else held.ordinal(candidate.block_hash))
+        shape.append(held.height(state.top_chain_hash_at_initiation))
+        shape.append(state.vote_count["yes"] > state.vote_count["no"])
+    if state.phase_one_timer.active:
+        shape += state.reconcile_vote_count.values()
+    if state.phase_two_timer.active:
+        offered = sorted(
+            (timestamp_us, block_hash, count)
+            for block_hash, (count, timestamp_us) in state.reconcile_response_dictionary.items()
+        )
+        for timestamp_us, block_hash, count in offered:
+            if block_hash and (ordinal := held.ordinal(block_hash)) != ELSEWHERE:
+                shape.append(("block", ordinal, count))
+            else:
+                shape.append(("new" if block_hash else "top", held.between(timestamp_us, block_hash), count))
+    if state.phase_three_timer.active and state.majority_response_block_hash is not None:
+        shape.append(held.ordinal(state.majority_response_block_hash))
+    return tuple(shape)

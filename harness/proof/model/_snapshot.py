@@ -1,0 +1,284 @@
+"""The whole state of an agent as a snapshot: its interned parts, and one step from it.
+
+What is left out of the key changes nothing that the agent will ever do: the moment of its last input, counters that
+are only reported, and what it has yet to hand over. Everything else that `ucp.state.AgentState` has is in it, also
+what it will have one day; a value of a kind that is not known here is an error, and never left out.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable
+from copy import copy
+from hashlib import blake2b
+from typing import Any, NamedTuple
+
+from harness.proof.model._flaws import Flaw
+from ucp.agent import Agent
+from ucp.block import Block
+from ucp.chain import Chain
+from ucp.state import AgentState
+from ucp.timers import Timer
+
+REPORTED = frozenset(("now", "sent", "reconciles", "chain_changed_at", "_sequence"))
+"""What an agent only counts or notes; no handler reads it but to make a trace or a datagram's number."""
+FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
+"""What never changes (no agent that is looked at seals its events), or is another name of what is there."""
+HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
+LEFT_OUT = REPORTED | FIXED | HANDED_OVER
+
+NOW_S = 1000.0
+"""The mission second of every input: what matters of time is in the zones."""
+RUNNING_S = 1e15
+"""The deadline of a timer that was running before the input."""
+
+Snapshot = dict[str, Any]
+NameOf = Callable[[bytes], int]
+"""A small number for a hash, always the same."""
+
+
+_DEAD_VOTE: Snapshot = {
+    "vote_count": {"yes": 0, "no": 0},
+    "voters": set(),
+    "candidate_block": None,
+    "top_chain_hash_at_initiation": b"",
+}
+_DEAD_PHASE_1: Snapshot = {"reconcile_vote_count": {"yes": 0, "no": 0}}
+_DEAD_RESPONDERS: Snapshot = {"reconcile_responders": set()}
+_DEAD_PHASE_2: Snapshot = {"reconcile_response_dictionary": {}}
+_DEAD_PHASE_3: Snapshot = {"majority_response_block_hash": None}
+
+
+def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
+    """A copy of the agent's state; of what is still as in `like` it has the very parts of that."""
+    state = vars(agent.state)
+    if like is None:
+        return {name: _copied(value) for name, value in state.items() if name not in LEFT_OUT}
+    return {
+        name: like[name] if name in like and _is_part(like[name], value) else _copied(value)
+        for name, value in state.items()
+        if name not in LEFT_OUT
+    }
+
+
+def dead(state: AgentState) -> Snapshot:
+    """What every handler of a right agent writes before it reads it again, as it is at the beginning."""
+    parts: Snapshot = {}
+    if not state.voting_timer.active:
+        parts |= _DEAD_VOTE
+    if not state.phase_one_timer.active:
+        parts |= _DEAD_PHASE_1
+        if not state.phase_two_timer.active:
+            parts |= _DEAD_RESPONDERS
+    if not state.phase_two_timer.active:
+        parts |= _DEAD_PHASE_2
+    if not state.phase_three_timer.active:
+        parts |= _DEAD_PHASE_3
+    return parts
+
+
+def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) -> None:
+    """Let the agent be in the state of the snapshot. Its running timers have the deadline RUNNING_S.
+
+    `since` is what it is now, if that is known: parts that both have are left alone.
+    """
+    state = vars(agent.state)
+    state["now"] = NOW_S
+    for name in HANDED_OVER & state.keys():
+        state[name].clear()
+    for name, value in snapshot.items():
+        if since is not None and name in since and since[name] is value:
+            continue
+        if isinstance(value, _TimerState | _ChainState):
+            value.put_back(state[name])
+        else:
+            state[name] = _copied(value)
+
+
+def _is_part(part: Any, value: Any) -> bool:
+    """Whether this part of the state still is what it was."""
+    if isinstance(part, _TimerState | _ChainState):
+        return part.is_of(value)
+    return bool(part == value)
+
+
+def replaced(value: Any, hash_of: Callable[[bytes], bytes], block_of: Callable[[Block], Block]) -> Any:
+    """A part of the state with other hashes and blocks in it."""
+    if isinstance(value, bytes):
+        return hash_of(value)
+    if isinstance(value, Block):
+        return block_of(value)
+    if isinstance(value, _ChainState):
+        return value.replaced(hash_of, block_of)
+    if isinstance(value, dict):
+        return {replaced(key, hash_of, block_of): replaced(item, hash_of, block_of) for key, item in value.items()}
+    if isinstance(value, list | deque | tuple | set):
+        return type(value)(replaced(item, hash_of, block_of) for item in value)
+    return value
+
+
+def keyed(value: Any, name_of: NameOf) -> Any:
+    """A part of the state as numbers and tuples, equal for equal parts and whichever machine it is."""
+    key = _KEYED.get(type(value))
+    return value if key is None else key(value, name_of)
+
+
+def key_of(snapshot: Snapshot, name_of: NameOf) -> tuple[Any, ...]:
+    """Equal for equal states, and only for these."""
+    return tuple(keyed(value, name_of) for value in snapshot.values())
+
+
+class _TimerState:
+    __slots__ = ("paused", "running")
+
+    def __init__(self, timer: Timer) -> None:
+        self.running = timer.deadline is not None
+        self.paused = timer.active and not self.running
+
+    @property
+    def active(self) -> bool:
+        return self.running or self.paused
+
+    def is_of(self, timer: Timer) -> bool:
+        """A timer that was started anew is not what it was."""
+        return (timer.deadline == RUNNING_S) == self.running and timer.active == (self.running or self.paused)
+
+    def put_back(self, timer: Timer) -> None:
+        timer.stop()
+        if self.running or self.paused:
+            timer.start(RUNNING_S, 0.0)
+        if self.paused:
+            timer.pause(RUNNING_S)
+
+
+class _ChainState:
+    __slots__ = ("kind", "parts")
+
+    def __init__(self, chain: Chain) -> None:
+        self.kind = type(chain)
+        self.parts = {name: _copied(value) for name, value in vars(chain).items() if name != "inception"}
+
+    def is_of(self, chain: Chain) -> bool:
+        now = vars(chain)
+        return type(chain) is self.kind and all(now[name] == value for name, value in self.parts.items())
+
+    def put_back(self, chain: Chain) -> None:
+        chain.__class__ = self.kind
+        for name, value in self.parts.items():
+            setattr(chain, name, _copied(value))
+
+    def replaced(self, hash_of: Callable[[bytes], bytes], block_of: Callable[[Block], Block]) -> "_ChainState":
+        other = copy(self)
+        other.parts = {name: replaced(value, hash_of, block_of) for name, value in self.parts.items()}
+        return other
+
+
+def _copied(value: Any) -> Any:
+    """A copy that shares nothing that changes."""
+    copy = _COPIED.get(type(value))
+    if copy is None:
+        copy = next((way for kind, way in _COPIED.items() if isinstance(value, kind)), None)
+    if copy is None:
+        raise TypeError(f"an agent's state has a {type(value).__name__}, and nobody has said how it is copied")
+    return copy(value)
+
+
+def _itself(value: Any) -> Any:
+    return value
+
+
+def _each(value: Any) -> Any:
+    return type(value)(map(_copied, value))
+
+
+_COPIED: dict[type, Callable[[Any], Any]] = {
+    **dict.fromkeys((type(None), bool, int, bytes, str, float, Block, _TimerState, _ChainState), _itself),
+    **dict.fromkeys((set, bytearray, Counter), lambda value: value.copy()),
+    **dict.fromkeys((list, deque, tuple), _each),
+    dict: lambda value: {key: _copied(item) for key, item in value.items()},
+    Timer: _TimerState,
+    Chain: _ChainState,
+}
+
+
+_KEYED: dict[type, Callable[[Any, NameOf], Any]] = {
+    bytes: lambda value, name_of: name_of(value),
+    Block: lambda value, name_of: name_of(value.block_hash),
+    _TimerState: lambda value, name_of: (value.running, value.paused),
+    _ChainState: lambda value, name_of: (
+        value.kind.__name__,
+        *[keyed(part, name_of) for part in value.parts.values()],
+    ),
+    dict: lambda value, name_of: tuple(
+        sorted([(keyed(key, name_of), keyed(item, name_of)) for key, item in value.items()])
+    ),
+    set: lambda value, name_of: tuple(sorted([keyed(item, name_of) for item in value])),
+    bytearray: lambda value, name_of: bytes(value),
+    **dict.fromkeys((list, deque, tuple), lambda value, name_of: tuple([keyed(item, name_of) for item in value])),
+}
+
+
+Started = tuple[tuple[int, int], ...]
+"""Timers that an agent has started in this instant and that run: (number, duration in microseconds)."""
+
+
+class Step(NamedTuple):
+    """What an input makes of an agent: its state, the messages that it sends, the timers that it has started."""
+
+    local: int
+    sent: tuple[int, ...]
+    started: Started
+
+
+class End(NamedTuple):
+    """What may come of it when a timer ends, and which of the candidates of phase 2 is the oldest then."""
+
+    step: Step
+    oldest: bytes | None
+
+
+NAMES_OF_OTHERS = ("voters", "reconcile_responders")
+"""Parts of the state that are sets of other agents."""
+
+
+class Parts:
+    """All parts of the states that were come upon."""
+
+    def __init__(self) -> None:
+        self._parts: dict[tuple[str, Any], Any] = {}
+        self._numbers: dict[int, int] = {}
+        """By `id`."""
+        self._digests: dict[int, bytes] = {}
+        """Of each part, by its `id`: the same on any machine."""
+        self._hashes: dict[int, bytes] = {}
+
+    def part(self, name: str, value: Any) -> Any:
+        """The one part that stands for all that are equal."""
+        key = name, keyed(value, self.name)
+        part = self._parts.setdefault(key, value)
+        if part is value:
+            self._numbers.setdefault(id(part), len(self._numbers))
+            self._digests[id(part)] = blake2b(repr(key[1]).encode(), digest_size=8).digest()
+        return part
+
+    def of(self, snapshot: Snapshot, like: Snapshot) -> Snapshot:
+        """The same state of parts that there are; of `like` all are."""
+        return {
+            name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
+        }
+
+    def key(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> tuple[Any, ...]:
+        """Equal for equal states, whose snapshots are of parts that there are."""
+        numbers = self._numbers
+        return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
+
+    def anonymous(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> int:
+        """Equal for states that differ only in who has voted and answered; the same number on any machine."""
+        parts = [
+            len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()
+        ]
+        return int.from_bytes(blake2b(repr((agent_id, flaw, parts)).encode(), digest_size=8).digest())
+
+    def name(self, digest: bytes) -> int:
+        """A number for a hash, the same on any machine."""
+        name = int.from_bytes(digest[:8])
+        assert self._hashes.setdefault(name, digest) == digest, "no two hashes that there are begin alike"
+        return name

@@ -1,0 +1,106 @@
+"""What tallies decide: agents that differ only in what their tallies will never ask again are one (docs/proof.md)."""
+
+from collections.abc import Callable, Sequence
+
+from harness.proof.model._known_states import DEAD, KnownStates
+from harness.proof.model._reduction import ReductionError
+from harness.proof.model._snapshot import NAMES_OF_OTHERS, End, Snapshot, Step
+from ucp.reconcile import most_named
+
+TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))
+"""Parts of the state in which answers are counted, and nothing else is done with them until a timer ends."""
+
+
+class Tallies:
+    """What is left of the tallies of each state when an instant is over.
+
+    `ends` asks the real agent what may come of it when a timer ends, by the state's number and the timer's place in
+    `timers`. `every_count`: of what is counted in a reconcile all stays.
+    """
+
+    def __init__(
+        self,
+        states: KnownStates,
+        timers: Sequence[str],
+        ends: Callable[[int, int], Sequence[End]],
+        *,
+        every_count: bool,
+    ) -> None:
+        self._states = states
+        self._phase_one = timers.index("phase one")
+        self._ends = ends
+        self._every_count = every_count
+        self._most_decides = not states.bounds.agent_settings().top_needs_majority
+        self._settled: dict[int, int] = {}
+
+    def settled(self, local: int) -> int:
+        """The same agent when all answers to what was asked have come, or are lost: who voted matters no more."""
+        number = self._settled.get(local)
+        if number is None:
+            tallies = {} if local == DEAD or local in self._states.flawed else self._left(local)
+            number = self._settled[local] = self._states.with_tallies(local, tallies) if tallies else local
+            self._check_that_it_ends_alike(local, number)
+        return number
+
+    def _left(self, local: int) -> Snapshot:
+        """What is left of its tallies: no more than what they decide."""
+        known = self._states.known[local]
+        snapshot = known.snapshot
+        left: Snapshot = {}
+        if snapshot["voting_timer"].active:
+            count = snapshot["vote_count"]
+            left |= {"vote_count": {"yes": int(count["yes"] > count["no"]), "no": 0}, "voters": set()}
+        if self._every_count:
+            return left
+        if snapshot["voting_timer"].active:
+            began_with = self._states.blocks.named(snapshot["top_chain_hash_at_initiation"])
+            if len(known.chain) + len(snapshot["reconcile_stack"]) > len(began_with):
+                left["top_chain_hash_at_initiation"] = b""  # blocks stay: the chain will not be that one again
+        if snapshot["phase_one_timer"].active:
+            left |= self._of_phase_1(local)
+        if snapshot["phase_two_timer"].active and self._most_decides:
+            left |= self._of_phase_2(snapshot)
+        return left
+
+    def _of_phase_1(self, local: int) -> Snapshot:
+        """What is left of the tally of phase 1, if it makes no difference what those say who have not answered yet."""
+        snapshot = self._states.known[local].snapshot
+        yes, no = (snapshot["reconcile_vote_count"][answer] for answer in ("yes", "no"))
+        silent = self._silent(snapshot)
+        clear = {tally: self._ends_with(local, *tally) for tally in ((1, 0), (0, 1))}
+        ends = self._ends_with(local, yes, no)
+        at_last = [self._ends_with(local, *tally) for tally in ((yes + silent, no), (yes, no + silent))]
+        if not yes + no or at_last != [ends, ends]:
+            return {}
+        yes, no = next(tally for tally, as_clear in clear.items() if as_clear == ends)
+        return {"reconcile_vote_count": {"yes": yes, "no": no}, "reconcile_responders": {*self._states.others}}
+
+    def _ends_with(self, local: int, yes: int, no: int) -> Sequence[End]:
+        """What comes of phase 1 if it ends with so many answers."""
+        counted = self._states.with_tallies(local, {"reconcile_vote_count": {"yes": yes, "no": no}})
+        return self._ends(counted, self._phase_one)
+
+    def _of_phase_2(self, snapshot: Snapshot) -> Snapshot:
+        """The same of phase 2, of which those candidates are left that most have named."""
+        candidates = snapshot["reconcile_response_dictionary"]
+        most, next_most, *_ = sorted([*(count for count, _ in candidates.values()), 0, 0], reverse=True)
+        silent = self._silent(snapshot)
+        if silent and most - next_most <= silent:
+            return {}
+        left = {candidate: [1, candidates[candidate][1]] for candidate in most_named(candidates)}
+        return {"reconcile_response_dictionary": left, "reconcile_responders": {*self._states.others}}
+
+    def _silent(self, snapshot: Snapshot) -> int:
+        """How many have not answered yet."""
+        return len(self._states.others) - len(snapshot["reconcile_responders"])
+
+    def _check_that_it_ends_alike(self, local: int, settled: int) -> None:
+        """A timer has to make the same of an agent whose tallies are settled as it would have made of it."""
+        if settled != local and any(
+            self._settled_ends(local, timer) != self._settled_ends(settled, timer)
+            for timer in self._states.known[local].running
+        ):
+            raise ReductionError("an agent asks more of a tally than it should: try again with --whole")
+
+    def _settled_ends(self, local: int, timer: int) -> set[Step]:
+        return {end.step._replace(local=self.settled(end.step.local)) for end in self._ends(local, timer)}

@@ -1,0 +1,98 @@
+"""Ways that lead back to where they began, when nothing is lost and no new block comes."""
+
+from array import array
+from collections.abc import Iterator
+
+from harness.proof.graph._exploration import Graph
+from harness.proof.questions._attractor import Check
+
+
+def cycles(graph: Graph, check: Check = lambda: None) -> list[list[int]]:
+    """A shortest way round in each part of the graph from whose states all others of it are reached; nearest first."""
+    parts = [part for part in _parts(graph, check) if len(part) > 1 or part[0] in _after(graph, part[0])]
+    return [_round(graph, min(part), set(part)) for part in sorted(parts, key=min)]
+
+
+def _after(graph: Graph, number: int) -> set[int]:
+    """What may follow; only of what was looked at, if that is not all."""
+    following = {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
+    if graph.ended == "complete":
+        return following
+    return {state for state in following if state < len(graph.quiet)}
+
+
+def _round(graph: Graph, start: int, part: set[int]) -> list[int]:
+    came_from: dict[int, int] = {}
+    layer = [start]
+    while layer:
+        following = []
+        for number in layer:
+            for after in _after(graph, number):
+                if after == start:
+                    way = [number]
+                    while way[-1] != start:
+                        way.append(came_from[way[-1]])
+                    return way[::-1]
+                if after in part and after not in came_from:
+                    came_from[after] = number
+                    following.append(after)
+        layer = following
+    raise AssertionError("a part has a way round")
+
+
+def _after_a_cycle(graph: Graph, check: Check) -> list[int]:
+    """States that are on a way round, or can be come to from one: those that are left when again and again what follows
+    none of those that are left is taken away."""
+    ways_in = array("q", bytes(8 * len(graph.quiet)))
+    for number in range(len(graph.quiet)):
+        check()
+        for after in _after(graph, number):
+            ways_in[after] += 1
+    waiting = [number for number, ways in enumerate(ways_in) if not ways]
+    while waiting:
+        check()
+        for after in _after(graph, waiting.pop()):
+            ways_in[after] -= 1
+            if not ways_in[after]:
+                waiting.append(after)
+    return [number for number, ways in enumerate(ways_in) if ways]
+
+
+def _parts(graph: Graph, check: Check) -> Iterator[list[int]]:
+    """Strongly connected components (Tarjan), without recursion; without most of those that are one state."""
+    index: dict[int, int] = {}
+    low: dict[int, int] = {}
+    stack: list[int] = []
+    on_stack: set[int] = set()
+    for root in _after_a_cycle(graph, check):
+        if root in index:
+            continue
+        work = [(root, iter(_after(graph, root)))]
+        index[root] = low[root] = len(index)
+        stack.append(root)
+        on_stack.add(root)
+        while work:
+            check()
+            number, rest = work[-1]
+            for after in rest:
+                if after not in index:
+                    index[after] = low[after] = len(index)
+                    stack.append(after)
+                    on_stack.add(after)
+                    work.append((after, iter(_after(graph, after))))
+                    break
+                if after in on_stack:
+                    low[number] = min(low[number], index[after])
+            else:
+                work.pop()
+                if work:
+                    low[work[-1][0]] = min(low[work[-1][0]], low[number])
+                if low[number] == index[number]:
+                    part = []
+                    while True:
+                        member = stack.pop()
+                        on_stack.remove(member)
+                        part.append(member)
+                        if member == number:
+                            break
+                    yield part

@@ -1,0 +1,202 @@
+"""The same bounds looked at twice: the real agent by `harness.proof`, and the specification by TLC."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from math import gcd
+from typing import Any
+
+from harness.errors import INTERRUPTED, VIOLATED
+from harness.proof._progress_bar import Ended, Progress
+from harness.proof._proof import INCOMPLETE, Limits
+from harness.proof.bounds import Bounds, BoundsError
+from harness.proof.graph._exploration import explore
+from harness.proof.model._global_states import Swarm
+from harness.proof.questions import _convergence
+from harness.proof.specification import _spec_states as states
+from harness.proof.specification._spec_states import readings, unspecified
+from harness.proof.specification._tlc import checked, command, in_tla
+from harness.scenario.agent_options import Staggered
+from ucp.clock import MICROSECONDS
+
+MEGABYTE = 1e6
+AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
+"""Quirks that the specification has, too: what the thesis prints, and cannot mean."""
+TIMERS: dict[Staggered, tuple[str, str]] = {
+    "vote_timeout_s": ("VoteTimeout", "VoteStagger"),
+    "phase1_timeout_s": ("Phase1Timeout", "Phase1Stagger"),
+    "phase2_timeout_s": ("Phase2Timeout", "Phase2Stagger"),
+    "phase3_timeout_s": ("Phase3Timeout", "Phase3Stagger"),
+    "finalize_gap_s": ("FinalizeGap", "FinalizeStagger"),
+}
+"""The constants of the specification for how long each lasts, and for how much longer from agent to agent."""
+INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
+"""In the specification, and as `prove` calls what they forbid."""
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """What both say. `states` and `specified` are None where somebody has not looked at everything.
+
+    States of timers that run for different times are one, so that `specified` is what TLC counts if timers end in any
+    order, and less otherwise. `only_*`: how many states only one of the two has.
+    """
+
+    bounds: Bounds
+    ended: Ended
+    flaw: str | None
+    violated: str | None
+    states: int | None = None
+    specified: int | None = None
+    distinct: int | None = None
+    only_real: int | None = None
+    only_specified: int | None = None
+    livelock: bool | None = None
+    specified_livelock: bool | None = None
+    """Whether one can go round for ever though nothing is lost; None on a network that loses."""
+
+    @property
+    def decided(self) -> bool:
+        return self.ended in ("complete", "flaw")
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both say the same, and have found the same states if nothing is wrong about them."""
+        same = not self.only_real and not self.only_specified and self.livelock == self.specified_livelock
+        return self.decided and self.flaw == self.violated and same
+
+    @property
+    def exit_status(self) -> int:
+        if not self.decided:
+            return INTERRUPTED if self.ended == "interrupted" else INCOMPLETE
+        return 0 if self.agrees and self.flaw is None and not self.livelock else VIOLATED
+
+    def to_json(self) -> dict[str, Any]:
+        bounds = asdict(self.bounds)
+        return {
+            "schema": "ucp-second-opinion/1",
+            "agents": bounds["agents"],
+            "blocks": bounds["blocks"],
+            "network": bounds["network"],
+            "crossing": bounds["crossing"],
+            "timers": "any" if bounds["timers_any"] else "duration",
+            "stagger": bounds["stagger"],
+            "settings": dict(self.bounds.settings),
+            "quirks": dict(self.bounds.quirks),
+            "ended": self.ended,
+            "agree": self.agrees,
+            "prove": {
+                "states": self.states,
+                "flaw": self.flaw,
+                "only_here": self.only_real,
+                "livelock": self.livelock,
+            },
+            "tlc": {
+                "states": self.specified,
+                "distinct": self.distinct,
+                "violated": self.violated,
+                "only_here": self.only_specified,
+                "livelock": self.specified_livelock,
+            },
+        }
+
+    def in_words(self) -> Iterator[str]:
+        yield f"{self.bounds.in_words()}: the agent, and the specification in TLA+"
+        if not self.decided:
+            yield f"- not decided: not everything was looked at ({self.ended})"
+            return
+        if self.flaw is None and self.violated is None:
+            yield "✔ both hold: characteristics 2, 3 and 4, and nobody hangs"
+            yield f"  states: {self.states:,} of the agent, {self.specified:,} of the specification"
+            if not self.only_real and not self.only_specified:
+                yield "✔ they are the same states"
+            else:
+                yield f"✘ {self.only_real:,} states only the agent has, {self.only_specified:,} only the specification"
+            if self.livelock != self.specified_livelock:
+                yield f"✘ only the {'agent' if self.livelock else 'specification'} can go round for ever"
+            elif self.livelock is not None:
+                yield "✘ both can go round for ever" if self.livelock else "✔ neither can go round for ever"
+            return
+        yield f"{'✔ both violate' if self.agrees else '✘ they differ'}: the agent {_word(self.flaw)}, the " + (
+            f"specification {_word(self.violated)}"
+        )
+
+
+def _word(kind: str | None) -> str:
+    return "nothing" if kind is None else f"characteristic {kind}" if kind.isdecimal() else kind
+
+
+def second_opinion(
+    bounds: Bounds, limits: Limits | None = None, *, watch: Callable[[Progress], None] = lambda progress: None
+) -> Opinion:
+    """What both say. Raises BoundsError for what the specification does not have, NoCheckerError without TLC."""
+    bounds, limits = replace(bounds, reduced=False), limits or Limits()
+    config = _config(bounds)
+    command()
+    graph = explore(Swarm(bounds), most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
+    flaw = None if graph.flaw is None else graph.flaw.kind
+    if graph.ended not in ("complete", "flaw"):
+        return Opinion(bounds, graph.ended, flaw, None)
+    most_s = None if limits.most_s == float("inf") else limits.most_s
+    memory_mb = int(limits.most_bytes / MEGABYTE)
+    try:
+        with checked("Swarm", config, dump=True, memory_mb=memory_mb, most_s=most_s) as said:
+            violated = said.violated and INVARIANTS[said.violated]
+            if flaw or violated:
+                return Opinion(bounds, "flaw", flaw, violated)
+            lossless = bounds.network == "lossless"
+            real, specified = set(states.real(graph)), set(states.specified(said.states))
+            return Opinion(
+                bounds,
+                "complete",
+                None,
+                None,
+                len(real),
+                len(specified),
+                said.distinct,
+                len(real - specified),
+                len(specified - real),
+                bool(_convergence.look(graph).cycles) if lossless else None,
+                states.goes_round(said.states) if lossless else None,
+            )
+    except TimeoutError:
+        return Opinion(bounds, "time", flaw, None)
+
+
+def _config(bounds: Bounds) -> str:
+    """What TLC is to check. Raises BoundsError."""
+    if bounds.network == "any":
+        raise BoundsError("the specification is of --network lossless and lossy: any is looked at in another way")
+    if bounds.faults:
+        raise BoundsError("the specification has no faults: leave --faults out")
+    if bounds.coincidences is not None:
+        raise BoundsError("the specification does not count coincidences: leave --coincidences out")
+    if bounds.losses is not None:
+        raise BoundsError("the specification does not count losses: leave --losses out")
+    if bounds.clocks_any:
+        raise BoundsError("the specification has clocks that agree: leave --clocks any out")
+    if bounds.captured is not None:
+        raise BoundsError("the specification has nobody who lies: leave --captured out")
+    unknown = [name for name in bounds.quirks if name not in AS_PRINTED]
+    if unknown:
+        raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}, not {unknown[0]}")
+    settings = bounds.agent_settings()
+    if (name := unspecified(settings)) is not None:
+        raise BoundsError(f"the specification is of the thesis alone: leave --settings {name} out")
+    durations = {
+        name: round(duration_s * MICROSECONDS)
+        for timer, names in TIMERS.items()
+        for name, duration_s in zip(names, (getattr(settings, timer), bounds.stagger.get(timer, 0.0)), strict=True)
+    }
+    unit = gcd(*durations.values())
+    constants = {
+        "Agents": bounds.agents,
+        "MostBlocks": bounds.blocks,
+        "Lossy": bounds.network == "lossy",
+        "Crossing": bounds.crossing,
+        "Timed": not bounds.timers_any,
+        **{name: duration // unit for name, duration in durations.items()},
+        **readings(settings),
+        "AsPrinted": f"{{{', '.join(str(AS_PRINTED[name]) for name, value in bounds.quirks.items() if value)}}}",
+    }
+    assigned = (f"  {name} = {in_tla(value)}" for name, value in constants.items())
+    return "\n".join(["SPECIFICATION Spec", "CONSTANTS", *assigned, "INVARIANTS", *INVARIANTS, ""])

@@ -1,0 +1,167 @@
+"""States and settings of the specification, and the same of the real agents.
+
+Blocks are called 1, 2, ... in the order in which they were completed; a chain hash is the blocks of its chain.
+"""
+
+import json
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from harness.proof.graph._exploration import Graph
+from harness.proof.model._global_states import AGENTS
+from harness.proof.model._local_steps import LocalStates
+from ucp.clock import MICROSECONDS
+from ucp.settings import Settings
+from ucp.state import AgentState
+
+Plain = tuple[Any, ...]
+"""An agent, or all of them."""
+
+NO_HASH = -1
+TOP_OF_CHAIN = 0
+_SIGNS = str.maketrans({"{": "\1", "}": "\2", "[": "{", "]": "}", "(": "{", ")": "}"})
+_WORDS = {"<<": "[", ">>": "]", "\1": "[", "\2": "]", " @@": ",", ":>": ":", "TRUE": "true", "FALSE": "false"}
+_NODE = re.compile(r'-?\d+ \[label="((?:[^"\\]|\\.)*)"')
+_EDGE = re.compile(r"(-?\d+) -> (-?\d+)")
+_FIELD = re.compile(r"(\w+) \|->")
+
+
+def specified(graph: Path) -> Iterator[Plain]:
+    """All states that TLC has found."""
+    with graph.open() as lines:
+        for line in lines:
+            if node := _NODE.match(line):
+                text = node[1].replace("\\n", " ").replace('\\"', '"').replace("\\\\", "\\")
+                yield tuple(map(_of_record, _value(text.partition("=")[2])))
+
+
+def goes_round(graph: Path) -> bool:
+    """Whether a way through the states that TLC has found leads back to where it was."""
+    after: dict[str, set[str]] = defaultdict(set)
+    with graph.open() as lines:
+        for line in lines:
+            if edge := _EDGE.match(line):
+                after[edge[1]].add(edge[2])
+    ways_in = Counter(other for others in after.values() for other in others)
+    waiting = [state for state in after if not ways_in[state]]
+    while waiting:
+        for other in after.pop(waiting.pop(), ()):
+            ways_in[other] -= 1
+            if not ways_in[other]:
+                waiting.append(other)
+    return bool(after)
+
+
+def _value(text: str) -> Any:
+    """A value of TLA+ as Python has it; sets are lists."""
+    text = text.translate(_SIGNS)
+    for sign, other in _WORDS.items():
+        text = text.replace(sign, other)
+    return json.loads(_FIELD.sub(r'"\1":', text))
+
+
+def _of_record(agent: dict[str, Any]) -> Plain:
+    def hashes(blocks: list[dict[str, Any]]) -> Plain:
+        return tuple(block["hash"] for block in blocks)
+
+    return (
+        tuple((link["block"]["hash"], link["chainHash"]) for link in agent["blockChain"]),
+        hashes(agent["blocksToBeCommittedDeque"]),
+        hashes(agent["reconcileStack"]),
+        hashes(agent["completed"]),
+        agent["currentBlock"],
+        tuple(sorted(name for name, left in agent["timer"].items() if left)),
+        agent["candidateBlock"]["hash"],
+        agent["topChainHashAtInitiation"],
+        (agent["voteCount"]["yes"], agent["voteCount"]["no"], *sorted(agent["voters"])),
+        agent["reconcileInProgress"],
+        (agent["reconcileVoteCount"]["yes"], agent["reconcileVoteCount"]["no"]),
+        tuple(sorted(agent["responders"])),
+        tuple(sorted((r["blockHash"], r["count"], r["timestamp"]) for r in agent["reconcileResponseDictionary"])),
+        agent["majorityResponseBlockHash"],
+    )
+
+
+def real(graph: Graph) -> Iterator[Plain]:
+    """All states that `harness.proof` has found, without how long their timers have yet to run."""
+    translator = _Translator(graph.swarm.local)
+    for state in graph.states:
+        yield tuple(map(translator.plain, state[AGENTS:]))
+
+
+class _Translator:
+    """Names the hashes of the real agents as the specification does."""
+
+    def __init__(self, local: LocalStates) -> None:
+        self._local = local
+        self._plain: dict[int, Plain] = {}
+        self._block: dict[bytes, int] = {b"": TOP_OF_CHAIN}
+        self._chain: dict[bytes, int] = {b"": NO_HASH}
+        for number in range(len(local.known)):
+            state = local.state(number)
+            self._chain[state.chain.inception.chain_hash] = below = 0
+            for block in (*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack):
+                self._block[block.block_hash] = block.timestamp_us // MICROSECONDS
+            for block, chain_hash in state.chain.with_chain_hashes():
+                self._chain[chain_hash] = below = 10 * below + self._block[block.block_hash]
+
+    def plain(self, number: int) -> Plain:
+        if number not in self._plain:
+            self._plain[number] = self._of_state(self._local.state(number))
+        return self._plain[number]
+
+    def _of_state(self, state: AgentState) -> Plain:
+        block, votes, answers = self._block, state.vote_count, state.reconcile_vote_count
+        candidate, majority = state.candidate_block, state.majority_response_block_hash
+        return (
+            tuple((block[link.block_hash], self._chain[top]) for link, top in state.chain.with_chain_hashes()),
+            tuple(block[waiting.block_hash] for waiting in state.blocks_to_be_committed),
+            tuple(block[popped.block_hash] for popped in state.reconcile_stack),
+            tuple(block[block_hash] for block_hash in state.completed),
+            len(state.current_block),
+            tuple(sorted(timer.name for timer in state.timers if timer.active)),
+            NO_HASH if candidate is None else block[candidate.block_hash],
+            self._chain[state.top_chain_hash_at_initiation],
+            (votes["yes"], votes["no"], *sorted(state.voters)),
+            state.reconcile_in_progress,
+            (answers["yes"], answers["no"]),
+            tuple(sorted(state.reconcile_responders)),
+            tuple(
+                sorted(
+                    (block[name], count, timestamp_us // MICROSECONDS)
+                    for name, (count, timestamp_us) in state.reconcile_response_dictionary.items()
+                )
+            ),
+            NO_HASH if majority is None else block[majority],
+        )
+
+
+SPECIFIED = frozenset(
+    (
+        *("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s"),
+        *("max_block_bytes", "max_event_bytes"),
+        *("vote_names_chain", "changed_before_tally", "phase1_tie", "phase2_tie"),
+    )
+)
+
+
+def unspecified(settings: Settings) -> str | None:
+    """A setting that is not as by default, and that the specification does not have."""
+    default = Settings()
+    names = (item.name for item in fields(Settings))
+    changed = (name for name in names if getattr(settings, name) != getattr(default, name))
+    return next((name for name in changed if name not in SPECIFIED), None)
+
+
+def readings(settings: Settings) -> dict[str, bool]:
+    """The constants that are readings of the thesis with a setting."""
+    return {
+        "VoteNamesChain": settings.vote_names_chain,
+        "ChangedBeforeTally": settings.changed_before_tally,
+        "Phase1TiePops": settings.phase1_tie == "pop",
+        "Phase2TieTakesBlock": settings.phase2_tie == "block",
+    }

@@ -1,0 +1,236 @@
+"""Recorded runs held against the specification: does TLC find that chapter 3 allows what each agent did?
+
+Many lives of agents are given to one TLC, as it takes longer to start than to look at one.
+"""
+
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from harness.archive.archive import RunArchive
+from harness.archive.traces import Trace, read_trace, why_none
+from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
+from harness.errors import INTERRUPTED, VIOLATED, WRONG_REQUEST
+from harness.proof.specification._recorded_lives import Chains, Life, lives, module
+from harness.proof.specification._spec_states import readings, unspecified
+from harness.proof.specification._tlc import CheckerError, command, in_tla
+from harness.proof.specification._tlc import checked as looked_at
+from harness.run.simulate import simulate
+from harness.scenario import Scenario
+from ucp.agent import HANDLERS
+
+STEPS_AT_ONCE = 20_000
+"""So many handler runs, and those of the trace that passes it, are given to one TLC."""
+MEMORY_MB = 2048
+
+Constants = tuple[tuple[str, object], ...]
+
+AT_END = "what it triggered has yet to run"
+"""Of a life as a whole, not of a step of it."""
+
+_REJECTED = re.compile(r'<<\s*"rejected",\s*(\d+),\s*(\d+),\s*\{([^}]*)\}\s*>>')
+_WHAT = re.compile(r'"([^"]*)"')
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """The first step of a life that the specification does not allow; `what` is what is otherwise there."""
+
+    run: str
+    agent_id: int
+    life: int
+    line: int
+    handler: str
+    what: tuple[str, ...]
+
+    def in_words(self) -> str:
+        algorithm = HANDLERS[self.handler].algorithm
+        life = f", life {self.life}" if self.life > 1 else ""
+        return (
+            f"{self.run}: agent {self.agent_id}{life}, line {self.line}, Algorithm {algorithm}, {self.handler}: "
+            f"not as specified: {', '.join(self.what)}"
+        )
+
+
+@dataclass
+class Validation:
+    """`steps` are the handler runs that were looked at, of `lives` lives; `unread` says what could not be, and why.
+
+    `interrupted`: what came after these was not looked at.
+    """
+
+    runs: int = 0
+    lives: int = 0
+    steps: int = 0
+    rejected: list[Rejected] = field(default_factory=list)
+    unread: list[str] = field(default_factory=list)
+    interrupted: bool = False
+
+    @property
+    def exit_status(self) -> int:
+        if self.interrupted and not self.rejected:
+            return INTERRUPTED
+        return VIOLATED if self.rejected else WRONG_REQUEST if self.unread or not self.steps else 0
+
+    def to_json(self) -> dict[str, Any]:
+        return {"schema": "ucp-validation/1", **asdict(self)}
+
+    def in_words(self) -> Iterator[str]:
+        for rejected in self.rejected:
+            yield f"✘ {rejected.in_words()}"
+        for sentence in self.unread:
+            yield f"- {sentence}"
+        runs = f"{self.runs:,} run{'s' if self.runs != 1 else ''}"
+        looked = f"{runs}, {self.lives:,} lives of agents, {self.steps:,} handler runs"
+        if self.rejected:
+            count = len(self.rejected)
+            yield f"✘ {looked}: {count:,} {'life' if count == 1 else 'lives'} not as specified"
+        elif self.exit_status == 0:
+            yield f"✔ {looked}: all as specified"
+        else:
+            yield f"- {looked}: as specified, as far as they could be looked at"
+
+
+@dataclass
+class _Batch:
+    """Lives that are looked at together, and where each is from."""
+
+    chains: Chains = field(default_factory=Chains)
+    lives: list[Life] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    steps: int = 0
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A run: what it is called, its traces, whose agents came to its end, and what is missing or damaged."""
+
+    name: str
+    traces: Sequence[Trace]
+    ended: Collection[int] = ()
+    problems: Sequence[str] = ()
+
+
+def recorded(paths: Iterable[Path]) -> Iterator[Recorded]:
+    """Run directories, directories of what agents left, and traces. Raises RunDirectoryError for anything else."""
+    for path in paths:
+        if path.is_file():
+            trace = read_trace(path)
+            yield Recorded(str(path), [trace] if trace else [], problems=[] if trace else [why_none(path)])
+            continue
+        archive = RunArchive(path)
+        traces = archive.traces
+        missing = sorted(set(archive.roster) - set(traces)) if traces else []
+        problems = [*archive.problems, *(f"there is no trace of agent {agent_id}" for agent_id in missing)]
+        problems += [] if traces else ["there are no traces"]
+        yield Recorded(str(path), list(traces.values()), archive.exports.by_agent.keys(), problems)
+
+
+def simulated(scenario: Scenario, seeds: Iterable[int]) -> Iterator[Recorded]:
+    """The scenario played in virtual time. Raises HarnessError."""
+    for seed in seeds:
+        evidence = simulate(scenario, seed, tracing=True).evidence
+        yield Recorded(f"seed {seed}", list(evidence.traces.values()), evidence.exports.keys())
+
+
+def validate(runs: Iterable[Recorded], *, watch: Callable[[Validation], None] = lambda validation: None) -> Validation:
+    """Hold runs against the specification. Raises NoCheckerError without TLC, and whatever `runs` raise."""
+    command()
+    validation = Validation()
+    try:
+        for constants, batch in _batches(runs, validation):
+            _look(constants, batch, validation)
+            watch(validation)
+    except KeyboardInterrupt:
+        validation.interrupted = True
+    return validation
+
+
+def _batches(runs: Iterable[Recorded], validation: Validation) -> Iterator[tuple[Constants, _Batch]]:
+    batches: dict[Constants, _Batch] = {}
+    for run in runs:
+        validation.runs += 1
+        validation.unread += [f"{run.name}: {problem}" for problem in run.problems]
+        for trace in run.traces:
+            try:
+                header, constants = _constants(trace)
+            except _OutsideError as error:
+                validation.unread.append(f"{run.name}: agent {trace.header.agent_id}: {error}")
+                continue
+            batch = batches.setdefault(constants, _Batch())
+            for life in lives(trace, header, batch.chains, ended=header.agent_id in run.ended):
+                batch.lives.append(life)
+                batch.names.append(run.name)
+                batch.steps += len(life.steps)
+                if life.unread is not None:
+                    validation.unread.append(f"{run.name}: agent {life.agent_id}: {life.unread}")
+            if batch.steps >= STEPS_AT_ONCE:
+                yield constants, batches.pop(constants)
+    yield from batches.items()
+
+
+class _OutsideError(Exception):
+    """A record that cannot be held against the specification: why."""
+
+
+def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
+    """The agent's mission, and what TLC has to know of its settings. Raises _OutsideError."""
+    if not trace.header.has_inputs:
+        raise _OutsideError("its trace is of ucp-trace/1, which lacks what the agent received")
+    try:
+        header = checked(trace.header)
+    except ImpossibleHeaderError as error:
+        raise _OutsideError(str(error)) from None
+    settings = header.settings
+    if (name := unspecified(settings)) is not None:
+        raise _OutsideError(f"the specification does not have its setting {name}")
+    return header, (
+        ("SizeMaxEvent", settings.max_event_bytes),
+        ("SizeMaxBlock", settings.max_block_bytes),
+        ("FinalizeGap", settings.finalize_gap_s > 0),
+        *readings(settings).items(),
+    )
+
+
+def _look(constants: Constants, batch: _Batch, validation: Validation) -> None:
+    """Let TLC look at these lives; at halves of them where it can not, so that only what it cannot look at is left."""
+    try:
+        rejected = _rejected(constants, batch)
+    except CheckerError as error:
+        if len(batch.lives) == 1:
+            validation.unread.append(f"{batch.names[0]}: agent {batch.lives[0].agent_id}: {error}")
+            return
+        middle = len(batch.lives) // 2
+        for half in (slice(middle), slice(middle, None)):
+            _look(constants, _Batch(batch.chains, batch.lives[half], batch.names[half]), validation)
+        return
+    for number, (life, name) in enumerate(zip(batch.lives, batch.names, strict=True), 1):
+        validation.lives += 1
+        if number not in rejected:
+            validation.steps += len(life.steps)
+            continue
+        step, what = rejected[number]
+        validation.steps += step
+        line, handler = life.lines[step - 1], life.handlers[step - 1]
+        validation.rejected.append(Rejected(name, life.agent_id, life.number, line, handler, what))
+
+
+def _rejected(constants: Constants, batch: _Batch) -> dict[int, tuple[int, tuple[str, ...]]]:
+    """Of which lives, counting from 1, which step is not as specified, and what of it. Raises CheckerError."""
+    assigned = (f"  {name} = {in_tla(value)}" for name, value in constants)
+    config = "\n".join(["SPECIFICATION Spec", "VIEW Position", "CONSTANTS", *assigned, ""])
+    records = {"Lives": module(batch.lives, batch.chains)}
+    with looked_at("Recorded", config, others=records, memory_mb=MEMORY_MB) as said:
+        rejected = {
+            int(number): (int(step), tuple(sorted(_WHAT.findall(what))))
+            for number, step, what in _REJECTED.findall(said.told)
+        }
+    positions = 1
+    for number, life in enumerate(batch.lives, 1):
+        step, what = rejected.get(number, (len(life.steps), (AT_END,)))
+        positions += step + (AT_END in what)
+    if positions != said.distinct:
+        raise CheckerError(f"TLC has looked at {said.distinct} positions of {positions}")
+    return rejected

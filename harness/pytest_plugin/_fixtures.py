@@ -1,0 +1,86 @@
+"""What the fixtures `swarm` and `scenario` do, imported when a test asks for one of them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.backend_names import BACKEND_NAMES, BackendName
+from harness.errors import ScenarioError
+from harness.play.progress import Silent
+from harness.pytest_plugin._findings import Findings
+from harness.pytest_plugin._judged_run import Trial, discard, new_directory, one_sentence
+from harness.pytest_plugin._options import Options
+from harness.pytest_plugin._stash import TRIAL
+from harness.pytest_plugin._swarm_in_test import SwarmInTest
+from harness.run.run import Run, run
+from harness.scenario import Scenario, load_scenario
+from harness.scenario.load import parse
+
+DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
+
+
+def swarm_for(node: pytest.Item) -> Iterator[SwarmInTest]:
+    """The swarm of a test. `Trial` ends and judges it, or it ends here if the test does not come to its end."""
+    with one_sentence():
+        options = Options.of(node.config)
+        keys = {**DEFAULTS, "name": node.name[:200], "vehicles": {"kind": "none"}}
+        for marker in reversed(list(node.iter_markers("swarm"))):  # the nearest has the last word
+            keys |= marker.kwargs
+        backend, seed = _backend_and_seed(keys.pop("backend"), keys.pop("seed"), options)
+        options.refuse(backend)
+        scenario = options.laid_over(parse(keys))
+        directory = new_directory(node, options)
+        swarm = SwarmInTest(scenario, seed, backend, directory)
+    trial = node.stash[TRIAL] = Trial(scenario, swarm.finish)
+    try:
+        yield swarm
+    finally:
+        swarm.close()
+    if trial.passed:
+        discard(directory, options)
+
+
+def scenario_for(node: pytest.Item) -> Iterator[Findings]:
+    """The findings of the scenario that the marker names, once it has been played."""
+    with one_sentence():
+        options = Options.of(node.config)
+        path, keys = _marked(node)
+        backend, seed = _backend_and_seed(keys["backend"], keys["seed"], options)
+        options.refuse(backend)
+        scenario = options.laid_over(load_scenario(path))
+        directory = new_directory(node, options)
+        finished = play(scenario, seed, backend, directory)
+    trial = node.stash[TRIAL] = Trial(scenario, lambda _: finished)
+    yield Findings(directory, finished.result)
+    if trial.passed:
+        discard(directory, options)
+
+
+def play(scenario: Scenario, seed: int, backend: BackendName, directory: Path, *, delivers_all: bool = False) -> Run:
+    """Play and judge a scenario. Raises HarnessError, and KeyboardInterrupt if the run was interrupted."""
+    finished = run(scenario, seed, directory, Silent(), backend, delivers_all=delivers_all)
+    if finished.played.outcome == "interrupted":
+        raise KeyboardInterrupt(f"{finished.played.outcome_detail}; report: {finished.report}")
+    return finished
+
+
+def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
+    marker = node.get_closest_marker("scenario")
+    if marker is None or len(marker.args) != 1 or not marker.kwargs.keys() <= DEFAULTS.keys():
+        raise ScenarioError(
+            "the fixture `scenario` needs a marker that says which, and may say where and from what seed: "
+            '@pytest.mark.scenario("loss_15.yaml", backend="sim", seed=3)'
+        )
+    return node.path.parent / marker.args[0], {**DEFAULTS, **marker.kwargs}
+
+
+def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[BackendName, int]:
+    """What a marker says of them, unless the command line says something else. Raises ScenarioError."""
+    if backend not in BACKEND_NAMES:
+        *names, last = map(repr, BACKEND_NAMES)
+        raise ScenarioError(f"`backend` is {backend!r}: it should be {', '.join(names)} or {last}")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ScenarioError(f"`seed` is {seed!r}: it should be a number, 0 or more")
+    return options.backend or backend, seed if options.seed is None else options.seed

@@ -1,0 +1,161 @@
+"""Scenarios and stories as pytest items: one for each backend and seed."""
+
+from collections.abc import Iterator
+from difflib import unified_diff
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.archive.archive import RunArchive
+from harness.archive.vocabulary import first_of, unknown_words
+from harness.backend_names import BackendName
+from harness.errors import HarnessError, ScenarioError
+from harness.play.backends import in_virtual_time
+from harness.pytest_plugin._fixtures import play
+from harness.pytest_plugin._judged_run import Trial, discard, new_directory, one_sentence
+from harness.pytest_plugin._options import Options
+from harness.pytest_plugin._stash import TRIAL
+from harness.report.stories.narration import Telling
+from harness.report.stories.story_file import Story, read_story
+from harness.scenario import Scenario, load_scenario
+from harness.scenario.expect import Expect
+
+
+class ScenarioFile(pytest.File):
+    def collect(self) -> Iterator[pytest.Item]:
+        try:
+            options = Options.of(self.config)
+            scenario = options.laid_over(load_scenario(self.path))
+        except HarnessError as error:
+            raise self.CollectError(str(error)) from None
+        expect = scenario.expect or Expect()
+        backends = expect.backends if options.backend is None else [options.backend]
+        seeds = expect.seeds if options.seed is None else [options.seed]
+        for backend, seed in product(backends, seeds):
+            name = f"{backend}-seed{seed}"
+            yield ScenarioItem.from_parent(self, name=name, scenario=scenario, backend=backend, seed=seed)
+
+
+class ScenarioItem(pytest.Item):
+    """One run; whether it is as expected is judged where that of every test is (`pytest_runtest_call`)."""
+
+    def __init__(self, *, scenario: Scenario, backend: BackendName, seed: int, **node: Any) -> None:
+        super().__init__(**node)
+        self._scenario = scenario
+        self._backend = backend
+        self._seed = seed
+        self._directory: Path | None = None
+
+    def runtest(self) -> None:
+        with one_sentence():
+            options = Options.of(self.config)
+            options.refuse(self._backend)
+            self._directory = new_directory(self, options)
+            finished = play(self._scenario, self._seed, self._backend, self._directory)
+        self.stash[TRIAL] = Trial(self._scenario, lambda _: finished)
+
+    def teardown(self) -> None:
+        if self._directory is not None and TRIAL in self.stash and self.stash[TRIAL].passed:
+            discard(self._directory, Options.of(self.config))
+
+    def reportinfo(self) -> tuple[Path, None, str]:
+        return self.path, None, f"{self.path.name}::{self.name}"
+
+
+CONTEXT_LINES = 3
+
+
+class StoryFile(pytest.File):
+    def collect(self) -> Iterator[pytest.Item]:
+        try:
+            options = Options.of(self.config)
+            story = read_story(self.path)
+        except HarnessError as error:
+            raise self.CollectError(str(error)) from None
+        backends = (story.scenario.expect or Expect()).backends if options.backend is None else [options.backend]
+        for backend in backends:
+            yield StoryItem.from_parent(self, name=backend, story=story, backend=backend)
+
+
+class StoryItem(pytest.Item):
+    """One run; it is judged where that of every test is (`pytest_runtest_call`)."""
+
+    def __init__(self, *, story: Story, backend: BackendName, **node: Any) -> None:
+        super().__init__(**node)
+        self._story = story
+        self._backend = backend
+        self._directory: Path | None = None
+
+    def runtest(self) -> None:
+        options = Options.of(self.config)
+        with one_sentence():
+            options.refuse(self._backend)
+            virtual = in_virtual_time(self._backend)
+            if not virtual:
+                self._skip_what_needs_virtual_time()
+            scenario = options.laid_over(self._story.in_virtual_time if virtual else self._story.scenario)
+            self._directory = new_directory(self, options)
+            finished = play(
+                scenario, 1 if options.seed is None else options.seed, self._backend, self._directory, delivers_all=True
+            )
+        self.stash[TRIAL] = Trial(scenario, lambda _: finished)
+        if finished.played.outcome != "completed":
+            return  # whoever judges the run says why
+        archive = RunArchive(finished.directory)
+        text = self._told(archive)
+        if options.rewrite:
+            self._rewrite(text)
+        elif text != self._story.text:
+            if unknown := self._unknown_word(archive):
+                pytest.skip(f"what agents do cannot be compared: {unknown}")
+            pytest.fail(
+                "\n".join([*self._difference(text), *archive.problems, *archive.gaps, f"report: {finished.report}"]),
+                pytrace=False,
+            )
+
+    def _skip_what_needs_virtual_time(self) -> None:
+        from harness.play.process.process_preflight import refuse_what_needs_virtual_time
+
+        try:
+            refuse_what_needs_virtual_time(self._story.scenario)
+        except ScenarioError as error:
+            pytest.skip(str(error))
+
+    def _rewrite(self, text: str) -> None:
+        try:
+            self.path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            pytest.fail(f"{self.path} cannot be written: {error.strerror}", pytrace=False)
+
+    def _told(self, archive: RunArchive) -> str:
+        """The story as it was played."""
+        telling = Telling(archive.traces, self._story.scenario.roster)
+        answers = [telling.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
+        return self._story.with_answers(answers)
+
+    def _unknown_word(self, archive: RunArchive) -> str | None:
+        """What an agent says in another word than stories do; None if all is said in theirs."""
+        for agent_id, trace in archive.traces.items():
+            if unknown := first_of(unknown_words(trace.runs)):
+                return f"{unknown} in the trace of agent {agent_id}"
+        return None
+
+    def _difference(self, text: str) -> Iterator[str]:
+        yield "agents do not do what the story tells; if they are right, --ucp-rewrite writes it anew"
+        yield from unified_diff(
+            self._story.text.splitlines(),
+            text.splitlines(),
+            f"{self.path.name}, as it is told",
+            "as it was played",
+            lineterm="",
+            n=CONTEXT_LINES,
+        )
+
+    def teardown(self) -> None:
+        if self._directory is not None and TRIAL in self.stash and self.stash[TRIAL].passed:
+            discard(self._directory, Options.of(self.config))
+
+    def reportinfo(self) -> tuple[Path, None, str]:
+        return self.path, None, f"{self.path.name}::{self.name}"

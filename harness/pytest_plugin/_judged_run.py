@@ -1,0 +1,123 @@
+"""A run of a test: its directory, its verdict, and whether the scenario expected it."""
+
+import re
+import shlex
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from harness.archive.archive import RunArchive
+from harness.errors import HarnessError, MachineError, RunDirectoryError
+from harness.pytest_plugin._findings import JudgementInTest
+from harness.pytest_plugin._options import Options
+from harness.report.agent_programs import in_sentence, programs
+from harness.run.run import Run
+from harness.scenario import Scenario
+from harness.scenario.agent_options import in_words
+from harness.scenario.expect import Expect
+
+
+class Trial:
+    """`finish` ends the run, once the agents have settled if its argument says so, and judges it."""
+
+    def __init__(self, scenario: Scenario, finish: Callable[[bool], Run]) -> None:
+        self._expect = scenario.expect or Expect()
+        self._quirks = scenario.quirks
+        self._finish = finish
+        self.passed = False
+
+    def end_of_test(self) -> None:
+        """Raises pytest's Failed if the run is not what is expected of it."""
+        try:
+            finished = self._finish(True)
+        except HarnessError as error:
+            raise pytest.fail.Exception(str(error), pytrace=False) from None
+        if finished.played.outcome == "not supported":
+            pytest.skip(finished.played.outcome_detail or "not supported")
+        if lines := self._unexpected(finished):
+            pytest.fail("\n".join([*lines, *_where(finished)]), pytrace=False)
+        self.passed = True
+
+    def end_of_failed_test(self) -> str:
+        """What there is to say beside the test's own failure."""
+        try:
+            finished = self._finish(False)
+        except HarnessError as error:
+            return str(error)
+        return "\n".join([*self._unexpected(finished), *_where(finished)])
+
+    def _unexpected(self, finished: Run) -> list[str]:
+        played = finished.played
+        lines = [played.outcome_detail] if played.outcome_detail else []
+        if played.outcome == "completed":
+            lines += [f"{fate}, so this run does not show what it was meant to" for fate in played.unmatched_fates]
+        for key, judgement in finished.result.judgements.items():
+            if not self._expect.as_expected(key, judgement.verdict):
+                expected = self._expect.verdict(key)
+                lines += JudgementInTest.of(key, judgement).lines()
+                lines += [f"    expected: {expected}"] if expected else []
+        deviating = [(finding.agent_id, finding.handler) for finding in finished.result.beside["steps"].evidence]
+        lines += self._expect.out_of_range(finished.result.figures)
+        lines += self._expect.other_common(finished.result.chains)
+        lines += self._expect.other_deviations(deviating)
+        lines += self._other_chains(finished)
+        if not lines:
+            return []
+        wrong = ", ".join(in_words(self._quirks))
+        ran = in_sentence(programs(finished.record))
+        return [*lines, *([f"wrong on purpose: {wrong}"] if wrong else []), *([ran] if ran else [])]
+
+    def _other_chains(self, finished: Run) -> list[str]:
+        if not self._expect.chains:
+            return []
+        exports = RunArchive(finished.directory).exports.by_agent
+        return [*self._expect.other_chains({agent: export.top_chain_hash for agent, export in exports.items()})]
+
+
+def _where(finished: Run) -> list[str]:
+    """Where the report is, and what plays the run once more."""
+    again = shlex.join(["ucp-harness", "run", str(finished.directory), "--backend", str(finished.record.backend)])
+    return [f"report: {finished.report}", f"again, with seed {finished.record.seed}: {again}"]
+
+
+@contextmanager
+def one_sentence() -> Iterator[None]:
+    """Skip what this machine cannot do, and fail for what else is wrong, with the sentence that says it."""
+    try:
+        yield
+    except MachineError as error:
+        raise pytest.skip.Exception(str(error)) from None
+    except HarnessError as error:
+        raise pytest.fail.Exception(str(error), pytrace=False) from None
+
+
+MAX_NAME = 100
+
+
+def new_directory(node: pytest.Item, options: Options) -> Path:
+    """An empty directory of its own for a run of this test. Raises RunDirectoryError."""
+    name = re.sub(r"\W+", "-", node.nodeid).strip("-")[-MAX_NAME:]
+    if options.keep is None:
+        factory = node.config._tmp_path_factory  # type: ignore[attr-defined] # a file that is a test has no fixtures
+        return cast(pytest.TempPathFactory, factory).mktemp(name)
+    for number in count(1):
+        directory = options.keep / (name if number == 1 else f"{name}-{number}")
+        try:
+            directory.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise RunDirectoryError(f"--ucp-keep: {directory} cannot be made: {error.strerror}") from None
+        return directory
+    raise AssertionError("numbers do not end")
+
+
+def discard(directory: Path, options: Options) -> None:
+    """Remove the directory of a run that went as expected, unless it is to be kept."""
+    if options.keep is None:
+        shutil.rmtree(directory, ignore_errors=True)

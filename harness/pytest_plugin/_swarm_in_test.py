@@ -1,0 +1,348 @@
+"""The swarm of a test, which tells what happens to it: any backend, mission seconds, one sentence after another."""
+
+import asyncio
+import math
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness import checker
+from harness.archive.archive import RunArchive
+from harness.backend_names import BackendName
+from harness.errors import HarnessError, ScenarioError
+from harness.play import mission
+from harness.play.backend import Backend
+from harness.play.backends import BACKENDS
+from harness.play.mission import RunOutcome, Sought
+from harness.play.progress import Silent
+from harness.pytest_plugin._findings import Findings, JudgementInTest
+from harness.pytest_plugin._live_story import Sentence, Told
+from harness.run.run import Recording, Run
+from harness.scenario import Scenario
+from harness.scenario.faults import ASKED_FOR
+from harness.scenario.injection import INJECTIONS
+
+_VERBS = [*(kind.what for kind in ASKED_FOR), *INJECTIONS]
+
+
+class RunEndedError(Exception):
+    """The run has ended before the test: an agent or a vehicle failed, or the machine."""
+
+
+class _Block(AbstractContextManager[None]):
+    """What a verb returns, for `with`: at the end of a block that ends well what was told is undone."""
+
+    def __init__(self, undo: Callable[[], object]) -> None:
+        self._undo = undo
+
+    def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
+        __tracebackhide__ = True
+        if kind is None:
+            self._undo()
+
+
+class SwarmInTest:
+    """Agents on any backend, told what happens. Times are mission seconds, agents are named by their IDs.
+
+    Between two sentences virtual time stands still; real processes go on, and what is due then comes with the next.
+    What a test asks between two sentences is answered as of one moment. A sentence that cannot be is a ScenarioError,
+    and leaves everything as it is. Raises HarnessError if it cannot begin.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, backend: BackendName, out: Path) -> None:
+        self._told = Told(scenario)
+        chosen = BACKENDS[backend]
+        chosen.refuse(scenario)
+        self._recording = Recording(scenario, seed, out, backend)
+        self._judged = False
+        self._seen: Findings | None = None
+        self._interrupted = asyncio.Event()
+        self._runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
+        self._loop = self._runner.get_loop()
+        self._thread = ThreadPoolExecutor(1, "ucp-swarm")
+        self._playing: Future[Any] = self._thread.submit(self._play, chosen, seed)
+        try:
+            wait((self._told.begun, self._playing), return_when=FIRST_COMPLETED)
+            if self._playing.done():
+                self._playing.result()
+        except BaseException:
+            self.close()
+            raise
+
+    def __repr__(self) -> str:
+        return f"<swarm, run in {self.directory}>"
+
+    def _play(self, backend: Backend, seed: int) -> RunOutcome:
+        scenario, directory = self._told.scenario, self._recording.directory
+        with self._runner:
+            try:
+                opening = backend.open(scenario, seed, directory, Silent(), self._interrupted, told=True)
+                return self._runner.run(mission.play_on(opening, scenario, self._told.story))
+            except HarnessError as error:
+                self._recording.fail(error)
+                raise
+
+    # The network
+
+    def partition(self, *groups: list[int], for_s: float | None = None) -> AbstractContextManager[None]:
+        """Cut the groups from each other; agents that none of them names form one more together.
+
+        `with swarm.partition([1, 2]):` heals at the end of its block.
+        """
+        __tracebackhide__ = True
+        self._change(partition=[list(group) for group in groups], for_s=for_s)
+        return _Block(self.heal)
+
+    def _for_a_block(self, **entry: Any) -> AbstractContextManager[None]:
+        __tracebackhide__ = True
+        at_s = self._change(**entry)
+        return _Block(partial(self._act, lambda swarm: self._told.undo(swarm, at_s)))
+
+    def heal(self) -> None:
+        """Undo the partition."""
+        __tracebackhide__ = True
+        self._change(heal=True)
+
+    def loss(self, probability: float, for_s: float | None = None) -> AbstractContextManager[None]:
+        """From now on every receiver loses each message with this probability.
+
+        Here and below: for good, for so many mission seconds, or `with swarm.loss(0.5):` for a block.
+        """
+        __tracebackhide__ = True
+        return self._for_a_block(loss=probability, for_s=for_s)
+
+    def network(self, for_s: float | None = None, **keys: Any) -> AbstractContextManager[None]:
+        """From now on these keys of a scenario's `network` count: `network(delay=0.2, receivers={3: {"loss": 1}})`."""
+        __tracebackhide__ = True
+        return self._for_a_block(network=keys, for_s=for_s)
+
+    def link(
+        self,
+        sender: int | list[int],
+        receiver: int | list[int],
+        *,
+        both: bool = False,
+        for_s: float | None = None,
+        **keys: Any,
+    ) -> AbstractContextManager[None]:
+        """From now on what goes from one to the other meets this: `link(1, 2, loss=0.9)`; `both`: and back."""
+        __tracebackhide__ = True
+        if not keys:
+            raise ScenarioError("a link needs what is other on it than elsewhere, such as loss=0.9")
+        return self.network(for_s, links=[{"from": sender, "to": receiver, "both": both, **keys}])
+
+    def hold(self, message: str | None = None, **which: Any) -> AbstractContextManager[None]:
+        """From now on messages that match are on their way and do not arrive before `release`: virtual time alone.
+
+        They match as those of a scenario's fate do, by `message`, `sender`, `receiver`, `block` and `count`; what is
+        not said may be any. The end of `with swarm.hold("Commit Block", sender=2):` releases them, and so does that of
+        the test.
+        """
+        __tracebackhide__ = True
+        words = _of_message(message, which)
+        number = self._act(lambda swarm: self._told.hold(swarm, **words))
+        return _Block(partial(self._act, lambda swarm: self._told.let_go(swarm, number)))
+
+    def release(self, message: str | None = None, **which: Any) -> None:
+        """Let go of what was held by these words, or of everything that is held."""
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.release(swarm, **_of_message(message, which)))
+
+    # The agents
+
+    def __getattr__(self, verb: str) -> Callable[..., None]:
+        """Each fault is a verb, with the further keys of its timeline entry: `kill(2, 4)`, `reboot(3, down_s=10)`.
+
+        And so is each injection: `replay("Commit Block", sender=2, count=3)`, `flood(for_s=10, per_s=50)`.
+        """
+        __tracebackhide__ = True
+        fault = next((kind for kind in ASKED_FOR if kind.what == verb), None)
+        if verb in INJECTIONS:
+            return partial(self._inject, verb)
+        if fault is None:
+            raise AttributeError(f"a swarm has no {verb!r}; what can happen to it: {', '.join(_VERBS)}")
+
+        def happen(*agents: int, **further: Any) -> None:
+            __tracebackhide__ = True
+            self._change(**fault.told(*agents, **further))
+
+        happen.__doc__ = fault.__doc__
+        return happen
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *_VERBS]
+
+    def _inject(self, verb: str, message: str | None = None, **keys: Any) -> None:
+        """A rogue node sends this from now on."""
+        __tracebackhide__ = True
+        self._change(**{verb: _of_message(message, keys)})
+
+    # Time
+
+    @property
+    def now_s(self) -> float:
+        """Mission seconds since the start."""
+        __tracebackhide__ = True
+        return float(self._hear(_now))
+
+    def run_for(self, seconds: float) -> None:
+        """Let the mission go on for so long."""
+        __tracebackhide__ = True
+        if not 0 <= seconds < math.inf:
+            raise ScenarioError(f"a mission does not go on for {seconds:g} s")
+        self._act(lambda swarm: self._told.until(swarm, swarm.now() + seconds))
+
+    def run_until(self, mission_s: float) -> None:
+        """Let the mission go on until then, which is not over yet."""
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.from_now_until(swarm, mission_s))
+
+    def wait_for(
+        self, handler: str, branch: str | None = None, agent: int | None = None, limit_s: float = 1800.0
+    ) -> int:
+        """Let the mission go on until an agent runs this handler, with this branch; the agent's ID.
+
+        What was told last may have it run at once. Names are those of traces (ucp/contract/HANDLERS.md). Raises
+        AssertionError if nobody runs it within `limit_s`.
+        """
+        __tracebackhide__ = True
+        if not 0 <= limit_s < math.inf:
+            raise ScenarioError(f"nobody waits for {limit_s:g} s")
+        sought = Sought(handler, branch, agent)
+        found = self._act(lambda swarm: self._told.until_run(swarm, sought, limit_s))
+        if found is None:
+            who = "no agent has" if agent is None else f"agent {agent} has not"
+            how = "" if branch is None else f" with the branch {branch!r}"
+            raise AssertionError(f"within {limit_s:g} mission seconds {who} run {handler}{how}")
+        return int(found)
+
+    def wait_idle(self, limit_s: float = 1800.0) -> None:
+        """Let the mission go on until what was told last has sunk in.
+
+        That is, until each agent that runs has put a block of its own to the vote since, and all are idle. Raises
+        AssertionError if that takes longer than `limit_s`.
+        """
+        __tracebackhide__ = True
+        played = self._act(lambda swarm: self._told.until_idle(swarm, limit_s))
+        if played is None:
+            raise AssertionError(f"within {limit_s:g} mission seconds not every agent has voted and become idle")
+        self._seen = self._judge_by_now(played)
+
+    def final_reconcile(self) -> None:
+        """The end of the mission: no more events, no more conditions, and one agent after another reconciles."""
+        __tracebackhide__ = True
+        self._act(lambda swarm: self._told.end(swarm, reconcile_finally=True))
+
+    # What there is by now
+
+    def characteristic(self, number: int) -> JudgementInTest:
+        """The verdict as things stand: `holds`, `verdict`, `reason` and `evidence`."""
+        __tracebackhide__ = True
+        return self._findings().characteristic(number)
+
+    def judgement(self, key: str) -> JudgementInTest:
+        """`steps`, `records` or `liveness`, as things stand."""
+        __tracebackhide__ = True
+        return self._findings().judgement(key)
+
+    @property
+    def figures(self) -> dict[str, float | int | None]:
+        """As in run.json: `mutual_chain`, `distinct_chains`, `reconciles`, ..."""
+        __tracebackhide__ = True
+        return self._findings().figures
+
+    def chain(self, agent: int) -> list[str]:
+        """The names of the blocks in the agent's chain, such as "4.11", the oldest first."""
+        __tracebackhide__ = True
+        return self._findings().chain(agent)
+
+    @property
+    def directory(self) -> Path:
+        """That of the run."""
+        return self._recording.directory.path
+
+    @property
+    def report(self) -> Path:
+        """Where the report is once the test has ended, if it failed or `--ucp-keep` was given."""
+        return self.directory / "report.html"
+
+    def _findings(self) -> Findings:
+        """As of the first look since the last sentence, or of the moment for which `wait_idle` has waited."""
+        __tracebackhide__ = True
+        if self._seen is None:
+            self._seen = self._judge_by_now(self._hear(_snapshot))
+        return self._seen
+
+    def _judge_by_now(self, played: RunOutcome) -> Findings:
+        self._recording.tell(self._told.scenario)
+        self._recording.take_down(played)
+        return Findings(self.directory, checker.check(checker.gather(RunArchive(self.directory))))
+
+    # Between the test and the run
+
+    def _change(self, **entry: Any) -> float:
+        __tracebackhide__ = True
+        return float(self._act(lambda swarm: self._told.change(swarm, **entry)))
+
+    def _act(self, sentence: Sentence) -> Any:
+        __tracebackhide__ = True
+        self._seen = None
+        return self._hear(sentence)
+
+    def _hear(self, sentence: Sentence) -> Any:
+        __tracebackhide__ = True
+        answer: Future[Any] = Future()
+        self._in_loop(self._told.hear, sentence, answer)
+        wait((answer, self._playing), return_when=FIRST_COMPLETED)
+        if not answer.done():
+            ended = self._playing.result()
+            if ended.outcome == "not supported":
+                pytest.skip(ended.outcome_detail or ended.outcome)
+            raise RunEndedError(ended.outcome_detail or "the run has ended")
+        if mistake := answer.exception():
+            raise ScenarioError(str(mistake)) from None
+        return answer.result()
+
+    def _in_loop(self, callback: Callable[..., None], *arguments: Any) -> None:
+        with suppress(RuntimeError):  # the loop has ended, and the run with it
+            self._loop.call_soon_threadsafe(callback, *arguments)
+
+    def finish(self, settle: bool) -> Run:
+        """End the run, once the agents have settled if `settle`, and judge it. Raises MachineError."""
+        if settle:
+            with suppress(RunEndedError):  # the record says why
+                self._hear(lambda swarm: self._told.end(swarm, reconcile_finally=False))
+        self._in_loop(self._told.stop)
+        return self._judge()
+
+    def close(self) -> None:
+        """End the run at once, if nothing has ended it before, and judge what there is."""
+        self._in_loop(self._interrupted.set)
+        self._in_loop(self._told.stop)
+        self._thread.shutdown()
+        if not self._judged:
+            with suppress(HarnessError):  # it could not even begin, or the disk is full
+                self._judge()
+
+    def _judge(self) -> Run:
+        played = self._playing.result()
+        self._judged = True
+        self._recording.tell(self._told.scenario)
+        return self._recording.end(played)
+
+
+def _of_message(message: str | None, keys: dict[str, Any]) -> dict[str, Any]:
+    return keys if message is None else {"message": message, **keys}
+
+
+async def _snapshot(swarm: mission.Swarm) -> RunOutcome:
+    return await swarm.snapshot()
+
+
+async def _now(swarm: mission.Swarm) -> float:
+    return swarm.now()

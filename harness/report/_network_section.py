@@ -1,0 +1,122 @@
+"""What the network was set to, what it did, and what happened to it, as it is on record."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from harness.archive.connectivity import Connectivity, Losses, Pair, quality
+from harness.archive.run_record import FaultRecord, NetworkState, OperatorCommand, RunRecord
+from harness.play.backends import in_virtual_time
+from harness.present import text
+from harness.report import _network_strip
+from harness.report.map_parts import divisions
+
+MOST_PAIRS = 10
+"""Lanes of pairs; of more only those that lost most."""
+NAMED_PAIRS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """Lanes along mission time, from top to bottom, and what they are called."""
+
+    names: list[str]
+    picture: Markup
+
+
+def strip(network: Connectivity, faults: Sequence[FaultRecord], end_s: float) -> Strip | None:
+    """What the network did up to `end_s`, as it is on record; None if it is not."""
+    if not network.states:
+        return None
+    partitions = [
+        (division.at_s, *(("", 0.0) if division.together else (division.in_words(), 1.0)))
+        for division in divisions(network.states)
+    ]
+    losses = [(losses.at_s, _in_words(losses), losses.mean) for losses in network.losses]
+    lanes = [
+        ("partition", _network_strip.steps(partitions, end_s)),
+        ("loss", _network_strip.steps(losses, end_s)),
+        *_pairs(network, end_s),
+    ]
+    ticks = [(fault.at_s, f"{text.duration(fault.at_s)}: {fault.what}") for fault in faults]
+    return Strip([name for name, _ in lanes], _network_strip.draw(lanes, ticks, end_s))
+
+
+def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network_strip.Span]]]:
+    """A lane for the pairs whose links were alike all along, those that lost most first; none if all were alike."""
+    alike: defaultdict[tuple[tuple[float, float], ...], list[Pair]] = defaultdict(list)
+    for pair, history in network.pair_losses.items():
+        alike[tuple(history)].append(pair)
+    if len(alike) < 2:
+        return []
+    lanes = []
+    for states, pairs in alike.items():
+        spans = _network_strip.steps([(at_s, _lost(loss), loss) for at_s, loss in states], end_s)
+        lanes.append((sum(span.level * (span.to_s - span.from_s) for span in spans), _named(pairs), spans))
+    lanes.sort(key=lambda lane: -lane[0])
+    return [(name, spans) for _, name, spans in lanes[:MOST_PAIRS]]
+
+
+def _lost(loss: float) -> str:
+    return "no link" if loss == 1.0 else text.percent(round(loss, 2)) if quality(loss) else ""
+
+
+def _named(pairs: Sequence[Pair]) -> str:
+    names = ", ".join(f"{low}\u2013{high}" for low, high in pairs[:NAMED_PAIRS])
+    return f"{names} and {len(pairs) - NAMED_PAIRS} more" if len(pairs) > NAMED_PAIRS else names
+
+
+def _in_words(losses: Losses) -> str:
+    mean, worst = text.percent(losses.mean), text.percent(losses.worst)
+    return mean if mean == worst else f"{mean}, the worst link {worst}"
+
+
+def start(states: Sequence[NetworkState]) -> str | None:
+    """What the network was set to at the start, in words; None if that is not on record."""
+    return states[0].detail if states else None
+
+
+def happened(record: RunRecord) -> list[tuple[str, str, str]]:
+    """When, what, and everything else that is known of each fault, and of each command of an operator, in order."""
+    rows = [(fault.at_s, fault.what, _of_fault(fault)) for fault in record.faults]
+    station, refused = record.ground_station, "; refused" if in_virtual_time(record.backend) else ""
+    if station is not None:
+        rows += [(command.at_s, "operator", _of_command(command) + refused) for command in station.commands]
+    rows.sort(key=lambda row: row[0])
+    told = [(text.duration(at_s), what, detail) for at_s, what, detail in rows]
+    if station is not None and station.commands_left_out:
+        told.append(("later", "operator", f"{station.commands_left_out} more commands, which nobody has kept"))
+    return told
+
+
+def _of_fault(fault: FaultRecord) -> str:
+    details = [fault.detail] if fault.detail else []
+    if fault.fully_connected is not None:
+        details.append(f"fully connected: {text.value(fault.fully_connected)}")
+    if fault.by_hand:
+        details.append("asked for by hand")
+    return "; ".join(details)
+
+
+def _of_command(command: OperatorCommand) -> str:
+    """ "vehicle 2: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 2:05": what is 0 goes without saying."""
+    who = f"vehicle{'s' if len(command.vehicles) > 1 else ''} {' '.join(map(str, command.vehicles))}"
+    details = [f"{who}: {command.command or command.message}"]
+    values = [f"{name} {text.value(value)}" for name, value in command.values.items() if value]
+    if values:
+        details.append(", ".join(values))
+    if command.times > 1:
+        details.append(f"{command.times} times until {text.duration(command.until_s)}")
+    return "; ".join(details)
+
+
+def ground_station(record: RunRecord) -> str | None:
+    """A sentence on what passed between the vehicles and a ground station, if there was one."""
+    if (station := record.ground_station) is None:
+        return None
+    dropped = f", and {text.value(station.dropped)} were dropped" if station.dropped else ""
+    came = f"{text.value(station.received)} came from it{dropped}"
+    refused = " Its commands were refused: tracks are computed." if in_virtual_time(record.backend) else ""
+    return f"Ground station at {station.address}: {text.value(station.sent)} datagrams went there, {came}.{refused}"

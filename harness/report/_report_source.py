@@ -1,0 +1,68 @@
+"""What a report is made of: a run's archive, with ink for each agent and a sentence for everything that is missing."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from harness.archive.archive import RunArchive
+from harness.archive.connectivity import Connectivity
+from harness.archive.exports import Exports
+from harness.archive.record_file import DamagedRecordError
+from harness.archive.run_record import RunRecord
+from harness.archive.traces import Trace
+from harness.errors import RunDirectoryError
+from harness.present.colours import Ink
+from harness.report import _swarm_section, facts
+
+
+@dataclass(frozen=True)
+class ReportSource:
+    """Made by `read_source`."""
+
+    archive: RunArchive
+    run_dir: Path
+    ink: dict[int, Ink]
+
+    @property
+    def record(self) -> RunRecord:
+        return self.archive.record
+
+    @property
+    def exports(self) -> Exports:
+        return self.archive.exports
+
+    @cached_property
+    def traces(self) -> dict[int, Trace]:
+        """Large ones without what only took a message in."""
+        traces = self.archive.traces
+        return {agent: trace.skimmed() for agent, trace in traces.items()} if self.archive.large else traces
+
+    @cached_property
+    def network(self) -> Connectivity:
+        return self.archive.network(self.ink)
+
+    @property
+    def chains_missing(self) -> list[str]:
+        """A sentence for each agent without a usable export, and for each export that cannot be used."""
+        return [*_swarm_section.missing(self.archive), *map(self.archive.within, self.exports.errors)]
+
+    @property
+    def files_missing(self) -> list[str]:
+        """Likewise for everything else that a whole run leaves."""
+        exports = set(self.exports.errors)
+        problems = [*(problem for problem in self.archive.problems if problem not in exports), *self.archive.gaps]
+        return [
+            *map(self.archive.within, problems),
+            *self.network.problems,
+            *filter(None, [facts.gaps(self.record.capture or {})]),
+        ]
+
+
+def read_source(archive: RunArchive) -> ReportSource:
+    """Raises RunDirectoryError if this is no run directory, or one of another version."""
+    error, directory = archive.record_error, archive.directory
+    if directory is None or not (archive.recorded or archive.roster):
+        raise error or RunDirectoryError(f"{directory}: there is nothing of a run here; is this a run directory?")
+    if error is not None and not isinstance(error, DamagedRecordError):
+        raise error
+    return ReportSource(archive, directory, _swarm_section.agent_inks(archive))

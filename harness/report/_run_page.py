@@ -1,0 +1,104 @@
+"""The page: everything that a run left, in one file.
+
+The page loads nothing; its Content-Security-Policy allows its own style sheet and the script of its timeline, which
+it can do without, and nothing else.
+Whatever comes from agents and scenarios is text to the template, which escapes all of it.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from harness.archive.block_names import name_blocks
+from harness.archive.exports import Export
+from harness.present.colours import Ink
+from harness.report import (
+    _map_section,
+    _network_section,
+    _rogue_section,
+    _survival_section,
+    _swarm_section,
+    facts,
+    html,
+    verdict_section,
+)
+from harness.report import _timeline_section as timeline
+from harness.report._report_source import ReportSource
+from harness.report.chain_tree_svg import STYLE as TREE_STYLE
+from harness.report.chain_tree_svg import ChainTreePicture
+from harness.report.map_svg import STYLE as MAP_STYLE
+
+EVIDENCE_SHOWN = 3
+LONG_TEXT = 240
+
+_TEMPLATE = Path(__file__).with_name("page.html.j2")
+
+
+def draw(left: ReportSource) -> str:
+    """The page, as HTML."""
+    record, exports, ink = left.record, left.exports, left.ink
+    judged, outcome = verdict_section.verdicts(record), facts.outcome(record)
+    timeline_section = timeline.section(left, name_blocks(exports.by_agent))
+    return html.render(
+        _TEMPLATE,
+        styles=[TREE_STYLE + MAP_STYLE + timeline.STYLE + html.PAGE_STYLE],
+        script=timeline.SCRIPT if timeline_section else "",
+        title=facts.title(record),
+        about=record.scenario.about if record.scenario else "",
+        summary=facts.summary(record, exports),
+        headline=verdict_section.headline(judged, completed=outcome is None),
+        outcome=outcome,
+        missing=[
+            ("Not all chains are known. What is below is drawn from the others.", left.chains_missing),
+            ("Not all that a run leaves is here. What is below is drawn from the rest.", left.files_missing),
+            ("This run does not show all that it was meant to.", record.unmatched_fates),
+        ],
+        verdicts=judged,
+        figures=facts.figures(record),
+        survival=_survival_section.section(record.survival, ink),
+        pictures=_pictures(exports.by_agent, left.archive.before_final_reconcile, ink),
+        counts=_swarm_section.counts(exports.by_agent, record),
+        blocks=_swarm_section.block_rows(exports.by_agent, ink),
+        timeline=timeline_section,
+        strip=_network_section.strip(left.network, record.faults, timeline.end_s(left)),
+        network=_network_section.start(record.network),
+        happened=_network_section.happened(record),
+        ground_station=_network_section.ground_station(record),
+        rogue=_rogue_section.section(record.rogue),
+        flight=_map_section.section(left.archive.tracks(ink), left.network, ink, facts.vehicle_types(record)),
+        agents=_swarm_section.agents_table(left.archive, ink),
+        versions=record.versions,
+        evidence_shown=EVIDENCE_SHOWN,
+        long_text=LONG_TEXT,
+    )
+
+
+def _pictures(
+    exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, Ink]
+) -> list[dict[str, Any]]:
+    """The chains at the end of the run, and how the mission had left them where a final reconcile changed them."""
+    if not exports:
+        return []
+    if not before:
+        return [_picture("", exports, ink, "chains")]
+    changed = any(
+        agent_id in exports and export.top_chain_hash != exports[agent_id].top_chain_hash
+        for agent_id, export in before.items()
+    )
+    if not changed:
+        return [_picture("As the mission left them; the final reconcile changed nothing", before, ink, "chains")]
+    return [
+        _picture("As the mission left them", before, ink, "before"),
+        _picture("After the final reconcile", exports, ink, "chains"),
+    ]
+
+
+def _picture(heading: str, exports: Mapping[int, Export], ink: Mapping[int, Ink], key: str) -> dict[str, Any]:
+    tree = ChainTreePicture(exports, ink, key)
+    return {
+        "heading": heading,
+        "key": key,
+        "hidden": tree.hidden,
+        "abridged": tree.draw("abridged"),
+        "full": tree.draw("full") if tree.hidden else None,
+    }

@@ -1,0 +1,130 @@
+"""A run in short: report.md for people, junit.xml for build servers."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from harness.archive.run_record import RunRecord
+from harness.present import text
+from harness.present import text as words
+from harness.present.junit import Case, to_xml
+from harness.present.text import escaped, row
+from harness.report import _network_section, _rogue_section, _survival_section, facts
+from harness.report._report_source import ReportSource
+from harness.report.verdict_section import Verdict, headline, verdicts
+from harness.scenario.expect import Expect
+
+EVIDENCE_SHOWN = 3
+SENTENCES_SHOWN = 8
+FAULTS_SHOWN = 12
+TEXT_LENGTH = 240
+
+
+def to_markdown(left: ReportSource) -> str:
+    record = left.record
+    judged, ended = verdicts(record), facts.outcome(record)
+    verdict, _ = headline(judged, completed=ended is None)
+    lines = [f"## {_short(facts.title(record))}", "", f"**{verdict}**", ""]
+    lines += [_short(" \u00b7 ".join(facts.summary(record, left.exports))), ""]
+    if ended:
+        lines += [f"**{_short(ended[0])}** {_short(ended[1])}".rstrip(), ""]
+    lines += _listed([*left.chains_missing, *left.files_missing, *record.unmatched_fates])
+    lines += [*_verdict_table(judged), *_evidence(judged)] if judged else []
+    if figures := facts.figures(record):
+        lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]
+    if survived := _survival_section.section(record.survival, left.ink):
+        lines += _listed(survived.sentences)
+    lines += _happened(_network_section.happened(record))
+    lines += _listed([station] if (station := _network_section.ground_station(record)) else [])
+    lines += _listed(_rogue_section.sentences(record.rogue))
+    versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
+    return "\n".join([*lines, f"<sub>{_short(versions)}</sub>"]) + "\n"
+
+
+def _verdict_table(judged: Sequence[Verdict]) -> Iterator[str]:
+    yield row(["", "characteristic", "verdict", "reason"])
+    yield row(["--:", "---", "---", "---"])
+    for verdict in judged:
+        yield row(map(_short, [verdict.number, verdict.name, f"{verdict.icon} {verdict.verdict}", verdict.reason]))
+    yield ""
+
+
+def _evidence(judged: Sequence[Verdict]) -> list[str]:
+    return _listed(
+        f"{verdict.topic}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
+        for verdict in judged
+        for piece in (verdict.evidence[:EVIDENCE_SHOWN] if verdict.is_bad else ())
+    )
+
+
+def _happened(happened: Sequence[tuple[str, str, str]]) -> Iterator[str]:
+    if not happened:
+        return
+    yield row(["mission time", "fault", ""])
+    yield row(["--:", "---", "---"])
+    yield from (row(map(_short, thing)) for thing in happened[:FAULTS_SHOWN])
+    yield ""
+    if len(happened) > FAULTS_SHOWN:
+        yield f"{len(happened) - FAULTS_SHOWN} more are in report.html."
+        yield ""
+
+
+def _listed(sentences: Iterable[str]) -> list[str]:
+    """An item for each; nothing, if there is none."""
+    all_sentences = list(sentences)
+    items = [f"- {_short(sentence)}" for sentence in all_sentences[:SENTENCES_SHOWN]]
+    if len(all_sentences) > SENTENCES_SHOWN:
+        items.append(f"- and {len(all_sentences) - SENTENCES_SHOWN} more in report.html")
+    return [*items, ""] if items else []
+
+
+def _short(text: str) -> str:
+    return escaped(text if len(text) <= TEXT_LENGTH else f"{text[: TEXT_LENGTH - 1]}\u2026")
+
+
+def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> str:
+    """A characteristic fails if it is violated, or other than its scenario expects: as in pytest. One that was not
+    applicable is skipped, with the reason. `chains` has the blocks of each agent's."""
+    return to_xml(facts.title(record), "ucp-run", record.started_at or "", record.wall_s, _cases(record, chains))
+
+
+def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[Case]:
+    judged, expect = verdicts(record), (record.scenario and record.scenario.expect) or Expect()
+    if record.outcome == "not supported":
+        yield Case("run", skipped=record.outcome_detail or record.outcome)
+        return
+    if wrong := [*_wrong_with_run(record), *([] if judged else ["There is no verdict."])]:
+        yield Case("run", wrong)
+    for verdict in judged:
+        yield _characteristic(verdict, expect)
+    if expect.figures:
+        figures: dict[str, float | None] = {name: record.figures.get(name) for name in expect.figures}
+        yield Case("expected figures", list(expect.out_of_range(figures)))
+    if expect.common:
+        yield Case("expected chains", list(expect.other_common(chains)))
+    if expect.deviations:
+        found = [(finding.agent_id, finding.handler) for finding in (record.steps.evidence if record.steps else ())]
+        yield Case("expected deviations", list(expect.other_deviations(found)))
+
+
+def _wrong_with_run(record: RunRecord) -> Iterator[str]:
+    if ended := facts.outcome(record):
+        yield ": ".join(filter(None, ended))
+    for fate in record.unmatched_fates:
+        yield f"{fate}, so this run does not show what it was meant to"
+
+
+def _characteristic(verdict: Verdict, expect: Expect) -> Case:
+    name, expected = verdict.title, expect.verdict(verdict.key)
+    if verdict.verdict == expected or (expected is None and verdict.kind == "holds"):
+        return Case(name)
+    message = f"{verdict.verdict}: {verdict.reason}" if verdict.reason else verdict.verdict
+    if expected is None and not verdict.is_bad:
+        return Case(name, skipped=message)
+    return Case(
+        name, [message, *map(_run_junit_evidence, verdict.evidence), *([f"expected: {expected}"] if expected else [])]
+    )
+
+
+def _run_junit_evidence(piece: dict[str, Any]) -> str:
+    where = ", ".join(f"{label} {text.value(content)}" for label, content in piece.items() if label != "detail")
+    return ": ".join(filter(None, (where, text.value(piece.get("detail") or ""))))

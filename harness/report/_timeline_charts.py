@@ -1,0 +1,118 @@
+"""Small charts under the lanes: the chains and the copies of blocks along the same time axis."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from harness.archive.replication import Replication
+from harness.archive.run_record import FaultRecord
+from harness.present import text
+from harness.present.svg import n
+from harness.report._timeline_plot import Shade, plot, seconds, shaded, short
+
+HEIGHT = 72
+MAX_MOMENTS = 600
+
+_TOP, _BOTTOM = 14, 4  # room above the highest value and below 0
+
+Figure = Callable[[Replication], float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """`lines` say how each line is drawn, and what it is."""
+
+    name: str
+    lines: list[tuple[Markup, str]]
+    drawing: Markup
+
+
+_CHARTS: tuple[tuple[str, tuple[tuple[str, Figure], ...]], ...] = (
+    (
+        "blocks in chain",
+        (("longest", lambda spread: spread.longest_chain), ("mutual", lambda spread: spread.mutual_chain)),
+    ),
+    ("distinct chains", (("chains", lambda spread: spread.distinct_chains),)),
+    ("copies in chains", (("mean", lambda spread: spread.copies_mean), ("fewest", lambda spread: spread.copies_min))),
+)
+_LOOKS = ("broken", "whole")
+"""Of two lines; one by itself is whole."""
+
+
+def draw(
+    spreads: Sequence[Replication], faults: Sequence[FaultRecord], shades: Sequence[Shade], end_s: float
+) -> list[Chart]:
+    """A chart for each group of figures; `spreads` are how things stood from when on, in order, one at least."""
+    moments = thinned(spreads, end_s)
+    behind = shaded(shades, faults, HEIGHT)
+    return [_chart(name, figures, moments, behind, end_s) for name, figures in _CHARTS]
+
+
+def thinned(spreads: Sequence[Replication], end_s: float) -> Sequence[Replication]:
+    """Where there are many: of those that nobody could tell apart in the whole picture, the worst and the last."""
+    if len(spreads) <= MAX_MOMENTS:
+        return spreads
+    kept: dict[int, tuple[Replication, Replication]] = {}
+    for spread in spreads:
+        place = int(spread.at_s / end_s * MAX_MOMENTS / 2)
+        worst = min(kept[place][0], spread, key=lambda moment: moment.mutual_chain) if place in kept else spread
+        kept[place] = worst, spread
+    return [spread for pair in kept.values() for spread in dict.fromkeys(pair)]
+
+
+def _chart(
+    name: str, figures: Sequence[tuple[str, Figure]], moments: Sequence[Replication], behind: Markup, end_s: float
+) -> Chart:
+    highest = max(
+        (value for _, figure in figures for moment in moments if (value := figure(moment)) is not None), default=0
+    )
+    looks = _LOOKS[-len(figures) :]
+    per_px = max(highest, 1) / (HEIGHT - _TOP - _BOTTOM)
+    lines = [
+        Markup('<path class="line {}" d="{}"/>').format(look, _steps(moments, figure, per_px, end_s))
+        for look, (_, figure) in zip(looks, figures, strict=True)
+    ]
+    until = [*(moment.at_s for moment in moments[1:]), end_s]
+    tips = [
+        Markup('<rect class="tip" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
+            short(moment.at_s), short(until_s - moment.at_s), HEIGHT, _tip(moment, figures, name)
+        )
+        for moment, until_s in zip(moments, until, strict=True)
+        if until_s > moment.at_s
+    ]
+    base = Markup('<path class="base" d="M0 {}H{}"/>').format(n(HEIGHT - _BOTTOM), short(end_s))
+    scale = Markup('<text class="scale" x="4" y="11">{}</text>').format(text.value(highest))
+    at_end = ", ".join(f"{what} {text.value(figure(moments[-1]))}" for what, figure in figures)
+    description = f"{name} along mission time, at most {text.value(highest)}; at the end {at_end}"
+    return Chart(
+        name,
+        [
+            (
+                Markup(
+                    '<svg width="34" height="16" aria-hidden="true"><path class="line {}" d="M1 8h32"/></svg>'
+                ).format(look),
+                what,
+            )
+            for look, (what, _) in zip(looks, figures, strict=True)
+        ],
+        plot([behind, base, *lines, *tips], [scale], HEIGHT, end_s, description),
+    )
+
+
+def _steps(moments: Sequence[Replication], figure: Figure, per_px: float, end_s: float) -> str:
+    """A line that goes up or down where the value does, and begins where there is one."""
+    path = ""
+    last: float | None = None
+    for moment in moments:
+        value = figure(moment)
+        if value is not None and value != last:
+            y = n(HEIGHT - _BOTTOM - value / per_px)
+            path += f"H{short(moment.at_s)}V{y}" if path else f"M{short(moment.at_s)} {y}"
+            last = value
+    return f"{path}H{short(end_s)}" if path else ""
+
+
+def _tip(moment: Replication, figures: Sequence[tuple[str, Figure]], name: str) -> str:
+    values = ", ".join(f"{what} {text.value(figure(moment))}" for what, figure in figures)
+    return f"from {seconds(moment.at_s)}: {name}: {values}"

@@ -1,0 +1,266 @@
+"""A run as it is to be exported: its archive, the clock of its mission, and all that is known to have happened.
+
+The run may have broken off, parts of it may be damaged, or it may be a flight that `import` made of field logs: what is
+there is exported, and `problems` are a sentence on each thing that cannot be.
+"""
+
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from heapq import merge
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.archive.archive import RunArchive
+from harness.archive.block_names import name_blocks
+from harness.archive.connectivity import Components, Connectivity, Losses, Topology
+from harness.archive.history import LATEST_S, History, ends_at, history_of, in_time, possible
+from harness.archive.replication import replication_of
+from harness.archive.run_record import FaultRecord
+from harness.archive.tracks import Tracks
+from harness.errors import ExportError, RunDirectoryError
+from harness.report import logbook
+from harness.report.export._logs import log_files, read_log
+from harness.report.export._samples import (
+    Broadcast,
+    Level,
+    LossesChanged,
+    MissionTime,
+    NetworkChanged,
+    Place,
+    Position,
+    Reconciled,
+    Refused,
+    Said,
+    Sample,
+    Spread,
+    Step,
+    Voted,
+    mission_time,
+)
+from harness.report.export._telemetry import read_telemetry, telemetry_logs
+from harness.report.logbook.positions import tracks
+from harness.scenario.strict_model import MAX_AGENTS
+from harness.scenario.verdict_names import kind_of
+from sitl.vehicle import Home
+from ucp.trace import Dropped
+
+if TYPE_CHECKING:
+    from ucp.secure.sealing import Depot
+
+FAULTS, OPERATOR, VERDICTS = "faults", "operator", "verdicts"
+MAX_LINKED = 100
+"""Of so many vehicles the links are told one by one: there are 9900."""
+
+
+class Recording:
+    """Where vehicles were is asked of their events, sealed or not, if nothing else tells: `depot` opens sealed ones.
+
+    Raises RunDirectoryError if the directory is none of a run, ExportError if there is nothing in it to export.
+    """
+
+    def __init__(self, directory: Path, depot: "Depot | None" = None) -> None:
+        if not directory.is_dir():
+            raise RunDirectoryError(f"{directory} is not a directory: name the directory of a run, or of an import")
+        self.directory = directory
+        self.archive = RunArchive(directory)
+        self._depot = depot
+        self._problems: list[str] = []
+        if self.archive.recorded and self.archive.record.outcome == "running":
+            self.add_problem("the run has not recorded its end: it is still going on, or it was killed")
+        headers = {agent: trace.header for agent, trace in self.archive.traces.items()}
+        self.time: MissionTime = mission_time(headers, self.archive.record, self._problems)
+        if not any((self.agents, self._telemetry, self._logs)):
+            raise ExportError(
+                f"{directory}: no traces, chains, telemetry or logs are in it: there is nothing to export"
+            )
+        if len(self.agents) > MAX_AGENTS:
+            raise ExportError(
+                f"{directory}: {len(self.agents)} agents are named in it, and a run has at most {MAX_AGENTS}; "
+                "run.json was edited or damaged"
+            )
+
+    @cached_property
+    def agents(self) -> list[int]:
+        """All that anything tells of, the lowest ID first."""
+        archive = self.archive
+        return sorted({*archive.roster, *archive.traces, *archive.exports.by_agent})
+
+    @cached_property
+    def block_names(self) -> dict[str, str]:
+        """Block hash -> "4.11"."""
+        return name_blocks(self.archive.exports.by_agent)
+
+    def block(self, block_hash: str) -> str:
+        """A block's name, or the beginning of its hash if no export has it."""
+        return self.block_names.get(block_hash, block_hash[:12])
+
+    @cached_property
+    def history(self) -> History:
+        """What the agents voted on, reconciled and sent."""
+        return history_of(self.archive.traces, self.faults, self.end_s)
+
+    @cached_property
+    def faults(self) -> list[FaultRecord]:
+        return possible(self.archive.record.faults)
+
+    @cached_property
+    def network(self) -> Connectivity:
+        return self.archive.network(self.agents)
+
+    @cached_property
+    def tracks(self) -> Tracks:
+        return self.archive.tracks(self.agents)
+
+    @cached_property
+    def end_s(self) -> float:
+        """When the last of it happened, in mission seconds."""
+        told = self.archive.record.mission_s or 0.0
+        flown = (fixes[-1].at_s for fixes in self.tracks.by_vehicle.values())
+        return max([ends_at(self.archive.traces), *flown, *([told] if 0 <= told <= LATEST_S else [])])
+
+    @property
+    def problems(self) -> list[str]:
+        """A sentence on each thing that is damaged or missing; of what `samples` read, once they were read."""
+        archive = self.archive
+        sentences = [*archive.problems, *archive.gaps, *self.tracks.problems, *self.network.problems, *self._problems]
+        return list(dict.fromkeys(map(archive.within, sentences)))
+
+    def add_problem(self, sentence: str) -> None:
+        """Something more that cannot be exported."""
+        self._problems.append(sentence)
+
+    @cached_property
+    def _telemetry(self) -> list[tuple[int, Path]]:
+        return telemetry_logs(self.directory)
+
+    @cached_property
+    def _logs(self) -> list[tuple[str, Path]]:
+        return list(log_files(self.directory))
+
+    # All that happened
+
+    def samples(self) -> Iterator[Sample]:
+        """Everything, in order of time; telemetry and logs are read as it goes."""
+        streams: list[Iterable[Sample]] = [
+            self.positions(),
+            self._losses(),
+            self._network(),
+            self._spread(),
+            self._messages(),
+            self._votes(),
+            self._reconciles(),
+            self._told(),
+            *map(self._steps, self.archive.traces),
+            *map(self._refused, self.archive.traces),
+            *(read_telemetry(vehicle, path, self.time, self._problems) for vehicle, path in self._telemetry),
+            *(read_log(source, path, self.time, self._problems) for source, path in self._logs),
+        ]
+        return merge(*streams, key=attrgetter("at_ns"))
+
+    def positions(self) -> Iterator[Position]:
+        """Where the vehicles were, by the run's record, else by what they logged."""
+        made = self._by_tracks() if self.tracks.by_vehicle else self._by_events()
+        return iter(sorted(made, key=attrgetter("at_ns")))
+
+    def _by_tracks(self) -> Iterator[Position]:
+        scenario = self.archive.record.scenario
+        if scenario is None:
+            self._problems.append("where the field lies is not known: vehicles are in metres, and on no map")
+        home = scenario.vehicles.field if scenario else None
+        for vehicle, fixes in self.tracks.by_vehicle.items():
+            for fix in fixes:
+                metres = fix.east_m, fix.north_m, fix.up_m
+                there = home.offset(fix.north_m, fix.east_m) if home else None
+                place = Place(there.lat_deg, there.lon_deg, there.alt_m + fix.up_m) if there else None
+                yield Position(self.time.at(fix.at_s), vehicle, metres, place)
+
+    def _by_events(self) -> Iterator[Position]:
+        """The middle of the field is where the first position was logged."""
+        if not self.archive.exports.by_agent:
+            return
+        untimed, field = 0, None
+        read = logbook.read(self.archive, self._depot)
+        if read.event_data.is_closed:
+            self._problems.append("event data is sealed to the depot: positions are not known without --depot-key")
+        for track in tracks(read):
+            for timestamp_us, logged in track.fixes:
+                place = Place(*(logged.lat_e7 / 1e7, logged.lon_e7 / 1e7, logged.alt_mm / 1e3))
+                field = field or Home(*place)
+                at_ns = self.time.of_timestamp(timestamp_us)
+                if at_ns is None:
+                    untimed += 1
+                else:
+                    north_m, east_m, up_m = field.metres_to(*place)
+                    yield Position(at_ns, track.agent_id, (east_m, north_m, up_m), place)
+        if untimed:
+            self._problems.append(f"{untimed} logged positions with an impossible time are left out")
+
+    def _losses(self) -> Iterator[LossesChanged]:
+        if len(self.agents) > MAX_LINKED:
+            self._problems.append(f"links are told one by one of up to {MAX_LINKED} vehicles, and here are more")
+            return
+        for at_s, losses in self.archive.link_losses(self.agents):
+            if at_s <= LATEST_S:
+                yield LossesChanged(self.time.at(at_s), losses)
+
+    def _network(self) -> Iterator[NetworkChanged]:
+        def at(change: Topology | Losses) -> float:
+            return change.at_s
+
+        groups: Components = ()
+        losses = Losses(0.0, 0.0, 0.0)
+        changes: list[Topology | Losses] = [*self.network.states, *self.network.losses]
+        for at_s, at_once in groupby(sorted(changes, key=at), at):
+            for change in at_once:
+                if isinstance(change, Losses):
+                    losses = change
+                else:
+                    groups = change.components
+            if at_s <= LATEST_S:
+                yield NetworkChanged(self.time.at(at_s), groups, losses.mean, losses.worst)
+
+    def _spread(self) -> Iterator[Spread]:
+        for replication in replication_of(self.archive.traces, self.faults):
+            yield Spread(self.time.at(replication.at_s), replication)
+
+    def _steps(self, agent: int) -> Iterator[Step]:
+        for run in self.archive.traces[agent].runs:
+            if in_time(run):
+                yield Step(self.time.at(run.t, agent), agent, run)
+
+    def _refused(self, agent: int) -> Iterator[Refused]:
+        for _, aside in self.archive.traces[agent].asides:
+            if isinstance(aside, Dropped) and 0 <= aside.t <= LATEST_S:
+                yield Refused(self.time.at(aside.t, agent), agent, aside.dropped)
+
+    def _messages(self) -> Iterator[Broadcast]:
+        for message in self.history.messages or ():
+            yield Broadcast(self.time.at(message.at_s, message.sender), message)
+
+    def _votes(self) -> Iterator[Voted]:
+        for vote in sorted(self.history.votes, key=attrgetter("end_s")):
+            yield Voted(self.time.at(vote.end_s, vote.agent), vote)
+
+    def _reconciles(self) -> Iterator[Reconciled]:
+        for reconcile in sorted(self.history.reconciles, key=attrgetter("end_s")):
+            yield Reconciled(self.time.at(reconcile.end_s, reconcile.agent), reconcile)
+
+    def _told(self) -> Iterator[Said]:
+        """What the run says to people: what was done to it, and at its end the verdicts."""
+        for state in self.archive.record.network[:1]:
+            yield Said(self.time.at(0.0), "info", FAULTS, f"{state.what}: {state.detail}")
+        for fault in self.faults:
+            yield Said(self.time.at(fault.at_s), "warning", FAULTS, f"{fault.what}: {fault.detail}")
+        record = self.archive.record
+        for command in record.ground_station.commands if record.ground_station else ():
+            who = f"vehicle{'s' if len(command.vehicles) > 1 else ''} {' '.join(map(str, command.vehicles))}"
+            told = f"{command.command or command.message} to {who}"
+            yield Said(self.time.at(command.at_s), "warning", OPERATOR, told)
+        for sentence in record.unmatched_fates:
+            yield Said(self.time.at(self.end_s), "warning", FAULTS, sentence)
+        for key, judgement in self.archive.record.judgements.items():
+            level: Level = "error" if kind_of(judgement.verdict) == "bad" else "info"
+            sentence = f"{key} {judgement.name}: {judgement.verdict}: {judgement.reason}"
+            yield Said(self.time.at(self.end_s), level, VERDICTS, sentence)

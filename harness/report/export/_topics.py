@@ -1,0 +1,228 @@
+"""What there is to plot of a run, as topics of JSON objects, each with a JSON Schema: one for each kind of sample.
+
+A value that is not known has no key: there are no nulls, which plotting tools do not know. Every object has the mission
+second, besides the time of the message.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from harness.archive.connectivity import Link
+from harness.report.export._exported_run import Recording
+from harness.report.export._samples import (
+    Broadcast,
+    LossesChanged,
+    NetworkChanged,
+    Reconciled,
+    Refused,
+    Sample,
+    Spread,
+    Step,
+    Telemetry,
+    Voted,
+)
+from ucp.trace import HandlerRun
+
+Object = dict[str, Any]
+Schema = dict[str, Any]
+
+_NUMBER, _WHOLE, _YES_OR_NO, _TEXT = ({"type": name} for name in ("number", "integer", "boolean", "string"))
+_AGENTS = {"type": "array", "items": _WHOLE}
+_LARGEST = 2**53
+"""Beyond it tools that have floats alone do not tell whole numbers apart."""
+
+
+def schema(**properties: Schema) -> Schema:
+    """Of an object with these keys, any of which may be missing."""
+    return {"type": "object", "properties": {"mission_s": _NUMBER, **properties}}
+
+
+_CHANGES = {"type": "array", "items": schema(operation=_TEXT, block=_TEXT, block_hash=_TEXT)}
+_SENT = {"type": "array", "items": schema(message=_TEXT, seq=_WHOLE, block=_TEXT, block_hash=_TEXT)}
+_PHASES = {"type": "array", "items": schema(name=_TEXT, start_s=_NUMBER, end_s=_NUMBER, rounds=_WHOLE)}
+
+SCHEMAS: dict[str, Schema] = {
+    "ucp.AgentState": schema(
+        chain=_WHOLE, deque=_WHOLE, stack=_WHOLE, reconciling=_YES_OR_NO, idle=_YES_OR_NO, top_chain_hash=_TEXT
+    ),
+    "ucp.ChainChange": schema(length=_WHOLE, operation=_TEXT, block=_TEXT, block_hash=_TEXT, handler=_TEXT),
+    "ucp.HandlerRun": schema(
+        handler=_TEXT,
+        algorithm=_WHOLE,
+        branch=_TEXT,
+        trigger=_TEXT,
+        trigger_name=_TEXT,
+        sender=_WHOLE,
+        seq=_WHOLE,
+        changes=_CHANGES,
+        sent=_SENT,
+    ),
+    "ucp.RefusedDatagram": schema(reason=_TEXT),
+    "ucp.Message": schema(
+        sender=_WHOLE, message=_TEXT, block=_TEXT, block_hash=_TEXT, received_by=_AGENTS, receivers=_WHOLE
+    ),
+    "ucp.Vote": schema(block=_TEXT, block_hash=_TEXT, start_s=_NUMBER, duration_s=_NUMBER, outcome=_TEXT),
+    "ucp.Reconcile": schema(start_s=_NUMBER, duration_s=_NUMBER, reason=_TEXT, done=_YES_OR_NO, phases=_PHASES),
+    "ucp.Network": schema(groups=_WHOLE, largest_group=_WHOLE, connected=_TEXT, mean_loss=_NUMBER, worst_loss=_NUMBER),
+    "ucp.Replication": schema(
+        mutual_chain=_WHOLE, longest_chain=_WHOLE, distinct_chains=_WHOLE, copies_min=_WHOLE, copies_mean=_NUMBER
+    ),
+}
+
+
+class Topics:
+    """Makes objects of samples; `schemas` are those of all topics that it uses, by name."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._state: dict[int, Any] = {}
+        self.schemas = dict(SCHEMAS)
+        links = {_link((sender, to)): _NUMBER for sender in recording.agents for to in recording.agents if sender != to}
+        self.schemas["ucp.LinkLosses"] = schema(**links)
+
+    def of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
+        """Topic, name of its schema, and object, of each that a sample gives."""
+        for topic, name, told in self._of(sample):
+            known = {key: value for key, value in told.items() if _can_be_told(value)}
+            yield topic, name, {"mission_s": round(self._recording.time.mission_s(sample.at_ns), 6), **known}
+
+    def _of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
+        match sample:
+            case Step(agent=agent, run=run):
+                yield f"/agents/{agent}/handler_runs", "ucp.HandlerRun", self._run(run)
+                yield from self._chain(agent, run)
+                if self._state.get(agent) != run.state:
+                    self._state[agent] = run.state
+                    yield f"/agents/{agent}/state", "ucp.AgentState", _state(run)
+            case Refused(agent=agent, reason=reason):
+                yield f"/agents/{agent}/refused", "ucp.RefusedDatagram", {"reason": reason}
+            case Broadcast(message=message):
+                receivers = sorted({agent for agent, _ in message.receipts})
+                told = {"sender": message.sender, "message": message.name, **self._block(message.block)}
+                yield "/messages", "ucp.Message", told | {"received_by": receivers, "receivers": len(receivers)}
+            case Voted(vote=vote):
+                told = {"start_s": vote.start_s, "duration_s": vote.end_s - vote.start_s, "outcome": vote.outcome}
+                yield f"/agents/{vote.agent}/votes", "ucp.Vote", self._block(vote.block) | told
+            case Reconciled(reconcile=reconcile):
+                told = {
+                    "start_s": reconcile.start_s,
+                    "duration_s": reconcile.end_s - reconcile.start_s,
+                    "reason": reconcile.reason,
+                    "done": reconcile.done,
+                    "phases": [
+                        {"name": phase.name, "start_s": phase.start_s, "end_s": phase.end_s, "rounds": phase.rounds}
+                        for phase in reconcile.phases
+                    ],
+                }
+                yield f"/agents/{reconcile.agent}/reconciles", "ucp.Reconcile", told
+            case NetworkChanged(groups=groups):
+                told = {
+                    "groups": len(groups),
+                    "largest_group": max(map(len, groups), default=0),
+                    "connected": " | ".join(" ".join(map(str, sorted(group))) for group in groups),
+                    "mean_loss": sample.mean_loss,
+                    "worst_loss": sample.worst_loss,
+                }
+                yield "/network/state", "ucp.Network", told
+            case LossesChanged(losses=losses):
+                yield "/network/losses", "ucp.LinkLosses", {_link(link): loss for link, loss in losses.items()}
+            case Spread(replication=replication):
+                told = {
+                    "mutual_chain": replication.mutual_chain,
+                    "longest_chain": replication.longest_chain,
+                    "distinct_chains": replication.distinct_chains,
+                    "copies_min": replication.copies_min,
+                    "copies_mean": replication.copies_mean,
+                }
+                yield "/swarm/replication", "ucp.Replication", told
+            case Telemetry(vehicle=vehicle, message=message):
+                kind = message.get_type()
+                name = f"mavlink.{kind}"
+                if name not in self.schemas:
+                    self.schemas[name] = _mavlink_schema(type(message))
+                yield f"/vehicles/{vehicle}/mavlink/{kind}", name, _mavlink(message)
+
+    def _run(self, run: HandlerRun) -> Object:
+        trigger, name = next(iter(run.trigger.items()), (None, None))
+        return {
+            "handler": run.handler,
+            "algorithm": _whole(run.algorithm),
+            "branch": run.branch,
+            "trigger": trigger,
+            "trigger_name": None if name is None else str(name),
+            "sender": _whole(run.trigger.get("from")),
+            "seq": _whole(run.trigger.get("seq")),
+            "changes": [{"operation": operation, **self._block(block)} for operation, block in run.changes],
+            "sent": [
+                {"message": sent.message, "seq": _whole(sent.seq), **self._block(sent.block)} for sent in run.sent
+            ],
+        }
+
+    def _chain(self, agent: int, run: HandlerRun) -> Iterator[tuple[str, str, Object]]:
+        changes = [(operation, block) for operation, block in run.changes if operation in ("chain+", "chain-")]
+        length = run.state.chain - sum(1 if operation == "chain+" else -1 for operation, _ in changes)
+        for operation, block in changes:
+            length += 1 if operation == "chain+" else -1
+            told = {"length": _whole(length), "operation": "added" if operation == "chain+" else "taken off"}
+            yield f"/agents/{agent}/chain", "ucp.ChainChange", told | self._block(block) | {"handler": run.handler}
+
+    def _block(self, block_hash: str | None) -> Object:
+        return {"block": self._recording.block(block_hash), "block_hash": block_hash} if block_hash else {}
+
+
+def _can_be_told(value: Any) -> bool:
+    """Whether it is known, and in JSON."""
+    return math.isfinite(value) if isinstance(value, float) else value is not None
+
+
+def _state(run: HandlerRun) -> Object:
+    state = run.state
+    return {
+        "chain": _whole(state.chain),
+        "deque": _whole(state.deque),
+        "stack": _whole(state.stack),
+        "reconciling": state.reconciling,
+        "idle": state.idle,
+        "top_chain_hash": state.top,
+    }
+
+
+def _link(link: Link) -> str:
+    return f"loss_{link[0]}_to_{link[1]}"
+
+
+def _whole(number: Any) -> int | None:
+    """None of what no tool can show."""
+    return number if isinstance(number, int) and abs(number) <= _LARGEST else None
+
+
+# MAVLink, as pymavlink's dialect describes it
+
+
+def _mavlink_schema(message: type[Any]) -> Schema:
+    fields = zip(message.fieldnames, message.fieldtypes, _lengths(message), strict=True)
+    return schema(**{name: _field_schema(kind, length) for name, kind, length in fields})
+
+
+def _lengths(message: type[Any]) -> Iterable[int]:
+    """How many elements each field has, 0 if it is none of several."""
+    in_order: Mapping[str, int] = dict(zip(message.ordered_fieldnames, message.array_lengths, strict=True))
+    return [in_order[name] for name in message.fieldnames]
+
+
+def _field_schema(kind: str, length: int) -> Schema:
+    if kind == "char":
+        return _TEXT
+    one = _NUMBER if kind in ("float", "double") else _WHOLE
+    return {"type": "array", "items": one} if length else one
+
+
+def _mavlink(message: Any) -> Object:
+    return {name: _field(getattr(message, name)) for name in message.fieldnames}
+
+
+def _field(raw: Any) -> Any:
+    if isinstance(raw, list | tuple):
+        return [0.0 if isinstance(part, float) and not math.isfinite(part) else part for part in raw]
+    return raw.decode("utf-8", "replace") if isinstance(raw, bytes) else raw

@@ -1,0 +1,189 @@
+"""What one agent does, from its trace, line by line: what a page shows of it, as changes.
+
+A change is a list that becomes a line of JSON: its kind, its mission second, and what it is about
+(`harness.report.live.feed`
+has them all). Most lines of a trace only take a message in; those are looked at as text, and no further.
+"""
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from harness.archive.history import COMMITTED_BY, LATEST_S, PHASES, REASONS
+from harness.archive.traces import Header, Held, parsed
+from harness.report.live._live_trace import Lives
+from ucp.trace import Commanded, Dropped, Entry, HandlerRun
+
+Change = list[Any]
+
+KEY_LENGTH = 16
+"""Digits of a block's hash that the page knows it by."""
+
+_TAKES_IN = re.compile(
+    rb'\{"t":([\d.]+),"handler":"receive_\w+","algorithm":\d+,'
+    rb'"trigger":\{"message":"[\w ]+","from":(\d+),"seq":(\d+)\}'
+)
+_CANNOT_MATTER = b'"branch":"no vote running"'
+_NOTHING_ELSE = b'"changes":[],"sent":[]'
+
+
+class Heard(NamedTuple):
+    """An agent took in message `seq` of `sender`."""
+
+    t: float
+    sender: int
+    seq: int
+
+
+class Sent(NamedTuple):
+    """An agent broadcast its message `seq`; `block` is the key of the one that it is about, if any."""
+
+    t: float
+    seq: int
+    message: str
+    block: str | None
+
+
+class Course:
+    """An agent of the run. `changes` are those since somebody took them, `sent` and `heard` likewise."""
+
+    def __init__(self, agents: Path, agent_id: int) -> None:
+        self.agent_id = agent_id
+        self.changes: list[Change] = []
+        self.sent: list[Sent] = []
+        self.heard: list[Heard] = []
+        self.at_s = 0.0
+        """When it did what was read last."""
+        self.problem: str | None = None
+        """Why nothing more of it is read, if that is so."""
+        self.takes_in_all = False
+        """Whether it was given something that cannot matter to it: not so in virtual time, unless asked for."""
+        self._lives = Lives(agents, agent_id)
+        self._ahead: Heard | HandlerRun | Dropped | None = None
+        """What was read, and is of later than somebody has asked for."""
+        self._born = False
+        self._held = Held()
+        self._completed: dict[str, int] = {}
+        self._twice: set[str] = set()
+        self._idle_without = False
+        self._doing = ""
+
+    def read(self, until_s: float, at_most: int) -> bool:
+        """Go on until so many lines are read, or all up to then; whether there is more up to then."""
+        for _ in range(at_most):
+            entry = self._ahead or self._next()
+            if entry is None:
+                return False
+            if entry.t > until_s:
+                self._ahead = entry
+                return False
+            self._ahead = None
+            self.at_s = max(self.at_s, entry.t)
+            if isinstance(entry, Heard):
+                self.heard.append(entry)
+            elif isinstance(entry, HandlerRun):
+                self._ran(entry)
+            else:
+                self.changes.append(["d", entry.t, self.agent_id, str(entry.dropped)[:80]])
+        return True
+
+    @property
+    def next_s(self) -> float | None:
+        """When it did what was not asked for yet; None if all that was written by now has been taken in."""
+        return None if self._ahead is None else self._ahead.t
+
+    def close(self) -> None:
+        self._lives.close()
+
+    def _next(self) -> Heard | HandlerRun | Dropped | None:
+        """The next line that says something and has a possible time."""
+        while self.problem is None:
+            line = self._lives.next()
+            if line is None:
+                self.problem = self._lives.trouble
+                return None
+            self.takes_in_all = self.takes_in_all or _CANNOT_MATTER in line
+            if _NOTHING_ELSE in line and (taken := _TAKES_IN.match(line)) and not self._may_be_idle_too_early(line):
+                t, sender, seq = taken.groups()
+                entry: Heard | Header | Entry = Heard(float(t), int(sender), int(seq))
+            else:
+                try:
+                    entry = parsed(line)
+                except ValueError:
+                    self.problem = f"the trace of agent {self.agent_id} is damaged, and read up to there"
+                    return None
+            if isinstance(entry, Header):
+                self._begin()
+            elif not isinstance(entry, Commanded) and 0 <= entry.t <= LATEST_S:
+                return entry
+        return None
+
+    def _may_be_idle_too_early(self, line: bytes) -> bool:
+        return bool(self._held.not_in_chain) and b'"idle":true' in line
+
+    def _begin(self) -> None:
+        """A life begins."""
+        if self._born:
+            self.changes.append(["z", self.at_s, self.agent_id])
+        self._born, self._doing, self._held, self._idle_without = True, "", Held(), False
+        self._twice.clear()
+
+    def _ran(self, run: HandlerRun) -> None:
+        trigger = run.trigger
+        if "message" in trigger and isinstance(trigger.get("from"), int) and isinstance(trigger.get("seq"), int):
+            self.heard.append(Heard(run.t, int(trigger["from"]), int(trigger["seq"])))
+        for sent in run.sent:
+            self.sent.append(Sent(run.t, sent.seq, sent.message[:80], sent.block and sent.block[:KEY_LENGTH]))
+        if run.changes:
+            self._changed(run)
+        self._does(run)
+        self._hold_against(run)
+
+    def _changed(self, run: HandlerRun) -> None:
+        self._held.replay(run)
+        moves = []
+        for operation, block in run.changes:
+            key = block[:KEY_LENGTH]
+            if operation == "complete":
+                ordinal = self._completed.setdefault(block, len(self._completed) + 1)
+                self.changes.append(["b", run.t, key, self.agent_id, ordinal])
+            else:
+                moves.append([operation[:6], key])
+        if moves:
+            how = COMMITTED_BY.get(run.handler, "")
+            self.changes.append(["c", run.t, self.agent_id, moves, run.state.top[:KEY_LENGTH], how])
+
+    def _does(self, run: HandlerRun) -> None:
+        """What it is about: a vote, a phase of a reconcile, or nothing."""
+        handler, branch = run.handler, run.branch
+        if handler == "process_next_deque_block" and branch == "proposed":
+            block = next((sent.block or "" for sent in run.sent), "")
+            self._say(run.t, "voting", block[:KEY_LENGTH])
+        elif handler == "vote_timer_expiration":
+            self._say(run.t, "voted", branch[:80])
+        elif handler == "reconcile_begin" and branch == "begun":
+            by = next(iter(run.trigger.values()), "")
+            self._say(run.t, "reconciling", REASONS.get(str(by), "asked by the operator"))
+        elif handler == "reconcile_finalize" and branch == "done":
+            self._say(run.t, "reconciled", "")
+        elif run.state.reconciling:
+            if branch.startswith("tie:"):
+                self._say(run.t, "tie", branch[:80])
+            elif (name := PHASES.get(handler)) and name != self._doing:
+                self._say(run.t, name, "")
+
+    def _say(self, t: float, doing: str, more: str) -> None:
+        self._doing = doing
+        self.changes.append(["s", t, self.agent_id, doing, more])
+
+    def _hold_against(self, run: HandlerRun) -> None:
+        """What can be seen at once to be against characteristics 2 and 3, the first time that it is seen."""
+        for operation, block in run.changes:
+            if operation.endswith("+") and self._held.copies[block] > 1 and block not in self._twice:
+                self._twice.add(block)
+                self.changes.append(["x", run.t, self.agent_id, 3, block[:KEY_LENGTH]])
+        idle_without = run.state.idle and bool(self._held.not_in_chain)
+        if idle_without and not self._idle_without:
+            first = next(iter(self._held.not_in_chain))
+            self.changes.append(["x", run.t, self.agent_id, 2, first[:KEY_LENGTH]])
+        self._idle_without = idle_without

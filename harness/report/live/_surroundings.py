@@ -1,0 +1,155 @@
+"""What is around the agents of a run: the network with what links lose, faults, and where the vehicles are."""
+
+from collections.abc import Callable, Collection
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic import ValidationError
+
+from harness.archive.connectivity import NETWORK_FILE, Network, NetworkLine, Pair
+from harness.archive.tracks import TRACKS_FILE, TrackLine
+from harness.report.live._agent_course import Change
+from harness.report.live._live_trace import GrowingFile
+from harness.scenario.changes import RANGE
+from harness.scenario.faults import named
+from harness.scenario.faults.fault import PAUSED, Fault
+
+MAX_DETAIL = 300
+
+
+class _Told(NetworkLine):
+    detail: Any = ""
+    """What it did, for people."""
+    by_hand: bool = False
+
+
+Line = TypeVar("Line", _Told, TrackLine)
+
+
+class _Lines(Generic[Line]):
+    """A file of which each line is what `model` says, and is to be played at its second."""
+
+    def __init__(self, path: Path, model: type[Line], play: Callable[[Line], None]) -> None:
+        self._file = GrowingFile(path)
+        self._model: type[Line] = model
+        self._play: Callable[[Line], None] = play
+        self.ahead: Line | None = None
+        """What was read, and is of later than somebody has asked for."""
+        self.at_s = 0.0
+        """Of when is what was played last."""
+        self.problems: dict[str, None] = {}
+
+    def read(self, until_s: float, at_most: int) -> bool:
+        """Go on until so many lines are read, or all up to then; whether there is more up to then."""
+        name = self._file.path.name
+        for _ in range(at_most):
+            entry, self.ahead = self.ahead, None
+            if entry is None:
+                if (text := self._file.next()) is None:
+                    if self._file.trouble:
+                        self.problems[f"{name} {self._file.trouble}"] = None
+                    return False
+                try:
+                    entry = self._model.model_validate_json(text)
+                except ValidationError:
+                    self.problems[f"{name} has damaged lines, which are left out"] = None
+                    continue
+            if entry.at_s > until_s:
+                self.ahead = entry
+                return False
+            self.at_s = max(self.at_s, entry.at_s)
+            try:
+                self._play(entry)
+            except (ValueError, TypeError, AttributeError, KeyError):
+                self.problems[f"{name} has lines that mean nothing, which are left out"] = None
+        return True
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class Around:
+    """`changes` are those since somebody took them."""
+
+    def __init__(self, directory: Path, vehicles: Collection[int]) -> None:
+        self.changes: list[Change] = []
+        self._known = set(vehicles)
+        self._network = Network(vehicles)
+        self._losses: dict[Pair, tuple[float, float]] = {}
+        self._parts: tuple[frozenset[int], ...] = ()
+        self._conditions = _Lines(directory / NETWORK_FILE, _Told, self._changed)
+        self._tracks = _Lines(directory / TRACKS_FILE, TrackLine, self._moved)
+
+    def read(self, until_s: float, at_most: int) -> bool:
+        """Go on until so many lines of a file are read, or all up to then; whether there is more up to then."""
+        more = self._conditions.read(until_s, at_most)
+        return self._tracks.read(until_s, at_most) or more
+
+    @property
+    def at_s(self) -> float:
+        """When happened what was read last."""
+        return max(self._conditions.at_s, self._tracks.at_s)
+
+    @property
+    def next_s(self) -> float | None:
+        """When happened what was not asked for yet; None if all that was written by now has been taken in."""
+        ahead = (self._conditions.ahead, self._tracks.ahead)
+        return min((line.at_s for line in ahead if line is not None), default=None)
+
+    @property
+    def problems(self) -> list[str]:
+        """A sentence on each thing that could not be read."""
+        return [*self._conditions.problems, *self._tracks.problems]
+
+    def close(self) -> None:
+        self._conditions.close()
+        self._tracks.close()
+
+    def _changed(self, line: _Told) -> None:
+        """The network, or some agents. Raises ValueError, TypeError, AttributeError or KeyError if it means nothing."""
+        if not self._parts and line.asked is None:
+            raise ValueError("the record begins with conditions")
+        network = self._network
+        network.play(line)
+        fault = named(line.what)
+        whole = line.asked is not None or fault.takes_the_vehicle or fault.brings_a_vehicle
+        pairs = [*combinations(network.vehicles, 2)] if whole else [_pair(name) for name in line.losses]
+        losses = {pair: _rounded(network.directions(pair)) for pair in pairs}
+        changed = [[*pair, *loss] for pair, loss in losses.items() if self._losses.get(pair) != loss]
+        self._losses |= losses
+        parts = network.components() if changed or not self._parts else self._parts
+        named_parts = None if parts == self._parts else [sorted(part) for part in parts]
+        self._parts = parts
+        agents = [agent for agent in line.agents if agent in self._known]
+        what = "" if line.what in (RANGE, "end") else line.what
+        detail = str(line.detail)[:MAX_DETAIL]
+        self.changes.append(
+            ["n", line.at_s, what, detail, agents, _state_after(fault), changed, named_parts, line.by_hand]
+        )
+
+    def _moved(self, line: TrackLine) -> None:
+        places = {str(vehicle): place for vehicle, place in line.places.items() if vehicle in self._known}
+        self.changes.append(["p", line.at_s, places])
+
+
+def _state_after(fault: type[Fault]) -> str:
+    """In what state a fault leaves its agents, in a word; nothing if it leaves them as they are."""
+    states = {
+        "gone": fault.takes_the_vehicle,
+        "down": fault.ends_a_life,
+        "back": fault.begins_a_life,
+        "still": fault.stands_still,
+        "awake": PAUSED in fault.needs,
+    }
+    return next((state for state, is_so in states.items() if is_so), "")
+
+
+def _rounded(losses: tuple[float, float]) -> tuple[float, float]:
+    there, back = losses
+    return round(there, 3), round(back, 3)
+
+
+def _pair(name: str) -> Pair:
+    low, _, high = name.partition("-")
+    return int(low), int(high)

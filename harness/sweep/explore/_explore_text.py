@@ -1,0 +1,57 @@
+"""What the command line says of an exploration: while it goes on, and at its end."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+from rich.console import Console
+
+from harness.run.finding import ENDED, evidence_lines
+from harness.scenario.verdict_names import BAD_IN_WORDS
+from harness.sweep.explore._exploring import Explored, Violation, Watcher
+
+_WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}
+
+LINE_EVERY_S = 10.0
+REDRAW_EVERY_S = 0.1
+CLEAR_LINE = "\r\x1b[2K"
+
+
+@contextlib.contextmanager
+def watching(console: Console) -> Iterator[Watcher]:
+    """Says what is found, and how shrinking goes: on one line of a terminal, else in a line now and then."""
+    every_s = REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S
+    last = 0.0
+
+    def on_violation(violation: Violation) -> None:
+        words = " and ".join(_WORDS[key] for key in violation.keys)
+        console.print(f"seed {violation.seed}: {words}; shrinking", highlight=False)
+
+    def on_step(runs: int, words: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= every_s:
+            last = time.monotonic()
+            so_far = f"{words} after {runs} {'run' if runs == 1 else 'runs'}"
+            if console.is_terminal:
+                console.file.write(f"{CLEAR_LINE}{so_far}"[: console.width + len(CLEAR_LINE)])
+                console.file.flush()
+            else:
+                console.print(so_far, highlight=False, soft_wrap=True)
+
+    try:
+        yield Watcher(on_violation, on_step, shown=True)
+    finally:
+        if console.is_terminal:
+            console.file.write(CLEAR_LINE)
+
+
+def in_words(explored: Explored) -> Iterator[str]:
+    played = explored.searched.played
+    yield f"{played} seed{'' if played == 1 else 's'} played" + (
+        "" if explored.searched.violation else ": no characteristic is violated"
+    )
+    if explored.shrunk:
+        yield from evidence_lines(explored.shrunk.violated)
+        yield explored.shrunk.words
+        yield str(explored.shrunk.path)
+        yield explored.shrunk.replay

@@ -1,0 +1,184 @@
+"""Explore seeds until a run violates a characteristic, then record, shrink and write it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from harness.checker.judgement import Judgement
+from harness.errors import INTERRUPTED, VIOLATED
+from harness.run.finding import Judge, claim, evidence_lines, simulated, write
+from harness.run.parallel import Failed, sweep
+from harness.run.simulate import same_twice
+from harness.scenario import Scenario
+from harness.sweep.explore._recording import Recording, record
+from harness.sweep.explore._scenario_document import Document, document_of
+from harness.sweep.explore._shrink import BudgetSpentError, Shrinker, file_of
+from harness.sweep.explore._smaller import replays, scenario_of, shrink, size
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """The run of `seed` violates these characteristics, by number, and judgements beside them, by key."""
+
+    seed: int
+    keys: tuple[str, ...]
+
+
+@dataclass
+class Searched:
+    """What became of seeds from the first on. `failed`: seed -> why there is no verdict on its run."""
+
+    played: int = 0
+    violation: Violation | None = None
+    failed: dict[int, str] = field(default_factory=dict)
+    interrupted: bool = False
+
+
+def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> Searched:
+    """Play `seeds` in order; the lowest that violates a characteristic is the one found, however many `jobs`.
+
+    Ctrl-C ends it early. Raises HarnessError if the scenario cannot be played.
+    """
+    searched = Searched()
+    try:
+        with sweep(seeds, lambda seed: judge(scenario, seed).bad, jobs, what="seeds" if shown else None) as outcomes:
+            for seed, outcome in outcomes:
+                searched.played += 1
+                if isinstance(outcome, Failed):
+                    searched.failed[seed] = outcome.reason
+                elif outcome:
+                    searched.violation = Violation(seed, outcome)
+                    break
+    except KeyboardInterrupt:
+        searched.interrupted = True
+    return searched
+
+
+MAX_RUNS = 5000
+
+
+@dataclass(frozen=True)
+class Shrunk:
+    """The smallest run that was found: where it is written, and how it came about."""
+
+    path: Path
+    seed: int
+    violated: dict[str, Judgement]
+    words: str
+    replay: str
+
+
+@dataclass
+class Explored:
+    """`interrupted`: by Ctrl-C, in the search or while shrinking. `shrunk` is None if no run violated anything."""
+
+    searched: Searched
+    shrunk: Shrunk | None = None
+    interrupted: bool = False
+
+    @property
+    def exit_status(self) -> int:
+        if self.interrupted:
+            return INTERRUPTED
+        return VIOLATED if self.searched.violation or self.searched.failed else 0
+
+
+@dataclass(frozen=True)
+class Watcher:
+    """What is told meanwhile. `on_step` gets the number of runs so far, and the size in words."""
+
+    on_violation: Callable[[Violation], None] = field(default=lambda violation: None)
+    on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
+    shown: bool = False
+
+
+def explore(
+    scenario: Scenario,
+    source: str,
+    seeds: range,
+    jobs: int,
+    out: Path | None = None,
+    *,
+    judge: Judge = simulated,
+    max_runs: int = MAX_RUNS,
+    watcher: Watcher | None = None,
+) -> Explored:
+    """Play `scenario`, which `source` names for people, with `seeds`, and shrink the first run that violates.
+
+    Raises HarnessError if the scenario cannot be played, the file cannot be written, or an agent is not the same twice.
+    """
+    watcher = watcher or Watcher()
+    path = claim(out, scenario.name)
+    if scenario.foreign:
+        same_twice(scenario, seeds[0])
+    searched = search(scenario, seeds, jobs, judge, shown=watcher.shown)
+    explored = Explored(searched, interrupted=searched.interrupted)
+    if searched.violation is None:
+        return explored
+    seed, key = searched.violation.seed, searched.violation.keys[0]
+    watcher.on_violation(searched.violation)
+
+    def still(candidate: Scenario) -> bool:
+        return key in judge(candidate, seed).bad
+
+    def recorded(document: Document) -> Recording:
+        return record(scenario_of(document), seed)
+
+    smallest, words, explored.interrupted = smallest_of(
+        document_of(scenario), still, recorded, jobs=jobs, max_runs=max_runs, on_step=watcher.on_step
+    )
+    explored.shrunk = _written(smallest, path, source, seed, words, judge, recorded)
+    return explored
+
+
+def smallest_of(
+    original: Document,
+    still: Callable[[Scenario], bool],
+    recorded: Callable[[Document], Recording],
+    *,
+    jobs: int,
+    max_runs: int,
+    on_step: Callable[[int, str], None],
+) -> tuple[Document, str, bool]:
+    """The smallest document that `still` is what it is; how it came about, in words; whether Ctrl-C ended that."""
+    interrupted = False
+    shrinker = Shrinker(
+        original,
+        still,
+        jobs=jobs,
+        max_runs=max_runs,
+        adopted=lambda shrinker: on_step(shrinker.runs, size(shrinker.best)),
+    )
+    how = "and nothing more could be left out"
+    first = size(original)
+    try:
+        shrinker.first(replays(original, recorded(original)))
+        first = size(shrinker.best)
+        shrink(shrinker, recorded)
+    except BudgetSpentError:
+        how = "when the bound was reached: it may not be the smallest"
+    except KeyboardInterrupt:
+        interrupted = True
+        how = "when it was interrupted: it may not be the smallest"
+    return shrinker.best, f"{first} -> {size(shrinker.best)} in {shrinker.runs} runs, {how}", interrupted
+
+
+def _written(
+    document: Document,
+    path: Path,
+    source: str,
+    seed: int,
+    words: str,
+    judge: Judge,
+    recorded: Callable[[Document], Recording],
+) -> Shrunk:
+    result = judge(scenario_of(document), seed)
+    judgements = {key: result.judgements[key] for key in result.bad}
+    replay = f"ucp-harness run {path} --backend sim --seed {seed}"
+    header = [
+        *evidence_lines(judgements),
+        f"Shrunk from {source}, seed {seed}: {words}.",
+        f"  {replay}",
+    ]
+    written = write(path, file_of(document, header, recorded(document)))
+    return Shrunk(written, seed, judgements, words, replay.replace(str(path), str(written)))

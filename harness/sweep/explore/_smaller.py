@@ -1,0 +1,210 @@
+"""What smaller means, in the order in which it pays: first what makes runs short, then what makes them simple.
+
+Fates are tried in two forms. By time, a fate still means the same message when others are no longer sent; by count it
+means the same when everything comes earlier. After each change of form all that is left out again is tried once more.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from itertools import combinations
+from typing import Any
+
+from harness.scenario import Scenario
+from harness.sweep.explore._recording import Logged, Recording
+from harness.sweep.explore._scenario_document import (
+    Document,
+    at,
+    cut_after,
+    event_of,
+    fate_by_count,
+    fate_by_time,
+    instants,
+    moved,
+    script,
+    scripted,
+    timeline,
+    with_agents,
+    with_drops,
+    with_key,
+)
+from harness.sweep.explore._shrink import Shrinker
+from ucp.events import EVENT_HEADER_BYTES
+from ucp.settings import Settings
+
+MAX_ROUNDS = 8
+MAX_PAIRED = 12
+"""Among more agents there are too many pairs to try."""
+DELAY_S = 0.02
+SLACKS_S = (0.3, 0.03)
+GAPS_S = (1, 2, 5, 10, 11, 15, 20, 30, 60)
+"""Whole seconds between two things that happen, the smallest first."""
+
+Record = Callable[[Document], Recording]
+
+
+def shrink(shrinker: Shrinker, record: Record) -> None:
+    """Until nothing can be left out. Raises BudgetSpentError."""
+    for _ in range(MAX_ROUNDS):
+        before = shrinker.best
+        for express in (_by_time, _by_count):
+            express(shrinker, record)
+            for step in (_less_time, _no_final_reconcile, _fewer_agents, _fewer_of_each, _plainer):
+                step(shrinker)
+            _blocks_of_one_event(shrinker, record)
+        _round_times(shrinker)
+        _closer_together(shrinker)
+        if shrinker.best == before:
+            return
+
+
+def replays(document: Document, recording: Recording) -> Iterator[Document]:
+    """What could play the recorded run again without chance; the last is `document` itself, chance and all."""
+    lost = [loss for loss in recording.lost if not loss.by_quirk]
+    everything = scripted(document, recording.logged, [fate_by_count(loss) for loss in recording.lost])
+    ignored = at(document, "quirks.ignore_commit")
+    if ignored:
+        yield with_key(everything, "quirks.ignore_commit", None)
+    faithful = scripted(document, recording.logged, [fate_by_count(loss) for loss in lost])
+    yield faithful
+    yield with_key(faithful, "network.delay", DELAY_S)
+    yield {**document, "events": {"source": "scripted", "script": [event_of(event) for event in recording.logged]}}
+    yield document
+
+
+def _by_time(shrinker: Shrinker, record: Record) -> None:
+    document, lost = shrinker.best, record(shrinker.best).lost
+    if document.get("fates"):
+        shrinker.first(with_drops(document, [fate_by_time(loss, slack) for loss in lost]) for slack in SLACKS_S)
+
+
+def _by_count(shrinker: Shrinker, record: Record) -> None:
+    document, lost = shrinker.best, record(shrinker.best).lost
+    if document.get("fates"):
+        shrinker.first([with_drops(document, [fate_by_count(loss) for loss in lost])])
+
+
+def _less_time(shrinker: Shrinker) -> None:
+    """End the mission as soon as possible; then not later than the last thing happens."""
+    moments = instants(shrinker.best)
+    low, high = -1, len(moments) - 1  # it is not known to violate up to `low`, and does up to `high`
+    while high - low > 1:
+        middle = (low + high) // 2
+        if shrinker.first([cut_after(shrinker.best, moments[middle])]) is not None:
+            high = middle
+        else:
+            low = middle
+    last = max(instants(shrinker.best), default=0.0)
+    now = shrinker.best.get("duration_s", 1200.0)
+    ends = [max(1.0, last), *(last + gap for gap in GAPS_S)]
+    shrinker.first({**shrinker.best, "duration_s": float(math.ceil(end))} for end in ends if math.ceil(end) < now)
+
+
+def _no_final_reconcile(shrinker: Shrinker) -> None:
+    shrinker.first([with_key(shrinker.best, "final_reconcile", None)])
+
+
+def _fewer_agents(shrinker: Shrinker) -> None:
+    document = shrinker.best
+    for delay in (at(document, "network.delay"), DELAY_S):  # with fewer agents chance gives others their latencies
+        base = with_key(document, "network.delay", delay)
+        shrinker.fewest(document["agents"], lambda kept, base=base: with_agents(base, kept))  # type: ignore[misc]
+        while _two_agents_fewer(shrinker, delay):
+            pass
+        if len(shrinker.best["agents"]) < len(document["agents"]):
+            return
+
+
+def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
+    """Two at a time keep an even number of voters even."""
+    base = with_key(shrinker.best, "network.delay", delay)
+    agents = set(base["agents"])
+    if len(agents) > MAX_PAIRED:
+        return False
+    pairs = combinations(reversed(base["agents"]), 2)
+    return shrinker.first(with_agents(base, agents - {*pair}) for pair in pairs) is not None
+
+
+def _fewer_of_each(shrinker: Shrinker) -> None:
+    wrong = [f"quirks.{name}.agents" for name in shrinker.best.get("quirks", {})]
+    for key in ("timeline", "schedule", "events.script", "fates", "datagrams", "network.links", *wrong):
+        document = shrinker.best
+        if at(document, key):
+            shrinker.fewest(at(document, key), lambda kept, d=document, k=key: with_key(d, k, list(kept)))  # type: ignore[misc]
+    for key in ("clocks", "lateness", "network.receivers"):
+        document = shrinker.best
+        named: dict[str, Any] = at(document, key) or {}
+        shrinker.fewest(list(named.items()), lambda kept, d=document, k=key: with_key(d, k, dict(kept)))  # type: ignore[misc]
+
+
+def _plainer(shrinker: Shrinker) -> None:
+    """What can be as by default; and if not, one latency for all messages."""
+    for key in (
+        "initial_data",
+        "lateness",
+        "settings",
+        "stagger",
+        "quirks",
+        "network",
+        "settle",
+        "timeline",
+        "schedule",
+    ):
+        shrinker.first([with_key(shrinker.best, key, None)])
+    for part in ("settings", "quirks", "network"):
+        for key in list(at(shrinker.best, part) or ()):
+            shrinker.first([with_key(shrinker.best, f"{part}.{key}", None)])
+    if at(shrinker.best, "network.delay") is None or isinstance(at(shrinker.best, "network.delay"), dict):
+        shrinker.first([with_key(shrinker.best, "network.delay", DELAY_S)])
+
+
+def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
+    """The same blocks at the same times, each of the one event that completed it."""
+    document = shrinker.best
+    largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes
+    if at(document, "settings.max_block_bytes") == largest or not script(document):
+        return
+    size = min(256, largest - EVENT_HEADER_BYTES)
+    events = [Logged(event.at_s, event.agent, size, True) for event in record(document).logged if event.completes]
+    smaller = with_key(document, "events.script", [event_of(event) for event in events])
+    shrinker.first([with_key(smaller, "settings.max_block_bytes", largest)])
+
+
+def _round_times(shrinker: Shrinker) -> None:
+    document = shrinker.best
+    shrinker.first(moved(document, lambda at_s, digits=digits: float(round(at_s, digits))) for digits in (0, 1, 2, 3))  # type: ignore[misc]
+
+
+def _closer_together(shrinker: Shrinker) -> None:
+    """Less time between one thing that happens and the next."""
+    for index in range(len(instants(shrinker.best))):
+        moments = instants(shrinker.best)
+        if index >= len(moments):
+            return
+        moment, before = moments[index], moments[index - 1] if index else 0.0
+        gap = moment - before
+        gaps = [*(float(shorter) for shorter in GAPS_S if shorter < gap), float(math.ceil(gap))]
+        shrinker.first(moved(shrinker.best, _bring(moment, before + shorter)) for shorter in gaps if shorter != gap)
+
+
+def _bring(moment: float, earlier: float) -> Callable[[float], float]:
+    """Move `moment`, and all after it."""
+    return lambda at_s: round(at_s - moment + earlier, 6) if at_s >= moment else at_s
+
+
+def size(document: Document) -> str:
+    """In words: "5 agents, 203 events, 61 fates"."""
+    counts = {
+        "agent": len(document["agents"]),
+        "event": len(script(document)),
+        "fate": len(document.get("fates", [])),
+        "fault": len(timeline(document)),
+        "datagram": len(document.get("datagrams", [])),
+    }
+    always = ("agent", "event", "fate")
+    return ", ".join(
+        f"{count} {word}{'' if count == 1 else 's'}" for word, count in counts.items() if count or word in always
+    )
+
+
+def scenario_of(document: Document) -> Scenario:
+    return Scenario.model_validate(document)

@@ -1,0 +1,290 @@
+"""What is kept between nights, in a directory: scenarios that reached something, and what was found.
+
+corpus.json    which scenario it is of
+runs/          a scenario for each run that is kept; its name ends in the seed
+findings.json  what was found, with the night in which it was first and last seen
+findings/      the smallest scenario of each finding
+nights/        what each night came to, as JSON
+report.html    the last night
+
+Whatever is there may come from anybody. A file that is no scenario of this corpus is left out, and told; none of them
+says which program is started.
+"""
+
+import fcntl
+import json
+import re
+import stat
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from harness.errors import MachineError, RunDirectoryError, ScenarioError
+from harness.scenario import Scenario
+from harness.scenario.load import parse, read_yaml
+from harness.sweep.explore._scenario_document import Document, document_of
+from harness.sweep.explore.guided._finding_identity import Identity
+from harness.sweep.explore.guided._hunt import MOST_KEPT, Candidate
+from harness.sweep.explore.guided._hunt_trial import with_liveness_phase, without_liveness_phase
+from harness.sweep.explore.guided._mutation import Limits
+from ucp.agent_files import write_atomically, write_json_atomically
+
+SCHEMA = "ucp-corpus/1"
+MOST_BYTES = 256 * 1024
+"""No file of a run that is kept is larger."""
+MOST_FINDINGS = 500
+MOST_NIGHTS = 400
+MOST_STATES = 10**12
+CHANGED = frozenset(
+    (
+        "agents",
+        "duration_s",
+        "network",
+        "timeline",
+        "schedule",
+        "events",
+        "settings",
+        "clocks",
+        "fates",
+        "lateness",
+        "settle",
+        "final_reconcile",
+        "initial_data",
+        "datagrams",
+        "name",
+    )
+)
+"""Keys in which a run may differ from the scenario that the corpus is of; no other says anything to this machine."""
+LONGEST_S = 3600.0
+_NAME = re.compile(r"[0-9a-f]{12}-seed-(\d{1,10})\.yaml")
+Text = Annotated[str, Field(max_length=500)]
+NightName = Annotated[str, Field(max_length=40)]
+
+
+class Finding(BaseModel):
+    """Something bad that runs showed. `first` and `last` are the nights that saw it, by when they were begun."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    key: Text
+    verdict: Text
+    handler: Text = ""
+    shape: Text = ""
+    seed: Annotated[int, Field(ge=0, lt=2**32)]
+    first: NightName
+    last: NightName
+    words: Annotated[list[Text], Field(max_length=20)] = []
+    """What one sees of it."""
+
+    @property
+    def identity(self) -> Identity:
+        return Identity(self.key, self.verdict, self.handler, self.shape)
+
+    @property
+    def file(self) -> str:
+        """The name of its scenario."""
+        digest = sha256(repr((self.key, self.verdict, self.handler, self.shape)).encode()).hexdigest()[:8]
+        slug = re.sub(r"[^a-z0-9]+", "_", f"{self.key} {self.verdict} {self.handler}".lower()).strip("_")[:60]
+        return f"{slug}_{digest}.yaml"
+
+
+class _Findings(BaseModel):
+    model_config = ConfigDict(populate_by_name=True)
+
+    schema_: Literal["ucp-findings/2"] = Field(default="ucp-findings/2", alias="schema")
+    findings: Annotated[list[Finding], Field(max_length=MOST_FINDINGS)] = []
+
+
+@dataclass
+class Corpus:
+    """An open directory, which nobody else works on. `left_out` says why files of it are not used."""
+
+    directory: Path
+    base: Document
+    limits: Limits
+    left_out: list[str] = field(default_factory=list)
+    _lock: BinaryIO | None = None
+
+    def close(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+
+    # Runs
+
+    def runs(self) -> list[Candidate]:
+        """Those that are kept, each once, in the order of their names."""
+        paths = sorted((self.directory / "runs").iterdir())
+        if len(paths) > 2 * MOST_KEPT:
+            self.left_out.append(f"{len(paths) - 2 * MOST_KEPT} of {len(paths)} files in {self.directory / 'runs'}")
+        by_name: dict[str, Candidate] = {}
+        for path in paths[: 2 * MOST_KEPT]:
+            if (candidate := self._run(path)) is not None:
+                name = _name_of(candidate)
+                by_name[name] = candidate
+                if path.name != name:  # as others, or older versions, name it
+                    self._rename(path, name)
+        return list(by_name.values())
+
+    def _run(self, path: Path) -> Candidate | None:
+        name = _NAME.fullmatch(path.name)
+        document = None if name is None else self._document(path)
+        if name is None or document is None:
+            if name is None:
+                self.left_out.append(f"{path} is no run that was kept here")
+            return None
+        return Candidate(without_liveness_phase(document), int(name[1]))
+
+    def keep(self, candidate: Candidate) -> None:
+        """Raises MachineError if the disk refuses."""
+        text = json.dumps(with_liveness_phase(candidate.document), sort_keys=True)
+        self._write(self.directory / "runs" / _name_of(candidate), text + "\n")
+
+    def drop(self, candidate: Candidate) -> None:
+        """It gives nothing that others do not."""
+        (self.directory / "runs" / _name_of(candidate)).unlink(missing_ok=True)
+
+    # Findings
+
+    def findings(self) -> list[Finding]:
+        """Those that were told before."""
+        path = self.directory / "findings.json"
+        if not path.exists():
+            return []
+        try:
+            return _Findings.model_validate_json(self._read(path)).findings
+        except (ValidationError, ValueError, RecursionError, ScenarioError):
+            self.left_out.append(f"{path} is no list of findings: what was found before is not known")
+            return []
+
+    def scenario_of(self, finding: Finding) -> Document | None:
+        """What shows it; None if its file is gone, or is none."""
+        path = self.directory / "findings" / finding.file
+        return self._document(path) if path.exists() else None
+
+    def write_findings(self, findings: list[Finding]) -> None:
+        document = _Findings(findings=findings[-MOST_FINDINGS:]).model_dump(mode="json", by_alias=True)
+        self._tell(lambda path: write_json_atomically(path, document), self.directory / "findings.json")
+
+    def write_scenario(self, finding: Finding, text: str) -> Path:
+        path = self.directory / "findings" / finding.file
+        self._write(path, text)
+        return path
+
+    # Nights
+
+    def write_night(self, began: str, document: dict[str, Any], page: Callable[[list[dict[str, Any]]], str]) -> Path:
+        """Keep it, and draw `page` from all that are there."""
+        name = re.sub("[^0-9TZ]", "", began)
+        self._tell(lambda path: write_json_atomically(path, document), self.directory / "nights" / f"{name}.json")
+        report = self.directory / "report.html"
+        self._write(report, page(list(self._nights())))
+        return report
+
+    def _nights(self) -> Iterator[dict[str, Any]]:
+        for path in sorted((self.directory / "nights").glob("*.json"))[-MOST_NIGHTS:]:
+            try:
+                night = json.loads(self._read(path))
+                if type(night["local_states"]) is not int or not 0 <= night["local_states"] < MOST_STATES:
+                    raise ValueError
+            except (ValueError, KeyError, TypeError, RecursionError, ScenarioError):
+                self.left_out.append(f"{path} is no night of this corpus")
+                continue
+            yield night
+
+    # Files
+
+    def _document(self, path: Path) -> Document | None:
+        try:
+            if path.stat(follow_symlinks=False).st_size > MOST_BYTES:
+                raise ScenarioError(f"{path}: larger than {MOST_BYTES} bytes")
+            document = json.loads(text) if (text := self._read(path)).startswith(b"{") else read_yaml(path, "scenario")
+            return fitting(document, self.base, self.limits)
+        except (OSError, ValueError, RecursionError, ScenarioError) as error:
+            self.left_out.append(f"{path.name} is left out: {str(error)[:200]}")
+            return None
+
+    def _rename(self, path: Path, name: str) -> None:
+        def rename(path: Path) -> None:
+            path.replace(path.with_name(name))
+
+        self._tell(rename, path)
+
+    def _read(self, path: Path) -> bytes:
+        status = path.stat(follow_symlinks=False)
+        if not stat.S_ISREG(status.st_mode) or status.st_size > 64 * MOST_BYTES:
+            raise ScenarioError(f"{path} is no file that was written here")
+        return path.read_bytes()
+
+    def _write(self, path: Path, text: str) -> None:
+        self._tell(lambda path: write_atomically(path, text), path)
+
+    def _tell(self, write: Callable[[Path], None], path: Path) -> None:
+        try:
+            write(path)
+        except OSError as error:
+            raise MachineError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def opened(directory: Path, scenario: Scenario, limits: Limits) -> Corpus:
+    """Make the directory, or go on with what is there.
+
+    Raises RunDirectoryError if it is another's: of another scenario, or no corpus; or if another command works on it.
+    """
+    base, path = document_of(scenario), directory / "corpus.json"
+    try:
+        for part in ("runs", "findings", "nights"):
+            if not path.exists() and directory.exists() and any(directory.iterdir()) and part == "runs":
+                raise RunDirectoryError(f"{directory} is not empty, and no corpus: choose another --corpus")
+            (directory / part).mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            write_json_atomically(path, {"schema": SCHEMA, "scenario": base})
+        lock = path.open("rb")
+    except OSError as error:
+        raise RunDirectoryError(f"{directory} cannot be used: {error.strerror}; choose another --corpus") from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        header = json.loads(lock.read(64 * MOST_BYTES))
+        if not isinstance(header, dict) or header.get("schema") != SCHEMA:
+            raise ValueError
+    except BlockingIOError:
+        raise RunDirectoryError(f"another command works on the corpus in {directory}: wait for its end") from None
+    except (ValueError, RecursionError):
+        raise RunDirectoryError(f"{path} is no corpus of this version ({SCHEMA}): choose another --corpus") from None
+    if header.get("scenario") != json.loads(json.dumps(base)):
+        raise RunDirectoryError(f"{directory} is the corpus of another scenario: choose another --corpus")
+    return Corpus(directory, base, limits, _lock=lock)
+
+
+def fitting(document: Any, base: Document, limits: Limits) -> Document:
+    """The document, if changes of the base could have come to it. Raises ScenarioError."""
+    if not isinstance(document, dict):
+        raise ScenarioError("it is no scenario")
+    document = {"agents": base["agents"], **document}
+    for key in document.keys() | base.keys():
+        if key not in CHANGED and not _is_part(document.get(key), base.get(key)):
+            raise ScenarioError(f"its {str(key)[:40]} is not that of the corpus's scenario")
+    scenario = parse(document)
+    if not set(scenario.roster) <= set(limits.roster):
+        raise ScenarioError("it has agents that the corpus's scenario has not")
+    if scenario.duration_s > max(LONGEST_S, limits.last_s) or len(scenario.events.script) > MOST_KEPT:
+        raise ScenarioError("it is longer than any that were kept")
+    settles_s = (base.get("settle") or {}).get("limit_s", Scenario.model_fields["settle"].default.limit_s)
+    if scenario.settle.limit_s > max(settles_s, LONGEST_S):
+        raise ScenarioError("it settles for longer than any that were kept")
+    return {**document, "agents": list(scenario.roster)}
+
+
+def _is_part(value: Any, whole: Any) -> bool:
+    """Whether it says no more than the whole does: of fewer agents it may be less."""
+    if isinstance(value, dict) and isinstance(whole, dict):
+        return all(_is_part(part, whole.get(key)) for key, part in value.items())
+    return bool(value == whole)
+
+
+def _name_of(candidate: Candidate) -> str:
+    text = json.dumps(with_liveness_phase(candidate.document), sort_keys=True)  # as it is read again
+    return f"{sha256(text.encode()).hexdigest()[:12]}-seed-{candidate.seed}.yaml"

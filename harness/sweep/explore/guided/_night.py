@@ -1,0 +1,327 @@
+"""A night: known findings are played first, then the hunt goes on from what is kept, until its time is over.
+
+What ends it early loses the run under way: whatever reached something, and whatever was found, is written at once.
+"""
+
+import resource
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from random import Random
+from typing import Any, Literal
+
+from harness.errors import INTERRUPTED, VIOLATED, HarnessError
+from harness.proof import Bounds
+from harness.proof.coverage import Existing, existing
+from harness.proof.coverage import to_json as coverage_to_json
+from harness.run.finding import evidence_lines, simulated
+from harness.run.parallel import sweep
+from harness.run.run import versions
+from harness.run.simulate import same_twice
+from harness.scenario import Scenario
+from harness.sweep.explore._exploring import smallest_of
+from harness.sweep.explore._recording import record
+from harness.sweep.explore._scenario_document import Document
+from harness.sweep.explore._shrink import file_of
+from harness.sweep.explore._smaller import scenario_of
+from harness.sweep.explore.guided._corpus import Corpus, Finding, opened
+from harness.sweep.explore.guided._finding_identity import Identity
+from harness.sweep.explore.guided._hunt import Candidate, Hunt
+from harness.sweep.explore.guided._hunt_trial import beginnings, found_in, with_liveness_phase
+from harness.sweep.explore.guided._mutation import Limits
+from harness.sweep.explore.guided._night_page import to_html
+
+Status = Literal["new", "resolved", "rare", "ongoing"]
+
+SCHEMA = "ucp-exploration/1"
+BEGUN_WITH = 4
+"""Runs of the scenario whose beginnings are changed at first."""
+SEEDS = 20
+"""With so many seeds it is seen how often a finding shows."""
+RARE = 0.5
+"""Findings that show with less than this share of them are rare."""
+SHRINKING_RUNS = 400
+MOST_AGENTS, MOST_BLOCKS = 3, 3
+"""Shares are of what exists within these bounds."""
+SAMPLES = 200
+
+
+@dataclass(frozen=True)
+class Watcher:
+    """Who is told meanwhile: of runs, local states, findings; and of what happens now, in words."""
+
+    on_progress: Callable[[int, int, int], None] = lambda runs, states, findings: None
+    on_event: Callable[[str], None] = lambda words: None
+
+
+@dataclass
+class Told:
+    """A finding as of this night: it showed with `shown` of `of` seeds."""
+
+    finding: Finding
+    status: Status
+    shown: int
+    of: int
+    path: Path | None
+
+    @property
+    def replay(self) -> str | None:
+        """The command that plays it again."""
+        return None if self.path is None else f"ucp-harness run {self.path} --backend sim --seed {self.finding.seed}"
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "status": self.status,
+            **self.finding.model_dump(),
+            "in_words": str(self.finding.identity),
+            "shown": self.shown,
+            "of": self.of,
+            "scenario": None if self.path is None else str(self.path),
+            "replay": self.replay,
+        }
+
+
+@dataclass
+class Night:
+    """What came of it. `growth`: runs, and local states that were known after them."""
+
+    scenario: Scenario
+    directory: Path
+    hunt: Hunt
+    began: str
+    told: list[Told] = field(default_factory=list)
+    growth: list[tuple[int, int]] = field(default_factory=list)
+    interrupted: bool = False
+    seconds: float = 0.0
+    processor_s: float = 0.0
+    left_out: list[str] = field(default_factory=list)
+    there: Existing | None = None
+    report: Path | None = None
+
+    def grow(self) -> None:
+        """Take down what is known by now; of a long night every second, fourth, eighth run."""
+        self.growth.append((self.hunt.runs, self.hunt.local_states))
+        if len(self.growth) > 2 * SAMPLES:
+            del self.growth[1::2]
+
+    @property
+    def exit_status(self) -> int:
+        if self.interrupted:
+            return INTERRUPTED
+        return VIOLATED if self.hunt.failed or any(told.status != "resolved" for told in self.told) else 0
+
+    def to_json(self) -> dict[str, Any]:
+        reached = self.hunt.reached
+        return {
+            "schema": SCHEMA,
+            "scenario": self.scenario.name,
+            "started_at": self.began,
+            "outcome": "interrupted" if self.interrupted else "completed",
+            "seconds": round(self.seconds, 1),
+            "processor_s": round(self.processor_s, 1),
+            "runs": self.hunt.runs,
+            "kept": len(self.hunt.kept),
+            "local_states": self.hunt.local_states,
+            "pairs": self.hunt.pairs,
+            "coverage": coverage_to_json(reached, self.there),
+            "growth": [list(sample) for sample in self.growth],
+            "findings": [told.to_json() for told in self.told],
+            "failed": [{"seed": candidate.seed, "reason": reason} for candidate, reason in self.hunt.failed],
+            "failures": self.hunt.failures,
+            "left_out": self.left_out[:SAMPLES],
+            "versions": versions(),
+        }
+
+
+def spend(
+    scenario: Scenario,
+    directory: Path,
+    *,
+    first_seed: int = 0,
+    for_s: float = float("inf"),
+    most_runs: float = float("inf"),
+    jobs: int = 1,
+    watcher: Watcher = Watcher(),
+) -> Night:
+    """Hunt for so long, or so many runs, and keep in `directory` what is worth it. Ctrl-C ends it early.
+
+    Raises HarnessError if the scenario cannot be played, or the directory not be used.
+    """
+    if scenario.foreign:
+        same_twice(scenario, first_seed)
+    limits, begun = beginnings(scenario, range(first_seed, first_seed + BEGUN_WITH))
+    corpus = opened(directory, scenario, limits)
+    try:
+        return _Nightwatch(scenario, corpus, limits, first_seed, for_s, most_runs, jobs, watcher).spend(
+            [Candidate(*each) for each in begun]
+        )
+    finally:
+        corpus.close()
+
+
+class _Nightwatch:
+    """Goes through one night."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        corpus: Corpus,
+        limits: Limits,
+        first_seed: int,
+        for_s: float,
+        most_runs: float,
+        jobs: int,
+        watcher: Watcher,
+    ) -> None:
+        self._corpus, self._jobs, self._watcher = corpus, jobs, watcher
+        self._most_runs = most_runs
+        self._began_s, self._began_processor_s = time.monotonic(), _processor_s()
+        self._ends_s = self._began_s + for_s
+        began = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+        self._night = Night(scenario, corpus.directory, Hunt(limits, Random(f"{first_seed}")), began)
+        self._known = {finding.identity: finding for finding in corpus.findings()}
+        self._new: dict[Identity, Finding] = {}
+        self._shown: dict[Identity, tuple[int, int]] = {}
+
+    def spend(self, begun: list[Candidate]) -> Night:
+        night = self._night
+        try:
+            self._replay()
+            self._hunt(begun)
+            self._shrink()
+            bounds = Bounds(min(len(night.hunt.limits.roster), MOST_AGENTS), min(night.hunt.limits.blocks, MOST_BLOCKS))
+            night.there = existing(bounds)
+        except KeyboardInterrupt:
+            night.interrupted = True
+        self._tell()
+        return night
+
+    def _replay(self) -> None:
+        """Play what was found before: does it still show, and how often?"""
+        for identity, finding in self._known.items():
+            document = self._corpus.scenario_of(finding)
+            if document is None:
+                self._corpus.left_out.append(f"{finding.file}: nothing shows {identity} again")
+            else:
+                self._watcher.on_event(f"known, played again: {identity}")
+                self._shown[identity] = self._how_often(identity, document, finding.seed)
+
+    def _how_often(self, identity: Identity, document: Document, seed: int) -> tuple[int, int]:
+        seeds = [seed, *(other for other in range(1, SEEDS + 1) if other != seed)][:SEEDS]
+
+        def shows(with_seed: int) -> bool:
+            return identity in found_in(Scenario.model_validate(document), with_seed)
+
+        with sweep(seeds, shows, self._jobs) as outcomes:
+            return sum(outcome is True for _, outcome in outcomes), len(seeds)
+
+    def _hunt(self, begun: list[Candidate]) -> None:
+        """From what is kept; what of that gives nothing any more is dropped, if there was time to play all of it."""
+        hunt, before = self._night.hunt, self._corpus.runs()
+        kept = set(map(id, self._taken(hunt.begin([*begun, *before], self._jobs))))
+        if not hunt.kept:
+            reason = hunt.failed[0][1] if hunt.failed else "no run of the scenario can be changed and played"
+            raise HarnessError(f"there is nothing to begin with: {reason}")
+        for candidate in () if self._over else before:
+            if id(candidate) not in kept:
+                self._corpus.drop(candidate)
+        while not self._over:
+            for _ in self._taken(hunt.round(self._jobs)):
+                pass
+            for candidate in hunt.dropped():
+                self._corpus.drop(candidate)
+
+    @property
+    def _over(self) -> bool:
+        return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
+
+    def _taken(self, runs: Iterator[tuple[Candidate, bool]]) -> Iterator[Candidate]:
+        """Those that reached something are written at once, and so is what is found."""
+        night, hunt = self._night, self._night.hunt
+        for candidate, is_kept in runs:
+            night.grow()
+            if is_kept:
+                self._corpus.keep(candidate)
+                yield candidate
+            for identity in hunt.found.keys() - self._known.keys() - self._new.keys():
+                self._take_down(identity, hunt.found[identity])
+            self._watcher.on_progress(hunt.runs, hunt.local_states, len(hunt.found))
+            if self._over:
+                return
+
+    def _take_down(self, identity: Identity, candidate: Candidate) -> None:
+        finding = Finding(
+            **vars(identity),
+            seed=candidate.seed,
+            first=self._night.began,
+            last=self._night.began,
+        )
+        self._new[identity] = finding
+        self._write(finding, with_liveness_phase(candidate.document), "as it was found")
+        self._watcher.on_event(f"found: {identity}")
+
+    def _write(self, finding: Finding, document: Document, words: str) -> None:
+        result = simulated(scenario_of(document), finding.seed)
+        lines = evidence_lines({key: result.judgements[key] for key in result.bad})
+        finding.words[:] = [line[:500] for line in lines][:20]
+        header = [*lines, f"Found by exploring {self._night.scenario.name!r}, {words}."]
+        path = self._corpus.write_scenario(
+            finding, file_of(document, header, record(scenario_of(document), finding.seed))
+        )
+        self._corpus.write_findings([*self._known.values(), *self._new.values()])
+        assert path.exists()
+
+    def _shrink(self) -> None:
+        """Make what is new small."""
+        for identity, finding in self._new.items():
+            document = with_liveness_phase(self._night.hunt.found[identity].document)
+            self._watcher.on_event(f"shrinking: {identity}")
+
+            def still(scenario: Scenario, identity: Identity = identity, seed: int = finding.seed) -> bool:
+                return identity in found_in(scenario, seed)
+
+            smallest, words, interrupted = smallest_of(
+                document,
+                still,
+                lambda document, seed=finding.seed: record(scenario_of(document), seed),  # type: ignore[misc]
+                jobs=self._jobs,
+                max_runs=SHRINKING_RUNS,
+                on_step=lambda runs, words: None,
+            )
+            self._write(finding, smallest, words)
+            if interrupted:
+                raise KeyboardInterrupt
+            self._shown[identity] = self._how_often(identity, smallest, finding.seed)
+
+    def _tell(self) -> None:
+        """What the night came to."""
+        night, corpus = self._night, self._corpus
+        for identity, finding in {**self._known, **self._new}.items():
+            shown, of = self._shown.get(identity, (0, 0))
+            in_hunt = night.hunt.shown[identity]
+            status: Status = "ongoing"
+            if identity in self._new:
+                status = "new"
+            elif of and not shown and not in_hunt and not night.interrupted:
+                status = "resolved"
+            elif of and shown < RARE * of:
+                status = "rare"
+            if status != "resolved" and (shown or in_hunt):
+                finding.last = night.began
+            path = corpus.directory / "findings" / finding.file
+            night.told.append(Told(finding, status, shown, of, path if path.exists() else None))
+        corpus.write_findings([*self._known.values(), *self._new.values()])
+        night.seconds = time.monotonic() - self._began_s
+        night.processor_s = _processor_s() - self._began_processor_s
+        night.left_out = corpus.left_out
+        document = night.to_json()
+        night.report = corpus.write_night(night.began, document, lambda nights: to_html(document, nights))
+
+
+def _processor_s() -> float:
+    return sum(
+        usage.ru_utime + usage.ru_stime
+        for usage in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )

@@ -1,0 +1,62 @@
+"""What the command line says of a night: while it goes on, and at its end."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+from rich.console import Console
+
+from harness.proof.coverage import in_words as coverage_in_words
+from harness.sweep.explore.guided._night import Night, Watcher
+
+REDRAW_EVERY_S = 0.1
+FIRST_LINE_S, LINES_GROW, LONGEST_S = 10.0, 1.5, 600.0
+"""Where there is no terminal a line comes after so long, and ever later ones, but at last every ten minutes."""
+CLEAR_LINE = "\r\x1b[2K"
+
+
+@contextlib.contextmanager
+def watching(console: Console) -> Iterator[Watcher]:
+    """On one line of a terminal; elsewhere a line now and then, ever more seldom."""
+    began = last = time.monotonic()
+    every_s = REDRAW_EVERY_S if console.is_terminal else FIRST_LINE_S
+
+    def on_progress(runs: int, states: int, findings: int) -> None:
+        nonlocal last, every_s
+        if time.monotonic() - last < every_s:
+            return
+        last = time.monotonic()
+        words = f"{last - began:.0f} s: {runs:,} runs, {states:,} local states, {findings} findings"
+        if console.is_terminal:
+            console.file.write(f"{CLEAR_LINE}{words}"[: console.width + len(CLEAR_LINE)])
+            console.file.flush()
+        else:
+            every_s = min(every_s * LINES_GROW, LONGEST_S)
+            console.print(words, highlight=False, soft_wrap=True)
+
+    def on_event(words: str) -> None:
+        if console.is_terminal:
+            console.file.write(CLEAR_LINE)
+        console.print(words, highlight=False, soft_wrap=True, markup=False)
+
+    try:
+        yield Watcher(on_progress, on_event)
+    finally:
+        if console.is_terminal:
+            console.file.write(CLEAR_LINE)
+
+
+def in_words(night: Night) -> Iterator[str]:
+    """What came of it."""
+    for told in night.told:
+        of = f", shown with {told.shown} of {told.of} seeds" if told.of else ""
+        yield f"{told.status}: {told.finding.identity}{of}"
+        if told.replay:
+            yield f"  {told.replay}"
+    if not night.told:
+        yield "nothing found"
+    for candidate, reason in night.hunt.failed[:3]:
+        yield f"no verdict on a run with seed {candidate.seed}: {reason}"
+    yield f"{night.hunt.runs:,} runs, {len(night.hunt.kept):,} kept in {night.directory}"
+    yield from coverage_in_words(night.hunt.reached, night.there)
+    yield f"{night.report}"

@@ -1,0 +1,90 @@
+"""Runs, and all runs at one point of the matrix summed up."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.backend_names import BackendName
+from harness.scenario.verdict_names import JUDGED, Verdict, kind_of
+from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, estimate_share
+from harness.sweep.matrix._matrix_file import Point, Task
+
+
+class Placed(BaseModel):
+    """What belongs to one point of the matrix."""
+
+    model_config = ConfigDict(frozen=True)
+
+    loss: float
+    agents: int
+    backend: BackendName
+
+    @property
+    def point(self) -> Point:
+        return Point(self.loss, self.agents, self.backend)
+
+
+class Run(Placed):
+    """What one run leaves here: figures, and the verdicts by number or key.
+
+    Or why it has none: it `failed`, or an agent said that what it needs is `unsupported`.
+    """
+
+    seed: int
+    figures: dict[str, float | int | None] = {}
+    verdicts: dict[str, Verdict] = {}
+    failed: str | None = None
+    unsupported: str | None = None
+    reached: Annotated[Any, Field(exclude=True)] = None
+    """Of a run that was just played, and watched: a `harness.proof.coverage.Reached`. It is not written."""
+
+    @property
+    def judged(self) -> bool:
+        return self.failed is None and self.unsupported is None
+
+    @property
+    def task(self) -> Task:
+        return Task(self.point, self.seed)
+
+
+class Cell(Placed):
+    """`runs` at one point, of which `failed` and `unsupported` have no figures; an estimate per metric; how often each
+    verdict fell.
+
+    `violated` has the seeds of the runs that violated a characteristic, or what is judged beside them.
+    """
+
+    runs: int
+    failed: int
+    estimates: dict[str, Estimate]
+    verdicts: dict[str, dict[Verdict, int]]
+    violated: dict[str, list[int]]
+    unsupported: int = 0
+
+    @property
+    def finished(self) -> Estimate:
+        """The share of the runs whose swarm finished, of those that tell."""
+        told = self.verdicts.get("liveness", {})
+        finished = told.get("finished", 0)
+        return estimate_share(finished, finished + told.get("not finished", 0) + told.get("never finishes", 0))
+
+
+def sum_up(point: Point, runs: Sequence[Run]) -> Cell:
+    failed = sum(run.failed is not None for run in runs)
+    unsupported = sum(run.unsupported is not None for run in runs)
+    judged = [run for run in runs if run.judged]
+    estimates = {metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS}
+    before = {metric.name: metric.estimate(run.figures for run in judged) for metric in BEFORE_FINAL_RECONCILE}
+    verdicts = {key: {run.seed: run.verdicts[key] for run in judged if key in run.verdicts} for key in JUDGED}
+    bad = {key: [seed for seed in by_seed if kind_of(by_seed[seed]) == "bad"] for key, by_seed in verdicts.items()}
+    return Cell(
+        **point._asdict(),
+        runs=len(runs),
+        failed=failed,
+        unsupported=unsupported,
+        estimates=estimates | {name: estimate for name, estimate in before.items() if estimate.n},
+        verdicts={key: dict(Counter(by_seed.values())) for key, by_seed in verdicts.items() if by_seed},
+        violated={key: seeds for key, seeds in bad.items() if seeds},
+    )

@@ -1,0 +1,109 @@
+"""One run of a matrix: in the simulation, or as processes or containers in a run directory of its own."""
+
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.archive.archive import RunArchive
+from harness.checker import Result, gather
+from harness.errors import VIOLATED, HarnessError, InterruptedRunError, UnsupportedError
+from harness.gc_pause import gc_paused
+from harness.play.backends import BACKENDS
+from harness.play.progress import Silent
+from harness.proof.coverage import Reached, Watcher, reached_in
+from harness.proof.coverage.simulated import simulate_watched
+from harness.run.run import run
+from harness.scenario import Scenario
+from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._matrix_file import Matrix, Point, Task
+
+Judge = Callable[[Scenario, int], Result]
+"""Plays a scenario with a seed, and judges it."""
+
+
+class RunFailedError(HarnessError):
+    """A run did not come to its end, or an agent crashed or hung in it."""
+
+    exit_status = VIOLATED
+
+
+@gc_paused()
+def simulated(scenario: Scenario, seed: int) -> Result:
+    """With traces, so that all of it is judged, every step, too."""
+    from harness.run.simulate import simulate
+
+    return simulate(scenario, seed, tracing=True).result
+
+
+@gc_paused()
+def watched(scenario: Scenario, seed: int, reached: Reached) -> Result:
+    """As `simulated`, and adds to what was reached."""
+    watcher = Watcher()
+    result = simulate_watched(scenario, seed, watcher.step).result
+    reached.add(watcher.reached)
+    return result
+
+
+def _same_twice(scenario: Scenario, seed: int) -> None:
+    from harness.run.simulate import same_twice
+
+    same_twice(scenario, seed)
+
+
+@dataclass(frozen=True)
+class Player:
+    """Plays any run of `matrix`; processes leave their run directories in `directory`. `judge` is for virtual time."""
+
+    matrix: Matrix
+    directory: Path
+    judge: Judge = simulated
+    covers: bool = False
+    """Whether to watch what runs reach. Of virtual time these are judged by no other `judge`."""
+
+    def __call__(self, task: Task) -> Run:
+        scenario = self.matrix.scenario_at(task.point)
+        in_memory = BACKENDS[task.point.backend].plays_in_memory
+        try:
+            if in_memory and scenario.foreign and task.seed == self.matrix.seed_list[0]:
+                _same_twice(scenario, task.seed)
+            reached = Reached() if self.covers else None
+            if not in_memory:
+                result = self._for_real(scenario, task, reached)
+            elif reached is not None:
+                result = watched(scenario, task.seed, reached)
+            else:
+                result = self.judge(scenario, task.seed)
+        except UnsupportedError as error:
+            return Run(**task.point._asdict(), seed=task.seed, unsupported=str(error))
+        verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}
+        return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts, reached=reached)
+
+    def refuse(self, points: Iterable[Point]) -> None:
+        """Raises HarnessError if a backend, or this machine, cannot play these: before hours of others have gone by."""
+        for point in points:
+            BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
+
+    def _for_real(self, scenario: Scenario, task: Task, reached: Reached | None) -> Result:
+        """Raises UnsupportedError, or RunFailedError, which names the run directory."""
+        directory = self.directory / directory_name(task)
+        shutil.rmtree(directory, ignore_errors=True)  # of a run that was broken off
+        try:
+            finished = run(scenario, task.seed, directory, Silent(), task.point.backend)
+        except HarnessError as error:  # what every run would meet has been refused
+            raise RunFailedError(f"{error}; see {directory}") from None
+        if finished.played.outcome == "interrupted":
+            raise InterruptedRunError(f"the run in {directory} was interrupted")
+        if finished.played.outcome == "not supported":
+            raise UnsupportedError(finished.played.outcome_detail)
+        if finished.played.outcome == "failed":
+            raise RunFailedError(f"{finished.played.outcome_detail}; see {directory}")
+        if reached is not None:
+            reached.add(reached_in(gather(RunArchive(directory))))
+        if not finished.result.bad and self.matrix.keep == "violated":
+            shutil.rmtree(directory)
+        return finished.result
+
+
+def directory_name(task: Task) -> str:
+    return f"{task.point.file_name}-{task.point.backend}-seed-{task.seed}"

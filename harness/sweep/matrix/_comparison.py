@@ -1,0 +1,58 @@
+"""Tonight's cells beside an earlier night's: which figures changed by more than chance explains.
+
+A figure changed if its two 95 % intervals have nothing in common. Its metric says which direction is worse.
+"""
+
+from collections.abc import Iterator, Sequence
+
+from pydantic import BaseModel
+
+from harness.sweep.matrix._cell import Cell, Placed
+from harness.sweep.matrix._estimate import BY_NAME, Estimate
+
+
+class Change(Placed):
+    """`metric` was `before`, is `now`, and the intervals are apart."""
+
+    metric: str
+    before: Estimate
+    now: Estimate
+    worse: bool
+
+
+class Comparison(BaseModel):
+    """With the matrix of `started_at`, whose matrix.json is `baseline`."""
+
+    baseline: str
+    started_at: str
+    changes: list[Change]
+
+    @property
+    def regressions(self) -> list[Change]:
+        return [change for change in self.changes if change.worse]
+
+
+def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
+    """What changed, in the order of `now`; cells that only one of them has are left out."""
+    earlier = {cell.point: cell for cell in before}
+    for cell in now:
+        if cell.point not in earlier:
+            continue
+        figures_before = earlier[cell.point].estimates
+        for metric in BY_NAME.values():
+            if metric.name not in figures_before or metric.name not in cell.estimates:
+                continue
+            was, is_now = figures_before[metric.name], cell.estimates[metric.name]
+            direction = _moved(was, is_now)
+            if direction and metric.worse:
+                worse = direction == metric.worse
+                yield Change(**cell.point._asdict(), metric=metric.name, before=was, now=is_now, worse=worse)
+
+
+def _moved(before: Estimate, now: Estimate) -> str | None:
+    """Where to, if the intervals are apart; a figure without an interval tells nothing."""
+    if before.low is None or before.high is None or now.low is None or now.high is None:
+        return None
+    if now.high < before.low:
+        return "lower"
+    return "higher" if now.low > before.high else None

@@ -1,0 +1,66 @@
+"""How much of the protocol a matrix has tried, if somebody asks: in all, and in each cell."""
+
+from collections import defaultdict
+from typing import Any
+
+from pydantic import BaseModel
+
+from harness.proof import Bounds
+from harness.proof.coverage import Reached, existing, to_json
+from harness.proof.coverage.reached import BRANCHES
+from harness.sweep.matrix._cell import Placed
+from harness.sweep.matrix._matrix_file import Matrix, Point
+
+MOST_AGENTS, MOST_BLOCKS = 3, 3
+"""Shares are of what exists within these bounds."""
+
+
+class CellTried(Placed):
+    """Of the runs of a cell that were played by this command."""
+
+    local_states: int
+    pairs: int
+    branches: int
+
+
+class Tried(BaseModel):
+    """`runs` that were looked at; `all_cells` is a `ucp-coverage/1`."""
+
+    runs: int
+    all_cells: dict[str, Any]
+    cells: list[CellTried]
+
+
+class Tally:
+    """Adds up what runs have reached."""
+
+    def __init__(self) -> None:
+        self._runs = 0
+        self._reached = Reached()
+        self._by_point: dict[Point, Reached] = defaultdict(Reached)
+
+    def add(self, point: Point, reached: Reached) -> None:
+        self._runs += 1
+        self._reached.add(reached)
+        self._by_point[point].add(reached)
+
+    def tried(self, matrix: Matrix, runs: int) -> Tried:
+        """`runs` are all that there are: of those that an earlier command played nothing is known."""
+        if runs > self._runs:
+            self._reached.untold = f"{runs - self._runs} of {runs} runs were played before, and not looked at"
+        scenario = matrix.scenario_at(matrix.points[0])
+        there = existing(Bounds(min(MOST_AGENTS, len(scenario.roster)), MOST_BLOCKS))
+        return Tried(
+            runs=self._runs,
+            all_cells=to_json(self._reached, there),
+            cells=[
+                CellTried(
+                    **point._asdict(),
+                    local_states=len(reached.states),
+                    pairs=len(reached.pairs),
+                    branches=sum(branch in reached.branches for branch in BRANCHES),
+                )
+                for point in matrix.points
+                if (reached := self._by_point.get(point))
+            ],
+        )

@@ -1,0 +1,95 @@
+"""The runs of each cell, those that went wrong first, and how to play one of them again."""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+from harness.present import text
+from harness.report.verdict_section import ICONS
+from harness.scenario.verdict_names import JUDGED, kind_of
+from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._cell_play import directory_name
+from harness.sweep.matrix._cell_scenarios import scenario_file
+from harness.sweep.matrix.matrix_run import Finished
+from harness.sweep.matrix.matrix_table import name_of
+from harness.sweep.matrix.report._heatmap import anchor
+
+MAX_ROWS = 12_000
+"""Of all cells together, so that the page stays below 3 MB."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """`href` is the report of the run if it was kept; `failed` and `unsupported` why it has no verdicts and figures."""
+
+    seed: int
+    href: str | None
+    verdicts: list[str]
+    figures: list[str]
+    failed: str | None
+    unsupported: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class CellRuns:
+    """Of one cell: `left_out` says for how many there was no room."""
+
+    anchor: str
+    name: str
+    runs: str
+    command: str
+    figures: list[str]
+    rows: list[Row]
+    left_out: int
+
+
+def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
+    """`directory` is the matrix's, beside whose files the page will be."""
+    by_point = [(point, list(runs)) for point, runs in groupby(finished.runs, key=lambda run: run.point)]
+    room = MAX_ROWS // max(1, len(by_point))
+    cells = []
+    for point, runs in by_point:
+        runs.sort(key=lambda run: (run.failed is None, not _bad(run), run.judged))
+        figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
+        played = ["ucp-harness", "run", scenario_file(point), "--backend", point.backend, "--seed", str(runs[0].seed)]
+        cells.append(
+            CellRuns(
+                anchor(point),
+                name_of(finished.record.matrix, point),
+                _count(runs),
+                shlex.join(played),
+                [text.label(name) for name in figures],
+                [_row(run, figures, directory) for run in runs[:room]],
+                max(0, len(runs) - room),
+            )
+        )
+    return cells
+
+
+def _count(runs: Sequence[Run]) -> str:
+    counts = [f"{text.value(len(runs))} run{'s' if len(runs) > 1 else ''}"]
+    if number := sum(map(_bad, runs)):
+        counts.append(f"{number} judged bad")
+    if number := sum(run.failed is not None for run in runs):
+        counts.append(f"{number} failed")
+    if number := sum(run.unsupported is not None for run in runs):
+        counts.append(f"{number} not supported")
+    return ", ".join(counts)
+
+
+def _bad(run: Run) -> bool:
+    return any(kind_of(verdict) == "bad" for verdict in run.verdicts.values())
+
+
+def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:
+    kept = f"runs/{directory_name(run.task)}/report.html"
+    return Row(
+        run.seed,
+        kept if (directory / kept).exists() else None,
+        [] if not run.judged else [ICONS[kind_of(run.verdicts.get(key, ""))] for key in JUDGED],
+        [] if not run.judged else [text.value(run.figures.get(name)) for name in figures],
+        run.failed,
+        run.unsupported,
+    )

@@ -1,0 +1,182 @@
+"""Figures at each point of a matrix as a heatmap, and the menu of figures.
+
+The shade grows with the figure. It has one hue, so that anybody sees it, and each cell says its number; a sign and
+words say what was violated, failed, or changed.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from harness.present import text as words
+from harness.present.colours import ramp
+from harness.sweep.matrix._cell import Cell
+from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, Metric, estimate_share, figure
+from harness.sweep.matrix._matrix_file import Point
+from harness.sweep.matrix.matrix_record import MatrixRecord
+from harness.sweep.matrix.matrix_table import name_of, say, say_interval, say_mean, violated
+
+MEANINGS = {
+    "uniform": "Share of the runs that end with one uniform chain on all agents.",
+    "mutual_share": "Share of a run\u2019s blocks that end in the chain that all agents have in common.",
+    "distinct_chains": "How many different chains there are at the end.",
+    "reconciles": "Reconciles of all agents.",
+    "copies_mean": "In how many chains a block is at the end, mean of the blocks.",
+    "copies_min": "In how many chains the block is at the end that fewest have.",
+    "messages_per_block": "Messages that all agents sent for each block.",
+    "uniform_before_final_reconcile": "Share of the runs that the mission left with one uniform chain.",
+    "mutual_share_before_final_reconcile": "Share of a run\u2019s blocks that the mission left in all chains.",
+    "finished": "Share of the runs whose agents became idle once no more events came.",
+    "violated": "Share of the runs that violated a characteristic.",
+}
+_FINISHED = Metric("finished", "finished", figure("finished"), "share of runs")
+_VIOLATED = Metric("violated", "violated", figure("violated"), "share of runs")
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    metric: Metric
+
+    @property
+    def meaning(self) -> str:
+        return MEANINGS[self.metric.name]
+
+    def of(self, cell: Cell) -> Estimate:
+        if self.metric is _VIOLATED:
+            return estimate_share(violated(cell), cell.runs - cell.failed - cell.unsupported)
+        if self.metric is _FINISHED:
+            return cell.finished
+        return cell.estimates.get(self.metric.name, Estimate(n=0))
+
+
+def known(cells: Iterable[Cell]) -> list[Figure]:
+    """Those that a run told, first what the mission left; the violated at least."""
+    cells = list(cells)
+    names = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
+    metrics = [metric for metric in BEFORE_FINAL_RECONCILE + METRICS if metric.name in names]
+    judged = [_FINISHED] if any(cell.finished.n for cell in cells) else []
+    return [Figure(metric) for metric in (*metrics, *judged, _VIOLATED)]
+
+
+SHADES = 11
+_LIGHT = ramp((236, 244, 250), (0, 78, 122), SHADES)
+_DARK = ramp((30, 41, 50), (120, 200, 245), SHADES)
+
+
+def _style(inks: list[tuple[int, str, str]]) -> str:
+    return "".join(f".shade-{step}{{background:{fill};color:{text}}}\n" for step, fill, text in inks)
+
+
+STYLE = (
+    _style([(step, ink.fill, ink.text) for step, ink in enumerate(_LIGHT)])
+    + "@media screen and (prefers-color-scheme: dark) {\n"
+    + _style([(step, ink.fill, ink.text) for step, ink in enumerate(_DARK)])
+    + "}\n"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """`kind` is bad or good, for the style sheet."""
+
+    sign: str
+    text: str
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """A cell; `shade` is None if the figure is not known there, and `href` if there are no runs to show."""
+
+    shade: int | None
+    mean: str
+    interval: str
+    marks: list[Mark]
+    in_words: str
+    href: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Of one backend: a row for each number of agents, a column for each loss."""
+
+    backend: str
+    losses: list[str]
+    rows: list[tuple[str, list[Tile]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Heatmap:
+    """`lowest` and `highest` are what the first and the last shade stand for."""
+
+    figure: Figure
+    lowest: str
+    highest: str
+    grids: list[Grid]
+
+
+def anchor(point: Point) -> str:
+    """Where in the page its runs are."""
+    return f"{point.file_name}-{point.backend}"
+
+
+def heatmap(record: MatrixRecord, figure: Figure) -> Heatmap:
+    cells = {cell.point: cell for cell in record.cells}
+    scale = _scale(figure, record)
+    points = record.matrix.points
+    grids = []
+    for backend in record.matrix.backend:
+        agents = list(dict.fromkeys(point.agents for point in points))
+        rows = []
+        for number in agents:
+            its_points = [Point(loss, number, backend) for loss in record.matrix.loss]
+            tiles = [_tile(record, figure, point, cells.get(point), scale) for point in its_points]
+            rows.append((f"{number} agents" if number > 1 else "1 agent", tiles))
+        grids.append(Grid(backend, [words.percent(loss) for loss in record.matrix.loss], rows))
+    lowest, highest = (say_mean(figure.metric, Estimate(n=1, mean=bound)) for bound in scale)
+    return Heatmap(figure, lowest, highest, grids)
+
+
+def _scale(figure: Figure, record: MatrixRecord) -> tuple[float, float]:
+    """Shares are shaded from 0 to 100 %, numbers from the lowest to the highest mean."""
+    if figure.metric.unit != "number":
+        return 0.0, 1.0
+    means = [mean for cell in record.cells if (mean := figure.of(cell).mean) is not None]
+    return min(means, default=0.0), max(means, default=0.0)
+
+
+def _tile(record: MatrixRecord, figure: Figure, point: Point, cell: Cell | None, scale: tuple[float, float]) -> Tile:
+    name = name_of(record.matrix, point)
+    if cell is None:
+        return Tile(None, "\u2013", "", [], f"{name}: no run has ended", None)
+    estimate, marks = figure.of(cell), _marks(record, figure, cell)
+    text = ", ".join([say(figure.metric, estimate), *(mark.text for mark in marks)])
+    return Tile(
+        None if estimate.mean is None else _shade(estimate.mean, *scale),
+        say_mean(figure.metric, estimate),
+        say_interval(figure.metric, estimate),
+        marks,
+        f"{name}: {figure.metric.label} {text}",
+        f"#{anchor(point)}",
+    )
+
+
+def _shade(mean: float, lowest: float, highest: float) -> int:
+    return round((SHADES - 1) * (mean - lowest) / (highest - lowest)) if highest > lowest else 0
+
+
+def _marks(record: MatrixRecord, figure: Figure, cell: Cell) -> list[Mark]:
+    marks = []
+    if number := violated(cell):
+        marks.append(Mark("\u2717", f"{number} violated", "bad"))
+    if cell.failed:
+        marks.append(Mark("!", f"{cell.failed} failed", "bad"))
+    if cell.unsupported:
+        marks.append(Mark("\u2013", f"{cell.unsupported} not supported", "good"))
+    for change in record.against.changes if record.against else ():
+        if change.point == cell.point and change.metric == figure.metric.name:
+            up = change.now.mean is not None and change.before.mean is not None and change.now.mean > change.before.mean
+            text, kind = ("worse", "bad") if change.worse else ("better", "good")
+            marks.append(Mark("\u25b2" if up else "\u25bc", text, kind))
+    if cell.runs < (asked := len(record.matrix.seed_list)):
+        marks.append(Mark("\u2026", f"{cell.runs} of {asked} runs", "good"))
+    return marks

@@ -1,0 +1,85 @@
+"""The page: what is shown where. Whatever comes from scenarios, runs and earlier nights is text to the template."""
+
+from pathlib import Path
+
+from markupsafe import Markup
+
+from harness.errors import CANNOT_HERE
+from harness.present import svg, text
+from harness.report import html
+from harness.report.agent_programs import asked_for
+from harness.scenario.verdict_names import JUDGED
+from harness.sweep.matrix._matrix_picture import draw, series_of
+from harness.sweep.matrix.matrix_record import MatrixRecord
+from harness.sweep.matrix.matrix_run import Finished
+from harness.sweep.matrix.matrix_summary import tried_in_words, verdict
+from harness.sweep.matrix.matrix_table import explanation, improvements, name_of, troubles, unjudged
+from harness.sweep.matrix.nights import Nights
+from harness.sweep.matrix.report import _heatmap, _trend
+from harness.sweep.matrix.report._drilldown import drilldown
+
+_TEMPLATE = Path(__file__).with_name("page.html.j2")
+_STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
+
+
+def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -> str:
+    """`directory` is where the page will be, beside the runs that were kept; `nights` has this one too, if finished."""
+    record = finished.record
+    shown = _heatmap.known(record.cells)
+    drawn = _trend.nights_drawn(nights.records, record, len(shown)) if nights else []
+    return html.render(
+        _TEMPLATE,
+        styles=[html.PAGE_STYLE + _heatmap.STYLE + _STYLE + _choosing(shown), svg.STYLE],
+        record=record,
+        headline=(verdict(record), _kind(record)),
+        summary=_summary(record),
+        explanation=explanation(record) + unjudged(record),
+        troubles=[
+            (_heatmap.anchor(cell.point), name_of(record.matrix, cell.point), sentence)
+            for cell in record.cells
+            for sentence in troubles(record, cell)
+        ],
+        improvements=list(improvements(record)),
+        heatmaps=[_heatmap.heatmap(record, figure) for figure in shown],
+        shades=range(_heatmap.SHADES),
+        cells=drilldown(finished, directory),
+        judged=JUDGED,
+        tried=list(tried_in_words(record.tried)) if record.tried else [],
+        tried_cells=[(name_of(record.matrix, cell.point), cell) for cell in record.tried.cells] if record.tried else [],
+        not_taken=record.tried.all_cells["branches"]["not_taken"] if record.tried else [],
+        nights=nights,
+        drawn=drawn,
+        trends=[(figure, _trend.trend(drawn, record, figure)) for figure in shown] if len(drawn) > 1 else [],
+        series=series_of(record),
+        picture=Markup(draw(record)),  # noqa: S704 - it has escaped what is not ours
+    )
+
+
+def _choosing(shown: list[_heatmap.Figure]) -> str:
+    """Of what is drawn for each figure only the chosen one's is shown; on paper all heatmaps are."""
+    others = [
+        f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown
+    ]
+    on_screen, always = (",\n".join(rule.format(place) for rule in others) for place in ("", ".trend"))
+    return f"@media screen {{\n{on_screen} {{ display: none; }}\n}}\n{always} {{ display: none; }}\n"
+
+
+def _kind(record: MatrixRecord) -> str:
+    """For the style sheet: half a matrix is no success."""
+    if record.outcome == "interrupted":
+        return "violated" if record.failed or any(cell.violated for cell in record.cells) else "unknown"
+    return {0: "holds", CANNOT_HERE: "unknown"}.get(record.exit_status, "violated")
+
+
+def _summary(record: MatrixRecord) -> list[str]:
+    matrix = record.matrix
+    agents = list(dict.fromkeys(point.agents for point in matrix.points))
+    return [
+        f"{', '.join(map(str, agents))} agents",
+        f"{text.duration(matrix.scenario.duration_s)} mission",
+        f"{len(matrix.loss)} loss rates" if len(matrix.loss) > 1 else f"{text.percent(matrix.loss[0])} loss",
+        f"{len(matrix.seed_list)} seeds" if len(matrix.seed_list) > 1 else f"seed {matrix.seed_list[0]}",
+        f"backend {', '.join(matrix.backend)}",
+        *(program.in_words for program in asked_for(matrix.scenario_at(matrix.points[-1]))),
+        f"begun {text.started(record.started_at)}",
+    ]

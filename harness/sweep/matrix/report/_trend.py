@@ -1,0 +1,96 @@
+"""A figure over the nights: a small panel for each loss, one below the other for each number of agents and backend.
+
+Dots and lines are means, bands their 95 % intervals; each panel has a scale of its own, since here it is change that
+matters. One step to the right is one night that was played.
+"""
+
+import math
+from collections.abc import Sequence
+
+from markupsafe import Markup
+
+from harness.present import svg, text
+from harness.present.svg import Area, Axis, n
+from harness.sweep.matrix._cell import Cell
+from harness.sweep.matrix._estimate import Estimate
+from harness.sweep.matrix._matrix_picture import Dot, curve
+from harness.sweep.matrix.matrix_record import MatrixRecord
+from harness.sweep.matrix.matrix_table import say, series, series_name
+from harness.sweep.matrix.report._heatmap import Figure
+
+COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
+MAX_DOTS = 12_000
+"""Of all panels of a page; where there would be more, fewer nights are drawn."""
+LARGEST = 1e12
+"""No figure is larger, whatever a file says."""
+
+
+def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
+    """The last of them, two at least."""
+    return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
+
+
+def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: Figure) -> list[tuple[str, Markup]]:
+    """A drawing for each number of agents and backend, with its name if there are several."""
+    of_night = [{cell.point: figure.of(cell) for cell in night.cells} for night in nights]
+    begun = [text.started(night.started_at)[:16] for night in nights]
+    drawings = []
+    for cells in series(tonight):
+        cells = sorted(cells, key=lambda cell: cell.loss)
+        areas = svg.grid(len(cells), COLUMNS, 0, PANEL_HEIGHT)
+        panels = []
+        for cell, area in zip(cells, areas, strict=True):
+            known = [(at, by_point[cell.point]) for at, by_point in enumerate(of_night) if cell.point in by_point]
+            dots = [
+                Dot(at, estimate, f"{begun[at]}: {say(figure.metric, estimate)}")
+                for at, estimate in known
+                if _is_sane(estimate)
+            ]
+            panels.append(_panel(figure, cell, dots, [night.started_at[5:10] for night in nights], area))
+        height = math.ceil(len(cells) / COLUMNS) * PANEL_HEIGHT + FOOT
+        name = ", ".join(series_name(tonight.matrix, cells[0].point))
+        drawings.append((name, _drawing(height, f"{figure.metric.label} over {len(nights)} nights", panels)))
+    return drawings
+
+
+def _drawing(height: float, label: str, panels: Sequence[Markup]) -> Markup:
+    return Markup(
+        '<svg xmlns="http://www.w3.org/2000/svg" class="chart" role="img" width="{w}" height="{h}"'
+        ' viewBox="0 0 {w} {h}" aria-label="{label}" font-size="13" fill="none">{panels}</svg>'
+    ).format(w=svg.WIDTH, h=n(height), label=label, panels=Markup("").join(panels))
+
+
+def _panel(figure: Figure, cell: Cell, dots: Sequence[Dot], dates: Sequence[str], area: Area) -> Markup:
+    last = len(dates) - 1
+    across = Axis(0, last, *area.across, sorted({0, last // 2, last} if last > 3 else {0, last}))
+    up = _value_axis(figure, [dot.estimate for dot in dots], area)
+    frame = svg.frame(
+        f"{text.percent(cell.loss)} loss",
+        across,
+        up,
+        (dates[int(tick)] for tick in across.ticks),
+        (text.value(round(tick, 6)) if figure.metric.unit == "number" else text.percent(tick) for tick in up.ticks),
+    )
+    drawing, _ = curve(0, dots, across, up)
+    return Markup('<g class="panel">{}<g class="series {}">{}</g></g>\n').format(frame, svg.CLASSES[0], drawing)
+
+
+def _value_axis(figure: Figure, estimates: Sequence[Estimate], area: Area) -> Axis:
+    """Around all intervals, and never so narrow that a trifle looks like a change."""
+    bounds = [
+        bound for estimate in estimates for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None
+    ]
+    low, high = min(bounds, default=0.0), max(bounds, default=1.0)
+    least = 0.04 if figure.metric.unit != "number" else max(0.2, 0.1 * abs(high))
+    margin = max(0.0, least - (high - low)) / 2
+    low, high = low - margin, high + margin
+    every = svg.step(high - low, 3)
+    first, last = math.floor(low / every + 1e-9) * every, math.ceil(high / every - 1e-9) * every
+    ceiling = 1.0 if figure.metric.unit != "number" else last
+    ticks = [number * every for number in range(round(first / every), round(last / every) + 1)]
+    first, last = max(0.0, first), min(ceiling, last)
+    return Axis(first, last, *area.up, [tick for tick in ticks if first <= tick <= last])
+
+
+def _is_sane(estimate: Estimate) -> bool:
+    return all(abs(bound) < LARGEST for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None)

@@ -1,0 +1,128 @@
+"""The switch and the cables: bridge `air`, and for every vehicle a network namespace on a veth pair.
+
+A vehicle sees `eth0` with its address and a default route on it (ArduPilot built with CAN needs a route
+for its multicast). The other end, `v<ID>`, is a port of the bridge in the lab's own namespace, where the
+engines meet every packet on its way to that vehicle. The vehicles' namespaces have no names: they live as
+long as this process holds them open or someone lives in them. One that is there already, a container's, can
+be a vehicle's too: the cable then ends in it.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+
+from netem import _namespaces, addresses
+from netem._fabric_requests import address, bridge, default_route, forwarding, set_up, veth_pair
+from netem._netlink import Netlink, Request
+from netem.errors import LabError
+
+BRIDGE = "air"
+
+# Interface numbers are ours to choose in a fresh namespace, which saves asking the kernel for them.
+_LO = 1
+_ETH0 = 2
+_BRIDGE_INDEX = 2
+_FIRST_PORT_INDEX = 3
+
+_CARRIER_DEADLINE_S = 5.0
+
+
+class Fabric:
+    """The lab's network; built in the network namespace that the calling thread is in."""
+
+    def __init__(self, vehicles: Sequence[int], networks: Mapping[int, int]) -> None:
+        self.vehicles = tuple(vehicles)
+        self.home = _namespaces.open_network()
+        self.netlink = Netlink()
+        self._namespaces = dict(networks)
+        _silence_ipv6()
+        _bypass_firewall()
+        self.netlink.send([set_up("lo", _LO), bridge(BRIDGE, _BRIDGE_INDEX)])
+        inside = {vehicle: self._namespace(vehicle) for vehicle in self.vehicles}
+        self.netlink.send([self._cable(vehicle) for vehicle in self.vehicles])
+        for vehicle, netlink in inside.items():
+            netlink.send(_configure(vehicle))
+            netlink.close()
+        self._await_carrier()
+
+    def port_index(self, vehicle: int) -> int:
+        """Interface number of a vehicle's switch port `v<ID>` in the lab's namespace."""
+        return _FIRST_PORT_INDEX + self.vehicles.index(vehicle)
+
+    def inside(self, vehicle: int | None) -> AbstractContextManager[None]:
+        """Run a block in a vehicle's network, or in the lab's own for None."""
+        return _namespaces.inside(self.home if vehicle is None else self._namespaces[vehicle], self.home)
+
+    def _namespace(self, vehicle: int) -> Netlink:
+        """Make a vehicle's namespace, if there is none yet, and return a netlink socket that stays in it."""
+        if vehicle in self._namespaces:
+            _namespaces.enter_network(self._namespaces[vehicle])
+        else:
+            _namespaces.unshare_network()
+            self._namespaces[vehicle] = _namespaces.open_network()
+        try:
+            _silence_ipv6()
+            return Netlink()
+        finally:
+            _namespaces.enter_network(self.home)
+
+    def _cable(self, vehicle: int) -> Request:
+        return veth_pair(
+            addresses.port(vehicle),
+            self.port_index(vehicle),
+            _BRIDGE_INDEX,
+            far_name="eth0",
+            far_index=_ETH0,
+            mac=addresses.mac(vehicle),
+            network=self._namespaces[vehicle],
+        )
+
+    def _await_carrier(self) -> None:
+        """Wait until the bridge forwards on every port: the kernel notices a cable a moment later."""
+        deadline = time.monotonic() + _CARRIER_DEADLINE_S
+        while True:
+            ready = forwarding(self.netlink)
+            if missing := [v for v in self.vehicles if self.port_index(v) not in ready]:
+                if time.monotonic() > deadline:
+                    names = ", ".join(map(addresses.port, missing[:5]))
+                    raise LabError(f"The bridge does not forward on port {names} after {_CARRIER_DEADLINE_S} s")
+                time.sleep(0.002)
+            else:
+                return
+
+
+def _silence_ipv6() -> None:
+    """No IPv6 on links made from here on: an idle link carries nothing that nobody asked for."""
+    _sysctl("ipv6/conf/default/disable_ipv6", b"1")
+
+
+def _bypass_firewall() -> None:
+    """Where br_netfilter is loaded (by Docker, often), keep it from judging what our bridge carries."""
+    for protocol in ("iptables", "ip6tables", "arptables"):
+        _sysctl(f"bridge/bridge-nf-call-{protocol}", b"0")
+
+
+def _sysctl(name: str, value: bytes) -> None:
+    """Set a value of the network namespace that we are in, if its kernel has such a thing."""
+    try:
+        fd = os.open(f"/proc/sys/net/{name}", os.O_WRONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return
+    try:
+        os.write(fd, value)
+    finally:
+        os.close(fd)
+
+
+def _configure(vehicle: int) -> list[Request]:
+    where = f"vehicle {vehicle}"
+    own = addresses.address(vehicle)
+    return [
+        set_up(f"{where}: lo", _LO),
+        set_up(f"{where}: eth0", _ETH0),
+        address(f"{where}: address {own}", _ETH0, own, addresses.PREFIX_LENGTH, addresses.BROADCAST),
+        default_route(f"{where}: default route", _ETH0),
+    ]

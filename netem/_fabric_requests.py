@@ -1,0 +1,92 @@
+"""The requests of the fabric: what it says to the kernel about links, addresses and routes, and what it reads there.
+
+Messages and numbers are those of linux/rtnetlink.h, if_link.h, if_addr.h and veth.h; see rtnetlink(7).
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+
+from netem._attributes import attribute, nested, number, parse, text
+from netem._netlink import NEW, RTM_GETLINK, RTM_NEWADDR, RTM_NEWLINK, RTM_NEWROUTE, Netlink, Request
+
+_IFINFOMSG = struct.Struct("=BxHiII")  # family, type, index, flags, which of them change
+_IFADDRMSG = struct.Struct("=4BI")  # family, length of the prefix, flags, scope, index
+_RTMSG = struct.Struct("=8BI")  # family, two lengths of prefixes, TOS, table, protocol, scope, type, flags
+
+_IFF_UP = 1
+_IFLA_ADDRESS, _IFLA_IFNAME, _IFLA_MASTER, _IFLA_PROTINFO, _IFLA_LINKINFO, _IFLA_NET_NS_FD = 1, 3, 10, 12, 18, 28
+_IFLA_INFO_KIND, _IFLA_INFO_DATA = 1, 2
+_IFLA_BR_FORWARD_DELAY, _IFLA_BR_STP_STATE, _IFLA_BR_MCAST_SNOOPING = 1, 5, 23
+_IFLA_BRPORT_STATE, _BR_STATE_FORWARDING = 1, 3
+_VETH_INFO_PEER = 1
+_IFA_ADDRESS, _IFA_LOCAL, _IFA_BROADCAST = 1, 2, 4
+_RTA_OIF = 4
+_RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST = 254, 4, 253, 1
+
+
+def set_up(what: str, index: int) -> Request:
+    return Request(what, RTM_NEWLINK, _IFINFOMSG.pack(0, 0, index, _IFF_UP, _IFF_UP))
+
+
+def bridge(name: str, index: int) -> Request:
+    """A switch that is up: without spanning tree and delay, so that a port forwards at once, and without snooping, so
+    that multicast reaches everyone, as it does over the air.
+    """
+    settings = (
+        number(_IFLA_BR_STP_STATE, 0),
+        number(_IFLA_BR_FORWARD_DELAY, 0),
+        attribute(_IFLA_BR_MCAST_SNOOPING, bytes(1)),
+    )
+    return _link(f"create bridge {name}", index, name, _of_kind("bridge", *settings))
+
+
+def veth_pair(name: str, index: int, bridge: int, *, far_name: str, far_index: int, mac: str, network: int) -> Request:
+    """A cable from a port of the bridge, which is up, to the namespace that the file `network` is; its far end has that
+    MAC address.
+    """
+    far_end = (
+        _IFINFOMSG.pack(0, 0, far_index, 0, 0),
+        text(_IFLA_IFNAME, far_name),
+        attribute(_IFLA_ADDRESS, bytes.fromhex(mac.replace(":", ""))),
+        number(_IFLA_NET_NS_FD, network),
+    )
+    kind = _of_kind("veth", nested(_VETH_INFO_PEER, *far_end))
+    return _link(f"create veth pair {name}", index, name, number(_IFLA_MASTER, bridge), kind)
+
+
+def address(what: str, index: int, own: str, prefix_length: int, broadcast: str) -> Request:
+    """An IPv4 address for a link."""
+    attributes = [
+        attribute(kind, socket.inet_aton(each))
+        for kind, each in ((_IFA_LOCAL, own), (_IFA_ADDRESS, own), (_IFA_BROADCAST, broadcast))
+    ]
+    message = _IFADDRMSG.pack(socket.AF_INET, prefix_length, 0, 0, index)
+    return Request(what, RTM_NEWADDR, message + b"".join(attributes), NEW)
+
+
+def default_route(what: str, index: int) -> Request:
+    """Whoever is on that link is next door, whatever the address."""
+    kind = (_RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST)
+    return Request(what, RTM_NEWROUTE, _RTMSG.pack(socket.AF_INET, 0, 0, 0, *kind, 0) + number(_RTA_OIF, index), NEW)
+
+
+def forwarding(netlink: Netlink) -> set[int]:
+    """Interface numbers of the ports on which their bridge forwards."""
+    ports = netlink.dump("list the ports of the bridge", RTM_GETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, 0, 0, 0))
+    return {_IFINFOMSG.unpack_from(port)[2] for port in ports if _forwards(port)}
+
+
+def _forwards(port: bytes) -> bool:
+    of_bridge = parse(parse(port[_IFINFOMSG.size :]).get(_IFLA_PROTINFO, b""))
+    return of_bridge.get(_IFLA_BRPORT_STATE) == bytes([_BR_STATE_FORWARDING])
+
+
+def _link(what: str, index: int, name: str, *attributes: bytes) -> Request:
+    message = _IFINFOMSG.pack(0, 0, index, _IFF_UP, _IFF_UP) + text(_IFLA_IFNAME, name)
+    return Request(what, RTM_NEWLINK, message + b"".join(attributes), NEW)
+
+
+def _of_kind(kind: str, *data: bytes) -> bytes:
+    return nested(_IFLA_LINKINFO, text(_IFLA_INFO_KIND, kind), nested(_IFLA_INFO_DATA, *data))

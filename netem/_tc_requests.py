@@ -1,0 +1,272 @@
+"""The requests of engine "netem": what it says to the kernel about one switch port, and what it reads there.
+
+Numbers are those of linux/pkt_sched.h, pkt_cls.h and tc_act/. HTB is here for its classes alone: their rate is the
+highest that the interface takes without its 64-bit attribute (34 Gbit/s), beyond what a veth pair carries.
+
+netem keeps what a change does not name (corruption, rate, reordering, the table of a distribution) or forgets it (the
+model of loss), so a change names everything. It says again what it holds, except for the table.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+from netem import _distributions
+from netem._attributes import attribute, nested, number, parse, parse_number, text
+from netem._netlink import (
+    NEW,
+    NLM_F_CREATE,
+    RTM_DELQDISC,
+    RTM_DELTCLASS,
+    RTM_DELTFILTER,
+    RTM_GETQDISC,
+    RTM_GETTFILTER,
+    RTM_NEWQDISC,
+    RTM_NEWTCLASS,
+    RTM_NEWTFILTER,
+    Netlink,
+    Request,
+)
+from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
+
+MAX_KIND = 0x7FFF
+"""The highest number of a class that leaves a number for its netem."""
+
+_SET = NLM_F_CREATE | 0x100  # NLM_F_REPLACE: make it so, whether it is there or not
+_ROOT = 0xFFFFFFFF
+_CLSACT = 0xFFFFFFF1
+_CLSACT_HANDLE = 0xFFFF0000
+_INGRESS = 0xFFFFFFF2
+_EGRESS = 0xFFFFFFF3
+_HTB = 0x10000  # 1:
+_RATE = 0xFFFFFFFF  # bytes/s
+_BURST = 15625  # 1 ms in ticks of 64 ns
+_QUANTUM = 60000  # bytes
+_ETH_P_ALL = socket.htons(3)
+_ONLY = 1  # handle of a port's only basic filter in one direction
+_HEARD, _NOT_HEARD = 1, 2  # priorities of filters at egress
+_TICK_NS = 64
+_ALWAYS = 0xFFFFFFFF  # netem's probability 1
+_NANO = 1_000_000_000
+_NO_LIMIT = MAX_LIMIT + 1  # packets: unlimited, as far as a memory allows
+_TABLE_SIZE = 4094  # with its length 8 KB in the kernel
+
+_KIND, _OPTIONS, _STATISTICS = 1, 2, 7  # TCA_KIND, TCA_OPTIONS, TCA_STATS2
+_NETEM_CORR, _NETEM_TABLE, _NETEM_REORDER, _NETEM_CORRUPT, _NETEM_LOSS, _NETEM_RATE = range(1, 7)
+_NETEM_RATE64, _NETEM_LATENCY64, _NETEM_JITTER64 = 8, 10, 11
+_NETEM_LOSS_GE = 2
+_ACT_OK, _ACT_SHOT = 0, 2
+
+_TCMSG = struct.Struct("=BBHiIII")
+_NETEM = struct.Struct("=6I")
+
+
+@dataclass(frozen=True)
+class Class:
+    """What one class does and has counted, in packets; of its delay's distribution the kernel does not speak."""
+
+    link: LinkConditions
+    passed: int
+    dropped: int
+    waiting: int
+
+
+class TrafficControl:
+    """Speaks of one switch port, by its interface number."""
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+    def install(self) -> list[Request]:
+        """An HTB without classes."""
+        settings = struct.pack("=5I", 3, 10, 0, 0, 0)  # version, rate2quantum, default class, debug, direct packets
+        return [Request("add qdisc htb", RTM_NEWQDISC, self._message("htb", _ROOT, _HTB, attribute(2, settings)), NEW)]
+
+    def guard(self) -> list[Request]:
+        """Places for filters; nothing is heard at this port from here on, until it is said what."""
+        drop = nested(1, text(1, "gact"), nested(2, attribute(2, struct.pack("=IIiii", 0, 0, _ACT_SHOT, 0, 0))))
+        message = self._filter("basic", _EGRESS, _NOT_HEARD, _ONLY, nested(3, drop))
+        return [
+            Request("add qdisc clsact", RTM_NEWQDISC, self._message("clsact", _CLSACT, _CLSACT_HANDLE), NEW),
+            Request("add filter basic with action gact", RTM_NEWTFILTER, message, NEW),
+        ]
+
+    def uninstall(self) -> list[Request]:
+        return [
+            Request("delete qdisc htb", RTM_DELQDISC, self._message("htb", _ROOT, _HTB)),
+            Request("delete qdisc clsact", RTM_DELQDISC, self._message("clsact", _CLSACT, _CLSACT_HANDLE)),
+        ]
+
+    def add_class(self, kind: int, link: LinkConditions) -> list[Request]:
+        rate = struct.pack("=BBHhHI", 0, 1, 0, 0, 0, _RATE)  # 1: Ethernet
+        figures = attribute(1, rate + rate + struct.pack("=5I", _BURST, _BURST, _QUANTUM, 0, 0))
+        message = self._message("htb", _HTB, _HTB | kind, figures)
+        return [Request("set class of htb", RTM_NEWTCLASS, message, _SET), self.change_class(kind, link)]
+
+    def change_class(self, kind: int, link: LinkConditions, *, table: bool = True) -> Request:
+        """Set the netem of a class, in place if there is one; without a `table` its distribution stays as it is."""
+        options = _options(link, table)
+        message = self._header(_HTB | kind, (0x8000 | kind) << 16) + text(_KIND, "netem") + options
+        return Request("set qdisc netem", RTM_NEWQDISC, message, _SET)
+
+    def remove_class(self, kind: int) -> Request:
+        return Request("delete class of htb", RTM_DELTCLASS, self._message("htb", _HTB, _HTB | kind))
+
+    def mark(self, kind: int, group: int) -> Request:
+        """From here on, packets that enter at this port are of a kind and a group; one step, in place."""
+        parameters = attribute(2, struct.pack("=IIiii", 0, 0, _ACT_OK, 0, 0))
+        edit = nested(1, text(1, "skbedit"), nested(2, parameters, number(3, _HTB | kind), number(5, group)))
+        message = self._filter("basic", _INGRESS, 1, _ONLY, nested(3, edit))
+        return Request("set filter basic with action skbedit", RTM_NEWTFILTER, message, _SET)
+
+    def hear(self, group: int) -> Request:
+        """Let packets of a group leave at this port."""
+        return Request("add filter fw", RTM_NEWTFILTER, self._filter("fw", _EGRESS, _HEARD, group), NEW)
+
+    def hear_no_more(self, group: int) -> Request:
+        return Request("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _HEARD, group))
+
+    def marked(self, netlink: Netlink) -> tuple[int, int] | None:
+        """The kind and the group that the kernel gives to packets that enter at this port."""
+        for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_INGRESS, 0)):
+            edit = _inside(parse(entry[_TCMSG.size :]), _OPTIONS, 3, 1, 2)
+            kind, group = parse_number(edit.get(3)), parse_number(edit.get(5))
+            if kind is not None and group is not None:
+                return kind & 0xFFFF, group
+        return None
+
+    def heard(self, netlink: Netlink) -> tuple[set[int], int]:
+        """The groups whose packets leave at this port, and how many packets of others did not."""
+        groups = set()
+        cut = 0
+        for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_EGRESS, 0)):
+            handle = _TCMSG.unpack_from(entry)[4]
+            attributes = parse(entry[_TCMSG.size :])
+            if attributes.get(_KIND) == b"fw\0" and handle:
+                groups.add(handle)
+            elif counted := _inside(attributes, _OPTIONS, 3, 1, 4).get(1):
+                (cut,) = struct.unpack_from("=8xI", counted)
+        return groups, cut
+
+    @staticmethod
+    def classes(netlink: Netlink) -> dict[int, dict[int, Class]]:
+        """For every port by interface number, what its classes do: one question for the whole switch."""
+        classes: dict[int, dict[int, Class]] = {}
+        for entry in netlink.dump("list qdiscs", RTM_GETQDISC, bytes(_TCMSG.size)):
+            _, _, _, index, _, parent, _ = _TCMSG.unpack_from(entry)
+            attributes = parse(entry[_TCMSG.size :])
+            if attributes[_KIND] != b"netem\0":
+                continue
+            statistics = parse(attributes[_STATISTICS])
+            (passed,) = struct.unpack_from("=8xI", statistics[1])
+            waiting, _, dropped = struct.unpack_from("=3I", statistics[3])
+            link = _link(attributes[_OPTIONS])
+            classes.setdefault(index, {})[parent & 0xFFFF] = Class(link, passed, dropped, waiting)
+        return classes
+
+    def _filter(self, kind: str, parent: int, priority: int, handle: int, *options: bytes) -> bytes:
+        header = self._header(parent, handle, priority << 16 | _ETH_P_ALL)
+        return header + text(_KIND, kind) + nested(_OPTIONS, *options)
+
+    def _message(self, kind: str, parent: int, handle: int, *options: bytes) -> bytes:
+        return self._header(parent, handle) + text(_KIND, kind) + (nested(_OPTIONS, *options) if options else b"")
+
+    def _header(self, parent: int, handle: int, info: int = 0) -> bytes:
+        return _TCMSG.pack(0, 0, 0, self.index, handle, parent, info)
+
+
+def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
+    """The attributes at the end of a path of nested ones; none if it does not lead anywhere."""
+    for kind in path:
+        attributes = parse(attributes.get(kind, b""))
+    return attributes
+
+
+@lru_cache(maxsize=1 << 12)
+def _options(link: LinkConditions, table: bool) -> bytes:
+    """What the conditions are to netem (TCA_OPTIONS)."""
+    delay = link.delay or Delay(0)
+    latency_ns, jitter_ns = _nanoseconds(delay.mean_s), _nanoseconds(delay.jitter_s)
+    loss = 0 if isinstance(link.loss, GilbertElliott) else _share(link.loss)
+    reorder = _share(link.reorder)
+    rate = 0 if link.rate is None else max(1, round(link.rate / 8))
+    options = _NETEM.pack(
+        min(latency_ns // _TICK_NS, 0xFFFFFFFF),
+        link.limit or _NO_LIMIT,
+        loss,
+        1 if reorder else 0,  # gap: any packet may overtake
+        _share(link.duplicate),
+        min(jitter_ns // _TICK_NS, 0xFFFFFFFF),
+    )
+    attributes = [
+        attribute(_NETEM_CORR, bytes(12)),
+        attribute(_NETEM_REORDER, struct.pack("=2I", reorder, 0)),
+        attribute(_NETEM_CORRUPT, struct.pack("=2I", _share(link.corrupt), 0)),
+        attribute(_NETEM_RATE, struct.pack("=IiIi", min(rate, 0xFFFFFFFF), 0, 0, 0)),
+        attribute(_NETEM_RATE64, struct.pack("=Q", rate)),
+        attribute(_NETEM_LATENCY64, struct.pack("=q", latency_ns)),
+        attribute(_NETEM_JITTER64, struct.pack("=q", jitter_ns)),
+    ]
+    if isinstance(link.loss, GilbertElliott):
+        bursts = link.loss
+        h = _ALWAYS - _share(bursts.loss_bad)
+        model = struct.pack("=4I", _share(bursts.p), _share(bursts.r), h, _share(bursts.loss_good))
+        attributes.append(nested(_NETEM_LOSS, attribute(_NETEM_LOSS_GE, model)))
+    if table and delay.jitter_s:
+        attributes.append(attribute(_NETEM_TABLE, _table(delay.distribution)))
+    return attribute(_OPTIONS, options + b"".join(attributes))
+
+
+@lru_cache
+def _table(distribution: Distribution) -> bytes:
+    return struct.pack(f"={_TABLE_SIZE}h", *_distributions.table(distribution, _TABLE_SIZE))
+
+
+def _link(options: bytes) -> LinkConditions:
+    """What netem's options are as conditions; the inverse of `_options`, but for the distribution."""
+    _, limit, loss, _, duplicate, _ = _NETEM.unpack_from(options)
+    attributes = parse(options[_NETEM.size :])
+    shares = (loss, duplicate, *(parse_number(attributes.get(key)) or 0 for key in (_NETEM_REORDER, _NETEM_CORRUPT)))
+    times_ns = tuple(struct.unpack("=q", attributes[key])[0] for key in (_NETEM_LATENCY64, _NETEM_JITTER64))
+    rate = attributes.get(_NETEM_RATE64) or attributes.get(_NETEM_RATE, b"")[:4]
+    bursts = parse(attributes.get(_NETEM_LOSS, b"")).get(_NETEM_LOSS_GE)
+    return _conditions(shares, times_ns, int.from_bytes(rate, sys.byteorder), limit, bursts)
+
+
+@lru_cache(maxsize=1 << 15)
+def _conditions(
+    shares: tuple[int, ...], times_ns: tuple[int, ...], rate: int, limit: int, bursts: bytes | None
+) -> LinkConditions:
+    # Nine digits: the kernel's own steps are a quarter of the last one.
+    loss, duplicate, reorder, corrupt = (round(share / _ALWAYS, 9) for share in shares)
+    model = None
+    if bursts is not None:
+        p, r, h, loss_good = (round(share / _ALWAYS, 9) for share in struct.unpack("=4I", bursts))
+        model = GilbertElliott(p, r, round(1 - h, 9), loss_good)
+    latency_s, jitter_s = (time_ns / _NANO for time_ns in times_ns)
+    return LinkConditions(
+        model or loss,
+        Delay(latency_s, jitter_s) if latency_s else None,
+        duplicate,
+        reorder,
+        corrupt,
+        8 * rate or None,
+        None if limit == _NO_LIMIT or not (latency_s or rate) else limit,
+    )
+
+
+def _share(probability: float) -> int:
+    """A probability in netem's steps; what is neither 0 nor 1 does not become it by rounding."""
+    if not 0.0 < probability < 1.0:
+        return _ALWAYS if probability else 0
+    return min(max(round(probability * _ALWAYS), 1), _ALWAYS - 1)
+
+
+def _nanoseconds(seconds: float) -> int:
+    """A time in netem's steps; what is not 0 does not become it by rounding."""
+    return max(round(seconds * _NANO), 1) if seconds else 0

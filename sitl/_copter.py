@@ -1,0 +1,73 @@
+"""How a copter moves. The figures are ArduCopter's defaults, parameters by name, or measured with ArduCopter 4.7."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sitl._kinematics import NEAR_M, Line, Motion, Point, Rest, Segment, end_of
+
+CRUISE_MS = 10.0  # WPNAV_SPEED
+CLIMB_MS = 2.5  # WPNAV_SPEED_UP
+DESCENT_MS = 1.5  # WPNAV_SPEED_DN
+ACCEL_MS2 = 2.5  # WPNAV_ACCEL
+VERTICAL_ACCEL_MS2 = 1.0  # WPNAV_ACCEL_Z
+LAND_SLOWLY_M = 10.0  # LAND_ALT_LOW
+LANDING_MS = 0.5  # LAND_SPEED
+SPIN_UP_S = 3.0  # from arming to the first movement, measured
+
+
+@dataclass(frozen=True)
+class Copter:
+    """The `MotionModel` of a copter: it stops at every place, and goes straight from one to the next.
+
+    `turning_s` goes by before it leaves a place, and `settling_s` before it comes down; what is given is measured, in
+    AUTO, where it smooths its way (WPNAV_JERK).
+    """
+
+    turning_s: float = 3.0
+    settling_s: float = 3.0
+
+    cruise_ms = CRUISE_MS
+
+    def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        top = Point(start.north_m, start.east_m, max(start.up_m, altitude_m))
+        spin_up = [Rest(start, SPIN_UP_S)] if start.up_m < NEAR_M else []
+        return [*spin_up, Line(start, top, CLIMB_MS, VERTICAL_ACCEL_MS2)]
+
+    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
+        level_m = math.dist(start.point[:2], place[:2])
+        climb_m = place.up_m - start.up_m
+        length_m = math.hypot(level_m, climb_m)
+        if not length_m:
+            return [Rest(start, 0.0)]
+        # along a slope the slower of the two axes sets the pace
+        limits = [(level_m, speed_ms, ACCEL_MS2)] if level_m else []
+        if climb_m:
+            limits.append((abs(climb_m), CLIMB_MS if climb_m > 0 else DESCENT_MS, VERTICAL_ACCEL_MS2))
+        speed = min(limit * length_m / part_m for part_m, limit, _ in limits)
+        accel = min(limit * length_m / part_m for part_m, _, limit in limits)
+        return [Rest(start, self.turning_s), Line(start, place, speed, accel)]
+
+    def loiter(
+        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+    ) -> Sequence[Segment]:
+        there = self.go_to(start, place, speed_ms)
+        return [*there, Rest(end_of(there), seconds)]
+
+    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
+        there = self.go_to(start, place._replace(up_m=start.up_m), CRUISE_MS)
+        above = end_of(there)
+        segments: list[Segment] = [*there, Rest(above, self.settling_s)]
+        if above.up_m > LAND_SLOWLY_M:
+            low = place._replace(up_m=LAND_SLOWLY_M)
+            segments.append(Line(above, low, DESCENT_MS, VERTICAL_ACCEL_MS2, to_ms=LANDING_MS))
+        ground = place._replace(up_m=0.0)
+        segments.append(Line(end_of(segments), ground, LANDING_MS, VERTICAL_ACCEL_MS2, LANDING_MS, LANDING_MS))
+        return [*segments, Rest(end_of(segments), 0.0)]
+
+    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        """It stays where it took off."""
+        climb = self.take_off(start, altitude_m)
+        return [*climb, Rest(end_of(climb), math.inf)]

@@ -1,0 +1,78 @@
+"""What a vehicle says of itself once it has booted: its version, and all of its parameters.
+
+A vehicle that leaves some of it out flies all the same; what it was given beyond its defaults it has to know.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Mapping
+from itertools import islice
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl._pilot_link import Link
+from sitl.procedure import HEARTBEAT, Step
+
+PATIENCE = 10
+"""So many heartbeats in which nothing comes mean that nothing will."""
+MOST_AT_ONCE = 50
+
+_VERSION = Step("its version")
+_LIST = Step("its list of parameters", 180.0)
+_GIVEN = Step("the parameters that it was given")
+
+
+class Introduction:
+    """The `Procedure` of asking for it. `given` are parameters that it was started with, or is to have from now on."""
+
+    purpose = "introduce itself"
+
+    def __init__(self, link: Link, given: Mapping[str, float]) -> None:
+        self._link = link
+        self._given = given
+        self._asked: Counter[Step] = Counter()
+        self._listed = 0
+
+    def next_step(self) -> Step | None:
+        link = self._link
+        if not link.heartbeats:
+            return HEARTBEAT
+        lacks = {
+            _VERSION: link.state.version is None,
+            _LIST: not link.has_listed_parameters,
+            _GIVEN: any(link.parameters.get(name) != _as_float(value) for name, value in self._given.items()),
+        }
+        return next((step for step, lacking in lacks.items() if lacking and self._asked[step] < PATIENCE), None)
+
+    def ask(self, step: Step) -> None:
+        link = self._link
+        self._asked[step] += 1
+        if step is _VERSION:
+            link.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        elif step is _LIST:
+            self._ask_for_list()
+        elif step is _GIVEN:
+            for name, value in self._given.items():
+                if name in link.parameters:
+                    link.set_parameter(name, value)
+                link.request_parameter(name)  # ArduPilot lists none of a group that is switched off
+
+    def _ask_for_list(self) -> None:
+        """All at first, then, once no more come by themselves, those that are missing."""
+        link = self._link
+        if link.parameter_count is None:
+            link.request_parameters()
+        elif len(link.listed) > self._listed:
+            self._asked[_LIST] = 1
+        else:
+            missing = (index for index in range(link.parameter_count) if index not in link.listed)
+            for index in islice(missing, MOST_AT_ONCE):
+                link.request_parameter_at(index)
+        self._listed = len(link.listed)
+
+
+def _as_float(value: float) -> float:
+    """As 32 bits have it, which is what a vehicle says."""
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])

@@ -1,0 +1,211 @@
+"""How things move: segments, each a closed formula of the time since it began, and courses made of them.
+
+There are no dynamics and no steps: where a vehicle is at some second does not depend on how often anybody looked. A
+process that wakes once in twenty simulated seconds and a simulation in virtual time see the same track. What a copter,
+a plane or a rover makes of these segments is in _copter.py, _plane.py and _rover.py.
+"""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+GRAVITY_MS2 = 9.81
+NEAR_M = 1e-6  # closer than this is there
+
+
+class Point(NamedTuple):
+    """A place in metres from home."""
+
+    north_m: float
+    east_m: float
+    up_m: float
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where a vehicle is relative to home, and how it moves: metres, metres per second, radians, all finite."""
+
+    north_m: float = 0.0
+    east_m: float = 0.0
+    up_m: float = 0.0
+    north_ms: float = 0.0
+    east_ms: float = 0.0
+    up_ms: float = 0.0
+    roll_rad: float = 0.0
+    yaw_rad: float = 0.0
+    yaw_rate_rads: float = 0.0
+
+    @property
+    def point(self) -> Point:
+        return Point(self.north_m, self.east_m, self.up_m)
+
+    @property
+    def halted(self) -> Motion:
+        """The same place and heading, without any movement."""
+        return Motion(self.north_m, self.east_m, self.up_m, yaw_rad=self.yaw_rad)
+
+
+class Segment(Protocol):
+    """A piece of a course."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long it takes; math.inf: it never ends by itself."""
+
+    def at(self, since_s: float) -> Motion:
+        """The motion so many seconds after the beginning, 0 to `duration_s`."""
+
+
+class Rest:
+    """Stay here."""
+
+    def __init__(self, start: Motion, duration_s: float = math.inf) -> None:
+        self.duration_s = duration_s
+        self._motion = start.halted
+
+    def at(self, since_s: float) -> Motion:
+        return self._motion
+
+
+class Line:
+    """A straight line at a trapezoidal speed: `accel_ms2` from `from_ms` to at most `speed_ms`, then down to `to_ms`.
+
+    A line too short to reach `speed_ms` has a triangular one. It must be long enough to get from `from_ms` to `to_ms`.
+    The vehicle looks where it goes; on a vertical line, where it looked before.
+    """
+
+    def __init__(
+        self, start: Motion, end: Point, speed_ms: float, accel_ms2: float, from_ms: float = 0.0, to_ms: float = 0.0
+    ) -> None:
+        north, east, up = (there - here for here, there in zip(start.point, end, strict=True))
+        self._start, self._end = start, end
+        self._length_m = math.hypot(north, east, up)
+        self._along = Point(*(part / max(self._length_m, NEAR_M) for part in (north, east, up)))
+        self._yaw_rad = math.atan2(east, north) % math.tau if math.hypot(north, east) > NEAR_M else start.yaw_rad
+        self._from_ms, self._accel_ms2 = from_ms, accel_ms2
+        peak_ms = math.sqrt(accel_ms2 * self._length_m + (from_ms**2 + to_ms**2) / 2)
+        self._top_ms = min(speed_ms, peak_ms)
+        self._speeding_up_s = (self._top_ms - from_ms) / accel_ms2
+        slowing_s = (self._top_ms - to_ms) / accel_ms2
+        ramps_m = self._speeding_up_s * (self._top_ms + from_ms) / 2 + slowing_s * (self._top_ms + to_ms) / 2
+        steady_s = max(0.0, self._length_m - ramps_m) / self._top_ms if self._top_ms else 0.0
+        self._slowing_from_s = self._speeding_up_s + steady_s
+        self.duration_s = self._slowing_from_s + slowing_s
+
+    def at(self, since_s: float) -> Motion:
+        speeding_s = min(since_s, self._speeding_up_s)
+        steady_s = min(since_s, self._slowing_from_s) - speeding_s
+        slowing_s = max(0.0, since_s - self._slowing_from_s)
+        ramp = self._accel_ms2 / 2
+        gone_m = self._from_ms * speeding_s + ramp * speeding_s**2 + self._top_ms * (steady_s + slowing_s)
+        gone_m = min(self._length_m, gone_m - ramp * slowing_s**2)
+        speed_ms = self._from_ms + self._accel_ms2 * (speeding_s - slowing_s)
+        place = self._end
+        if since_s < self.duration_s:
+            place = Point(*(was + part * gone_m for was, part in zip(self._start.point, self._along, strict=True)))
+        north_ms, east_ms, up_ms = (part * speed_ms for part in self._along)
+        return Motion(*place, north_ms, east_ms, up_ms, yaw_rad=self._yaw_rad)
+
+
+class Arc:
+    """Part of a level circle at constant speed; `turn_rad` clockwise is positive, and may be infinite."""
+
+    def __init__(self, start: Motion, centre: tuple[float, float], turn_rad: float, speed_ms: float) -> None:
+        north, east = start.north_m - centre[0], start.east_m - centre[1]
+        self._centre, self._up_m = centre, start.up_m
+        self._radius_m = math.hypot(north, east)
+        self._bearing_rad = math.atan2(east, north)
+        self._rate_rads = math.copysign(speed_ms / self._radius_m, turn_rad)
+        self._speed_ms = speed_ms
+        self.duration_s = turn_rad / self._rate_rads
+
+    def at(self, since_s: float) -> Motion:
+        bearing = self._bearing_rad + self._rate_rads * since_s
+        yaw = bearing + math.copysign(math.pi / 2, self._rate_rads)
+        return Motion(
+            self._centre[0] + self._radius_m * math.cos(bearing),
+            self._centre[1] + self._radius_m * math.sin(bearing),
+            self._up_m,
+            self._speed_ms * math.cos(yaw),
+            self._speed_ms * math.sin(yaw),
+            roll_rad=math.atan(self._speed_ms * self._rate_rads / GRAVITY_MS2),
+            yaw_rad=yaw % math.tau,
+            yaw_rate_rads=self._rate_rads,
+        )
+
+
+class Climbing:
+    """A level segment flown while climbing, or sinking, at `rate_ms` to `up_m`, and level from there."""
+
+    def __init__(self, level: Segment, up_m: float, rate_ms: float) -> None:
+        self._level, self._up_m = level, up_m
+        self._from_m = level.at(0.0).up_m
+        self._rate_ms = math.copysign(rate_ms, up_m - self._from_m)
+        self._climbs_s = (up_m - self._from_m) / self._rate_ms if rate_ms else 0.0
+        self.duration_s = level.duration_s
+
+    def at(self, since_s: float) -> Motion:
+        if since_s < self._climbs_s:
+            climbed_m = self._rate_ms * since_s
+            return replace(self._level.at(since_s), up_m=self._from_m + climbed_m, up_ms=self._rate_ms)
+        return replace(self._level.at(since_s), up_m=self._up_m)
+
+
+class Fall:
+    """Fall to the ground without power and without drag."""
+
+    def __init__(self, start: Motion) -> None:
+        self._start = start
+        self.duration_s = (start.up_ms + math.sqrt(start.up_ms**2 + 2 * GRAVITY_MS2 * start.up_m)) / GRAVITY_MS2
+
+    @property
+    def impact_ms(self) -> float:
+        """How fast it hits the ground, downwards."""
+        return GRAVITY_MS2 * self.duration_s - self._start.up_ms
+
+    def at(self, since_s: float) -> Motion:
+        start = self._start
+        up_m = start.up_m + start.up_ms * since_s - GRAVITY_MS2 * since_s**2 / 2 if since_s < self.duration_s else 0.0
+        return replace(
+            start,
+            north_m=start.north_m + start.north_ms * since_s,
+            east_m=start.east_m + start.east_ms * since_s,
+            up_m=max(0.0, up_m),
+            up_ms=start.up_ms - GRAVITY_MS2 * since_s,
+        )
+
+
+class Course:
+    """Segments one after another from `begin_s` on; times are seconds on any one clock."""
+
+    def __init__(self, begin_s: float, segments: Sequence[Segment]) -> None:
+        """There is at least one segment, and only the last may be without end."""
+        self._segments = segments
+        *self._begin_s, self.end_s = itertools.accumulate((part.duration_s for part in segments), initial=begin_s)
+
+    def at(self, now_s: float) -> Motion:
+        """The motion at `now_s`; before the beginning that of the beginning, after the end that of the end."""
+        index = max(0, bisect.bisect_right(self._begin_s, now_s) - 1)
+        segment = self._segments[index]
+        return segment.at(min(max(0.0, now_s - self._begin_s[index]), segment.duration_s))
+
+
+class Part:
+    """A part of a course, from `begin_s` to `end_s` on its clock."""
+
+    def __init__(self, course: Course, begin_s: float, end_s: float) -> None:
+        self._course, self._begin_s = course, begin_s
+        self.duration_s = end_s - begin_s
+
+    def at(self, since_s: float) -> Motion:
+        return self._course.at(self._begin_s + since_s)
+
+
+def end_of(segments: Sequence[Segment]) -> Motion:
+    """The motion where the last of these segments ends."""
+    return segments[-1].at(segments[-1].duration_s)

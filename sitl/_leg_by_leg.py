@@ -1,0 +1,56 @@
+"""The course of a plan that is flown in GUIDED: each leg ends where the pilot sees that it is made (_by_guided.py)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from sitl._kinematics import Course, Motion, Part, Segment, end_of
+from sitl._models import AT_ONCE
+from sitl._route import CLIMBED, Waypoint, is_near, limit_s, to_go_m
+from sitl.vehicle import VehicleType
+
+LOOK_S = 0.25  # so often the pilot hears where the vehicle is
+FAST = 4.0  # no vehicle goes so many times as fast as it was told to
+
+
+def leg_by_leg(
+    waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion
+) -> tuple[list[Segment], Segment]:
+    """The segments until the last waypoint is made, and what the vehicle does after them when it is told nothing.
+
+    A waypoint that is not made in the time that a pilot gives it is the last.
+    """
+    model, motion, goal = AT_ONCE[vehicle_type], start, None
+    flown: list[Segment] = []
+    course, now_s = Course(0.0, model.ascent(start, waypoints[0].place.up_m)), 0.0
+    for index, waypoint in enumerate(waypoints):
+        if waypoint.kind == "land":
+            course, now_s = Course(0.0, model.land(motion, motion.point)), 0.0
+            made_s = course.end_s
+        else:
+            if waypoint.kind != "take_off" and (waypoint.place, waypoint.speed_ms) != goal:
+                goal = waypoint.place, waypoint.speed_ms
+                course, now_s = Course(0.0, model.loiter(motion, *goal, math.inf)), 0.0
+            made_s = _made_s(course, now_s, waypoint, vehicle_type, now_s + limit_s(waypoints, index))
+        if math.isinf(made_s):
+            break
+        flown.append(Part(course, now_s, made_s))
+        motion, now_s = end_of(flown), made_s
+    return flown, Part(course, now_s, math.inf)
+
+
+def _made_s(course: Course, since_s: float, waypoint: Waypoint, vehicle_type: VehicleType, limit_s: float) -> float:
+    """The second of a course at which a waypoint is made; infinite if it is not made until `limit_s`."""
+    now_s = since_s
+    while now_s < limit_s:
+        place = course.at(now_s).point
+        if waypoint.kind == "take_off":
+            if place.up_m >= CLIMBED * waypoint.place.up_m:
+                return now_s
+            now_s += LOOK_S
+        elif is_near(place, waypoint, vehicle_type):
+            return now_s + waypoint.seconds
+        else:  # no need to look while it cannot be there yet
+            now_s += max(LOOK_S, to_go_m(place, waypoint, vehicle_type) / (FAST * waypoint.speed_ms))
+    return math.inf

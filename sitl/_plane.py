@@ -1,0 +1,280 @@
+"""How a plane moves: never slower than it flies, in arcs and straight lines.
+
+The figures are those of ArduPlane's SITL (plane.parm, parameters by name), or, where it says so, measured with
+ArduPlane 4.7. Its paths are shortest turns, as those of Dubins (1957), not those of ArduPlane's L1 controller: turns
+may differ from that by some tens of metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from sitl._kinematics import NEAR_M, Arc, Climbing, Line, Motion, Point, Rest, Segment, end_of
+
+CRUISE_MS = 22.0  # AIRSPEED_CRUISE
+OVER_GROUND = (
+    1.064  # metres over the ground for each that its airspeed sensor counts, measured: the air is thin up there
+)
+CLIMB_MS = 5.0  # TECS_CLMB_MAX
+LOITER_RADIUS_M = 96.4  # clockwise, at CRUISE_MS; measured, of WP_LOITER_RAD 80, which grows in thin air
+LOITER_RADIUS_M_PER_MS = 0.95  # measured: so much smaller for each metre per second less
+ROLL_S = 1.4  # measured: before it turns to a circle
+SWING_M = 120.0  # measured: how far before a place it begins to swing out for its circle
+JOIN_RAD = 1.1  # measured: how far to the left of straight ahead it leaves a place that it is to circle
+REACHED_M = 40.0  # measured: 20 to 28, and 52 before it turns round
+TURN_RADIUS_M = 55.0  # measured
+WIDE_TURN_RADIUS_M, WIDE_TURN_RAD = 110.0, 1.0  # measured: small turns are flown less tightly
+RATHER_LEFT_M = 60.0  # measured: who is to circle a place to the right swings out to the left before
+STILL_RIGHT_M = 80.0  # measured: who turns to the right goes on to, unless the other way is so much shorter
+SWAY_M = 2.0  # measured: it comes to that line from outside its turn, sways over it, and turns round to where it was
+LINE_AHEAD_M = 147.0  # how far ahead, on the line between two places, it aims at to come back to it
+HEADING_RAD = math.radians(10.0)  # as near as it heads for the next place when it leaves a circle
+LOW_M = 10.0  # low enough to land from a circle of LOITER_RADIUS_M
+
+SPOOL_UP_S = 0.7  # the take-off, measured
+RUNWAY_ACCEL_MS2 = 8.0
+RUNWAY_M = CRUISE_MS**2 / (2 * RUNWAY_ACCEL_MS2)  # from standing to flying
+TAKE_OFF_CLIMB_MS, TAKE_OFF_MS = 10.0, 26.5
+LEVEL_OFF_M = 30.0  # straight on, before it turns
+LEVEL_M = 30.0  # in its mode TAKEOFF it turns once it is so high (three times TKOFF_LVL_ALT),
+AHEAD_M = 200.0  # TKOFF_DIST: to circle a place so far ahead of where it stood
+
+LANDING_MS = 17.5  # the landing, measured
+ROLL_OUT_M, PAST_M = 60.0, 9.0  # how far before its place it touches down, and behind it stands
+ROLL_OUT_ACCEL_MS2 = LANDING_MS**2 / (2 * (ROLL_OUT_M + PAST_M))
+
+
+class Plane:
+    """The `MotionModel` of a plane: it flies by the places of a plan and circles where it is to stay."""
+
+    cruise_ms = CRUISE_MS
+
+    def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        run, path = _lift_off(start, altitude_m, altitude_m)
+        path.straight(LEVEL_OFF_M)
+        return [*run, *path.segments]
+
+    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        """As in its mode TAKEOFF: to the left side of a circle ahead, and round that for ever."""
+        run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
+        place = _ahead(start, AHEAD_M)._replace(up_m=altitude_m)
+        path.straight_to(_on_circle(place, LOITER_RADIUS_M, start.yaw_rad - math.pi / 2))
+        circle = _Path(end_of(path.segments), CRUISE_MS * OVER_GROUND, altitude_m, TAKE_OFF_CLIMB_MS)
+        circle.arc(place[:2], math.inf)
+        return [*run, *path.segments, *circle.segments]
+
+    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
+        return _back_and_on(start, place, before, speed_ms * OVER_GROUND, CLIMB_MS, REACHED_M)
+
+    def loiter(
+        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+    ) -> Sequence[Segment]:
+        """Clockwise round the place, for so many seconds from when it begins to swing out for the circle.
+
+        From inside it crosses the circle straight; from outside it flies towards the place, and passes it on its left.
+        """
+        path, radius_m = _Path(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS), loiter_radius_m(speed_ms)
+        if math.dist(start.point[:2], place[:2]) < radius_m:
+            joins_rad = start.yaw_rad - JOIN_RAD
+        else:
+            if not start.yaw_rate_rads:
+                path.straight(ROLL_S * path.speed_ms)
+            path.fly_by(place, SWING_M, 0.0 if start.yaw_rate_rads else RATHER_LEFT_M)
+            joins_rad = path.bearing_rad(place) - math.pi / 2
+        path.straight_to(_on_circle(place, radius_m, joins_rad))
+        swing_s = path.segments[-1].duration_s
+        path.arc(place[:2], max(0.0, seconds - swing_s) * path.speed_ms / radius_m)
+        if after is not None and math.isfinite(seconds):
+            path.arc(place[:2], _until_heading_for(after, place, end_of(path.segments)))
+        return path.segments
+
+    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
+        """Glide straight to the ground before the place, and roll to a stand; who is too high circles down before."""
+        touchdown = _towards(place, start.point, ROLL_OUT_M)._replace(up_m=0.0)
+        glide_s = _duration_s(_back_and_on(start, touchdown, before, LANDING_MS, 0.0, 0.0))
+        if start.up_m > CLIMB_MS * glide_s:
+            circling = self.loiter(start, place._replace(up_m=LOW_M), CRUISE_MS, (start.up_m - LOW_M) / CLIMB_MS)
+            return [*circling, *self.land(end_of(circling), place)]
+        sink_ms = start.up_m / glide_s if glide_s else 0.0
+        glide = _back_and_on(start, touchdown, before, LANDING_MS, sink_ms, 0.0)
+        ground = replace(end_of(glide), up_m=0.0)
+        stand = _ahead(ground, ROLL_OUT_M + PAST_M)
+        return [*glide, Line(ground, stand, LANDING_MS, ROLL_OUT_ACCEL_MS2, from_ms=LANDING_MS)]
+
+
+def _until_heading_for(there: Point, centre: Point, here: Motion) -> float:
+    """How far, in radians, to go on round a circle until it heads for a place, as near as ArduPlane wants it.
+
+    The place may be so near that it never does, which is as good at once.
+    """
+    away_m, radius_m = math.dist(centre[:2], there[:2]), math.dist(centre[:2], here.point[:2])
+    if away_m < 1.05 * radius_m:
+        return 0.0
+    leaves_rad = _bearing_rad(centre, there) - math.acos(radius_m / away_m) - HEADING_RAD
+    turn_rad = (leaves_rad - _bearing_rad(centre, here.point)) % math.tau
+    return 0.0 if turn_rad > math.tau - 2 * HEADING_RAD else turn_rad
+
+
+def loiter_radius_m(speed_ms: float) -> float:
+    """Of the circle that it flies round a place at this speed through the air."""
+    return LOITER_RADIUS_M + LOITER_RADIUS_M_PER_MS * (speed_ms - CRUISE_MS)
+
+
+def _duration_s(segments: Sequence[Segment]) -> float:
+    return sum(part.duration_s for part in segments)
+
+
+class _Path:
+    """Segments in the making, at one speed, climbing or sinking to one altitude at one rate."""
+
+    def __init__(self, start: Motion, speed_ms: float, up_m: float, rate_ms: float) -> None:
+        self.segments: list[Segment] = []
+        self.speed_ms = speed_ms
+        self._end, self._up_m, self._rate_ms = start, up_m, rate_ms
+
+    def straight(self, length_m: float) -> None:
+        self.straight_to(_ahead(self._end, length_m))
+
+    def straight_to(self, place: Point) -> None:
+        end = place._replace(up_m=self._end.up_m)
+        self._add(Line(self._end, end, self.speed_ms, RUNWAY_ACCEL_MS2, self.speed_ms, self.speed_ms))
+
+    def arc(self, centre: tuple[float, float], turn_rad: float) -> None:
+        self._add(Arc(self._end, centre, turn_rad, self.speed_ms))
+
+    def fly_by(self, place: Point, reached_m: float, rather_left_m: float = 0.0) -> None:
+        """Turn towards `place`, whichever way is shorter, and go straight until it is `reached_m` away.
+
+        To the right if that is shorter by more than `rather_left_m`.
+        """
+        here = self._end
+        if math.dist(here.point[:2], place[:2]) <= max(reached_m, NEAR_M):
+            self.straight(0.0)
+            return
+        turn = _turn_towards(here, place, WIDE_TURN_RADIUS_M, rather_left_m)
+        if turn is None or abs(turn.turn_rad) > WIDE_TURN_RAD:
+            turn = _turn_towards(here, place, TURN_RADIUS_M, rather_left_m)
+        if turn is None:  # neither way: it is beside and too close, so first get away from it
+            self.straight(2 * TURN_RADIUS_M)
+            self.fly_by(place, reached_m, rather_left_m)
+            return
+        if abs(turn.turn_rad) > NEAR_M:
+            self.arc(turn.centre, turn.turn_rad)
+        self.straight(max(0.0, turn.ahead_m - reached_m))
+
+    def bearing_rad(self, place: Point) -> float:
+        """Of a place as seen from the end of the path."""
+        return _bearing_rad(self._end.point, place)
+
+    def _add(self, level: Segment) -> None:
+        self.segments.append(Climbing(level, self._up_m, self._rate_ms))
+        if math.isfinite(level.duration_s):
+            self._end = end_of(self.segments)
+
+
+def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[Sequence[Segment], _Path]:
+    """The run, and the climb to `altitude_m` begun: straight on up to `straight_to_m`."""
+    run = Line(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
+    path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
+    path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
+    return [Rest(start, SPOOL_UP_S), run], path
+
+
+def _back_and_on(
+    start: Motion, place: Point, before: Point | None, speed_ms: float, rate_ms: float, reached_m: float
+) -> Sequence[Segment]:
+    """Back to the line that leads to `place` from `before`, and on it until it is `reached_m` away."""
+    aim = None if before is None else _back_on_line(start.point, before, place)
+    if before is None or aim is None:
+        return _fly_by(start, place, speed_ms, rate_ms, reached_m)
+    line_rad = _bearing_rad(before, place)
+    turn_rad = (line_rad - start.yaw_rad + math.pi) % math.tau - math.pi
+    sways_m = math.copysign(SWAY_M, turn_rad) if abs(turn_rad) < math.pi / 2 else 0.0
+    swayed = _beside(Motion(*aim, yaw_rad=line_rad), sways_m)
+    back = _fly_by(start, Point(*swayed, aim.up_m), max(speed_ms, CRUISE_MS * OVER_GROUND), rate_ms, REACHED_M)
+    return [*back, *_fly_by(end_of(back), place, speed_ms, rate_ms, reached_m)]
+
+
+def _fly_by(start: Motion, place: Point, speed_ms: float, rate_ms: float, reached_m: float) -> Sequence[Segment]:
+    path = _Path(start, speed_ms, place.up_m, rate_ms)
+    path.fly_by(place, reached_m)
+    return path.segments
+
+
+class _Turn(NamedTuple):
+    """A turn after which a place is straight ahead: centre, angle clockwise, and how far ahead it is then."""
+
+    centre: tuple[float, float]
+    turn_rad: float
+    ahead_m: float
+
+
+def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: float) -> _Turn | None:
+    """The turn that makes the shorter way; None: the place is inside both circles."""
+    ways = []
+    for side in (1, -1):  # to the right, to the left
+        centre = _beside(start, side * radius_m)
+        north, east = place.north_m - centre[0], place.east_m - centre[1]
+        away_m = math.hypot(north, east)
+        if away_m < radius_m:
+            continue
+        leaves = math.atan2(east, north) - side * math.acos(radius_m / away_m)
+        enters = start.yaw_rad - side * math.pi / 2
+        turn_rad = side * (leaves - enters) % math.tau
+        if math.tau - turn_rad < NEAR_M:  # straight ahead, but for rounding
+            turn_rad = 0.0
+        ways.append(_Turn(centre, side * turn_rad, math.sqrt(away_m**2 - radius_m**2)))
+    lengths_m = {way: abs(way.turn_rad) * radius_m + way.ahead_m for way in ways}
+    still_right_m = STILL_RIGHT_M if start.yaw_rate_rads > 0 else 0.0
+    return min(
+        ways,
+        key=lambda way: lengths_m[way] + (rather_left_m if way.turn_rad >= 0 else still_right_m),
+        default=None,
+    )
+
+
+def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
+    """Where on the line between two places to aim at from beside it; None: the place itself is as near."""
+    north, east = place.north_m - before.north_m, place.east_m - before.east_m
+    length_m = math.hypot(north, east)
+    if length_m < NEAR_M:
+        return None
+    along_m = ((here.north_m - before.north_m) * north + (here.east_m - before.east_m) * east) / length_m + LINE_AHEAD_M
+    if along_m > length_m - LINE_AHEAD_M:
+        return None
+    part = along_m / length_m
+    return Point(before.north_m + part * north, before.east_m + part * east, place.up_m)
+
+
+def _bearing_rad(here: Point, there: Point) -> float:
+    return math.atan2(there.east_m - here.east_m, there.north_m - here.north_m)
+
+
+def _on_circle(place: Point, radius_m: float, bearing_rad: float) -> Point:
+    """The point of the circle round a place in this direction from it."""
+    north_m, east_m = radius_m * math.cos(bearing_rad), radius_m * math.sin(bearing_rad)
+    return Point(place.north_m + north_m, place.east_m + east_m, place.up_m)
+
+
+def _towards(place: Point, other: Point, length_m: float) -> Point:
+    """So far from a place, on the way to the other."""
+    away_m = max(math.dist(place[:2], other[:2]), NEAR_M)
+    part = min(1.0, length_m / away_m)
+    north_m, east_m = (a + part * (b - a) for a, b in zip(place[:2], other[:2], strict=True))
+    return Point(north_m, east_m, place.up_m)
+
+
+def _ahead(start: Motion, length_m: float) -> Point:
+    return Point(
+        start.north_m + length_m * math.cos(start.yaw_rad),
+        start.east_m + length_m * math.sin(start.yaw_rad),
+        start.up_m,
+    )
+
+
+def _beside(start: Motion, right_m: float) -> tuple[float, float]:
+    """North and east of the point so far to the right."""
+    return start.north_m - right_m * math.sin(start.yaw_rad), start.east_m + right_m * math.cos(start.yaw_rad)

@@ -1,0 +1,96 @@
+"""A plan with nothing left open: every leg has its place, altitude and speed, and a plane its approach.
+
+Who flies a plan (the pilot) and who computes its track (track.py) both go by the route, so they cannot disagree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from sitl._kinematics import Point
+from sitl._models import MODELS
+from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
+from sitl.vehicle import VehicleType
+
+SLOWEST = 0.25  # who is this much slower than asked for will not come
+SLOWEST_CLIMB_MS = 0.25
+GRACE_S = 120.0
+
+CLIMBED = 0.95  # of the altitude asked for is up there, as ArduPilot's own tests have it
+NEAR_M: dict[VehicleType, float] = {"copter": 2.0, "plane": 120.0, "rover": 5.0}
+"""How close is there, in GUIDED: WPNAV_RADIUS, a circle of WP_LOITER_RAD and half as much, and about WP_RADIUS."""
+NEAR_UP_M = 10.0
+
+APPROACH_SLOPE = 0.1  # of a plane: it begins to land ten times as far away as it is high
+
+Kind = Literal["take_off", "go_to", "loiter", "land"]
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """One thing to do at `place`, at `speed_ms` on the way there, for `seconds` if it is a loiter."""
+
+    leg: str  # of the plan, in words: "leg 2 of 5 (...)"
+    kind: Kind
+    place: Point
+    speed_ms: float
+    seconds: float = 0.0
+
+
+def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Waypoint, ...]:
+    """The waypoints of `plan` for a vehicle whose home heads `heading_deg`. Raises PlanError."""
+    plan.check(vehicle_type)
+    cruise_ms = MODELS[vehicle_type].cruise_ms
+    place, speed_ms = Point(0.0, 0.0, 0.0), cruise_ms
+    waypoints: list[Waypoint] = []
+    for number, leg in enumerate(plan.legs, start=1):
+        name = f"leg {number} of {len(plan.legs)} ({leg})"
+        match leg:
+            case TakeOff(altitude_m):
+                place = place._replace(up_m=altitude_m)
+                waypoints.append(Waypoint(name, "take_off", place, cruise_ms))
+            case GoTo(north_m, east_m, altitude_m):
+                place = Point(north_m, east_m, place.up_m if altitude_m is None else altitude_m)
+                speed_ms = cruise_ms if leg.speed_ms is None else leg.speed_ms
+                waypoints.append(Waypoint(name, "go_to", place, speed_ms))
+            case Loiter(seconds):
+                waypoints.append(Waypoint(name, "loiter", place, speed_ms, seconds))
+            case Land():
+                if vehicle_type == "plane":
+                    waypoints.append(Waypoint(name, "go_to", _approach(place, heading_deg), cruise_ms))
+                waypoints.append(Waypoint(name, "land", place._replace(up_m=0.0), cruise_ms))
+    return tuple(waypoints)
+
+
+def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
+    """How many of the vehicle's seconds one waypoint may take, coming from the one before."""
+    waypoint = waypoints[index]
+    start = waypoints[index - 1].place if index else Point(0.0, 0.0, 0.0)
+    way_s = math.dist(start[:2], waypoint.place[:2]) / (SLOWEST * waypoint.speed_ms)
+    climb_s = abs(waypoint.place.up_m - start.up_m) / SLOWEST_CLIMB_MS
+    return GRACE_S + way_s + climb_s + waypoint.seconds / SLOWEST
+
+
+def is_near(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> bool:
+    """Whether who is led in GUIDED has come to the waypoint."""
+    level = vehicle_type == "rover" or abs(place.up_m - waypoint.place.up_m) <= NEAR_UP_M
+    return level and to_go_m(place, waypoint, vehicle_type) <= 0
+
+
+def to_go_m(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
+    """How far over the ground it is until there; less than 0 is past that."""
+    return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
+
+
+def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> int | None:
+    """Which waypoint begins a plane's landing, which is a mission even where the rest is flown in GUIDED."""
+    return len(waypoints) - 2 if vehicle_type == "plane" and waypoints[-1].kind == "land" else None
+
+
+def _approach(place: Point, heading_deg: float) -> Point:
+    """Where a plane begins to land at `place`: before it on the runway, which has the heading of home."""
+    before_m, heading = place.up_m / APPROACH_SLOPE, math.radians(heading_deg)
+    return Point(place.north_m - before_m * math.cos(heading), place.east_m - before_m * math.sin(heading), place.up_m)

@@ -1,0 +1,56 @@
+"""How a rover moves. The figures are those of ArduRover's SITL (rover.parm) and its defaults, parameters by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sitl._kinematics import Line, Motion, Point, Rest, Segment, end_of
+
+CRUISE_MS = 5.0  # CRUISE_SPEED
+ACCEL_MS2 = 1.0  # ATC_ACCEL_MAX
+TURN_RATE_RADS = math.radians(45.0)  # what it takes who stands to turn round first, as measured with 4.7
+CORNER_MS = 0.5  # at a corner it does not quite stand
+
+
+@dataclass(frozen=True)
+class Rover:
+    """The `MotionModel` of a rover: straight from place to place on level ground, almost with a stop at each.
+
+    `start_s` goes by before one that stands moves, and at corners it turns at `corner_rads`, radians per second; what
+    is given is measured with 4.7, in AUTO, where it makes up for its corners by smoothing them.
+    """
+
+    start_s: float = 1.5
+    corner_rads: float = math.inf
+
+    cruise_ms = CRUISE_MS
+
+    def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        """It cannot, and stays."""
+        return [Rest(start, 0.0)]
+
+    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
+        end = place._replace(up_m=start.up_m)
+        passes_ms = min(CORNER_MS, math.sqrt(2 * ACCEL_MS2 * math.dist(start.point, end)))
+        there = Line(start, end, speed_ms, ACCEL_MS2, to_ms=min(passes_ms, speed_ms))
+        if not there.duration_s:
+            return [there]
+        turn_rad = abs((there.at(0.0).yaw_rad - start.yaw_rad + math.pi) % math.tau - math.pi)
+        if start == start.halted:
+            return [Rest(start, self.start_s + turn_rad / TURN_RATE_RADS), there]
+        return [Rest(start, turn_rad / self.corner_rads), there]
+
+    def loiter(
+        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+    ) -> Sequence[Segment]:
+        there = self.go_to(start, place, speed_ms)
+        return [*there, Rest(end_of(there), seconds)]
+
+    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
+        """It never left the ground, and stays."""
+        return [Rest(start, 0.0)]
+
+    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+        return [Rest(start, math.inf)]

@@ -1,0 +1,95 @@
+"""Taking off without a plan, and to begin a plan that is flown in GUIDED; and falling down.
+
+The commands are those of ArduPilot's developer documentation, "Copter Commands in Guided Mode". A plane has no take-off
+in GUIDED: it takes off in its mode TAKEOFF, to the altitude of its parameter TKOFF_ALT. A rover only gets ready.
+"""
+
+from __future__ import annotations
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl._pilot_link import Link
+from sitl._route import CLIMBED
+from sitl.procedure import ARM, HEARTBEAT, Commander, Step
+from sitl.vehicle import VehicleType
+
+SLOWEST_CLIMB_MS = 0.5
+LOW_M = 2.0  # who is not higher lies on the ground
+
+PARAMETER = Step("parameter TKOFF_ALT")
+TAKE_OFF = Step("the take-off command")
+FALL = Step("the fall")
+FORCED_DISARM = Step("disarming by force")
+
+FORCE = 21196  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: in flight, too
+TKOFF_ALT = "TKOFF_ALT"
+
+
+class TakeOff:
+    """Set the mode, arm, take off, and climb to `altitude_m` above home; a rover arms in GUIDED, and that is all."""
+
+    purpose = "take off"
+
+    def __init__(self, link: Link, vehicle_type: VehicleType, altitude_m: float) -> None:
+        self._to = Commander(link, vehicle_type)
+        self._altitude_m = altitude_m
+        self._climb = Step("the climb", 60.0 + altitude_m / SLOWEST_CLIMB_MS)
+        self._mode = "TAKEOFF" if vehicle_type == "plane" else "GUIDED"
+        self._in_mode = Step(f"mode {self._mode}")
+
+    def next_step(self) -> Step | None:
+        link, state = self._to.link, self._to.state
+        if state.mode is None:
+            return HEARTBEAT
+        if self._to.vehicle_type == "plane" and abs(link.parameters.get(TKOFF_ALT, 0.0) - self._altitude_m) > 0.01:
+            return PARAMETER
+        if not self._to.in_mode(self._mode):
+            return self._in_mode
+        if step := self._to.arming():
+            return step
+        if self._to.vehicle_type == "rover":
+            return None
+        if self._to.vehicle_type == "copter" and not self._to.accepted(mavlink.MAV_CMD_NAV_TAKEOFF):
+            return TAKE_OFF
+        if state.position is None or state.position.relative_alt_m < CLIMBED * self._altitude_m:
+            return self._climb
+        return None
+
+    def ask(self, step: Step) -> None:
+        link = self._to.link
+        if step is PARAMETER:
+            link.set_parameter(TKOFF_ALT, self._altitude_m)
+        elif step is self._in_mode:
+            self._to.set_mode(self._mode)
+        elif step is ARM:
+            link.acks.pop(mavlink.MAV_CMD_NAV_TAKEOFF, None)
+            self._to.arm()
+        elif step is TAKE_OFF:
+            link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, self._altitude_m)
+
+
+class Termination:
+    """Disarm in flight, by force, and fall to the ground."""
+
+    purpose = "end its flight"
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._disarmed_at: float | None = None
+
+    def next_step(self) -> Step | None:
+        link, state = self._link, self._link.state
+        if state.mode is None:
+            return HEARTBEAT
+        if state.armed:
+            self._disarmed_at = None
+            return FORCED_DISARM
+        self._disarmed_at = self._disarmed_at or link.heard_at
+        heard_since = link.position_at is not None and link.position_at > self._disarmed_at
+        if not heard_since or state.position is None or state.position.relative_alt_m > LOW_M:
+            return FALL
+        return None
+
+    def ask(self, step: Step) -> None:
+        if step is FORCED_DISARM:
+            self._link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)

@@ -1,0 +1,53 @@
+"""The chain export, `ucp-chain-export/1`."""
+
+from ucp.contract.schemas._schema_parts import (
+    AGENT_ID,
+    BASE64,
+    COUNT,
+    EVENT_DATA,
+    FLAG,
+    HASH,
+    TIMESTAMP,
+    Schema,
+    listed,
+    record,
+)
+from ucp.export import SCHEMA
+
+SIGNATURE: Schema = {**BASE64, "minLength": 88, "maxLength": 88}
+"""Its maker's, 64 bytes, in a secured mission."""
+
+
+def block(chain_hash: Schema) -> Schema:
+    """A block of the chain; in deque and stack it has no chain hash."""
+    return record(
+        {
+            "agent_id": AGENT_ID,
+            "timestamp_us": TIMESTAMP,
+            "event_data": EVENT_DATA,
+            "block_hash": HASH,
+            "chain_hash": chain_hash,
+            "signature": SIGNATURE,
+        },
+        optional=("signature",),
+    )
+
+
+def schema() -> Schema:
+    """The document."""
+    aside = listed(block({"type": "null"}))
+    return record(
+        {
+            "schema": {"const": SCHEMA},
+            "agent_id": AGENT_ID,
+            "exported_at_us": COUNT,
+            "inception": record({"block_data": BASE64, "block_hash": HASH, "chain_hash": HASH}),
+            "chain": listed(block(HASH)),
+            "blocks_to_be_committed": aside,
+            "reconcile_stack": aside,
+            "current_block": record({"event_data": EVENT_DATA}),
+            "reconcile_in_progress": FLAG,
+            "idle": FLAG,
+            "completed": listed(HASH),
+        }
+    )

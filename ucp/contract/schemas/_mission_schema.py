@@ -1,0 +1,76 @@
+"""The mission file, `ucp-mission/1`."""
+
+import dataclasses
+from typing import get_args
+
+from ucp.block import MAX_EVENT_DATA_BYTES
+from ucp.contract.schemas._schema_parts import AGENT_ID, BASE64, FLAG, ROSTER, Schema, listed, record
+from ucp.events import MAX_MEAN_S
+from ucp.mission import LATEST_EPOCH_US, MAX_SPEEDUP, SCHEMA
+from ucp.settings import ADDED, MAX_TIMER_S, Phase1Tie, Phase2Tie, Settings
+from ucp.telemetry import EVENT_KINDS
+
+ABOVE_0: Schema = {"type": "number", "exclusiveMinimum": 0}
+OCTET = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
+IPV4: Schema = {"type": "string", "format": "ipv4", "pattern": rf"^{OCTET}(\.{OCTET}){{3}}$"}
+PORT: Schema = {"type": "integer", "minimum": 1, "maximum": 65535}
+BYTES: Schema = {"type": "integer", "minimum": 1, "maximum": MAX_EVENT_DATA_BYTES}
+
+SETTINGS: dict[str, Schema] = {
+    "vote_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
+    "phase1_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
+    "phase2_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
+    "phase3_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
+    "finalize_gap_s": {"type": "number", "minimum": 0, "maximum": MAX_TIMER_S},
+    "max_block_bytes": BYTES,
+    "max_event_bytes": BYTES,
+    "vote_names_chain": FLAG,
+    "changed_before_tally": FLAG,
+    "asks_after_commit": FLAG,
+    "top_needs_majority": FLAG,
+    "phase1_tie": {"enum": list(get_args(Phase1Tie))},
+    "phase2_tie": {"enum": list(get_args(Phase2Tie))},
+}
+
+
+def settings(*, optional: bool) -> Schema:
+    """The settings, each with its default; an `optional` one may be missing."""
+    defaults = dataclasses.asdict(Settings())
+    named = {name: {**schema, "default": defaults[name]} for name, schema in SETTINGS.items()}
+    return record(named, optional=tuple(named) if optional else ADDED)
+
+
+def events() -> Schema:
+    """Where an agent's events come from."""
+    of_telemetry: Schema = {
+        "mean_s": ABOVE_0 | {"maximum": MAX_MEAN_S},
+        "position_interval_s": ABOVE_0,
+        "log": listed({"enum": list(EVENT_KINDS)}),
+        "vehicle_host": {"type": "string", "minLength": 1},
+        "vehicle_port": PORT,
+    }
+    return record({"source": {"enum": ["random", "mavlink", "none"]}, **of_telemetry}, optional=tuple(of_telemetry))
+
+
+def schema() -> Schema:
+    """The document."""
+    return record(
+        {
+            "schema": {"const": SCHEMA},
+            "contract": {"type": "integer", "minimum": 1},
+            "features": listed({"type": "string"}),
+            "agent_id": AGENT_ID,
+            "roster": ROSTER,
+            "initial_data": BASE64,
+            "network": record({"address": IPV4, "broadcast": IPV4, "port": PORT}),
+            "events": events(),
+            "settings": settings(optional=True),
+            "quirks": {"type": "object", "additionalProperties": {"type": ["boolean", "number"]}},
+            "seed": {"type": "integer", "minimum": 0, "maximum": 2**64 - 1},
+            "speedup": ABOVE_0 | {"maximum": MAX_SPEEDUP},
+            "epoch_us": {"type": ["integer", "null"], "minimum": 0, "maximum": LATEST_EPOCH_US},
+            "store": {"type": ["string", "null"], "minLength": 1},
+            "security": {"oneOf": [{"type": "null"}, record({"bundle": {"type": "string", "minLength": 1}})]},
+        },
+        optional=("contract", "features", "settings", "quirks", "epoch_us", "store", "security"),
+    )

@@ -1,0 +1,81 @@
+"""A mission with keys told input by input: the peers seal what they say, and open what the agent answers."""
+
+from typing import Any
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from ucp.block import Block, InceptionBlock
+from ucp.chain import Chain
+from ucp.contract.vectors._mission_story import AGENT_ID, INITIAL_DATA, ROSTER, Story
+from ucp.messages import CARRY_A_BLOCK, TYPE_CODES, Message
+from ucp.sealed import seal_to
+from ucp.secure.block_signature import sign_block
+from ucp.secure.bundle import KeySet, bundle_name
+from ucp.secure.envelope import REQUEST_OF, REVOCATION
+from ucp.secure.opening import Opener
+from ucp.secure.revocation import Revocation
+from ucp.secure.sealed_datagrams import Request
+from ucp.secure.secured_agent import boot_of
+from ucp.secure.session import Session
+from ucp.trace import in_base64
+
+KEYS = KeySet.derived(bytes(range(32, 64)), ROSTER, seals=True)
+MAX_BLOCK_BYTES = 976
+
+
+class SecuredStory(Story):
+    """As any, of a mission that is secured, and whose events are sealed."""
+
+    def __init__(self) -> None:
+        assert KEYS.public.depot is not None, "it seals"
+        self.initial_data = seal_to(INITIAL_DATA, KEYS.public.depot)
+        self._lives = 0
+        self._opener = Opener(KEYS.bundle(AGENT_ID))
+        self._peers = {peer: Session(KEYS.bundle(peer), boot_of(peer, b"a chance")) for peer in ROSTER}
+        self._asked: dict[int, Request] = {}
+        super().__init__(max_block_bytes=MAX_BLOCK_BYTES)
+
+    def chain(self, *blocks: Block) -> Chain:
+        """A chain of this mission."""
+        chain = Chain(InceptionBlock(self.initial_data))
+        for block in blocks:
+            chain.append(block)
+        return chain
+
+    def revoke(self, *agents: int) -> None:
+        """The authority's first revocation, by the control socket."""
+        authority = Ed25519PrivateKey.from_private_bytes(KEYS.authority)
+        revocation = Revocation.signed(authority, KEYS.public.mission, 1, agents)
+        self.command("revoke", revocation=in_base64(revocation.encode()))
+        del self.output["answer"]["revoked"]  # which an agent may leave out
+
+    def hear_again(self) -> None:
+        """The last datagram once more."""
+        inputs = (exchange["input"] for exchange in reversed(self.exchanges))
+        self.now += 0.125
+        self._exchange({"datagram": next(given["datagram"] for given in inputs if "datagram" in given)})
+
+    def _signature(self, block: Block) -> bytes:
+        return sign_block(self._peers[block.agent_id].private_key, KEYS.public.mission, block.block_data())
+
+    def _of_mission(self) -> dict[str, Any]:
+        return {"security": {"bundle": bundle_name(AGENT_ID)}}
+
+    def _of_life(self) -> dict[str, Any]:
+        self._lives += 1
+        boot = boot_of(1_795_258_278_064_591 + self._lives, b"a chance")
+        return {"bundle": KEYS.bundle(AGENT_ID).to_json(), "boot": boot.hex()}
+
+    def _encoded(self, sender: int, sequence: int, message: Message) -> bytes:
+        code = TYPE_CODES[type(message)]
+        request = self._asked.get(REQUEST_OF[code]) if code in REQUEST_OF else None
+        signature = self._signature(message.block) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
+        return self._peers[sender].seal(sequence, message, request, signature, 0)
+
+    def _message(self, datagram: bytes) -> Message | None:
+        """What the agent said; its questions are what is answered next. None of a revocation."""
+        if datagram[3] == REVOCATION:
+            return None
+        opened = self._opener.open(datagram)
+        self._asked[opened.clear.type] = Request(AGENT_ID, opened.clear.boot, opened.clear.sequence)
+        return opened.said.message

@@ -1,0 +1,96 @@
+"""Vectors of secured missions: the datagram of each message with all that it is made of, and some that are dropped."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from ucp.block import Block
+from ucp.contract.vectors._hash_vectors import BLOCKS
+from ucp.contract.vectors._message_vectors import BLOCK_HASH, MESSAGES
+from ucp.messages import CARRY_A_BLOCK, TYPE_CODES, BlockAddResponse, CommitBlock, Message, RequestForBlock, encode
+from ucp.secure.block_signature import sign_block
+from ucp.secure.bundle import KeySet
+from ucp.secure.crypto_suite import expand
+from ucp.secure.envelope import CLEAR, REQUEST_OF
+from ucp.secure.sealed_datagrams import Request
+from ucp.secure.secured_agent import SecuredAgent, boot_of
+from ucp.secure.session import Session
+
+AGENT_ID, OTHER = 7, 28
+ROSTER = tuple(sorted({AGENT_ID, *(sender for sender, _, _ in MESSAGES), *(block.agent_id for block in BLOCKS)}))
+KEYS = KeySet.derived(bytes(range(32)), ROSTER)
+OTHER_KEYS = KeySet.derived(bytes(32), ROSTER)
+BOOT = boot_of(1_795_258_278_064_591, b"a chance")
+EPOCH = 3
+NOW = EPOCH * KEYS.public.epoch_s
+
+
+def session(agent_id: int, keys: KeySet = KEYS) -> Session:
+    """A life of that agent in the epoch of the vectors."""
+    begun = Session(keys.bundle(agent_id), BOOT)
+    begun.epochs.look_at(NOW)
+    return begun
+
+
+def signature_of(block: Block) -> bytes:
+    """Its maker's."""
+    return sign_block(session(block.agent_id).private_key, KEYS.public.mission, block.block_data())
+
+
+def cases() -> Iterator[tuple[str, bytes]]:
+    """What is about a datagram, and the datagram, as they reach agent 7 one after another."""
+    other = session(OTHER)
+    good = other.seal(1, RequestForBlock(BLOCK_HASH), None, None, 0)
+    yield "a plain one", encode(OTHER, 1, RequestForBlock(BLOCK_HASH))
+    yield "version 3", good[:2] + b"\3" + good[3:]
+    yield "half a header", good[:20]
+    yield "without its last byte", good[:-1]
+    yield "type 11", good[:3] + b"\x0b" + good[4:]
+    yield "its own", session(AGENT_ID).seal(0, RequestForBlock(BLOCK_HASH), None, None, 0)
+    yield "of nobody on the roster", good[:4] + (5).to_bytes(4, "big") + good[8:]
+    yield "of the epoch before the last", good[:14] + (EPOCH - 2).to_bytes(4, "big") + good[18:]
+    yield "nine epochs ahead", good[:14] + (EPOCH + 9).to_bytes(4, "big") + good[18:]
+    yield "with another revocation's number", good[:35] + b"\1" + good[36:]
+    yield "of another mission", session(OTHER, OTHER_KEYS).seal(1, RequestForBlock(BLOCK_HASH), None, None, 0)
+    yield "with another signature", good[:-1] + bytes([good[-1] ^ 1])
+    yield "a good one", good
+    yield "the same again", good
+    yield "of an earlier life", good[: CLEAR.size - 18] + bytes(16) + good[CLEAR.size - 2 :]
+    stale = Request(AGENT_ID, BOOT, 99)
+    yield "an answer to what was not asked", other.seal(2, BlockAddResponse(BLOCK_HASH, True), stale, None, 0)
+    forged = CommitBlock(Block(1, 5, b"never made"), BLOCK_HASH)
+    yield "a block that its maker did not sign", other.seal(3, forged, None, bytes(64), 0)
+    yield "type 10, by nobody", other.tell(1, bytes(72))
+
+
+def vectors() -> dict[str, Any]:
+    """Keys are in hex, as in a bundle; datagrams in base64."""
+    receiver = SecuredAgent(session(AGENT_ID), AGENT_ID, ROSTER, b"test", tracing=True)
+    dropped = []
+    for what, datagram in cases():
+        receiver.receive_datagram(datagram, NOW)
+        (entry,) = receiver.trace()
+        dropped.append({"what": what, "datagram": datagram, "dropped": getattr(entry, "dropped", None)})
+    return {
+        "epoch": EPOCH,
+        "boot": BOOT.hex(),
+        "group_secrets": {str(epoch): _secret(epoch).hex() for epoch in range(EPOCH + 1)},
+        "bundles": {str(agent_id): KEYS.bundle(agent_id).to_json() for agent_id in ROSTER},
+        "messages": [_sealed(*said) for said in MESSAGES],
+        "drops": {"agent_id": AGENT_ID, "roster": ROSTER, "now": NOW, "datagrams": dropped},
+    }
+
+
+def _secret(epoch: int) -> bytes:
+    secret = KEYS.group_secret
+    for _ in range(epoch):
+        secret = expand(secret, b"UCP epoch\0" + KEYS.public.mission, 32)
+    return secret
+
+
+def _sealed(sender: int, sequence: int, message: Message) -> dict[str, Any]:
+    request = Request(AGENT_ID, BOOT, 4) if TYPE_CODES[type(message)] in REQUEST_OF else None
+    signature = signature_of(message.block) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
+    sealed = session(sender).seal(sequence, message, request, signature, 0)
+    named = None if request is None else {**request._asdict(), "boot": BOOT.hex()}
+    plain = encode(sender, sequence, message)
+    return {"plain": plain, "request": named, "block_signature": signature, "datagram": sealed}

@@ -1,0 +1,260 @@
+"""What can be wrong about building and committing blocks: Algorithms 1-6."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from ucp.block import Block, next_chain_hash
+from ucp.chain import Chain
+from ucp.core import Core
+from ucp.handler import LocalEvent
+from ucp.messages import BlockAddRequest, BlockAddResponse, CommitBlock, Message
+from ucp.quirks._quirk import Handler, Helper, quirk
+from ucp.timers import Timer
+
+
+@quirk(1, helper=Core.complete)
+def oldest_event_timestamp(good: Helper, core: Core, block: Block) -> None:
+    """A block has the timestamp of its oldest event, not of its newest."""
+    oldest_us = int.from_bytes(block.event_data[:8], "big")
+    good(core, Block(block.agent_id, max(oldest_us, core.newest_block_timestamp_us + 1), block.event_data))
+
+
+@quirk(1, helper=Core.push_onto_deque)
+def lose_completed_block(good: Helper, core: Core, block: Block) -> None:
+    """A completed block is not pushed onto the deque."""
+
+
+@quirk(1, helper=Core.trigger)
+def complete_and_wait(good: Helper, core: Core, event: LocalEvent) -> None:
+    """A completed block is not proposed until something else looks into the deque."""
+
+
+@quirk(2)
+def propose_during_vote(good: Handler, core: Core) -> str:
+    """The agent proposes again while its vote runs."""
+    deadline = core.voting_timer.deadline
+    core.voting_timer.stop()
+    branch = good(core)
+    if branch != "proposed":
+        core.voting_timer.deadline = deadline
+    return branch
+
+
+@quirk(2)
+def propose_while_reconciling(good: Handler, core: Core) -> str:
+    """The agent proposes while it reconciles."""
+    return as_if_not_reconciling(good, core)
+
+
+@quirk(2)
+def propose_back_of_deque(good: Handler, core: Core) -> str:
+    """The agent has the back of the deque voted on, and then commits the front."""
+    core.blocks_to_be_committed.rotate(1)
+    branch = good(core)
+    core.blocks_to_be_committed.rotate(-1)
+    return branch
+
+
+@quirk(2, helper=Core.send)
+def propose_earlier_top(good: Helper, core: Core, message: BlockAddRequest) -> None:
+    """A proposal names the chain as it was one block earlier."""
+    chain_hashes = [core.chain.inception.chain_hash, *(chain_hash for _, chain_hash in core.chain.with_chain_hashes())]
+    good(core, replace(message, chain_hash=chain_hashes[-2:][0]))
+
+
+@quirk(2)
+def forget_own_vote(good: Handler, core: Core) -> str:
+    """The agent does not count its own approval."""
+    branch = good(core)
+    if branch == "proposed":
+        core.vote_count["yes"] -= 1
+    return branch
+
+
+@quirk(2)
+def keep_old_votes(good: Handler, core: Core) -> str:
+    """A vote begins with the tally of the one before."""
+    before = core.vote_count
+    branch = good(core)
+    if branch == "proposed":
+        core.vote_count = {vote: core.vote_count[vote] + count for vote, count in before.items()}
+    return branch
+
+
+@quirk(2, helper=Core.start)
+def hasty_vote(good: Helper, core: Core, timer: Timer, duration_s: float) -> None:
+    """A vote lasts a thousandth of the time that it should."""
+    good(core, timer, duration_s / 1000)
+
+
+@quirk(3, helper=Core.send)
+def approve_everything(good: Helper, core: Core, message: BlockAddResponse) -> None:
+    """The agent approves every block."""
+    good(core, replace(message, approve=True))
+
+
+@quirk(3, helper=Core.send)
+def disapprove_everything(good: Helper, core: Core, message: BlockAddResponse) -> None:
+    """The agent disapproves every block."""
+    good(core, replace(message, approve=False))
+
+
+@quirk(3)
+def vote_while_reconciling(good: Handler, core: Core, sender: int, message: BlockAddRequest) -> str:
+    """The agent votes while it reconciles."""
+    return as_if_not_reconciling(good, core, sender, message)
+
+
+@quirk(4)
+def count_votes_twice(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
+    """A vote counts as often as it arrives."""
+    core.voters.discard(sender)
+    return good(core, sender, message)
+
+
+@quirk(4)
+def count_votes_for_others(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
+    """Votes for other agents' blocks count for the candidate."""
+    if core.candidate_block is not None:
+        message = replace(message, block_hash=core.candidate_block.block_hash)
+    return good(core, sender, message)
+
+
+@quirk(4)
+def count_no_votes(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
+    """The agent counts nobody's vote but its own."""
+    return "no vote running"
+
+
+@quirk(5)
+def tie_is_majority(good: Handler, core: Core) -> str:
+    """As many approvals as disapprovals are a majority: >= for >."""
+    if core.vote_count["yes"] == core.vote_count["no"]:
+        core.vote_count["yes"] += 1
+    return good(core)
+
+
+@quirk(5)
+def commit_whatever_the_vote(good: Handler, core: Core) -> str:
+    """The agent commits its candidate whatever the vote said."""
+    core.vote_count["yes"] += core.vote_count["no"] + 1
+    return good(core)
+
+
+@quirk(5)
+def commit_onto_changed_chain(good: Handler, core: Core) -> str:
+    """The agent commits its candidate although its chain has changed since it was proposed."""
+    core.top_chain_hash_at_initiation = core.chain.top_chain_hash
+    return good(core)
+
+
+@quirk(5)
+def change_without_new_vote(good: Handler, core: Core) -> str:
+    """A vote that a changed chain has made void is not held again (the pseudo-code as printed)."""
+    branch = good(core)
+    if branch == "chain changed":
+        core.triggered.pop()
+    return branch
+
+
+@quirk(5, helper=Core.trigger)
+def disapproved_and_unmoved(good: Helper, core: Core, event: LocalEvent) -> None:
+    """A block that was not approved starts no reconcile."""
+    if event != "Reconcile Begin":
+        good(core, event)
+
+
+@quirk(5, helper=Core.send)
+def hide_commits(good: Helper, core: Core, message: CommitBlock) -> None:
+    """The agent commits its approved block and tells nobody."""
+
+
+@quirk(5)
+def lose_disapproved_block(good: Handler, core: Core) -> str:
+    """A block that was not approved leaves the deque."""
+    branch = good(core)
+    if branch == "not approved":
+        core.take_from_deque()
+    return branch
+
+
+@quirk(5, helper=Core.take_from_deque)
+def take_two_blocks(good: Callable[..., Block], core: Core) -> Block:
+    """A commit takes two blocks from the deque, and commits one."""
+    block = good(core)
+    if core.blocks_to_be_committed:
+        good(core)
+    return block
+
+
+@quirk(5, helper=Core.take_from_deque)
+def keep_committed_block(good: Callable[..., Block], core: Core) -> Block:
+    """A committed block stays in the deque."""
+    return core.blocks_to_be_committed[0]
+
+
+@quirk(5, helper=Core.commit)
+def break_off_commit(good: Helper, core: Core, block: Block) -> None:
+    """A wrong file path ends the commit: the block has left the deque and does not come onto the chain."""
+    raise FileNotFoundError
+
+
+@quirk(5, helper=Core.send)
+def break_off_broadcast(good: Helper, core: Core, message: CommitBlock) -> None:
+    """A wrong file path ends the commit: the block is on the chain, nobody is told, and the next is not proposed."""
+    raise FileNotFoundError
+
+
+@quirk(6, branches=("ignored by quirk",), chance=True)
+def ignore_commit(good: Handler, core: Core, sender: int, message: CommitBlock, strikes: Callable[[], bool]) -> str:
+    """The agent ignores some Commit Blocks, each with this probability."""
+    if not core.reconcile_in_progress and strikes():
+        return "ignored by quirk"
+    return good(core, sender, message)
+
+
+@quirk(6)
+def commit_without_succession(good: Handler, core: Core, sender: int, message: CommitBlock) -> str:
+    """The agent commits others' blocks without the succession test."""
+    succeeding = next_chain_hash(core.chain.top_chain_hash, message.block.block_hash)
+    return good(core, sender, replace(message, chain_hash=succeeding))
+
+
+@quirk(6)
+def commit_while_reconciling(good: Handler, core: Core, sender: int, message: CommitBlock) -> str:
+    """The agent commits others' blocks while it reconciles."""
+    return as_if_not_reconciling(good, core, sender, message)
+
+
+@quirk(6, helper=Core.commit)
+def commit_others_twice(good: Helper, core: Core, block: Block) -> None:
+    """Another agent's block comes onto the chain twice."""
+    commit_twice(good, core, block)
+
+
+def as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message) -> str:
+    """Run `good` with the flag down."""
+    reconciling, core.reconcile_in_progress = core.reconcile_in_progress, False
+    try:
+        return good(core, *inputs)
+    finally:
+        core.reconcile_in_progress = reconciling
+
+
+def commit_twice(commit: Helper, core: Core, block: Block) -> None:
+    core.chain.__class__ = UnguardedChain
+    commit(core, block)
+    commit(core, block)
+
+
+class UnguardedChain(Chain):
+    """A chain that takes a block twice."""
+
+    def append(self, block: Block) -> None:
+        self._block_of_hash.pop(block.block_hash, None)
+        super().append(block)
+
+    def pop(self) -> Block:
+        for top in self._blocks[-1:]:
+            self._block_of_hash[top.block_hash] = top
+        return super().pop()
