@@ -146,7 +146,7 @@ def _show(console: Console, finished: Run) -> None:
 
 def _emit_compose(console: Console, scenario: Scenario, seed: int, file: Path) -> None:
     from harness.play.containers.compose import write_compose
-    from harness.play.process.fleet import choose_vehicles
+    from harness.play.process.vehicle_kinds import choose_vehicles
     from sitl.system_ids import system_ids
 
     beside = write_compose(scenario, seed, choose_vehicles(scenario), system_ids(scenario.roster), file)

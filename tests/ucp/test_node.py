@@ -37,7 +37,7 @@ NEEDED = {
         "messages",
         "mission",
         "reconcile",
-        "request",
+        "_request",
         "settings",
         "short_value",
         "state",

@@ -61,7 +61,7 @@ class Processes(Backend):
         pace: Pace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
         from harness.play.process._program_backend import ProcessRun
-        from harness.play.process.fleet import choose_vehicles
+        from harness.play.process.vehicle_kinds import choose_vehicles
 
         # Another run is another mission: its blocks must not be taken for this one's.
         own = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()

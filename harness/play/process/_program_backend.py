@@ -19,10 +19,10 @@ from harness.play._vehicle_keys import Handed, handed_out
 from harness.play.agent_control import AgentRefusedError, Status
 from harness.play.mission import RunOutcome, Sought
 from harness.play.process._agent_process import AgentProcess, reboots_with_disk
+from harness.play.process._fleet import Fleet
 from harness.play.process._rogue_process import RogueProcess
 from harness.play.process._run_lab import MissionLab, OpenLab
 from harness.play.process._watchers import Watchers, unless_interrupted
-from harness.play.process.fleet import Fleet
 from harness.play.process.process_preflight import on_the_air
 from harness.play.progress import Progress, Snapshot
 from harness.scenario import Scenario

@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 
 from harness.errors import MachineError, ScenarioError
-from harness.play.process.fleet import choose_vehicles
+from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario
 from harness.scenario.changes import NetworkChange, timeline_of
 from netem.conditions import NetworkConditions

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from harness.errors import MachineError, ScenarioError
-from harness.play.process.fleet import choose_vehicles
+from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario, load_scenario
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
 from sitl.system_ids import system_ids

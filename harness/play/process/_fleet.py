@@ -1,24 +1,21 @@
-"""The vehicles of one run as programs: which kind each is, and their whole life."""
+"""The vehicles of one run as programs: made ready, flown, seen at a ground station, lost and replaced."""
 
 import asyncio
-import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from harness.archive.directory import RunDirectory
-from harness.errors import MachineError, ScenarioError
-from harness.play.process._run_lab import MissionLab
-from harness.play.process._vehicle_process import VehicleFailedError, VehicleProcess
-from harness.play.process._watchers import Watchers
+from harness.errors import ScenarioError
+from harness.play.process.run_lab import MissionLab
+from harness.play.process.vehicle_process import VehicleProcess
+from harness.play.process.watchers import Watchers
 from harness.scenario import Scenario
 from netem.radio import Place
 from sitl.address import Address
-from sitl.ardupilot import ArduPilot
 from sitl.circumstances import Circumstance
-from sitl.embedded import Embedded
 from sitl.ground_station import GroundStation
 from sitl.system_ids import system_ids
-from sitl.vehicle import Home, NoBinaryError, NoProgramError, VehicleError, VehicleKind
+from sitl.vehicle import Home, VehicleError, VehicleKind
 from ucp.clock import MissionClock
 
 
@@ -148,49 +145,3 @@ class Fleet:
 
     def to_json(self) -> dict[str, Any]:
         return {str(vehicle_id): vehicle.to_json() for vehicle_id, vehicle in self._vehicles.items()}
-
-
-def choose_vehicles(scenario: Scenario) -> dict[int, VehicleKind]:
-    """The kind of each vehicle; empty: no vehicles.
-
-    ArduPilot if the binaries of all are found, else the embedded vehicle, unless the scenario says. Raises
-    VehicleFailedError for a binary, or for what is asked of a vehicle, that will not do, MachineError if a program is
-    asked for and not here.
-    """
-    vehicles = scenario.vehicles
-    if vehicles.kind == "none":
-        return {}
-    try:
-        kinds = _ardupilots(scenario) or {
-            vehicle: Embedded(vehicles.type_of(vehicle), vehicles.setup_of(vehicle)) for vehicle in scenario.roster
-        }
-        for vehicle, kind in kinds.items():
-            _check(vehicle, kind)
-    except (NoBinaryError, NoProgramError) as error:
-        raise MachineError(str(error)) from None
-    except VehicleError as error:
-        raise VehicleFailedError(str(error)) from None
-    return kinds
-
-
-def _ardupilots(scenario: Scenario) -> dict[int, VehicleKind] | None:
-    """Raises NoBinaryError if they are asked for, or have to fly a frame of their own, and are not here."""
-    vehicles = scenario.vehicles
-    if vehicles.kind == "embedded":
-        return None
-    try:
-        return {
-            vehicle: ArduPilot.find(vehicles.binary, os.environ, vehicles.type_of(vehicle), vehicles.setup_of(vehicle))
-            for vehicle in scenario.roster
-        }
-    except NoBinaryError:
-        if vehicles.kind == "ardupilot":
-            raise
-        return None
-
-
-def _check(vehicle: int, kind: VehicleKind) -> None:
-    try:
-        kind.check()
-    except VehicleError as error:
-        raise type(error)(f"vehicle {vehicle}: {error}") from None
