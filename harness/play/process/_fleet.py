@@ -6,9 +6,9 @@ from typing import Any
 
 from harness.archive.directory import RunDirectory
 from harness.errors import ScenarioError
-from harness.play.process.run_lab import MissionLab
-from harness.play.process.vehicle_process import VehicleProcess
-from harness.play.process.watchers import Watchers
+from harness.play.process._run_lab import MissionLab
+from harness.play.process._vehicle_process import VehicleProcess
+from harness.play.process._watchers import Watchers
 from harness.scenario import Scenario
 from netem.radio import Place
 from sitl.address import Address

@@ -1,10 +1,11 @@
-"""Checks before a run with processes: what this machine or the scenario's ground station cannot do."""
+"""Checks before a run with processes: what this machine cannot do."""
 
 import asyncio
 import tempfile
 from pathlib import Path
 
 from harness.errors import MachineError, ScenarioError
+from harness.play._ground_station_check import refuse_what_no_ground_station_sees
 from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario
 from harness.scenario.changes import NetworkChange, timeline_of
@@ -13,20 +14,6 @@ from netem.errors import ConditionsError, EngineError, LabUnavailable, NetemErro
 from netem.lab import Lab
 from netem.radio import over_the_air
 from netem.tc import may_refuse
-from sitl.address import Address, connected
-from sitl.vehicle import VehicleError
-
-
-def refuse_what_no_ground_station_sees(scenario: Scenario) -> None:
-    """Raises ScenarioError if there is no way to the scenario's ground station, or nothing for it to see."""
-    if scenario.gcs is None:
-        return
-    if scenario.vehicles.kind == "none":
-        raise ScenarioError("a ground station sees vehicles, and `vehicles.kind` is none: leave out one of them")
-    try:
-        connected(Address.parse(scenario.gcs)).close()
-    except VehicleError as error:
-        raise ScenarioError(str(error)) from None
 
 
 def refuse_what_programs_cannot(scenario: Scenario) -> None:

@@ -3,7 +3,7 @@
 import os
 
 from harness.errors import MachineError
-from harness.play.process.vehicle_process import VehicleFailedError
+from harness.play.process._vehicle_process import VehicleFailedError
 from harness.scenario import Scenario
 from sitl.ardupilot import ArduPilot
 from sitl.embedded import Embedded
