@@ -68,7 +68,8 @@ from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import StoredState
 from ucp.timers import Timer
-from ucp.trace import Dropped, Entry, HandlerRun, Recorded, StateSummary, Tally, Trigger, in_base64
+from ucp.trace import Dropped, Entry, HandlerRun, Recorded, StateSummary, Tally, in_base64
+from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger, Trigger
 
 ON_MESSAGE: dict[type[Message], EventHandler[Any]] = {
     BlockAddRequest: commit.receive_request_add_block,
@@ -178,7 +179,7 @@ class Agent:
         core.now, core.running = now, handler
         branch = handler.run(core, sender, message)
         if self._tracing:
-            self._trace_run({"message": message.NAME, "from": sender, "seq": sequence}, datagram, handler, branch)
+            self._trace_run(MessageTrigger(message.NAME, sender, sequence), datagram, handler, branch)
         if core.triggered:
             self._run_triggered()
 
@@ -186,7 +187,7 @@ class Agent:
         """Log an event. Raises ValueError if it is larger than the mission's largest event."""
         self.check_size(event)
         came = Recorded(None, event) if self._tracing else None
-        self._handle(now, {"event": event.event_id}, came, self._on_local_event["Build Data Block"], event)
+        self._handle(now, EventTrigger(event.event_id), came, self._on_local_event["Build Data Block"], event)
 
     def check_size(self, event: LoggableEvent) -> None:
         """Raises ValueError if the event is larger than the mission's largest."""
@@ -227,7 +228,7 @@ class Agent:
     def end_timer(self, timer: Timer, now: float) -> None:
         """Run the handler of a timer that runs: it ends at `now`, however late."""
         timer.stop()
-        self._handle(now, {"timer": timer.name}, None, self._on_timer[timer.name])
+        self._handle(now, TimerTrigger(timer.name), None, self._on_timer[timer.name])
 
     def boot(self, recovered: StoredState, now: float) -> None:
         """Go on from what a former life left on its vehicle's disk; before any other input.
@@ -239,11 +240,11 @@ class Agent:
         core.now = now
         core.restore(recovered.completed, recovered.chain, recovered.deque, recovered.stack)
         came = Recorded(None, recovered) if self._tracing else None
-        self._handle(now, {"boot": len(core.chain)}, came, self._on_local_event["Reconcile Finalize"])
+        self._handle(now, BootTrigger(len(core.chain)), came, self._on_local_event["Reconcile Finalize"])
 
     def begin_reconcile(self, now: float) -> None:
         """Reconcile because the operator asks (a final reconcile at the depot, Section 5.1)."""
-        self._handle(now, {"operator": "reconcile"}, None, self._on_local_event["Reconcile Begin"])
+        self._handle(now, OperatorTrigger("reconcile"), None, self._on_local_event["Reconcile Begin"])
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
         """What to broadcast, in order, as (sequence, message); empties the outbox."""
@@ -292,7 +293,7 @@ class Agent:
             handler = core.running = self._on_local_event[event]
             branch = handler.run(core)
             if self._tracing:
-                self._trace_run({"local": by}, None, handler, branch)
+                self._trace_run(LocalTrigger(by), None, handler, branch)
 
     def _trace_run(self, trigger: Trigger, came: Recorded | None, handler: EventHandler[Any], branch: str) -> None:
         core, state = self._core, self._traced_state

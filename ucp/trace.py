@@ -12,12 +12,12 @@ from typing import Any, Protocol
 
 from ucp._dataclass import dataclass
 from ucp.messages import Datagram, Message, block_named
+from ucp.trigger import Trigger
 
 SCHEMA = "ucp-trace/2"
 
 _encode = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
 
-Trigger = dict[str, int | str]
 Tally = dict[str, int | list[int]]
 
 
@@ -105,8 +105,7 @@ class HandlerRun:
     """One run of one of the 20 handlers.
 
     t: mission seconds.
-    trigger: {"event": id}, {"message": name, "from": agent, "seq": n}, {"timer": name}, {"local": handler},
-        {"operator": command}, or {"boot": blocks in the chain that was found on disk}.
+    trigger: why the handler ran.
     changes: (operation, block hash); operations are `complete`, and `chain`, `deque`, `stack` with + or -.
     state: what holds after the run.
     input: what came with the trigger: the datagram as it was received; the event as a block has it; the blocks that
@@ -137,7 +136,7 @@ class HandlerRun:
             "t": round(self.t, 6),
             "handler": self.handler,
             "algorithm": self.algorithm,
-            "trigger": self.trigger,
+            "trigger": self.trigger.to_json(),
             "input": self.input and self.input.text,
             "branch": self.branch,
             "changes": self.changes,

@@ -14,6 +14,7 @@ from typing import Literal
 from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Trace
 from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
 
 LATEST_S = 1e7
 """No mission is as long; a handler run with a later time, or with none that can be, is left out."""
@@ -166,7 +167,7 @@ class _Incarnation:
             elif run.handler == "vote_timer_expiration":
                 self._end_vote(run.t, run.branch)
             elif run.handler == "reconcile_begin" and run.branch == "begun":
-                by = next(iter(run.trigger.items()), ("", ""))
+                by = next(iter(run.trigger.to_json().items()), ("", ""))
                 self._reconcile = REASONS.get(str(by[1]), "asked by the operator"), run.t
             elif self._reconcile is not None:
                 self._go_on(run)
@@ -225,7 +226,9 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
                     sent[agent, broadcast.seq].append(message)
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
-            of_this_number = sent.get((run.trigger.get("from"), run.trigger.get("seq")))
+            if not isinstance(run.trigger, MessageTrigger):
+                continue
+            of_this_number = sent.get((run.trigger.sender, run.trigger.sequence))
             if of_this_number and in_time(run):
                 by_then = bisect_right([message.at_s for message in of_this_number], run.t)
                 of_this_number[max(by_then - 1, 0)].receipts.append((agent, run.t))

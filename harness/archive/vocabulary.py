@@ -10,13 +10,13 @@ from typing import Literal
 from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER
 from ucp.quirks import CRASHED, QUIRKS
 from ucp.trace import HandlerRun
+from ucp.trigger import KINDS, LocalTrigger, MessageTrigger, TimerTrigger, UnknownTrigger
 
 Kind = Literal["trigger", "handler", "timer", "branch", "message", "operation", "tally"]
 
 Unknown = dict[Kind, str]
 """Kind -> the first unknown word of that kind, in words: "unknown timer name 'x'"."""
 
-TRIGGERS = frozenset(("message", "timer", "event", "local", "operator", "boot"))
 TIMERS = frozenset(ON_TIMER)
 MESSAGES = frozenset(message.NAME for message in ON_MESSAGE)
 OPERATIONS = frozenset(("complete", "chain+", "chain-", "deque+", "deque-", "stack+", "stack-"))
@@ -65,18 +65,18 @@ def unknown_words(runs: Iterable[HandlerRun]) -> Unknown:
             unknown.setdefault("branch", f"unknown branch {_shown(branch)} of {handler}")
     for run in runs:
         trigger = run.trigger
-        if "message" in trigger:
-            if trigger["message"] not in MESSAGES:
-                unknown.setdefault("message", f"unknown message name {_shown(trigger['message'])}")
-        elif "timer" in trigger:
-            if trigger["timer"] not in TIMERS:
+        if isinstance(trigger, MessageTrigger):
+            if trigger.message not in MESSAGES:
+                unknown.setdefault("message", f"unknown message name {_shown(trigger.message)}")
+        elif isinstance(trigger, TimerTrigger):
+            if trigger.timer not in TIMERS:
                 kind: Kind = "timer" if run.handler in _TIMER_OF else "trigger"
-                unknown.setdefault(kind, f"unknown timer name {_shown(trigger['timer'])}")
-        elif "local" in trigger:
-            if trigger["local"] not in HANDLERS:
-                unknown.setdefault("handler", f"unknown handler name {_shown(trigger['local'])}")
-        elif trigger and TRIGGERS.isdisjoint(trigger):
-            unknown.setdefault("trigger", f"unknown trigger {_shown(next(iter(trigger)))}")
+                unknown.setdefault(kind, f"unknown timer name {_shown(trigger.timer)}")
+        elif isinstance(trigger, LocalTrigger):
+            if trigger.handler not in HANDLERS:
+                unknown.setdefault("handler", f"unknown handler name {_shown(trigger.handler)}")
+        elif isinstance(trigger, UnknownTrigger) and names_another_kind(trigger):
+            unknown.setdefault("trigger", f"unknown trigger {_shown(next(iter(trigger.fields)))}")
         for operation, _ in run.changes:
             if operation not in OPERATIONS:
                 unknown.setdefault("operation", f"unknown operation {_shown(operation)}")
@@ -98,9 +98,14 @@ def tally_is_known(run: HandlerRun) -> bool:
     return not run.tally or keys is None or keys.issuperset(run.tally)
 
 
-def timer_that_ended(run: HandlerRun) -> str:
-    """The timer that triggered it: as it names it; by another name the one whose handler this is, if it is any's."""
-    name = str(run.trigger["timer"])
+def names_another_kind(trigger: UnknownTrigger) -> bool:
+    """Whether the trigger names a kind that the contract does not have, rather than none or a malformed one."""
+    return bool(trigger.fields) and KINDS.isdisjoint(trigger.fields)
+
+
+def timer_that_ended(run: HandlerRun, trigger: TimerTrigger) -> str:
+    """The timer that triggered the run. For an unknown name, the timer whose handler ran, if there is one."""
+    name = trigger.timer
     return name if name in TIMERS else _TIMER_OF.get(run.handler, name)
 
 

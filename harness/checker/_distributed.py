@@ -6,12 +6,21 @@ when its own timer does. Only traces can tell, and only in words that are known.
 
 from typing import Any
 
-from harness.archive.vocabulary import MESSAGES, TIMERS, TRIGGERS
+from harness.archive.vocabulary import MESSAGES, TIMERS, names_another_kind
 from harness.checker._waiting import waited_too_long
 from harness.checker.evidence import Evidence, Sendings
 from harness.checker.judgement import Finding, Judgement, agents, violated
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
 from ucp.trace import HandlerRun
+from ucp.trigger import (
+    BootTrigger,
+    EventTrigger,
+    LocalTrigger,
+    MessageTrigger,
+    OperatorTrigger,
+    TimerTrigger,
+    UnknownTrigger,
+)
 
 NAME = "distributed"
 
@@ -38,8 +47,8 @@ def check(evidence: Evidence) -> Judgement:
                 ran.add(run.handler)
                 if _is_plainly_right(run, ran, sent):
                     continue  # most runs are like this, and patterns take long
-                sender = run.trigger.get("from")
-                if isinstance(sender, int) and sender not in sent:
+                sender = run.trigger.sender if isinstance(run.trigger, MessageTrigger) else None
+                if sender is not None and sender not in sent:
                     untraced.add(sender)
                     continue
                 if not _is_in_known_words(run) or sender in sends_unknown:
@@ -48,7 +57,7 @@ def check(evidence: Evidence) -> Judgement:
                 if wrong and sender in evidence.injected.heard_of:
                     untraced.add(sender)
                     continue
-                if wrong and not (isinstance(sender, int) and evidence.traces[sender].problem):
+                if wrong and not (sender is not None and evidence.traces[sender].problem):
                     findings.append(Finding(agent_id, f"trace line {line}, t={run.t:g} s: {run.handler} {wrong}"))
     findings += waited_too_long(evidence)
     if findings:
@@ -71,54 +80,53 @@ def check(evidence: Evidence) -> Judgement:
 def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
     """Whether its own timer, an event, a handler that ran, or a message that its sender sent triggered the run."""
     trigger, handler = run.trigger, run.handler
-    if "seq" in trigger:
-        name = trigger.get("message")
-        if _OF_MESSAGE.get(name) != handler:  # type: ignore[arg-type]
-            return False
-        return trigger["seq"] in sent.get(trigger.get("from"), {}).get(name, ())
-    if len(trigger) > 1:
-        return False
-    if "local" in trigger:
-        return handler in _LOCAL and trigger["local"] in ran
-    if "event" in trigger:
+    if isinstance(trigger, MessageTrigger):
+        name = trigger.message
+        return _OF_MESSAGE.get(name) == handler and trigger.sequence in sent.get(trigger.sender, {}).get(name, ())
+    if isinstance(trigger, LocalTrigger):
+        return handler in _LOCAL and trigger.handler in ran
+    if isinstance(trigger, EventTrigger):
         return handler == _OF_EVENT
-    return _OF_TIMER.get(trigger.get("timer")) == handler  # type: ignore[arg-type]
+    return isinstance(trigger, TimerTrigger) and _OF_TIMER.get(trigger.timer) == handler
 
 
 def _is_in_known_words(run: HandlerRun) -> bool:
     """Whether handler and trigger are named as CONTRACT.md names them, as far as they are named at all."""
-    trigger = run.trigger
-    if run.handler not in HANDLERS or (trigger and TRIGGERS.isdisjoint(trigger)):
+    if run.handler not in HANDLERS:
         return False
-    return (
-        trigger.get("message", "") in {"", *MESSAGES}
-        and trigger.get("timer", "") in {"", *TIMERS}
-        and trigger.get("local", "") in {"", *HANDLERS}
-    )
+    match run.trigger:
+        case MessageTrigger(message):
+            return message in MESSAGES
+        case TimerTrigger(timer):
+            return timer in TIMERS
+        case LocalTrigger(handler):
+            return handler in HANDLERS
+        case UnknownTrigger() as unknown:
+            return not names_another_kind(unknown)
+    return True
 
 
 def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
     """What is wrong with the run's trigger, completing "the handler ..."; None if nothing is."""
-    trigger = run.trigger
-    match trigger:
-        case {"message": str(name), "from": int(sender), "seq": int(sequence)}:
+    match run.trigger:
+        case MessageTrigger(name, sender, sequence):
             if _OF_MESSAGE.get(name) != run.handler:
                 return f"was triggered by a {name}, which is another handler's"
             if sequence not in sent[sender].get(name, ()):
                 return f"was triggered by {name} number {sequence}, which agent {sender} never sent"
-        case {"timer": str(timer)}:
+        case TimerTrigger(timer):
             if _OF_TIMER.get(timer) != run.handler:
                 return f"was triggered by the {timer} timer, which is another handler's"
-        case {"local": by}:
+        case LocalTrigger(by):
             if run.handler not in _LOCAL or by not in ran:
                 return f"was triggered by {by}, which had not run"
-        case {"event": _}:
+        case EventTrigger():
             if run.handler != _OF_EVENT:
                 return "was triggered by a logged event, which is Build Data Block's"
-        case {"operator": _}:
+        case OperatorTrigger():
             if run.handler != "reconcile_begin":
                 return "was triggered by the operator, who can only begin a reconcile"
-        case {"boot": _}:
+        case BootTrigger():
             if run.handler != "reconcile_finalize" or len(ran) > 1:
                 return "was triggered by a boot, which only ends a reconcile, and before anything else"
         case _:

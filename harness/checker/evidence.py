@@ -23,6 +23,7 @@ from harness.play.rogue.rogue_line import OF_NO_INJECTION
 from ucp.block import HASH_BYTES
 from ucp.state import AgentState
 from ucp.trace import HandlerRun, Sent
+from ucp.trigger import MessageTrigger
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -88,11 +89,11 @@ class RogueTraffic:
                 self.heard_of.add(datagram.sender)
         return self
 
-    def may_be(self, trigger: dict[str, Any]) -> bool:
+    def may_be(self, trigger: MessageTrigger) -> bool:
         """Whether the rogue may have sent the message that triggered a handler."""
         if not self.messages:
             return False
-        return self.counted or (trigger.get("from"), trigger.get("seq"), trigger.get("message")) in self.messages
+        return self.counted or (trigger.sender, trigger.sequence, trigger.message) in self.messages
 
 
 @dataclass

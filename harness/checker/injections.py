@@ -24,6 +24,7 @@ from harness.play.rogue.rogue_line import injection_of
 from harness.scenario import Scenario
 from harness.scenario.changes import injections_of
 from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
 
 SKEW_S = 0.05
 """Mission seconds by which clocks of two processes may differ."""
@@ -131,10 +132,10 @@ def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[H
     """The handler runs that these messages triggered, or forged ones."""
     triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:
-        sequence = run.trigger.get("seq")
-        if isinstance(sequence, int):
-            key = (run.trigger.get("from"), sequence, run.trigger.get("message"))
-            if key in copies or injection_of(sequence) is not None:
+        trigger = run.trigger
+        if isinstance(trigger, MessageTrigger):
+            key = (trigger.sender, trigger.sequence, trigger.message)
+            if key in copies or injection_of(trigger.sequence) is not None:
                 triggered[key].append(run)
     return triggered
 

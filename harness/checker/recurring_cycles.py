@@ -15,6 +15,7 @@ from harness.checker._waiting import ALL_TIMERS, longest
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, agents
 from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
 
 SEVERAL = 5
 """So often in a row is no coincidence."""
@@ -120,7 +121,7 @@ def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | N
 def _own_runs(trace: Trace) -> list[HandlerRun]:
     """The last runs with which the agent went on or that changed something, in its last life."""
     start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
-    runs = (run for run in trace.runs[start:] if "message" not in run.trigger or run.changes)
+    runs = (run for run in trace.runs[start:] if run.changes or not isinstance(run.trigger, MessageTrigger))
     return [run for run in runs if run.branch != ALREADY]
 
 
@@ -162,10 +163,12 @@ def _waits(evidence: Evidence, rounds: dict[int, _Round], period_s: float) -> It
         for run in reversed(evidence.traces[agent_id].runs):
             if run.t < each.runs[-1].t - period_s:
                 break
+            if not isinstance(run.trigger, MessageTrigger):
+                continue
             if run.branch in COUNTED.get(run.handler, ()):
-                heard.add(int(run.trigger["from"]))
+                heard.add(run.trigger.sender)
             elif (run.handler, run.branch) == REFUSED:
-                refused_by.add(int(run.trigger["from"]))
+                refused_by.add(run.trigger.sender)
         asks = any(run.handler in ASKS for run in each.runs)
         silent = set(evidence.exports) - heard - {agent_id} if asks else set()
         if silent or refused_by:

@@ -13,6 +13,7 @@ from rich.text import Text
 from harness.commands.terminal import complain, print_json
 from harness.report.agent_programs import in_sentence
 from harness.report.difference import AgentDifference, Difference, Parting, Step, compare
+from ucp.trigger import MessageTrigger, Trigger
 
 DIFFERENT = 1
 VALUE_CHARACTERS = 60
@@ -98,11 +99,11 @@ def _step(step: Step | None, changes: bool, sent: bool) -> str:
     return words
 
 
-def _trigger(trigger: dict[str, int | str]) -> str:
+def _trigger(trigger: Trigger) -> str:
     """What made the handler run, such as: Commit Block, number 17 of agent 4."""
-    if "message" in trigger:
-        return f"{trigger['message']}, number {trigger.get('seq')} of agent {trigger.get('from')}"
-    return ", ".join(f"{kind} {what}" for kind, what in trigger.items())
+    if isinstance(trigger, MessageTrigger):
+        return f"{trigger.message}, number {trigger.sequence} of agent {trigger.sender}"
+    return ", ".join(f"{kind} {what}" for kind, what in trigger.to_json().items())
 
 
 def _value(value: Any) -> str:

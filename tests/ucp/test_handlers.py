@@ -19,6 +19,7 @@ from ucp.handler import EventHandler, LocalEvent
 from ucp.messages import Message, RequestForBlock
 from ucp.settings import Settings
 from ucp.state import AgentState
+from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger
 
 OF_MESSAGE = {message.NAME: handler.name for message, handler in ON_MESSAGE.items()}
 OF_TIMER = {timer: handler.name for timer, handler in ON_TIMER.items()}
@@ -63,23 +64,23 @@ def done(trace: Trace, handlers: dict[str, EventHandler[Any]]) -> Iterator[tuple
                 assert sent.message in {message.NAME for message in declared.sends}, where
                 yield run.handler, sent.message
             match run.trigger:
-                case {"message": message}:
+                case MessageTrigger(message):
                     assert OF_MESSAGE[message] == run.handler, where
-                case {"timer": timer}:
+                case TimerTrigger(timer):
                     assert OF_TIMER[timer] == run.handler, where
                     starters = {name for name, handler in HANDLERS.items() if timer in handler.starts}
                     assert starters & ran, where
                     yield from ((starter, timer) for starter in starters & ran)
-                case {"local": by}:
+                case LocalTrigger(by):
                     (event,) = (event for event, name in OF_LOCAL_EVENT.items() if name == run.handler)
                     assert event in handlers[by].triggers, where
                     assert by in ran, where
                     yield by, event
-                case {"event": _}:
+                case EventTrigger():
                     assert run.handler == OF_LOCAL_EVENT["Build Data Block"], where
-                case {"operator": _}:
+                case OperatorTrigger():
                     assert run.handler == OF_LOCAL_EVENT["Reconcile Begin"], where
-                case {"boot": _}:
+                case BootTrigger():
                     assert run.handler == OF_LOCAL_EVENT["Reconcile Finalize"], where
                 case other:
                     pytest.fail(f"{where} has the trigger {other}")

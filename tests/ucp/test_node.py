@@ -42,7 +42,7 @@ NEEDED = {
         "short_value",
         "state",
     ),
-    *("sealed", "_status", "store", "timers", "trace", "wire"),
+    *("sealed", "_status", "store", "timers", "trace", "trigger", "wire"),
 }
 """The modules of `ucp` that every agent loads."""
 
@@ -465,7 +465,7 @@ def test_a_killed_agent_with_a_store_goes_on_from_it(directory: Path, tmp_path: 
         assert trace is not None
         if known:
             first = trace.runs[0]
-            assert (first.handler, set(first.trigger)) == ("reconcile_finalize", {"boot"})
+            assert (first.handler, first.trigger.kind) == ("reconcile_finalize", "boot")
             assert [block for operation, block in first.changes if operation == "complete"] == known
             assert first.t > 1.0
         known = trace.completed()
@@ -544,7 +544,7 @@ def test_an_agent_that_joins_late_logs_no_events_of_before(directory: Path) -> N
     agent.process.communicate()
     trace = read_trace(directory / "7.trace.jsonl")
     assert trace is not None
-    events = [run.t for run in trace.runs if "event" in run.trigger]
+    events = [run.t for run in trace.runs if run.trigger.kind == "event"]
     assert min(events) > 10_000
     assert all(later > earlier for earlier, later in pairwise(events))
 

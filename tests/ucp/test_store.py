@@ -17,6 +17,7 @@ from ucp.messages import CommitBlock
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import Store, StoredState, StoreError
+from ucp.trigger import BootTrigger
 
 
 class StoringAir(Air):
@@ -98,7 +99,7 @@ def test_the_first_run_after_a_boot_names_all_that_was_found() -> None:
     mine, other, waiting, popped = Block(1, 1, b"a"), Block(2, 2, b"b"), Block(1, 3, b"c"), Block(2, 1, b"d")
     agent.boot(StoredState([mine.block_hash, waiting.block_hash], [mine, other], [waiting], [popped]), 60.0)
     first, second = agent.trace()
-    assert (first.handler, first.trigger, first.branch) == ("reconcile_finalize", {"boot": 2}, "done")
+    assert (first.handler, first.trigger, first.branch) == ("reconcile_finalize", BootTrigger(2), "done")
     hashes = {name: block.block_hash.hex() for name, block in locals().items() if isinstance(block, Block)}
     assert first.changes == [
         ("complete", hashes["mine"]),

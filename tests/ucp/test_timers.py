@@ -2,6 +2,7 @@
 
 from tests.ucp.air import Air
 from ucp.timers import Timer
+from ucp.trigger import TimerTrigger
 
 
 def test_a_paused_timer_keeps_what_was_left() -> None:
@@ -29,5 +30,5 @@ def test_timers_that_expired_meanwhile_are_handled_in_the_order_of_their_deadlin
     agent.handle_timer(60.0)
     agent.handle_timer(60.0)
     air.flush(1)
-    timers = [run.trigger["timer"] for run in air.runs[1] if "timer" in run.trigger]
+    timers = [run.trigger.timer for run in air.runs[1] if isinstance(run.trigger, TimerTrigger)]
     assert timers == ["voting", "phase one"]

@@ -11,6 +11,7 @@ from harness.archive.packets.pcap import INBOUND, OUTBOUND
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import times
 from harness.checker.records.contradiction import Contradiction, of_agent, slack_s
+from ucp.trigger import MessageTrigger
 
 COUNTS_DATAGRAMS = "nftables"
 """The engine whose counters are of what was broadcast; others also count what they doubled."""
@@ -42,7 +43,8 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
         if untold := sum((left[agent_id] - sent).values()):
             detail = f"{times(untold)} its vehicle's capture saw a message leave that its trace does not tell of"
             yield of_agent(agent_id, detail, "1", short=True)
-        heard = {(run.trigger.get("from"), run.trigger["seq"]) for run in trace.runs if "seq" in run.trigger}
+        triggers = (run.trigger for run in trace.runs)
+        heard = {(each.sender, each.sequence) for each in triggers if isinstance(each, MessageTrigger)}
         if unheard := len(heard - reached[agent_id].keys()):
             detail = f"{times(unheard)} it handled a message that its vehicle's capture did not see arrive"
             yield of_agent(agent_id, detail, "1")
@@ -88,7 +90,7 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
         if counted is None or counted.passed is None or counted.lost is None or counted.cut is None:
             continue
         by = record.mission_s - slack_s(trace)
-        heard = sum("seq" in run.trigger for run in trace.runs if run.t < by)
+        heard = sum(isinstance(run.trigger, MessageTrigger) for run in trace.runs if run.t < by)
         if heard > counted.passed:
             detail = f"it handled {heard} messages, and the kernel let {counted.passed} through to its vehicle"
             yield of_agent(agent_id, detail, "1")

@@ -7,6 +7,7 @@ from harness.checker._trace_replay import Life
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import Contradiction
+from ucp.trigger import BootTrigger
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
@@ -37,7 +38,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 def _over_brown_outs(evidence: Evidence, agent_id: int, lives: list[Life]) -> Iterator[Contradiction]:
     """What it had completed is found on its disk; it may have been killed over a line that its trace lacks."""
     for before, after in pairwise(lives):
-        if not after.runs or "boot" not in after.runs[0].trigger:
+        if not after.runs or not isinstance(after.runs[0].trigger, BootTrigger):
             continue
         restored = [block for operation, block in after.runs[0].changes if operation == "complete"]
         if restored[: len(before.completed)] != before.completed:

@@ -8,6 +8,7 @@ from harness.checker.records._trace_consistency import finding
 from harness.checker.records.contradiction import Contradiction, slack_s
 from ucp.messages import BlockResponse, CommitBlock
 from ucp.trace import HandlerRun, Recorded
+from ucp.trigger import MessageTrigger
 
 CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 
@@ -20,9 +21,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         for life in lives:
             for line, run in life.numbered():
                 trigger = run.trigger
-                if "seq" not in trigger:
+                if not isinstance(trigger, MessageTrigger):
                     continue
-                sent = sendings.get(trigger.get("from"), {}).get(trigger.get("message"), {}).get(trigger["seq"])
+                sent = sendings.get(trigger.sender, {}).get(trigger.message, {}).get(trigger.sequence)
                 if sent is None:
                     continue  # what nobody sent is characteristic 1's to say
                 first_s, message = sent[0]
@@ -31,22 +32,24 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                 if as_it_went and run.t >= first_s - slack and not run.changes:
                     continue  # most are like this
                 if not evidence.injected.may_be(trigger):
-                    for sight, touches in _unlike(line, run, sent, first_s - slack):
+                    for sight, touches in _unlike(line, run, trigger, sent, first_s - slack):
                         yield Contradiction(finding(evidence, agent_id, sight), touches)
 
 
-def _unlike(line: int, run: HandlerRun, sent: Sending, earliest_s: float) -> Iterator[tuple[Sight, str]]:
+def _unlike(
+    line: int, run: HandlerRun, trigger: MessageTrigger, sent: Sending, earliest_s: float
+) -> Iterator[tuple[Sight, str]]:
     """What was heard otherwise than it was sent, and the characteristic that it touches."""
     if run.t < earliest_s:
-        yield Sight(line, run, f"heard {_named(run)}, which was sent at {sent[0][0]:g} s"), "1"
+        yield Sight(line, run, f"heard {_named(trigger)}, which was sent at {sent[0][0]:g} s"), "1"
     if run.input is not None and not _as_it_went(run.input, sent):
-        yield Sight(line, run, f"heard {_named(run)} with another content than it was sent with"), "1"
-    elif run.changes and (other := _another_block(run, sent)):
-        yield Sight(line, run, f"took this block from {_named(run)}, which carried another", other), "4"
+        yield Sight(line, run, f"heard {_named(trigger)} with another content than it was sent with"), "1"
+    elif run.changes and (other := _another_block(run, trigger, sent)):
+        yield Sight(line, run, f"took this block from {_named(trigger)}, which carried another", other), "4"
 
 
-def _named(run: HandlerRun) -> str:
-    return "{message} number {seq} of agent {from}".format(**run.trigger)
+def _named(trigger: MessageTrigger) -> str:
+    return f"{trigger.message} number {trigger.sequence} of agent {trigger.sender}"
 
 
 def _as_it_went(datagram: Recorded, sent: Sending) -> bool:
@@ -54,9 +57,9 @@ def _as_it_went(datagram: Recorded, sent: Sending) -> bool:
     return None in told or datagram in told
 
 
-def _another_block(run: HandlerRun, sent: Sending) -> str | None:
+def _another_block(run: HandlerRun, trigger: MessageTrigger, sent: Sending) -> str | None:
     """The block that the agent took onto its chain from a message that did not carry it."""
-    if run.trigger["message"] not in CARRY_A_BLOCK:
+    if trigger.message not in CARRY_A_BLOCK:
         return None
     carried = {message.block for _, message in sent}
     return next((block for operation, block in run.changes if operation == "chain+" and block not in carried), None)

@@ -24,7 +24,8 @@ from ucp.events import MalformedEventsError
 from ucp.handler import EventHandler
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.state import AgentState
-from ucp.trace import HandlerRun, Recorded, StateSummary, Trigger
+from ucp.trace import HandlerRun, Recorded, StateSummary
+from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger
 
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
@@ -101,7 +102,7 @@ class Follower:
         if self.lost is not None:
             return
         core, trigger = self._core, run.trigger
-        local = trigger.get("local")
+        local = _triggered_by(run)
         if core.triggered or local is not None:
             self._triggered(line, run, local)
         core.now = now = self._header.local(run.t)
@@ -112,12 +113,12 @@ class Follower:
                 self._overdue(line, run.t, now)
         else:
             self._ran[run.handler] = line, run.t
-        heard = "message" in trigger
-        may_touch_timers = not heard or run.handler in TOUCH_A_TIMER
+        heard = trigger if isinstance(trigger, MessageTrigger) else None
+        may_touch_timers = heard is None or run.handler in TOUCH_A_TIMER
         before = core.before(run) if may_touch_timers else None
         try:
-            if heard:
-                handler, sender, message = self._message(run, trigger)
+            if heard is not None:
+                handler, sender, message = self._message(run, heard)
                 core.running = handler
                 if self.stops_before_handler:
                     breakpoint()
@@ -170,7 +171,7 @@ class Follower:
         """What the run that comes next shows to be wrong of those before it: what they triggered. Nothing is run."""
         foreseeing = self.copy()
         if foreseeing.lost is None:
-            foreseeing._triggered(line, run, run.trigger.get("local"))
+            foreseeing._triggered(line, run, _triggered_by(run))
         return foreseeing.deviations
 
     def end(self, at_s: float | None) -> None:
@@ -184,17 +185,17 @@ class Follower:
 
     # What should have come before
 
-    def _triggered(self, line: int, run: HandlerRun, local: int | str | None) -> None:
+    def _triggered(self, line: int, run: HandlerRun, by: str | None) -> None:
         """Handlers run that were triggered, and no others."""
         self._state = None
         triggered = self._core.triggered
         if self._adopted:
             triggered.clear()
             return
-        if local is None:
+        if by is None:
             self._not_run()
             return
-        by, event = str(local), EVENT_OF.get(run.handler, "what is no local event")
+        event = EVENT_OF.get(run.handler, "what is no local event")
         expected, truly_by = triggered[0] if triggered else (None, None)
         is_expected = expected is not None and ON_LOCAL_EVENT[expected].name == run.handler
         if is_expected and by == truly_by:
@@ -259,15 +260,15 @@ class Follower:
         """The handler that this runs, and what it is given, where no message came. Raises NotHandledError."""
         trigger = run.trigger
         inputs: tuple[Any, ...]
-        if "local" in trigger:
+        if isinstance(trigger, LocalTrigger):
             handler, inputs = self._local(run), ()
-        elif "timer" in trigger:
-            handler, inputs = self._timer(timer_that_ended(run), now), ()
-        elif "event" in trigger:
-            handler, inputs = ON_LOCAL_EVENT["Build Data Block"], self._event(run.input, trigger["event"])
-        elif trigger.get("operator") == "reconcile":
+        elif isinstance(trigger, TimerTrigger):
+            handler, inputs = self._timer(timer_that_ended(run, trigger), now), ()
+        elif isinstance(trigger, EventTrigger):
+            handler, inputs = ON_LOCAL_EVENT["Build Data Block"], self._event(run.input, trigger.event_id)
+        elif trigger == OperatorTrigger("reconcile"):
             handler, inputs = ON_LOCAL_EVENT["Reconcile Begin"], ()
-        elif "boot" in trigger:
+        elif isinstance(trigger, BootTrigger):
             self._boot(run)
             handler, inputs = ON_LOCAL_EVENT["Reconcile Finalize"], ()
         else:
@@ -283,7 +284,7 @@ class Follower:
             self._core.go_along(run)
         return HANDLERS[run.handler]
 
-    def _message(self, run: HandlerRun, trigger: Trigger) -> tuple[EventHandler[Any], int, Message]:
+    def _message(self, run: HandlerRun, trigger: MessageTrigger) -> tuple[EventHandler[Any], int, Message]:
         """The handler that this runs, and what it is given: a message, and who sent it. Raises NotHandledError."""
         try:
             sender, sequence, message = decoded(run.input)
@@ -293,10 +294,10 @@ class Follower:
             self._blocks.add_from(message)
         if reason := why_not_handled(self._header.agent_id, self._header.roster, sender, message):
             raise NotHandledError(f"handled a datagram that is to be dropped: {reason}")
-        name, by, number = trigger["message"], trigger.get("from"), trigger.get("seq")
+        name, by, number = trigger.message, trigger.sender, trigger.sequence
         if name != message.NAME or by != sender or number != sequence:
             raise NotHandledError(
-                f"said to have got {str(name)[:60]} {number} from agent {by}, "
+                f"said to have got {name[:60]} {number} from agent {by}, "
                 f"and the datagram is {message.NAME} {sequence} from agent {sender}"
             )
         handler = ON_MESSAGE[type(message)]
@@ -314,7 +315,7 @@ class Follower:
             raise NotHandledError(f"ran {early:.3g} s before the {name} timer ended")
         return ON_TIMER[name]
 
-    def _event(self, record: Recorded | None, event_id: int | str) -> tuple[Any, ...]:
+    def _event(self, record: Recorded | None, event_id: int) -> tuple[Any, ...]:
         try:
             event = event_of(record)
         except MalformedEventsError as malformed:
@@ -414,3 +415,8 @@ class Follower:
 
     def _differ(self, line: int, at_s: float, handler: str, what: str) -> None:
         self.deviations.append(Deviation(self._header.agent_id, line, at_s, handler, what))
+
+
+def _triggered_by(run: HandlerRun) -> str | None:
+    """The handler whose local event triggered the run; None if something else did."""
+    return run.trigger.handler if isinstance(run.trigger, LocalTrigger) else None

@@ -46,6 +46,7 @@ from ucp.messages import (
     encode,
 )
 from ucp.trace import Dropped, HandlerRun, Recorded, in_base64
+from ucp.trigger import LocalTrigger, MessageTrigger, OperatorTrigger
 
 START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
 HEAD_START_S = 2.0
@@ -130,7 +131,7 @@ def script_of(record: Record) -> Script:
             if reconciling and not run.state.reconciling:
                 finished.append(run.t)
             reconciling = run.state.reconciling
-            if "message" in run.trigger and run.input is not None:
+            if isinstance(run.trigger, MessageTrigger) and run.input is not None:
                 datagrams.append(_answering(questions, run.t, run.input))
             if run.handler == "reconcile_begin" and run.branch == "begun" and _by_itself(run):
                 reconciles.append(run.t)
@@ -177,7 +178,7 @@ def _answering(questions: Mapping[tuple[type, bytes], tuple[float, str]], t: flo
 
 
 def _by_itself(run: HandlerRun) -> bool:
-    return "operator" in run.trigger or run.trigger.get("local") == "vote_timer_expiration"
+    return isinstance(run.trigger, OperatorTrigger) or run.trigger == LocalTrigger("vote_timer_expiration")
 
 
 def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:

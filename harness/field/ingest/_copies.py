@@ -39,7 +39,7 @@ def _worth(life: Life) -> tuple[bool, int, int]:
 
 def _key(run: HandlerRun) -> tuple[object, ...]:
     """What tells one handler run of a life from all others."""
-    return round(run.t, 3), run.handler, *run.trigger.items(), run.branch, run.state.chain, run.state.top
+    return round(run.t, 3), run.handler, run.trigger, run.branch, run.state.chain, run.state.top
 
 
 def _is_copy(life: Life, other: Life) -> bool:

@@ -13,6 +13,7 @@ from harness.checker.steps.trace_header import CheckedHeader
 from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.messages import decode
 from ucp.trace import HandlerRun
+from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger
 
 
 class UnusableInputError(Exception):
@@ -102,7 +103,7 @@ class _Reader:
             words = unknown_words([run])
             if words.keys() - COMPARED_WITHOUT:
                 raise UnusableInputError(f"line {line}: {first_of(words)}")
-            if "local" in run.trigger:
+            if isinstance(run.trigger, LocalTrigger):
                 if current is None:
                     raise UnusableInputError(f"line {line}: {run.handler} ran for a local event before anything came")
                 current.runs.append(run)
@@ -119,33 +120,32 @@ class _Reader:
     def _what(self, line: int, run: HandlerRun) -> What:
         trigger = run.trigger
         try:
-            if "message" in trigger:
-                return Heard(self._datagram(line, run))
-            if "event" in trigger:
-                return Logged(event_of(run.input) if run.input is not None else self._event(line, trigger["event"]))
+            if isinstance(trigger, MessageTrigger):
+                return Heard(self._datagram(line, run, trigger))
+            if isinstance(trigger, EventTrigger):
+                return Logged(event_of(run.input) if run.input is not None else self._event(line, trigger.event_id))
         except (ValueError, MalformedEventsError):
             raise UnusableInputError(f"line {line}: the input of {run.handler} is damaged") from None
-        if "timer" in trigger:
-            return TimerEnded(timer_that_ended(run))
-        if "operator" in trigger:
+        if isinstance(trigger, TimerTrigger):
+            return TimerEnded(timer_that_ended(run, trigger))
+        if isinstance(trigger, OperatorTrigger):
             return Asked()
-        if "boot" in trigger:
+        if isinstance(trigger, BootTrigger):
             return Booted()
         raise UnusableInputError(f"line {line}: {run.handler} ran without a trigger that there is")
 
-    def _datagram(self, line: int, run: HandlerRun) -> bytes:
+    def _datagram(self, line: int, run: HandlerRun, trigger: MessageTrigger) -> bytes:
         if run.input is not None:
             return base64.b64decode(run.input.text, validate=True)
-        sender, sequence = run.trigger.get("from"), run.trigger.get("seq")
-        if isinstance(sender, int) and isinstance(sequence, int):
-            for datagram in self._missing.datagrams(sender, sequence):
-                if run.trigger["message"] == decode(datagram).message.NAME:
-                    return datagram
+        sender, sequence = trigger.sender, trigger.sequence
+        for datagram in self._missing.datagrams(sender, sequence):
+            if trigger.message == decode(datagram).message.NAME:
+                return datagram
         raise UnusableInputError(
             f"line {line}: datagram {sequence} of agent {sender} is on no record: bring its trace, or a capture"
         )
 
-    def _event(self, line: int, event_id: int | str) -> LoggableEvent:
+    def _event(self, line: int, event_id: int) -> LoggableEvent:
         if self._events is None:
             self._events = iter(self._missing.events(self._header.agent_id))
         event = next(self._events, None)

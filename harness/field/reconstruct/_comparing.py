@@ -9,6 +9,7 @@ from harness.field.reconstruct._rehearsal import Rehearsal, same_sent
 from harness.field.reconstruct._timetable import Timetable
 from harness.run.simulate import Simulated
 from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,9 @@ def _played(trace: Trace | None) -> Iterator[Step]:
 
 def _effective(steps: Iterable[Step]) -> Iterator[Step]:
     """Without messages of which nothing came but a tally."""
-    return (step for step in steps if step[2].changes or step[2].sent or "message" not in step[2].trigger)
+    return (
+        step for step in steps if step[2].changes or step[2].sent or not isinstance(step[2].trigger, MessageTrigger)
+    )
 
 
 def _compare(agent_id: int, recorded: Sequence[Step], played: Sequence[Step]) -> FirstDifference | None:

@@ -23,6 +23,7 @@ from ucp.messages import CommitBlock, MalformedDatagramError, decode, encode
 from ucp.quirks import Quirks, wrong_handlers
 from ucp.store import StoredState
 from ucp.trace import Entry, HandlerRun, Sent
+from ucp.trigger import LocalTrigger
 
 MAX_NAME = 40
 
@@ -252,7 +253,7 @@ def _differs(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | 
     runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
     for ours, theirs in zip_longest(runs, recorded):
         if ours is None:
-            if theirs.changes or theirs.sent or "local" in theirs.trigger:
+            if theirs.changes or theirs.sent or isinstance(theirs.trigger, LocalTrigger):
                 return f"ran {theirs.handler}, which should have done nothing"
         elif theirs is None:
             return f"did not run {ours.handler}, which was triggered"

@@ -15,6 +15,7 @@ from harness.field.replay._player import Player
 from harness.present.text import shown
 from ucp.clock import MICROSECONDS
 from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
 
 NEAR_S = 2.0
 """Steps of others so near to the moment are shown, in mission seconds before and after."""
@@ -101,8 +102,9 @@ class _Other:
 
     def has_to_do_with(self, theirs: int, run: HandlerRun) -> Iterator[Text]:
         """Where it sent what triggered our run, and what it made of what our run sent."""
-        if run.trigger.get("from") == theirs:
-            numbers = self._exchanges.that_sent(run.trigger.get("message"), run.trigger.get("seq"))
+        trigger = run.trigger
+        if isinstance(trigger, MessageTrigger) and trigger.sender == theirs:
+            numbers = self._exchanges.that_sent(trigger.message, trigger.sequence)
             for line, sending in self._nearest(numbers, run.t):
                 yield shown(
                     f"    sent it at line {line}, by {sending.handler[:40]}: {sending.branch[:40]}", style="green"

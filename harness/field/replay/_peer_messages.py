@@ -7,6 +7,7 @@ from harness.archive.traces import Trace
 from harness.field.reconstruct._clock_offsets import Delivery
 from harness.field.replay._agent_record import Record
 from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
 
 
 class Exchange(NamedTuple):
@@ -28,8 +29,9 @@ class Exchanges:
         for number, (_, run) in enumerate(self.runs):
             for message in run.sent:
                 self._sent.setdefault((message.message, message.seq), []).append(number)
-            if run.trigger.get("from") == record.agent_id and "message" in run.trigger:
-                self._heard.setdefault((run.trigger["message"], run.trigger.get("seq")), []).append(number)
+            trigger = run.trigger
+            if isinstance(trigger, MessageTrigger) and trigger.sender == record.agent_id:
+                self._heard.setdefault((trigger.message, trigger.sequence), []).append(number)
 
     def that_sent(self, message: object, sequence: object) -> list[int]:
         """The other's runs that sent a message of this type and number: one in each of its lives, at most."""
@@ -46,8 +48,9 @@ class Exchanges:
             run = entry.what
             if not isinstance(run, HandlerRun):
                 continue
-            if run.trigger.get("from") == other:
-                sent = self.that_sent(run.trigger.get("message"), run.trigger.get("seq"))
+            trigger = run.trigger
+            if isinstance(trigger, MessageTrigger) and trigger.sender == other:
+                sent = self.that_sent(trigger.message, trigger.sequence)
                 if len(sent) == 1:
                     yield Exchange(position, Delivery(other, own, self.runs[sent[0]][1].t, run.t))
             for message in run.sent:

@@ -22,6 +22,7 @@ from harness.field.replay.replay_names import RecordedBlocks
 from ucp.block import HASH_BYTES, Block, InceptionBlock, next_chain_hash
 from ucp.events import MalformedEventsError
 from ucp.trace import HandlerRun
+from ucp.trigger import EventTrigger
 
 _Below = dict[bytes, tuple[bytes, str]]
 """Chain hash -> the chain hash below it, and the block between."""
@@ -109,7 +110,7 @@ class Resumption:
         """The block that is being built after an entry, by the events that follow; None if nobody can know it."""
         logged = bytearray()
         for _, run in self._rest(position):
-            if run.handler != "build_data_block" or "event" not in run.trigger:
+            if run.handler != "build_data_block" or not isinstance(run.trigger, EventTrigger):
                 continue
             logged += event_of(run.input).encode()
             completed = next((block for operation, block in run.changes if operation == "complete"), None)

@@ -18,6 +18,7 @@ from ucp.block import Block
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError, Message
 from ucp.trace import Dropped, HandlerRun, Recorded, Sent
+from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger
 
 BLOCKS_SHOWN = 8
 
@@ -122,18 +123,17 @@ class Words:
 
     def _trigger(self, run: HandlerRun) -> str:
         match run.trigger:
-            case {"message": name}:
-                sender, sequence = run.trigger.get("from"), run.trigger.get("seq")
-                return f"{str(name)[:60]} {sequence} of agent {sender}: {self._datagram(run.input)}"
-            case {"timer": name}:
-                return f"the {str(name)[:60]} timer ended"
-            case {"local": handler}:
-                return f"triggered by {str(handler)[:60]}"
-            case {"event": event_id}:
+            case MessageTrigger(name, sender, sequence):
+                return f"{name[:60]} {sequence} of agent {sender}: {self._datagram(run.input)}"
+            case TimerTrigger(name):
+                return f"the {name[:60]} timer ended"
+            case LocalTrigger(handler):
+                return f"triggered by {handler[:60]}"
+            case EventTrigger(event_id):
                 return f"the vehicle logged event {event_id}"
-            case {"operator": command}:
-                return f"the operator asked: {str(command)[:60]}"
-            case {"boot": blocks}:
+            case OperatorTrigger(command):
+                return f"the operator asked: {command[:60]}"
+            case BootTrigger(blocks):
                 return f"it began again, and found a chain of {blocks} blocks on its disk"
         return "nothing that there is"
 

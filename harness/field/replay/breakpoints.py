@@ -15,6 +15,7 @@ from harness.field.replay.replay_names import Names, is_block
 from ucp.agent import HANDLERS
 from ucp.messages import MalformedDatagramError, block_named
 from ucp.trace import Commanded, Dropped, HandlerRun
+from ucp.trigger import MessageTrigger
 
 Place = Callable[[Entry], bool]
 """Whether an entry is there."""
@@ -59,7 +60,9 @@ def blocks_of(entry: Entry) -> set[str]:
     if isinstance(what, HandlerRun):
         hashes.update(block_hash for _, block_hash in what.changes)
         hashes.update(sent.block for sent in what.sent if sent.block)
-    datagram = what.datagram if isinstance(what, Dropped) else what.input if "message" in what.trigger else None
+    datagram = (
+        what.datagram if isinstance(what, Dropped) else what.input if isinstance(what.trigger, MessageTrigger) else None
+    )
     if datagram is not None:
         try:
             about = block_named(decoded(datagram).message)

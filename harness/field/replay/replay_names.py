@@ -10,6 +10,7 @@ from harness.checker.steps.recorded_inputs import Blocks, NotOnRecordError, deco
 from harness.field.replay._agent_record import Record
 from ucp.block import Block
 from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError
+from ucp.trigger import MessageTrigger
 
 SHOWN = 12
 _HASH = re.compile("[0-9a-f]{6,64}")
@@ -83,7 +84,7 @@ class RecordedBlocks(Blocks):
 def _blocks_of(trace: Trace) -> Iterator[Block]:
     """Those that the agent received or sent whole."""
     for run in trace.runs:
-        datagrams = [run.input] if "message" in run.trigger else []
+        datagrams = [run.input] if isinstance(run.trigger, MessageTrigger) else []
         for datagram in (*datagrams, *(sent.datagram for sent in run.sent)):
             try:
                 message = decoded(datagram).message

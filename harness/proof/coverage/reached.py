@@ -15,6 +15,7 @@ from harness.proof.model._shape import Held, Shape, shape_of
 from ucp.agent import HANDLERS
 from ucp.state import AgentState
 from ucp.trace import HandlerRun
+from ucp.trigger import EventTrigger, LocalTrigger, MessageTrigger, TimerTrigger
 
 Branch = tuple[str, str]
 """A handler, and a branch of it."""
@@ -74,7 +75,7 @@ class Watcher:
         else:
             reached.steps += 1
             reached.branches[run.handler, run.branch] += 1
-            if "local" not in run.trigger:
+            if not isinstance(run.trigger, LocalTrigger):
                 self._input, self._answers = run, False
             self._answers = self._answers or bool(run.sent)
             if state.triggered:
@@ -107,11 +108,11 @@ def _given(run: HandlerRun | None, held: Held) -> tuple[Any, ...] | None:
     if run is None:
         return None
     trigger = run.trigger
-    if "message" in trigger:
+    if isinstance(trigger, MessageTrigger):
         return held.input_shape(decoded(run.input).message)
-    if "timer" in trigger:
-        return ("timer", trigger["timer"])
-    return ("event",) if "event" in trigger else None
+    if isinstance(trigger, TimerTrigger):
+        return ("timer", trigger.timer)
+    return ("event",) if isinstance(trigger, EventTrigger) else None
 
 
 def reached_in(evidence: Evidence) -> Reached:

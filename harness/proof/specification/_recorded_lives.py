@@ -35,6 +35,7 @@ from ucp.messages import (
 )
 from ucp.sealed import SEAL_BYTES, sealed_to
 from ucp.trace import HandlerRun, Sent
+from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, TimerTrigger
 
 INCEPTION = 1
 TOP_OF_CHAIN, NO_HASH, IMPOSSIBLE = 0, -1, -7
@@ -180,19 +181,19 @@ class _Writer:
     def _came(self, run: HandlerRun) -> tuple[Item, bool]:
         """The input, and whether it is one that no handler should be given. Raises ValueError."""
         trigger = run.trigger
-        if "message" in trigger:
+        if isinstance(trigger, MessageTrigger):
             sender, _, message = decoded(run.input)
             dropped = why_not_handled(self._header.agent_id, self._header.roster, sender, message)
             if isinstance(message, CommitBlock):
                 self._on_top(self._tops[-1], message.block.block_hash)
             return (HEARD, sender, *self._message(message)), dropped is not None
-        if "timer" in trigger:
-            return (TIMER_ENDED, TIMERS[timer_that_ended(run)]), False
-        if "event" in trigger:
+        if isinstance(trigger, TimerTrigger):
+            return (TIMER_ENDED, TIMERS[timer_that_ended(run, trigger)]), False
+        if isinstance(trigger, EventTrigger):
             return self._logged(run), False
-        if "boot" in trigger:
-            return self._booted(run), False
-        return (TRIGGERED if "local" in trigger else ASKED,), False
+        if isinstance(trigger, BootTrigger):
+            return self._booted(run, trigger), False
+        return (TRIGGERED if isinstance(trigger, LocalTrigger) else ASKED,), False
 
     def _logged(self, run: HandlerRun) -> Item:
         event = event_of(run.input)
@@ -209,11 +210,11 @@ class _Writer:
         seals = sealed is not None and sealed_to(self._header.initial_data) is not None
         return sealed if seals and len(sealed or b"") == len(self._current) + SEAL_BYTES else None
 
-    def _booted(self, run: HandlerRun) -> Item:
+    def _booted(self, run: HandlerRun, trigger: BootTrigger) -> Item:
         """What it was found to hold: all changes before the reconcile stack is emptied."""
         found: dict[str, list[bytes]] = {"complete": [], "chain+": [], "deque+": [], "stack+": []}
         for operation, block_hash in run.changes:
-            if operation not in found or (len(found["chain+"]) == run.trigger["boot"] and operation == "chain+"):
+            if operation not in found or (len(found["chain+"]) == trigger.blocks and operation == "chain+"):
                 break
             found[operation].append(_digest(block_hash))
         blocks = {block.block_hash: block for block in stored_blocks(run.input)}

@@ -12,6 +12,7 @@ from harness.archive.traces import Line
 from harness.errors import RunDirectoryError
 from harness.report.agent_programs import Program, programs
 from harness.report.chain_tree import ranges
+from ucp.trigger import Trigger
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Step:
     life: int
     handler: str
     branch: str
-    trigger: dict[str, int | str]
+    trigger: Trigger
     changes: tuple[tuple[str, str], ...]
     sent: tuple[tuple[str, str | None], ...]
     t: float = field(compare=False)

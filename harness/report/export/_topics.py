@@ -23,6 +23,7 @@ from harness.report.export._samples import (
     Voted,
 )
 from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
 
 Object = dict[str, Any]
 Schema = dict[str, Any]
@@ -144,15 +145,16 @@ class Topics:
                 yield f"/vehicles/{vehicle}/mavlink/{kind}", name, _mavlink(message)
 
     def _run(self, run: HandlerRun) -> Object:
-        trigger, name = next(iter(run.trigger.items()), (None, None))
+        trigger, name = next(iter(run.trigger.to_json().items()), (None, None))
+        heard = run.trigger if isinstance(run.trigger, MessageTrigger) else None
         return {
             "handler": run.handler,
             "algorithm": _whole(run.algorithm),
             "branch": run.branch,
             "trigger": trigger,
             "trigger_name": None if name is None else str(name),
-            "sender": _whole(run.trigger.get("from")),
-            "seq": _whole(run.trigger.get("seq")),
+            "sender": _whole(heard and heard.sender),
+            "seq": _whole(heard and heard.sequence),
             "changes": [{"operation": operation, **self._block(block)} for operation, block in run.changes],
             "sent": [
                 {"message": sent.message, "seq": _whole(sent.seq), **self._block(sent.block)} for sent in run.sent

@@ -19,6 +19,7 @@ from harness.errors import MachineError
 from harness.report.export._exported_run import Recording
 from harness.report.export._samples import NetworkChanged, Position, Said, Sample, Spread, Step
 from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
 
 try:
     from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import (
@@ -91,8 +92,10 @@ class _Arrows:
             yield from self._from.pop((agent, sent.seq, run.t), ())
 
     def arriving(self, agent: int, run: HandlerRun) -> int | None:
-        sender, seq = run.trigger.get("from"), run.trigger.get("seq")
-        return self._to.pop((sender, seq, agent, run.t), None) if sender is not None else None  # type: ignore[arg-type]
+        trigger = run.trigger
+        if not isinstance(trigger, MessageTrigger):
+            return None
+        return self._to.pop((trigger.sender, trigger.sequence, agent, run.t), None)
 
 
 class _Trace:
@@ -157,7 +160,7 @@ class _Trace:
         event.flow_ids.extend(self._arrows.leaving(agent, run))
         if (arrow := self._arrows.arriving(agent, run)) is not None:
             event.terminating_flow_ids.append(arrow)
-        trigger = next(iter(run.trigger.items()), ("", ""))
+        trigger = next(iter(run.trigger.to_json().items()), ("", ""))
         _annotate(event, "trigger", f"{trigger[0]}: {trigger[1]}")
         _annotate(event, "branch", run.branch)
         block = self._recording.block
@@ -168,7 +171,7 @@ class _Trace:
         for name, parts in told.items():
             if parts:
                 _annotate(event, name, ", ".join(parts))
-        return at_ns, int("message" in run.trigger), packet
+        return at_ns, int(isinstance(run.trigger, MessageTrigger)), packet
 
     def votes(self, agent: int) -> Iterator[Event]:
         for vote in self._recording.history.votes:

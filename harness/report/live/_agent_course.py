@@ -13,6 +13,7 @@ from harness.archive.history import COMMITTED_BY, LATEST_S, PHASES, REASONS
 from harness.archive.traces import Header, Held, parsed
 from harness.report.live._live_trace import Lives
 from ucp.trace import Commanded, Dropped, Entry, HandlerRun
+from ucp.trigger import MessageTrigger
 
 Change = list[Any]
 
@@ -130,8 +131,8 @@ class Course:
 
     def _ran(self, run: HandlerRun) -> None:
         trigger = run.trigger
-        if "message" in trigger and isinstance(trigger.get("from"), int) and isinstance(trigger.get("seq"), int):
-            self.heard.append(Heard(run.t, int(trigger["from"]), int(trigger["seq"])))
+        if isinstance(trigger, MessageTrigger):
+            self.heard.append(Heard(run.t, trigger.sender, trigger.sequence))
         for sent in run.sent:
             self.sent.append(Sent(run.t, sent.seq, sent.message[:80], sent.block and sent.block[:KEY_LENGTH]))
         if run.changes:
@@ -162,8 +163,7 @@ class Course:
         elif handler == "vote_timer_expiration":
             self._say(run.t, "voted", branch[:80])
         elif handler == "reconcile_begin" and branch == "begun":
-            by = next(iter(run.trigger.values()), "")
-            self._say(run.t, "reconciling", REASONS.get(str(by), "asked by the operator"))
+            self._say(run.t, "reconciling", REASONS.get(str(run.trigger.subject), "asked by the operator"))
         elif handler == "reconcile_finalize" and branch == "done":
             self._say(run.t, "reconciled", "")
         elif run.state.reconciling:

@@ -17,6 +17,7 @@ from harness.report.stories.story_file import Section
 from harness.report.stories.story_names import ANSWERS, INCEPTION, LocalChain, Names, told
 from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun, Sent
+from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
 
 INSTANT_S = 1.5
 """Mission seconds in which what a message causes is of the instant in which it was sent, and a timer is as good as
@@ -46,10 +47,16 @@ class Deed:
 
     @property
     def heard_from(self) -> int | None:
-        sender = self.runs[0].trigger.get("from")
-        return sender if isinstance(sender, int) else None
+        trigger = self.runs[0].trigger
+        return trigger.sender if isinstance(trigger, MessageTrigger) else None
 
-    def message(self, sequence: int | str) -> Sent | None:
+    @property
+    def answer(self) -> MessageTrigger | None:
+        """The trigger, if it is an answer to a question."""
+        trigger = self.runs[0].trigger
+        return trigger if isinstance(trigger, MessageTrigger) and trigger.message in ANSWERS else None
+
+    def message(self, sequence: int) -> Sent | None:
         """What it sent under this number."""
         return next((sent for run in self.runs for sent in run.sent if sent.seq == sequence), None)
 
@@ -61,7 +68,7 @@ class Deed:
     @property
     def is_answer_to_another(self) -> bool:
         """Whether it is the receipt of an answer that somebody else had asked for, which everybody hears."""
-        if self.runs[0].trigger.get("message") not in ANSWERS or self.cause is None:
+        if self.answer is None or self.cause is None:
             return False
         asked_by = self.cause.heard_from
         return asked_by is not None and asked_by != self.agent_id and not self.does_something
@@ -108,9 +115,9 @@ class Telling:
         Which of several comes first, and is the one that counts, is chance.
         """
         run = deed.runs[0]
-        if deed.cause is None or run.trigger.get("message") not in ANSWERS:
+        if deed.cause is None or deed.answer is None:
             return deed.position
-        sent = deed.cause.message(run.trigger["seq"])
+        sent = deed.cause.message(deed.answer.sequence)
         return run.handler, told(sent, self._names) if sent else run.branch
 
     def _lines(self, alike: Sequence[Deed]) -> Iterator[str]:
@@ -171,7 +178,8 @@ def _connected(traces: Mapping[int, Trace]) -> list[Deed]:
     """When which timer of which agent should end."""
     for deed in sorted(deeds, key=lambda deed: (deed.runs[0].t, deed.agent_id, deed.position)):
         run = deed.runs[0]
-        timer_ends_s = due.get((deed.agent_id, run.trigger.get("timer")), -inf)
+        timer = run.trigger.timer if isinstance(run.trigger, TimerTrigger) else None
+        timer_ends_s = due.get((deed.agent_id, timer), -inf)
         deed.at_s = timer_ends_s if run.t - timer_ends_s < INSTANT_S else run.t
         if deed.heard_from is not None:
             _hear(deed, sent)
@@ -186,10 +194,10 @@ def _connected(traces: Mapping[int, Trace]) -> list[Deed]:
 
 def _hear(deed: Deed, sent: Mapping[tuple[int, int], Sequence[Deed]]) -> None:
     """Find whose message it was that caused this."""
-    sender, run = deed.heard_from, deed.runs[0]
-    sequence = run.trigger.get("seq")
-    if sender is None or not isinstance(sequence, int):
+    run = deed.runs[0]
+    if not isinstance(run.trigger, MessageTrigger):
         return
+    sender, sequence = run.trigger.sender, run.trigger.sequence
     earlier = [cause for cause in sent.get((sender, sequence), ()) if cause.runs[0].t < run.t]
     if earlier:
         cause = deed.cause = max(earlier, key=lambda cause: cause.runs[0].t)
@@ -204,7 +212,7 @@ def _deeds(agent_id: int, trace: Trace) -> Iterator[Deed]:
     for position, run in enumerate(trace.runs):
         if not in_time(run):
             continue
-        if "local" in run.trigger and deed is not None:
+        if isinstance(run.trigger, LocalTrigger) and deed is not None:
             deed.runs.append(run)
             continue
         if deed is not None:

@@ -21,6 +21,7 @@ from harness.scenario.fates import Fate
 from netem.medium import RandomDraws
 from ucp.messages import CommitBlock, Message, block_named
 from ucp.trace import Entry, HandlerRun
+from ucp.trigger import MessageTrigger
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +96,8 @@ class _Recorder(InMemory):
                     self._counts[agent_id] += 1
                     count = self._counts[agent_id]
                     self.sent[agent_id, sent.seq] = Lost(run.t, sent.message, agent_id, 0, count, None)
-            if run.branch == "ignored by quirk":
-                commit: Any = run.trigger.get("from"), run.trigger.get("seq")
-                lost = self.sent.get(commit)
+            if run.branch == "ignored by quirk" and isinstance(run.trigger, MessageTrigger):
+                lost = self.sent.get((run.trigger.sender, run.trigger.sequence))
                 if lost is not None:  # a rogue node's is no agent's
                     self.lost.append(
                         Lost(lost.at_s, lost.message, lost.sender, agent_id, lost.count, None, by_quirk=True)

@@ -19,6 +19,7 @@ from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from tests.harness.virtual import scenario
 from ucp.trace import HandlerRun, Sent, StateSummary
+from ucp.trigger import EventTrigger, MessageTrigger, OperatorTrigger
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 ROUGH: dict[str, Any] = {
@@ -49,7 +50,7 @@ def faults(simulated: Simulated) -> list[FaultRecord]:
 
 def a_run(at_s: float, handler: str, branch: str = "", **keys: Any) -> HandlerRun:
     state = StateSummary(0, 0, 0, reconciling=False, idle=True, top="")
-    given = {"trigger": {"event": 1}, "changes": [], "sent": [], **keys}
+    given = {"trigger": EventTrigger(1), "changes": [], "sent": [], **keys}
     return HandlerRun(at_s, handler, 1, branch=branch, state=state, **given)
 
 
@@ -102,7 +103,10 @@ def test_a_lost_commit_is_a_message_that_one_agent_did_not_handle() -> None:
 
 def test_what_a_loss_cuts_short_ends_with_it_and_the_rest_with_the_run() -> None:
     proposed = a_run(5.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")])
-    begun = [a_run(6.0, "reconcile_begin", "begun", trigger={"operator": "reconcile"}), a_run(6.0, "reconcile_phase_1")]
+    begun = [
+        a_run(6.0, "reconcile_begin", "begun", trigger=OperatorTrigger("reconcile")),
+        a_run(6.0, "reconcile_phase_1"),
+    ]
     traces = {1: a_trace(1, [proposed, *begun], [a_run(30.0, "process_next_deque_block", "proposed")])}
     found = history_of(traces, [FaultRecord(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
     assert found.votes == [Vote(1, "aa", 5.0, 8.0, told.CUT_SHORT), Vote(1, "", 30.0, 50.0, told.CUT_SHORT)]
@@ -119,10 +123,7 @@ def test_what_an_agent_still_did_while_it_was_killed_ends_at_its_next_life_at_th
 
 def test_a_message_is_of_the_life_that_sent_it() -> None:
     sends = [[a_run(at_s, "build_data_block", sent=[Sent("Commit Block", 0, None)])] for at_s in (1.0, 20.0)]
-    hears = [
-        a_run(at_s, "receive_commit_block", trigger={"message": "Commit Block", "from": 1, "seq": 0})
-        for at_s in (2.0, 21.0)
-    ]
+    hears = [a_run(at_s, "receive_commit_block", trigger=MessageTrigger("Commit Block", 1, 0)) for at_s in (2.0, 21.0)]
     found = history_of({1: a_trace(1, *sends), 2: a_trace(2, hears)}, [], 30.0)
     assert found.messages == [
         Message(1, 1.0, "Commit Block", None, [(2, 2.0)]),

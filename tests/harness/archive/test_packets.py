@@ -30,6 +30,7 @@ from ucp.messages import (
     RequestForBlock,
     encode,
 )
+from ucp.trigger import MessageTrigger
 
 BLOCK, CHAIN = Block(1, 5, b"events"), bytes(range(32))
 PROPOSAL = BlockAddRequest(BLOCK.block_hash, CHAIN)
@@ -100,11 +101,11 @@ def test_every_response_is_matched_to_what_its_agent_answered(flown: tuple[Air, 
         for response in exchanges.responses(request)
     }
     traced = {
-        (agent_id, sent.seq): (run.trigger["from"], run.trigger["seq"])
+        (agent_id, sent.seq): (run.trigger.sender, run.trigger.sequence)
         for agent_id, runs in air.runs.items()
         for run in runs
         for sent in run.sent
-        if "message" in run.trigger and "Response" in sent.message
+        if isinstance(run.trigger, MessageTrigger) and "Response" in sent.message
     }
     assert len(traced) > 100
     assert matched == traced

@@ -8,7 +8,7 @@ import pytest
 
 from harness.archive.archive import RunArchive
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import MESSAGES, OPERATIONS, TIMERS, TRIGGERS, VOTES
+from harness.archive.vocabulary import MESSAGES, OPERATIONS, TIMERS, VOTES
 from harness.checker import Evidence, check
 from harness.checker.survival import in_words, survival
 from harness.field.replay import Player, open_record
@@ -20,6 +20,7 @@ from tests.harness.command import harness
 from tests.harness.virtual import scenario
 from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun
+from ucp.trigger import KINDS, LocalTrigger, MessageTrigger, TimerTrigger, parse
 
 EVENTFUL = {
     "agents": 4,
@@ -62,7 +63,7 @@ def words() -> Iterator[tuple[str, Rename]]:
         yield f"message {message}", message_renamed(message)
     for operation in OPERATIONS:
         yield f"operation {operation}", operation_renamed(operation)
-    for trigger in TRIGGERS:
+    for trigger in KINDS:
         yield f"trigger {trigger}", trigger_renamed(trigger)
     for vote in VOTES:
         yield f"tally {vote}", tally_renamed(vote)
@@ -70,9 +71,7 @@ def words() -> Iterator[tuple[str, Rename]]:
 
 def handler_renamed(name: str) -> Rename:
     def rename(run: HandlerRun) -> HandlerRun:
-        trigger = run.trigger
-        if trigger.get("local") == name:
-            trigger = {"local": foreign(name)}
+        trigger = LocalTrigger(foreign(name)) if run.trigger == LocalTrigger(name) else run.trigger
         return dataclasses.replace(run, handler=foreign(name) if run.handler == name else run.handler, trigger=trigger)
 
     return rename
@@ -86,7 +85,7 @@ def branch_renamed(name: str, branch: str) -> Rename:
 
 def timer_renamed(timer: str) -> Rename:
     def rename(run: HandlerRun) -> HandlerRun:
-        trigger = {"timer": foreign(timer)} if run.trigger.get("timer") == timer else run.trigger
+        trigger = TimerTrigger(foreign(timer)) if run.trigger == TimerTrigger(timer) else run.trigger
         started = {foreign(name) if name == timer else name: after for name, after in (run.started or {}).items()}
         return dataclasses.replace(run, trigger=trigger, started=started or None)
 
@@ -96,8 +95,8 @@ def timer_renamed(timer: str) -> Rename:
 def message_renamed(message: str) -> Rename:
     def rename(run: HandlerRun) -> HandlerRun:
         trigger = run.trigger
-        if trigger.get("message") == message:
-            trigger = {**trigger, "message": foreign(message)}
+        if isinstance(trigger, MessageTrigger) and trigger.message == message:
+            trigger = dataclasses.replace(trigger, message=foreign(message))
         sent = [
             dataclasses.replace(each, message=foreign(message)) if each.message == message else each
             for each in run.sent
@@ -115,7 +114,8 @@ def operation_renamed(operation: str) -> Rename:
 
 def trigger_renamed(kind: str) -> Rename:
     return lambda run: dataclasses.replace(
-        run, trigger={foreign(key) if key == kind else key: value for key, value in run.trigger.items()}
+        run,
+        trigger=parse({foreign(key) if key == kind else key: value for key, value in run.trigger.to_json().items()}),
     )
 
 

@@ -11,6 +11,7 @@ from harness.checker.injections import account, in_words
 from harness.play.rogue.rogue_line import forged_sequence
 from tests.harness.virtual import scenario
 from ucp.trace import HandlerRun, StateSummary
+from ucp.trigger import MessageTrigger
 
 STATE = StateSummary(0, 0, 0, reconciling=False, idle=True, top="")
 TWICE = scenario(timeline=[{"at_s": 20, "replay": {}}, {"at_s": 30, "replay": {}}])
@@ -24,7 +25,7 @@ def trace(agent: int, *runs: tuple[float, int, str], changes: bool = False) -> T
             t,
             "receive_commit_block",
             6,
-            {"message": "Commit Block", "from": 1, "seq": sequence},
+            MessageTrigger("Commit Block", 1, sequence),
             branch,
             [("chain+", "00")] if changes else [],
             [],

@@ -24,6 +24,7 @@ from ucp.messages import TYPE_CODES
 from ucp.quirks import CRASHED, QUIRKS, Quirk
 from ucp.store import StoredState
 from ucp.trace import SCHEMA, Dropped, HandlerRun, Recorded, in_base64
+from ucp.trigger import EventTrigger, LocalTrigger, TimerTrigger, UnknownTrigger
 
 LOSSY = {"network": {"loss": 0.25}, "duration_s": 600}
 
@@ -68,7 +69,7 @@ def without_expiry(runs: list[HandlerRun]) -> None:
     """Nothing of all that the first end of a vote had for a consequence."""
     position = runs.index(expiry(runs))
     del runs[position]
-    while "local" in runs[position].trigger:
+    while runs[position].trigger.kind == "local":
         del runs[position]
 
 
@@ -157,14 +158,20 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
             "it ran as Algorithm 4; what came is for Algorithm 5",
         ),
         (lambda runs: setattr(expiry(runs), "t", expiry(runs).t - 3), "s before the voting timer ended"),
-        (lambda runs: expiry(runs).trigger.update(timer="finalize gap"), "the finalize gap timer ended, which was not"),
-        (lambda runs: expiry(runs).trigger.clear(), "it ran without a trigger that there is"),
-        (lambda runs: first_run(runs, "build_data_block").trigger.update(event=255), "said to have logged event 255"),
         (
-            lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", {"local": "reconcile_begin"}),
+            lambda runs: setattr(expiry(runs), "trigger", TimerTrigger("finalize gap")),
+            "the finalize gap timer ended, which was not",
+        ),
+        (lambda runs: setattr(expiry(runs), "trigger", UnknownTrigger({})), "it ran without a trigger that there is"),
+        (
+            lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", EventTrigger(255)),
+            "said to have logged event 255",
+        ),
+        (
+            lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", LocalTrigger("reconcile_begin")),
             "it ran without having been triggered",
         ),
-        (lambda runs: commit(runs).trigger.update(seq=77), "it said to have got Commit Block 77 from agent"),
+        (lambda runs: setattr(commit(runs).trigger, "sequence", 77), "it said to have got Commit Block 77 from agent"),
         (lambda runs: setattr(commit(runs), "input", Recorded("!")), "a datagram that is to be dropped: not base64"),
         (lambda runs: setattr(commit(runs), "input", None), "a datagram that is to be dropped: truncated"),
         (lambda runs: proposal(runs).sent.clear(), "it sent nothing; it should have sent"),

@@ -5,11 +5,12 @@ import pytest
 from harness.archive.traces import Header, Trace
 from harness.checker.timer_lag import ENOUGH, timer_lag
 from ucp.trace import HandlerRun, StateSummary
+from ucp.trigger import UnknownTrigger
 
 
 def _run(t: float, handler: str, branch: str, reconciling: bool = False) -> HandlerRun:
     state = StateSummary(chain=0, deque=0, stack=0, reconciling=reconciling, idle=False, top="")
-    return HandlerRun(t, handler, 1, {}, branch, [], [], state)
+    return HandlerRun(t, handler, 1, UnknownTrigger({}), branch, [], [], state)
 
 
 def _votes(*late_s: float, reconciling: bool = False) -> Trace:

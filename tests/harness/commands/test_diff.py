@@ -66,7 +66,7 @@ def test_one_lost_commit_is_where_the_runs_part(tmp_path: Path) -> None:
     assert parted.chain == ChainParting(4, None, "4.2")
     assert parted.run is not None and parted.run.a is None and parted.run.b is not None
     assert (parted.run.b.handler, parted.run.b.branch) == ("receive_commit_block", "committed")
-    assert parted.run.b.trigger["from"] == 4
+    assert parted.run.b.trigger.to_json()["from"] == 4
     assert ("chain+", "4.2") in parted.run.b.changes
     assert 117 < parted.run.at_s < 130
 

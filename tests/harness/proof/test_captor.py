@@ -232,7 +232,9 @@ def test_what_was_looked_at_is_what_is_played() -> None:
         document = Script(graph, graph.path(number)).document("a lie")
         lies = sum("lie" in entry for entry in document.get("timeline", ()))
         traces = simulate(parse(document), 1, tracing=True).evidence.traces
-        forged = [run for trace in traces.values() for run in trace.runs if run.trigger.get("seq", 0) >= 1 << 31]
+        forged = [
+            run for trace in traces.values() for run in trace.runs if run.trigger.to_json().get("seq", 0) >= 1 << 31
+        ]
         assert len(forged) == lies
         for place, local in enumerate(graph.states[number][AGENTS:]):
             if local != DEAD:

@@ -13,6 +13,7 @@ from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from tests.harness.virtual import scenario
+from ucp.trigger import MessageTrigger
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
@@ -31,7 +32,11 @@ def played(
 def arrivals(simulated: Simulated, agent_id: int, message: str) -> list[tuple[float, int]]:
     """(mission seconds, sender) of every such message that reached the agent."""
     runs = simulated.evidence.traces[agent_id].runs
-    return [(run.t, int(run.trigger["from"])) for run in runs if run.trigger.get("message") == message]
+    return [
+        (run.t, run.trigger.sender)
+        for run in runs
+        if isinstance(run.trigger, MessageTrigger) and run.trigger.message == message
+    ]
 
 
 def branches(simulated: Simulated, agent_id: int, handler: str) -> list[str]:

@@ -18,6 +18,7 @@ from tests.harness.virtual import scenario
 from ucp.events import RandomEvents
 from ucp.store import StoredState
 from ucp.trace import HandlerRun, StateSummary
+from ucp.trigger import BootTrigger, UnknownTrigger
 
 
 def faulty(timeline: list[dict[str, Any]], **keys: Any) -> Scenario:
@@ -70,7 +71,7 @@ def test_a_restarted_agent_begins_with_nothing_and_gets_everything_back() -> Non
 def test_a_restarted_agent_hears_nothing_that_was_sent_before() -> None:
     slow = {"delay": 10.0}
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 301, "restart": [2]}], network=slow)
-    heard = [run.t for run in simulated.evidence.traces[2].runs if "message" in run.trigger]
+    heard = [run.t for run in simulated.evidence.traces[2].runs if run.trigger.kind == "message"]
     assert not [t for t in heard if 300 < t < 311]
     assert [t for t in heard if t < 300 or t > 311]
     assert agent_seed(4, 2) != agent_seed(4, 2, life=2)
@@ -81,7 +82,9 @@ def test_a_restarted_agent_logs_its_own_events_only() -> None:
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 300.5, "restart": [2]}])
     source = RandomEvents(Random(agent_seed(4, 2, life=2)), mean_s=10)
     expected = [t for t in (300.5 + source.next()[0] for _ in range(100)) if t <= 600]
-    assert [run.t for run in simulated.evidence.traces[2].runs if run.t > 300 and "event" in run.trigger] == expected
+    assert [
+        run.t for run in simulated.evidence.traces[2].runs if run.t > 300 and run.trigger.kind == "event"
+    ] == expected
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -98,7 +101,7 @@ def test_a_reboot_with_its_disk_loses_no_block(seed: int) -> None:
     trace = simulated.evidence.traces[2]
     first, second, third = ([run for _, run in life] for life in trace.lives())
     assert max(run.t for run in first) <= 203 < 223 <= min(run.t for run in second)
-    assert (second[0].t, second[0].trigger) == (223, {"boot": first[-1].state.chain})
+    assert (second[0].t, second[0].trigger) == (223, BootTrigger(first[-1].state.chain))
     assert (third[0].t, third[0].handler) == (412, "reconcile_finalize")
     completed = simulated.evidence.exports[2].completed
     assert completed == list(dict.fromkeys(trace.completed()))
@@ -154,7 +157,14 @@ def test_a_reconcile_that_a_brown_out_ended_gives_no_chance_to_agree() -> None:
 
 def run_of(t: float, *, handler: str, algorithm: int, branch: str, reconciling: bool) -> HandlerRun:
     return HandlerRun(
-        t, handler, algorithm, {}, branch, [], [], StateSummary(0, 0, 0, reconciling, not reconciling, "")
+        t,
+        handler,
+        algorithm,
+        UnknownTrigger({}),
+        branch,
+        [],
+        [],
+        StateSummary(0, 0, 0, reconciling, not reconciling, ""),
     )
 
 
@@ -263,8 +273,8 @@ def test_a_reboot_loses_what_its_disk_does_not_keep(disk: Any, loses: bool) -> N
 
 def test_a_landed_agent_logs_nothing_more_and_takes_part_as_before() -> None:
     simulated = played([{"at_s": 300, "stop_events": [2, 5]}], network={"loss": 0.2})
-    assert not [run.t for run in simulated.evidence.traces[2].runs if "event" in run.trigger and run.t > 300]
-    assert [run.t for run in simulated.evidence.traces[1].runs if "event" in run.trigger and run.t > 300]
+    assert not [run.t for run in simulated.evidence.traces[2].runs if run.trigger.kind == "event" and run.t > 300]
+    assert [run.t for run in simulated.evidence.traces[1].runs if run.trigger.kind == "event" and run.t > 300]
     assert [run for run in simulated.evidence.traces[2].runs if run.branch == "committed" and run.t > 320]
 
 

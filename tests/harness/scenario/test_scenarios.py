@@ -253,7 +253,7 @@ def rogue(run: Simulated, seed: int) -> None:
     assert all("which agent 2 never sent" in finding.detail for finding in violated["1"].evidence)
     again = [step for trace in run.evidence.traces.values() for step in trace.runs if round(step.t, 3) == 300.026]
     assert len(again) == 3 * 4
-    assert {(step.trigger["message"], step.branch) for step in again} == {("Commit Block", "does not succeed")}
+    assert {(step.trigger.subject, step.branch) for step in again} == {("Commit Block", "does not succeed")}
 
 
 def field_test_2020(run: Simulated, seed: int) -> None:
@@ -266,7 +266,7 @@ def field_test_2020(run: Simulated, seed: int) -> None:
     assert seed != 76 or whole[aligned - 1] == "10.8", "the very block of the figure"
     assert run.evidence.switched_off == {118: 1740, 120: 1740, 122: 1740, 28: 1770, 32: 1770, 10: 1785}
     last_event_s = {
-        agent: max(step.t for step in trace.runs if "event" in step.trigger)
+        agent: max(step.t for step in trace.runs if step.trigger.kind == "event")
         for agent, trace in run.evidence.traces.items()
     }
     assert last_event_s[122] < 1380 < last_event_s[10] < 1680

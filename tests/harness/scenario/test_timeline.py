@@ -202,7 +202,7 @@ def test_a_link_that_loses_everything_for_a_while_is_silent_in_virtual_time() ->
         final_reconcile=True,
     )
     simulated = simulate(one, 1, tracing=True)
-    heard = [run.t for run in simulated.evidence.traces[2].runs if run.trigger.get("from") == 1]
+    heard = [run.t for run in simulated.evidence.traces[2].runs if run.trigger.to_json().get("from") == 1]
     assert not [at_s for at_s in heard if 100.1 < at_s < 200]
     assert [at_s for at_s in heard if at_s < 100]
     assert [at_s for at_s in heard if 200 < at_s < 300]

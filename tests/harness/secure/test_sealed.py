@@ -119,7 +119,7 @@ def test_a_consolidated_record_has_the_events_once_the_depot_opens_them(swarm: S
     assert opened.returncode == 0, opened.stderr
     assert "sealed" not in opened.stdout
     events = {name: (tmp_path / name).read_text().count('"line":"event"') for name in ("closed.jsonl", "open.jsonl")}
-    logged = sum(len(runs) for runs in ([r for r in rs if "event" in r.trigger] for rs in swarm.air.runs.values()))
+    logged = sum(len(runs) for runs in ([r for r in rs if r.trigger.kind == "event"] for rs in swarm.air.runs.values()))
     assert events["open.jsonl"] == logged
     assert events["closed.jsonl"] < logged
 

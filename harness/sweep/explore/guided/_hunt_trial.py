@@ -30,6 +30,7 @@ from harness.sweep.explore.guided._mutation import AFTER_LAST_S, FEW_BLOCKS, Lim
 from ucp.agent import ON_TIMER
 from ucp.events import EVENT_HEADER_BYTES
 from ucp.settings import Settings
+from ucp.trigger import TimerTrigger
 
 APPROVED = (ON_TIMER["voting"].name, "approved")
 MOST = 16
@@ -52,10 +53,10 @@ class Ended(NamedTuple):
 def timers_ended(evidence: Evidence) -> list[Ended]:
     """Of all agents, in order."""
     return sorted(
-        Ended(run.t, agent_id, str(run.trigger["timer"]), run.handler, run.branch)
+        Ended(run.t, agent_id, run.trigger.timer, run.handler, run.branch)
         for agent_id, trace in evidence.traces.items()
         for run in trace.runs
-        if "timer" in run.trigger
+        if isinstance(run.trigger, TimerTrigger)
     )
 
 
