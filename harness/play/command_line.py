@@ -1,9 +1,8 @@
 """An agent's command line, and the last output of a program that has ended.
 
-Such an agent ends with status 127 and a sentence on standard error (ucp/contract/CONTRACT.md). A shell, env(1) or the
-first
-process of a container ends with 127 as well, where it does not find a program: then nobody has said that anything is
-not supported, and something is broken.
+An agent that lacks a feature of its mission ends with status 127 and a sentence on standard error
+(ucp/contract/CONTRACT.md). A shell, env(1) and the first process of a container also end with 127, if they do not find
+the program. In that case there is no sentence of the agent, and the run has failed instead of being unsupported.
 """
 
 import os

@@ -12,9 +12,6 @@ sentences, made by the same code as one that was scheduled. It then stands in th
 `by_hand` among the faults there; `replay.yaml` in the run's directory plays it all again. What was to last for a while,
 and is changed by hand for good, is over by then. What cannot be is a ScenarioError, one sentence, and changes nothing.
 Every answer comes, if only that the run has ended.
-
-So what is told is checked as an entry is, and made by the same code; and it can be played again, from the scenario that
-it has come to.
 """
 
 import asyncio

@@ -1,11 +1,10 @@
 """The agents of a scenario: commands, events, keys, staggered timers and mistakes.
 
-agent_command: [./my_agent, --fast]
-agent_command: {2: [./my_agent, --fast], 5: [./another_agent]}
+    agent_command: [./my_agent, --fast]
+    agent_command: {2: [./my_agent, --fast], 5: [./another_agent]}
+    quirks: {ignore_commit: 0.2, crash_on_tie: {agents: [32, 122]}}
 
-quirks: {ignore_commit: 0.2, crash_on_tie: {agents: [32, 122]}}
-
-The mission says so: each agent is given settings of its own, and knows nothing of it.
+Each agent receives its own settings in its mission file. It does not know that other agents have other settings.
 """
 
 import base64

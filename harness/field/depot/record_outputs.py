@@ -1,6 +1,6 @@
 """The consolidated record as files, and its summary in sentences.
 
-maps.
+The files are JSON Lines (`harness.field.depot.record_lines`), a CSV table, and tracks for maps.
 """
 
 import csv

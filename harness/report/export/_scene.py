@@ -1,9 +1,8 @@
 """The swarm in Foxglove's 3D view: vehicles, and the links between them.
 
-A vehicle is drawn once, in a frame of its own that moves; links are drawn anew as it moves.
-
-They are drawn anew when vehicles have moved, at most once a mission second, and of many vehicles more seldom: there are
-as many as pairs.
+Each vehicle is drawn once, in a coordinate frame that moves with it. The links are drawn again whenever vehicles have
+moved, but at most once in a mission second. With many vehicles they are drawn less often, because the number of links
+grows with the square of the number of vehicles.
 """
 
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,11 +1,11 @@
 """A program that plays agents in virtual time, and the pool that reuses such programs.
 
-`--virtual`).
+The harness writes one line to the program's standard input and reads one line as its answer, as the contract describes
+for `--virtual`. The program has a few seconds of wall time for each answer. It does not receive Ctrl-C. It ends when
+the thread that started it ends.
 
-It dies with the thread that started it, hears no Ctrl-C of ours, and is given no longer than a few seconds of wall time
-for an answer.
-
-Each process of ours has its own; a process that it forks takes none of them over.
+Starting a program takes longer than playing a short mission, so a pool keeps them for the next mission. Each process
+of the harness has a pool of its own. A forked child starts with an empty pool.
 """
 
 import atexit
