@@ -18,7 +18,7 @@ from harness.checker.steps.recorded_inputs import decoded, event_of, sealed_of
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.errors import CaptureError
 from harness.field.ingest import Flight
-from harness.play.simulation.secured_agents import SealsOnRecord
+from harness.play.simulation.seals import SealsOnRecord
 from ucp.block import MAX_EVENT_DATA_BYTES, Block
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, MalformedEventsError, decode_events

@@ -27,7 +27,7 @@ from ucp.loop import Loop, Timer
 from ucp.messages import PORT
 
 if TYPE_CHECKING:
-    from harness.play.rogue._crafted import CapturedKeys
+    from harness.play.rogue._captured_bundle import CapturedKeys
 
 LINK = "eth0"
 DATAGRAMS_PER_TURN = 64
@@ -128,7 +128,7 @@ class RogueNode:
 
 
 def _keys(path: Path) -> "CapturedKeys":
-    from harness.play.rogue._crafted import CapturedKeys  # needs the extra `secure`
+    from harness.play.rogue._captured_bundle import CapturedKeys  # needs the extra `secure`
     from ucp.secure.bundle import load_bundle
 
     return CapturedKeys(load_bundle(path), partial(os.urandom, 8))

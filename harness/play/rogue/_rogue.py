@@ -37,7 +37,7 @@ from ucp.secure.envelope import NAMES, REQUEST_OF, read_clear
 from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
-    from harness.play.rogue._crafted import CapturedKeys
+    from harness.play.rogue._captured_bundle import CapturedKeys
     from ucp.secure.sealed_datagrams import Request
 
 REMEMBERED = 10_000

@@ -20,7 +20,7 @@ from harness.play.simulation.air import Happening, InFlight, Logged, StrayDatagr
 from harness.play.simulation.fate_script import FateScript, LateTimers, NameOf
 from harness.play.simulation.incarnations import BlockNames, Incarnation, Secured
 from harness.play.simulation.run_files import Recorder
-from harness.play.simulation.secured_agents import seals_of
+from harness.play.simulation.seals import seals_of
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import Medium

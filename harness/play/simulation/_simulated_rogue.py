@@ -14,7 +14,7 @@ from netem.medium import LATENCY
 from ucp.messages import Message, encode
 
 if TYPE_CHECKING:
-    from harness.play.rogue._crafted import CapturedKeys
+    from harness.play.rogue._captured_bundle import CapturedKeys
 
 MOMENT_S = LATENCY.mean_s
 

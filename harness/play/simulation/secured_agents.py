@@ -1,28 +1,23 @@
-"""Secured agents in virtual time, and the seals on record that cannot be made again.
+"""Secured agents in virtual time.
 
 All of it comes of the run's seed. Every datagram is sealed, and opened by whom it reaches; what many receivers work out
 of the same bytes is remembered (`_crypto_cache.py`).
 """
 
-import base64
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from random import Random
 from typing import Any
 
 from harness.play._vehicle_keys import keys_of
-from harness.play.rogue._crafted import CapturedKeys
+from harness.play.rogue._captured_bundle import CapturedKeys
 from harness.play.simulation._crypto_cache import remembered
 from harness.play.simulation._simulated_agent import OwnAgent
 from harness.scenario import Scenario
-from harness.scenario.agent_options import ScriptedEvent
 from netem.medium import LATENCY
 from ucp.clock import MICROSECONDS
-from ucp.events import MalformedEventsError, decode_events
 from ucp.export import export_chain
-from ucp.sealed import SEAL_BYTES
 from ucp.secure.bundle import Bundle
 from ucp.secure.sealing import seal_of
 from ucp.secure.secured_agent import SecuredAgent, boot_of
@@ -107,28 +102,3 @@ def _drops_nothing(scenario: Scenario) -> bool:
 def _of_seed(seed: int, what: str) -> bytes:
     """32 bytes that everybody who knows the seed can work out: keys of a simulated mission are no secrets."""
     return hashlib.sha256(f"{what} of seed {seed}".encode()).digest()
-
-
-@dataclass(frozen=True)
-class SealsOnRecord:
-    """By the event that filled the block, encoded; a block of which nothing is on record stays as it is."""
-
-    sealed: Mapping[bytes, bytes]
-
-    def __call__(self, event_data: bytes, timestamp_us: int) -> bytes:
-        try:
-            last = decode_events(event_data)[-1].encode()
-        except (MalformedEventsError, IndexError):
-            return event_data
-        sealed = self.sealed.get(last, b"")
-        return sealed if len(sealed) == len(event_data) + SEAL_BYTES else event_data
-
-
-def seals_of(script: Iterable[ScriptedEvent], agent_id: int) -> SealsOnRecord | None:
-    """What the script says that this agent sealed; None if nothing."""
-    sealed = {
-        event.logged.encode(): base64.b64decode(event.sealed)
-        for event in script
-        if event.agent == agent_id and event.sealed is not None
-    }
-    return SealsOnRecord(sealed) if sealed else None

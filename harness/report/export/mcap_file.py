@@ -13,8 +13,8 @@ from typing import IO, Any
 from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
 from harness.errors import MachineError
 from harness.report.export._exported_run import Recording
+from harness.report.export._links import FIELD, vehicle_frame
 from harness.report.export._samples import LossesChanged, Position, Said, Telemetry
-from harness.report.export._scene import FIELD, vehicle_frame
 from harness.report.export._topics import Topics
 
 try:

@@ -16,6 +16,7 @@ from harness.archive.history import LATEST_S
 from harness.archive.traces import Gap, Header
 from harness.errors import MachineError
 from harness.report.export._exported_run import Recording
+from harness.report.export._links import FIELD, Line, Links, vehicle_frame
 from harness.report.export._samples import (
     LossesChanged,
     Metres,
@@ -26,7 +27,6 @@ from harness.report.export._samples import (
     Step,
     Telemetry,
 )
-from harness.report.export._scene import FIELD, Line, Links, vehicle_frame
 
 try:
     import numpy

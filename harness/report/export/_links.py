@@ -1,0 +1,66 @@
+"""The links between vehicles as they move, for whoever draws them.
+
+They are drawn anew when vehicles have moved, at most once a mission second, and of many vehicles more seldom: there are
+as many as pairs.
+"""
+
+from itertools import combinations
+from typing import NamedTuple
+
+from harness.archive.connectivity import Link
+from harness.report.export._samples import Metres, Position
+
+FIELD = "field"
+"""The frame of the field: x is east, y north, z up, in metres from its middle."""
+PAIRS_A_SECOND = 100
+
+
+def vehicle_frame(vehicle: int) -> str:
+    """The frame in which a vehicle stands still."""
+    return f"vehicle_{vehicle}"
+
+
+class Line(NamedTuple):
+    """From one vehicle to another; `loss` is that of the worse direction, less than 1."""
+
+    low: Metres
+    high: Metres
+    loss: float
+
+    @property
+    def colour(self) -> dict[str, float]:
+        """From green, which loses nothing, to red, which is fainter; red, green, blue and opacity, 0 to 1."""
+        return {"r": self.loss, "g": 1.0 - self.loss, "b": 0.1, "a": 1.0 - 0.7 * self.loss}
+
+
+class Links:
+    """`losses` are those of the links as they are now."""
+
+    def __init__(self) -> None:
+        self.losses: dict[Link, float] = {}
+        self._places: dict[int, Metres] = {}
+        self._drawn_ns: int | None = None
+        self._moved_ns = -1
+
+    def moved(self, position: Position) -> list[Line] | None:
+        """The links before the vehicle moved, if they are to be drawn anew: all that moved at once have."""
+        at_ns = position.at_ns
+        due = at_ns > self._moved_ns and self._are_due(at_ns)
+        lines = self._lines() if due else None
+        self._drawn_ns = at_ns if due else self._drawn_ns
+        self._places[position.vehicle] = position.metres
+        self._moved_ns = at_ns
+        return lines
+
+    def _are_due(self, at_ns: int) -> bool:
+        pairs = len(self._places) * (len(self._places) - 1) // 2
+        every_ns = max(1.0, pairs / PAIRS_A_SECOND) * 1e9
+        return bool(self.losses and pairs) and (self._drawn_ns is None or at_ns - self._drawn_ns >= every_ns)
+
+    def _lines(self) -> list[Line]:
+        lines = []
+        for low, high in combinations(sorted(self._places), 2):
+            loss = max(self.losses.get((low, high), 1.0), self.losses.get((high, low), 1.0))
+            if loss < 1.0:
+                lines.append(Line(self._places[low], self._places[high], loss))
+        return lines
