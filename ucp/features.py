@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ucp.sealed import sealed_to
+from ucp.settings import ALTERNATIVES
 
 CONTRACT = 2
 """The version of contract/CONTRACT.md by which mission files are written."""
@@ -16,18 +17,18 @@ CONTRACT = 2
 UNSUPPORTED = 127
 """Exit status of an agent that lacks a feature of its mission."""
 
+
+def _has(name: str, value: bool | str) -> Callable[[Mapping[str, Any]], bool]:
+    return lambda mission: mission["settings"].get(name) == value
+
+
 FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "store": lambda mission: mission.get("store") is not None,
     "telemetry": lambda mission: mission["events"]["source"] == "mavlink",
     "secured": lambda mission: mission.get("security") is not None,
     "sealed": lambda mission: sealed_to(b64decode(mission["initial_data"])) is not None,
     "quirks": lambda mission: any(mission["quirks"].values()),
-    "vote_names_chain": lambda mission: mission["settings"]["vote_names_chain"],
-    "changed_before_tally": lambda mission: mission["settings"]["changed_before_tally"],
-    "asks_after_commit": lambda mission: mission["settings"].get("asks_after_commit", False),
-    "top_needs_majority": lambda mission: mission["settings"].get("top_needs_majority", False),
-    "phase1_tie=pop": lambda mission: mission["settings"]["phase1_tie"] == "pop",
-    "phase2_tie=block": lambda mission: mission["settings"]["phase2_tie"] == "block",
+    **{feature: _has(name, value) for feature, (name, value) in ALTERNATIVES.items()},
 }
 """Feature -> whether a mission file that has all keys needs it, but those of `ucp.settings.ADDED`."""
 

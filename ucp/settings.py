@@ -1,7 +1,14 @@
-"""What an agent can be told: timers, sizes, and the readings of an ambiguous thesis."""
+"""Settings of an agent: timers, sizes, readings of an ambiguous thesis, and changes of the protocol.
+
+Each setting is declared once, as a field of `Settings`. The declaration says what the field may be and what it does.
+Other modules read the declarations and do not name the settings: features, schemas, the table in contract/CONTRACT.md,
+the variants of the conformance test, the changes that `explore` tries, and the constants of the TLA+ specification. A
+new setting needs a field here and the handler that acts on it. `Annotated` carries a declaration because it needs no
+import of `dataclasses`, which would delay the start of an agent.
+"""
 
 import math
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from ucp._dataclass import dataclass
 from ucp.block import MAX_EVENT_DATA_BYTES
@@ -11,63 +18,154 @@ from ucp.short_value import shown
 MAX_TIMER_S = 1e9
 """Thirty years."""
 
-ADDED = ("asks_after_commit", "top_needs_majority")
-"""Settings that the first agents of contract 2 do not have."""
+
+@dataclass(eq=False, frozen=True, slots=True)
+class Number:
+    """The declaration of a setting that is a number. An agent needs no feature for any value."""
+
+    sentence: str
+    """What the setting does, for the table in contract/CONTRACT.md."""
+    allowed: str
+    """The range in words."""
+    low: float
+    high: float
+    whole: bool = False
+
+
+@dataclass(eq=False, frozen=True, slots=True)
+class Choice:
+    """The declaration of a setting with few values. An agent needs a feature for each value except the default."""
+
+    sentence: str
+    """What the setting does, for the table in contract/CONTRACT.md; for a boolean, what it does when it is true."""
+    values: tuple[bool, ...] | tuple[str, ...] = (False, True)
+    """The allowed values, the default first."""
+    is_reading: bool = False
+    """The setting chooses between readings of the thesis. `explore` and `reconstruct` try the other readings."""
+    always_written: bool = False
+    """Missions and traces name the setting even at its default. The first agents of contract 2 require the key."""
+    constant: str | None = None
+    """The constant of the TLA+ specification that is true unless the setting has its default."""
+
+    @property
+    def allowed(self) -> str:
+        """The values in words."""
+        return "true or false" if self.values == (False, True) else f"one of {', '.join(map(str, self.values))}"
+
 
 Phase1Tie = Literal["phase2", "pop"]
 Phase2Tie = Literal["oldest", "block"]
+
+
+def _timer(sentence: str) -> Number:
+    return Number(sentence, f"more than 0 seconds, at most {MAX_TIMER_S:g}", math.ulp(0.0), MAX_TIMER_S)
+
+
+def _size(sentence: str, most: str) -> Number:
+    return Number(sentence, f"1..{most}", 1, MAX_EVENT_DATA_BYTES, whole=True)
+
+
+def _reading(sentence: str, constant: str, values: tuple[bool, ...] | tuple[str, ...] = (False, True)) -> Choice:
+    return Choice(sentence, values, is_reading=True, always_written=True, constant=constant)
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
     """Durations in mission seconds, sizes in bytes. Raises ValueError for impossible values."""
 
-    vote_timeout_s: float = 10.0
-    phase1_timeout_s: float = 5.0
-    phase2_timeout_s: float = 5.0
-    phase3_timeout_s: float = 5.0
-    finalize_gap_s: float = 0.1
-    """Pause between the commits of Algorithm 20, so that others can follow (Section 4.2)."""
-
-    max_block_bytes: int = MAX_EVENT_DATA_BYTES
-    max_event_bytes: int = MAX_EVENT_BYTES
-
-    vote_names_chain: bool = False
-    """A vote also names the proposer's chain, so that a late vote of an earlier round cannot count."""
-    changed_before_tally: bool = False
-    """Algorithm 5 looks for a changed chain before it tallies, instead of after."""
-    asks_after_commit: bool = False
-    """Algorithm 5 asks, a finalize gap after its commit, who does not follow: who has diverged then reconciles."""
-    top_needs_majority: bool = False
-    """Algorithm 15 ends the search only where a vote would be approved: more than half have this very chain."""
-    phase1_tie: Phase1Tie = "phase2"
-    """Algorithm 11 on a tie: go on to phase 2 as printed, or pop another block."""
-    phase2_tie: Phase2Tie = "oldest"
-    """Algorithm 15 on a tie: the oldest timestamp, or never "Is Top Of Chain" while a block is on offer."""
+    vote_timeout_s: Annotated[float, _timer("Duration of the voting timer (Algorithm 2).")] = 10.0
+    phase1_timeout_s: Annotated[float, _timer("Duration of the phase 1 timer (Algorithm 8).")] = 5.0
+    phase2_timeout_s: Annotated[float, _timer("Duration of the phase 2 timer (Algorithm 12).")] = 5.0
+    phase3_timeout_s: Annotated[float, _timer("Duration of the phase 3 timer (Algorithm 16).")] = 5.0
+    finalize_gap_s: Annotated[
+        float,
+        Number(
+            "Pause between the commits of Algorithm 20, so that other agents can follow (Section 4.2). 0 is no pause.",
+            f"0..{MAX_TIMER_S:g} seconds",
+            0,
+            MAX_TIMER_S,
+        ),
+    ] = 0.1
+    max_block_bytes: Annotated[int, _size("Maximum size of the event data in a block.", str(MAX_EVENT_DATA_BYTES))] = (
+        MAX_EVENT_DATA_BYTES
+    )
+    max_event_bytes: Annotated[
+        int, _size("Maximum size of an event, including its 11 bytes of header.", "max_block_bytes")
+    ] = MAX_EVENT_BYTES
+    vote_names_chain: Annotated[
+        bool,
+        _reading(
+            "Algorithms 3 and 4: a vote also names the proposer's chain, so that a late vote of an earlier round does "
+            "not count.",
+            "VoteNamesChain",
+        ),
+    ] = False
+    changed_before_tally: Annotated[
+        bool,
+        _reading("Algorithm 5 checks for a changed chain before the tally, instead of after it.", "ChangedBeforeTally"),
+    ] = False
+    asks_after_commit: Annotated[
+        bool,
+        Choice(
+            "Algorithms 5, 7 and 20: a finalize gap after its commit, an agent asks which agents do not follow. An "
+            "agent that has diverged then reconciles."
+        ),
+    ] = False
+    top_needs_majority: Annotated[
+        bool,
+        Choice(
+            'Algorithm 15: "Is Top Of Chain" ends the search only if a vote would be approved: more than half of the '
+            "agents have this very chain."
+        ),
+    ] = False
+    phase1_tie: Annotated[
+        Phase1Tie,
+        _reading(
+            "Algorithm 11 on a tie: continue with phase 2 as printed, or pop another block.",
+            "Phase1TiePops",
+            get_args(Phase1Tie),
+        ),
+    ] = "phase2"
+    phase2_tie: Annotated[
+        Phase2Tie,
+        _reading(
+            'Algorithm 15 on a tie: take the oldest timestamp, or never "Is Top Of Chain" while a block is on offer.',
+            "Phase2TieTakesBlock",
+            get_args(Phase2Tie),
+        ),
+    ] = "oldest"
 
     def __post_init__(self) -> None:
-        for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s"):
-            self._check(name, f"more than 0 seconds, at most {MAX_TIMER_S:g}", (int, float), math.ulp(0.0), MAX_TIMER_S)
-        self._check("finalize_gap_s", f"0..{MAX_TIMER_S:g} seconds", (int, float), 0, MAX_TIMER_S)
-        self._check("max_block_bytes", f"1..{MAX_EVENT_DATA_BYTES}", (int,), 1, MAX_EVENT_DATA_BYTES)
-        self._check("max_event_bytes", "1..max_block_bytes", (int,), 1, self.max_block_bytes)
-        for name in ("vote_names_chain", "changed_before_tally", "asks_after_commit", "top_needs_majority"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} must be true or false, not {shown(getattr(self, name))}")
-        for name, allowed in (("phase1_tie", get_args(Phase1Tie)), ("phase2_tie", get_args(Phase2Tie))):
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {shown(getattr(self, name))}")
+        for name, number in NUMBERS.items():
+            value = getattr(self, name)
+            high = self.max_block_bytes if name == "max_event_bytes" else number.high
+            kinds = (int,) if number.whole else (int, float)
+            if type(value) not in kinds or not number.low <= value <= high:
+                raise ValueError(f"{name} must be {number.allowed}, not {shown(value)}")
+        for name, choice in CHOICES.items():
+            value = getattr(self, name)
+            if not isinstance(value, type(choice.values[0])) or value not in choice.values:
+                raise ValueError(f"{name} must be {choice.allowed}, not {shown(value)}")
 
     def told(self) -> dict[str, Any]:
-        """As missions and traces say them: what the contract once did not have is left out where it is as by default.
+        """Return the settings as missions and traces have them, without those of `ADDED` that have their default.
 
-        So an agent that knows nothing of it can play a mission that does not need it.
+        An agent that does not know such a setting can then play a mission that does not need it.
         """
         usual = Settings()
         told = {name: getattr(self, name) for name in self.__match_args__}
         return {name: value for name, value in told.items() if name not in ADDED or value != getattr(usual, name)}
 
-    def _check(self, name: str, allowed: str, kinds: tuple[type, ...], low: float, high: float) -> None:
-        value = getattr(self, name)
-        if type(value) not in kinds or not low <= value <= high:
-            raise ValueError(f"{name} must be {allowed}, not {shown(value)}")
+
+DECLARED: dict[str, Number | Choice] = {name: kind.__metadata__[0] for name, kind in Settings.__annotations__.items()}
+"""Name of each setting -> its declaration."""
+NUMBERS = {name: declared for name, declared in DECLARED.items() if isinstance(declared, Number)}
+CHOICES = {name: declared for name, declared in DECLARED.items() if isinstance(declared, Choice)}
+ADDED = tuple(name for name, choice in CHOICES.items() if not choice.always_written)
+"""Settings that the first agents of contract 2 do not have."""
+ALTERNATIVES: dict[str, tuple[str, bool | str]] = {
+    name if value is True else f"{name}={value}": (name, value)
+    for name, choice in CHOICES.items()
+    for value in choice.values[1:]
+}
+"""Feature -> the setting and the value for which an agent needs the feature."""

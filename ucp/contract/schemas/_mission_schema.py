@@ -1,42 +1,32 @@
 """The mission file, `ucp-mission/1`."""
 
 import dataclasses
-from typing import get_args
 
-from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.contract.schemas._schema_parts import AGENT_ID, BASE64, FLAG, ROSTER, Schema, listed, record
 from ucp.events import MAX_MEAN_S
 from ucp.mission import LATEST_EPOCH_US, MAX_SPEEDUP, SCHEMA
-from ucp.settings import ADDED, MAX_TIMER_S, Phase1Tie, Phase2Tie, Settings
+from ucp.settings import ADDED, DECLARED, Choice, Number, Settings
 from ucp.telemetry import EVENT_KINDS
 
 ABOVE_0: Schema = {"type": "number", "exclusiveMinimum": 0}
 OCTET = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
 IPV4: Schema = {"type": "string", "format": "ipv4", "pattern": rf"^{OCTET}(\.{OCTET}){{3}}$"}
 PORT: Schema = {"type": "integer", "minimum": 1, "maximum": 65535}
-BYTES: Schema = {"type": "integer", "minimum": 1, "maximum": MAX_EVENT_DATA_BYTES}
 
-SETTINGS: dict[str, Schema] = {
-    "vote_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
-    "phase1_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
-    "phase2_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
-    "phase3_timeout_s": ABOVE_0 | {"maximum": MAX_TIMER_S},
-    "finalize_gap_s": {"type": "number", "minimum": 0, "maximum": MAX_TIMER_S},
-    "max_block_bytes": BYTES,
-    "max_event_bytes": BYTES,
-    "vote_names_chain": FLAG,
-    "changed_before_tally": FLAG,
-    "asks_after_commit": FLAG,
-    "top_needs_majority": FLAG,
-    "phase1_tie": {"enum": list(get_args(Phase1Tie))},
-    "phase2_tie": {"enum": list(get_args(Phase2Tie))},
-}
+
+def _setting(declared: Number | Choice) -> Schema:
+    if isinstance(declared, Choice):
+        return FLAG if declared.values == (False, True) else {"enum": list(declared.values)}
+    if declared.whole:
+        return {"type": "integer", "minimum": declared.low, "maximum": declared.high}
+    low: Schema = ABOVE_0 if declared.low > 0 else {"type": "number", "minimum": 0}
+    return low | {"maximum": declared.high}
 
 
 def settings(*, optional: bool) -> Schema:
     """The settings, each with its default; an `optional` one may be missing."""
     defaults = dataclasses.asdict(Settings())
-    named = {name: {**schema, "default": defaults[name]} for name, schema in SETTINGS.items()}
+    named = {name: {**_setting(declared), "default": defaults[name]} for name, declared in DECLARED.items()}
     return record(named, optional=tuple(named) if optional else ADDED)
 
 
