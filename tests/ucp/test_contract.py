@@ -16,6 +16,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 import ucp
+from docs.generate.settings import table
 from harness.play.process.agent_mission import mission_file
 from harness.scenario import Scenario
 from tests.ucp.test_node import AgentUnderTest, mission
@@ -27,7 +28,7 @@ from ucp.contract.vectors.replay import differences
 from ucp.features import FEATURES, needed
 from ucp.messages import RequestForBlock, encode
 from ucp.sealed import seal_to
-from ucp.settings import Settings
+from ucp.settings import ALTERNATIVES, Settings
 
 PAGE = (Path(ucp.__path__[0]) / "contract" / "CONTRACT.md").read_text(encoding="utf-8")
 TRANSCRIPTS = sorted(vectors.MISSIONS.glob("*.jsonl"))
@@ -68,6 +69,11 @@ def test_the_page_has_each_handler_with_its_number_and_each_of_its_branches() ->
     for handler in HANDLERS.values():
         branches = re.findall(r'"([^"]+)"', told[f"{handler.algorithm:<2} {handler.name}"])
         assert {*branches} == {*handler.branches}, handler.name
+
+
+def test_page_has_the_table_of_settings() -> None:
+    page = PAGE.partition("<!-- table: begin -->\n")[2].partition("<!-- table: end -->")[0]
+    assert page == table(), "run `python -m docs.generate.settings`"
 
 
 @pytest.mark.parametrize(
@@ -143,14 +149,7 @@ def test_mission_files_fit_their_schema_and_name_the_features_that_they_need() -
         {
             "name": "rich",
             "quirks": {"ignore_commit": 0.5},
-            "settings": {
-                "vote_names_chain": True,
-                "changed_before_tally": True,
-                "asks_after_commit": True,
-                "top_needs_majority": True,
-                "phase1_tie": "pop",
-                "phase2_tie": "block",
-            },
+            "settings": dict(ALTERNATIVES.values()),
             "events": {"source": "mavlink"},
         }
     )
