@@ -15,6 +15,7 @@ from typing import Any
 from harness.run.parallel import Failed, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
+from ucp.settings import ALTERNATIVES, CHOICES
 
 JOBS = 2
 
@@ -39,10 +40,7 @@ def scenario(number: int) -> Scenario:
     if draw.random() < 0.3:
         document["settings"] = draw.choice(
             [
-                {"vote_names_chain": True},
-                {"changed_before_tally": True},
-                {"phase1_tie": "pop"},
-                {"phase2_tie": "block"},
+                *({name: value} for name, value in ALTERNATIVES.values() if CHOICES[name].is_reading),
                 {"max_block_bytes": 512},
                 {"finalize_gap_s": 0},
             ]

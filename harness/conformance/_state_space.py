@@ -14,7 +14,7 @@ from harness.conformance._alphabet import INPUTS, LOG, TIMER, Input
 from harness.conformance._reference_model import AGENT, OLD_US, YOUNG_US, Model, Moment, Outcome
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.reconcile import IS_TOP_OF_CHAIN
-from ucp.settings import Settings
+from ucp.settings import ALTERNATIVES, Settings
 
 STEP_S = 0.125
 """Mission seconds between two inputs that are not timers, in virtual time."""
@@ -46,12 +46,7 @@ VARIANTS: dict[str, Variant] = {
         Variant("default", _settings()),
         Variant("long votes", _settings(vote_timeout_s=45.0)),
         Variant("no finalize gap", _settings(finalize_gap_s=0.0)),
-        Variant("vote_names_chain", _settings(vote_names_chain=True), ("vote_names_chain",)),
-        Variant("changed_before_tally", _settings(changed_before_tally=True), ("changed_before_tally",)),
-        Variant("asks_after_commit", _settings(asks_after_commit=True), ("asks_after_commit",)),
-        Variant("top_needs_majority", _settings(top_needs_majority=True), ("top_needs_majority",)),
-        Variant("phase1_tie=pop", _settings(phase1_tie="pop"), ("phase1_tie=pop",)),
-        Variant("phase2_tie=block", _settings(phase2_tie="block"), ("phase2_tie=block",)),
+        *(Variant(feature, _settings(**{name: value}), (feature,)) for feature, (name, value) in ALTERNATIVES.items()),
     )
 }
 

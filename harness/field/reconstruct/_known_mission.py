@@ -19,7 +19,7 @@ from harness.field.reconstruct._other_records import Captured, Elsewhere
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import BlockAddResponse, decode
-from ucp.settings import Settings
+from ucp.settings import CHOICES, Settings
 
 TRIES = 10
 """Orders of what one agent received that are tried with one reading."""
@@ -49,10 +49,15 @@ def likely(
     return best
 
 
+SHOWN_BY_VOTES = "vote_names_chain"
+"""The setting that `_seen` reads from the votes."""
+
+
 def _others(seen: Settings) -> Iterator[Settings]:
-    yield replace(seen, phase2_tie="block")
-    yield replace(seen, phase1_tie="pop")
-    yield replace(seen, changed_before_tally=True)
+    for name, choice in reversed(CHOICES.items()):
+        if choice.is_reading and name != SHOWN_BY_VOTES:
+            for value in choice.values[1:]:
+                yield replace(seen, **{name: value})  # type: ignore[arg-type]  # each setting takes its own values
     yield replace(seen, finalize_gap_s=0.0)
 
 

@@ -7,7 +7,6 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from harness.proof.graph._exploration import Graph
 from harness.proof.model._global_states import AGENTS
 from harness.proof.model._local_steps import LocalStates
 from ucp.clock import MICROSECONDS
-from ucp.settings import Settings
+from ucp.settings import CHOICES, Settings
 from ucp.state import AgentState
 
 Plain = tuple[Any, ...]
@@ -140,28 +139,16 @@ class _Translator:
         )
 
 
-SPECIFIED = frozenset(
-    (
-        *("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s"),
-        *("max_block_bytes", "max_event_bytes"),
-        *("vote_names_chain", "changed_before_tally", "phase1_tie", "phase2_tie"),
-    )
-)
-
-
 def unspecified(settings: Settings) -> str | None:
-    """A setting that is not as by default, and that the specification does not have."""
-    default = Settings()
-    names = (item.name for item in fields(Settings))
-    changed = (name for name in names if getattr(settings, name) != getattr(default, name))
-    return next((name for name in changed if name not in SPECIFIED), None)
+    """Return a setting that does not have its default and that the specification does not have."""
+    unknown = (name for name, choice in CHOICES.items() if choice.constant is None)
+    return next((name for name in unknown if getattr(settings, name) != CHOICES[name].values[0]), None)
 
 
 def readings(settings: Settings) -> dict[str, bool]:
-    """The constants that are readings of the thesis with a setting."""
+    """Return the constants that stand for settings."""
     return {
-        "VoteNamesChain": settings.vote_names_chain,
-        "ChangedBeforeTally": settings.changed_before_tally,
-        "Phase1TiePops": settings.phase1_tie == "pop",
-        "Phase2TieTakesBlock": settings.phase2_tie == "block",
+        choice.constant: getattr(settings, name) != choice.values[0]
+        for name, choice in CHOICES.items()
+        if choice.constant is not None
     }

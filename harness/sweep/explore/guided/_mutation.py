@@ -6,12 +6,12 @@ finds out. All chance is drawn from the lots that are given: equal lots make equ
 
 from collections.abc import Callable, Sequence
 from random import Random
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 from harness.scenario.fates import MessageName
 from harness.scenario.strict_model import in_text, numbered
 from harness.sweep.explore._scenario_document import Document, at, script, timeline, with_agents, with_key
-from ucp.settings import Settings
+from ucp.settings import CHOICES, Settings
 
 MOST_FATES = 12
 MOST_ENTRIES = 6
@@ -21,13 +21,8 @@ AFTER_LAST_S = 30.0
 """So long after its last event a changed scenario goes on: a vote and a reconcile are over."""
 FEW_BLOCKS = 4
 MESSAGES = get_args(MessageName)
-READINGS: dict[str, tuple[Any, ...]] = {
-    "vote_names_chain": (True,),
-    "changed_before_tally": (True,),
-    "phase1_tie": ("pop",),
-    "phase2_tie": ("block",),
-}
-"""Settings that say how the thesis is read, and what they may be beside their defaults."""
+READINGS = {name: choice.values[1:] for name, choice in CHOICES.items() if choice.is_reading}
+"""Settings that choose a reading of the thesis -> their values except the default."""
 TIMERS_S = tuple(
     getattr(Settings(), name) for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s")
 )
