@@ -1,4 +1,7 @@
-"""What can happen to agents: a file for each fault, and no list of them anywhere else."""
+"""Faults of agents and vehicles, a class for each. This package finds the classes in its files.
+
+No other module lists the faults: to add one, add its class to a file in this directory.
+"""
 
 from collections.abc import Iterator
 from importlib import import_module
@@ -14,7 +17,7 @@ for file in iter_modules(__path__):
 
 
 def _below(kind: type[Fault]) -> Iterator[type[Fault]]:
-    """Those that have a word, in the order in which they were read."""
+    """Yield the subclasses that have a name, in the order of their definition."""
     for derived in kind.__subclasses__():
         if derived.what:
             yield derived
@@ -23,11 +26,11 @@ def _below(kind: type[Fault]) -> Iterator[type[Fault]]:
 
 KINDS: tuple[type[Fault], ...] = tuple(_below(Fault))
 ASKED_FOR: tuple[type[Fault], ...] = tuple(kind for kind in KINDS if kind.is_asked_for)
-"""Those that are keys of a timeline entry."""
+"""Faults that are keys of a timeline entry."""
 
 _BY_NAME = {kind.what: kind for kind in KINDS}
 
 
 def named(what: str) -> type[Fault]:
-    """What the word of a record stands for; Fault itself, which does nothing, if it is no fault that is known."""
+    """Return the class of the fault with this name, or `Fault`, which does nothing, for an unknown name."""
     return _BY_NAME.get(what, Fault)

@@ -1,9 +1,8 @@
 """A fault: what happens to agents and their vehicles at an instant, as a value.
 
-Everything that there is to know of one kind of fault is in its class: its word in YAML, in records and in pytest, what
-state it finds agents in and leaves them in, what becomes of their lives, vehicles and data, what a backend has to do,
-and how people are told. Whoever comes across a fault asks it, and compares no words. A class of its own in a file of
-its own in this directory is a new fault, which everything else then knows.
+The class of a fault holds everything about it: its name in YAML, in records and in pytest, the states of an agent
+before and after it, its effect on lives, vehicles and data, the calls to the backend, and the texts of the report.
+Other modules ask the class and do not compare names. To add a fault, add a class to a file in this directory.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""A new fault is one file: put beside the others, every room of the harness knows it."""
+"""A new fault needs one class. Every room of the harness then knows the fault."""
 
 import json
 import os
