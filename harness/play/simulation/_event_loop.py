@@ -32,10 +32,10 @@ from ucp.store import StoredState
 from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
+    from harness.play.simulation._secured_agents import Keys
     from harness.play.simulation._simulated_rogue import VirtualRogue
     from harness.play.simulation.foreign._foreigners import Foreigners
     from harness.play.simulation.foreign._virtual_program import Programs
-    from harness.play.simulation.secured_agents import Keys
     from ucp.secure.bundle import PublicKeys
     from ucp.secure.crypto_suite import Signed
 
@@ -123,7 +123,7 @@ class Clockwork:
         return self._keys.arithmetic.verified if self._keys else None
 
     def _keys_of_agents(self, *, told: bool) -> "Keys":
-        from harness.play.simulation.secured_agents import Keys  # needs the extra `secure`
+        from harness.play.simulation._secured_agents import Keys  # needs the extra `secure`
 
         return Keys(self.scenario, self.seed, told=told)
 

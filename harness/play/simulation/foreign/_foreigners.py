@@ -15,7 +15,7 @@ from harness.scenario import Scenario
 from netem import addresses
 
 if TYPE_CHECKING:
-    from harness.play.simulation.secured_agents import Keys
+    from harness.play.simulation._secured_agents import Keys
 
 MAX_RECORD_BYTES = 128 * 1024 * 1024
 """Of all that agents are given and answer in a mission, so much is kept, to be given to them again."""
