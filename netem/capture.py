@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from netem import pcapng
-from netem.errors import CaptureError
+from netem.errors import LiveCaptureError
 from netem.lab import Lab, LabProcess, in_words
 
 _READY_S = 20.0
@@ -53,7 +53,7 @@ class LiveCapture:
 
     @classmethod
     async def start(cls, lab: Lab, folder: Path, vehicles: Sequence[int] | None = None) -> LiveCapture:
-        """Tap the ports of `vehicles`, or of all in the lab; raises CaptureError.
+        """Tap the ports of `vehicles`, or of all in the lab; raises LiveCaptureError.
 
         What crosses them from now on waits in memory.
         """
@@ -74,7 +74,7 @@ class LiveCapture:
                         raise capture._ended(process.returncode)
                     await asyncio.sleep(_LOOK_AGAIN_S)
         except TimeoutError:
-            raise CaptureError(f"The capture was not ready within {_READY_S:g} s; see {log}") from None
+            raise LiveCaptureError(f"The capture was not ready within {_READY_S:g} s; see {log}") from None
         return capture
 
     async def begin(self, epoch_us: int, speedup: float) -> None:
@@ -84,13 +84,13 @@ class LiveCapture:
         await self._process.send_signal(signal.SIGUSR1)
 
     async def watch(self) -> None:
-        """Raises CaptureError when it ends by itself."""
+        """Raises LiveCaptureError when it ends by itself."""
         raise self._ended(await self._process.wait())
 
     async def stop(self) -> dict[int, dict[str, int]]:
         """Finish the files; of each vehicle how many frames were `received`, and how many of them `dropped`.
 
-        Those that were dropped are in no file. Raises CaptureError if the capture failed, now or before.
+        Those that were dropped are in no file. Raises LiveCaptureError if the capture failed, now or before.
         """
         returncode = await self._process.terminate(_STOP_S)
         if returncode != 0:
@@ -99,9 +99,9 @@ class LiveCapture:
         self.processor_s = report["processor_s"]
         return {int(vehicle): counted for vehicle, counted in report["vehicles"].items()}
 
-    def _ended(self, returncode: int) -> CaptureError:
+    def _ended(self, returncode: int) -> LiveCaptureError:
         how = in_words(returncode) if returncode < 0 else self._last_word()
-        return CaptureError(f"The capture of packets failed: {how}")
+        return LiveCaptureError(f"The capture of packets failed: {how}")
 
     def _last_word(self) -> str:
         lines = _log(self._folder).read_text(errors="replace").splitlines()

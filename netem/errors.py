@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class NetemError(Exception):
-    """Base of every error that `netem` raises on purpose."""
+    """The base of all errors that `netem` raises for its callers."""
 
 
 class ConditionsError(NetemError, ValueError):
@@ -28,7 +28,7 @@ class LabError(NetemError):
 
 
 class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
-    """This machine cannot run the lab (or the engine asked for); `way_out` says how it could."""
+    """This machine cannot run the lab or the requested engine. `way_out` says what the user can do."""
 
     def __init__(self, reason: str, way_out: str, stage: str = "namespaces") -> None:
         super().__init__(f"{reason.rstrip('.')}. {way_out}")
@@ -45,5 +45,5 @@ class UmlError(NetemError):
     """User Mode Linux is not here, did not boot, hung or panicked."""
 
 
-class CaptureError(NetemError):
-    """What crosses the air could not be taken down, or not to the end."""
+class LiveCaptureError(NetemError):
+    """A capture of packets failed to start, or ended early."""

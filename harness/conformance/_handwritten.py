@@ -3,10 +3,11 @@
 import asyncio
 from dataclasses import replace
 
-from harness.conformance._udp_lab import AgentEndedError, Air, UnsupportedError
+from harness.conformance._udp_lab import AgentEndedError, Air
 from harness.conformance.cases import ALL, Bench, ByHand
 from harness.conformance.cases._bench import CannotTellError, WrongError
 from harness.conformance.results import Case
+from harness.errors import UnsupportedError
 from harness.play.agent_control import AgentRefusedError, AgentUnsupportedError
 from ucp.agent import HANDLERS
 

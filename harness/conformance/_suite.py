@@ -14,8 +14,9 @@ from harness.conformance._reference_model import Model, Run
 from harness.conformance._state_space import COUNTING, Pair, Variant, advance, in_short, is_unchanged, walk
 from harness.conformance._subject import Start
 from harness.conformance._tours import Map, Suspicion, Tour
-from harness.conformance._udp_lab import AgentEndedError, NoAgentError, UnsupportedError
+from harness.conformance._udp_lab import AgentEndedError, NoAgentError
 from harness.conformance.vectors import Vectors
+from harness.errors import UnsupportedError
 
 SIDE_BY_SIDE = 24
 MORE_ROOM = 0.01

@@ -20,7 +20,7 @@ from typing import Any, Self
 from harness.conformance import _ports
 from harness.conformance._state_space import Variant
 from harness.conformance._subject import NO_KEYS, mission
-from harness.errors import HarnessError, MachineError
+from harness.errors import HarnessError, MachineError, UnsupportedError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
 from netem.errors import LabUnavailable, NetemError, SpawnError
 from netem.lab import Lab, LabProcess
@@ -43,10 +43,6 @@ UNSUPPORTED = 127
 
 class NoAgentError(HarnessError):
     """The agent does not start at all: nothing can be said of it."""
-
-
-class UnsupportedError(Exception):
-    """The agent says that it lacks a feature of its mission: its sentence."""
 
 
 class AgentEndedError(Exception):

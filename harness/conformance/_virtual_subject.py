@@ -28,10 +28,10 @@ from harness.conformance._udp_lab import (
     START_LIMIT_S,
     AgentEndedError,
     NoAgentError,
-    UnsupportedError,
     last_line,
 )
 from harness.conformance._virtual_lines import given_line, virtual_mission
+from harness.errors import UnsupportedError
 from ucp.clock import MICROSECONDS
 
 ANSWER_BYTES = 4 * 1024 * 1024

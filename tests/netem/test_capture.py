@@ -13,7 +13,7 @@ from scapy.layers.l2 import Ether
 
 from netem.capture import LiveCapture, begin_file
 from netem.conditions import Delay, LinkConditions, NetworkConditions
-from netem.errors import CaptureError
+from netem.errors import LiveCaptureError
 from netem.lab import Lab
 from tests.captured import comment, frames, statistics
 from tests.netem.conftest import DEADLINE_S, PACKETS, PORT, Air, assert_binomial, play
@@ -161,7 +161,7 @@ def test_a_capture_that_ends_by_itself_is_an_error_and_leaves_what_it_had(tmp_pa
             await asyncio.sleep(0.01)
         await capture._process.send_signal(signal.SIGKILL)
         for failed in (watched, capture.stop()):
-            with pytest.raises(CaptureError, match="The capture of packets failed: SIGKILL"):
+            with pytest.raises(LiveCaptureError, match="The capture of packets failed: SIGKILL"):
                 await failed
         assert captured() == [100, 100]
 
@@ -194,7 +194,7 @@ def test_a_lab_whose_ports_cannot_be_tapped_says_why(tmp_path: Path) -> None:
     async def story() -> None:
         async with await Lab.open([1, 2], log=tmp_path / "lab.log") as lab:
             lab.vehicles = (1, 2, 3)
-            with pytest.raises(CaptureError, match="The capture of packets failed: No such device"):
+            with pytest.raises(LiveCaptureError, match="The capture of packets failed: No such device"):
                 await LiveCapture.start(lab, tmp_path)
 
     play(story())

@@ -32,7 +32,7 @@ from harness.scenario.faults import Fault
 from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
-from netem.errors import CaptureError, LabUnavailable, NetemError
+from netem.errors import LabUnavailable, LiveCaptureError, NetemError
 from sitl.circumstances import Circumstance
 from sitl.vehicle import VehicleKind
 from ucp.clock import MICROSECONDS, MissionClock
@@ -126,7 +126,7 @@ class ProcessRun:
                     yield
             except HarnessError as error:
                 self._ended_early(error)
-            except CaptureError as error:
+            except LiveCaptureError as error:
                 self._ended_early(MachineError(str(error)))
             except NetemError as error:
                 self._ended_early(MachineError(f"the lab failed: {error}"))
@@ -438,7 +438,7 @@ class ProcessRun:
             return
         try:
             counted = await self._capture.stop()
-        except CaptureError as error:
+        except LiveCaptureError as error:
             if self.played.outcome == "completed":
                 self._ended_early(MachineError(str(error)))
             return
