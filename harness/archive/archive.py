@@ -10,7 +10,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from harness.archive._jsonlines import JsonLines, Record
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, Link, read_connectivity, read_link_losses
@@ -19,6 +19,7 @@ from harness.archive.exports import (
     BEFORE_FINAL_RECONCILE,
     RUN_FILE,
     Export,
+    ExportedBlock,
     Exports,
     agents_directory,
     export_files,
@@ -31,6 +32,7 @@ from harness.archive.run_record import JudgedRecord, RunRecord
 from harness.archive.traces import SUFFIX, Line, Trace, read_lines, read_trace, why_none
 from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
 from harness.errors import RunDirectoryError
+from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -42,15 +44,38 @@ MAX_TRACE_BYTES = 256 * 1024 * 1024
 _AGENT_ID = re.compile("[1-9][0-9]{0,4}")
 
 
-class RunArchive:
-    """What is in run directories, in directories of exports, or in exports from anywhere, with the traces beside them.
+class RecordedRun(NamedTuple):
+    """A handler run in a trace: the agent, its life (1 until its first restart), and the line in its trace, from 1."""
 
-    `directory` is the run's: the first that has a record, or the first that was named; None if only files were.
-    With `skim`, handler runs that only took a message in are left out of traces that are `large`. Raises
-    RunDirectoryError if a path does not exist, or is a directory of other things.
+    agent_id: int
+    life: int
+    line: int
+    run: HandlerRun
+
+
+class HeldBlock(NamedTuple):
+    """A block that agent `holder` holds in its `chain`, `deque` or reconcile `stack`.
+
+    `position` counts from 0, the oldest block of a chain first. The inception block is not counted.
     """
 
-    def __init__(self, *paths: Path, skim: bool = False) -> None:
+    holder: int
+    place: str
+    position: int
+    block: ExportedBlock
+
+
+class RunArchive:
+    """The archive of a run: what is left in a run directory, a directory of exports, or single export files.
+
+    Files are read at first use, and once. `directory` is the first directory with a record, else the first directory
+    given, else None. `exports` and `traces` hold what can be read, by agent; `problems` has a sentence for each
+    damaged file, and `gaps` one for each missing file. With `skim`, large traces are read without the handler runs
+    that only received a message. Raises RunDirectoryError if a path does not exist, or is a directory of other things.
+    """
+
+    def __init__(self, *given: Path | str, skim: bool = False) -> None:
+        paths = [Path(path) for path in given]
         self._export_files = export_files(paths)
         self._skim = skim
         directories = [path for path in paths if path.is_dir()]
@@ -137,6 +162,27 @@ class RunArchive:
         """The handler runs of an agent's trace as they stand in it. Raises RunDirectoryError, where it is damaged."""
         assert self.directory is not None
         return read_lines(agents_directory(self.directory) / f"{agent_id}{SUFFIX}")
+
+    def handler_runs(self) -> Iterator[RecordedRun]:
+        """Yield every handler run, trace by trace, agents in order of their IDs.
+
+        Traces are read line by line and not kept, so memory stays small however long they are. Raises
+        RunDirectoryError at the first damaged line; `traces` has what is before it.
+        """
+        for path in self._trace_files:
+            for line in read_lines(path):
+                yield RecordedRun(line.agent_id, line.life, line.number, line.parsed())
+
+    def blocks(self) -> Iterator[HeldBlock]:
+        """Yield every block that an agent holds in its export, agents in order of their IDs.
+
+        `problems` has a sentence for each export that cannot be read.
+        """
+        for agent_id, export in self.exports.by_agent.items():
+            places = {"chain": export.chain, "deque": export.blocks_to_be_committed, "stack": export.reconcile_stack}
+            for place, blocks in places.items():
+                for position, block in enumerate(blocks):
+                    yield HeldBlock(agent_id, place, position, block)
 
     @cached_property
     def large(self) -> bool:

@@ -336,6 +336,7 @@ class Line(NamedTuple):
 
     path: Path
     number: int
+    agent_id: int
     life: int
     text: bytes
 
@@ -349,7 +350,7 @@ def read_lines(path: Path) -> Iterator[Line]:
 
     Raises RunDirectoryError, when it comes there, if the file cannot be read or a line is not what it should be.
     """
-    life = number = 0
+    life = number = agent_id = 0
     try:
         with path.open("rb") as file:
             while text := file.readline(MAX_LINE_BYTES):
@@ -357,11 +358,11 @@ def read_lines(path: Path) -> Iterator[Line]:
                 if not text.endswith(b"\n") and len(text) < MAX_LINE_BYTES:
                     break
                 if life and b'"handler"' in text:
-                    yield Line(path, number, life, text)
+                    yield Line(path, number, agent_id, life, text)
                 elif life and b'"schema"' not in text:
                     _validated(ASIDE, path, number, text)
                 else:
-                    _validated(HEADER, path, number, text)
+                    agent_id = _validated(HEADER, path, number, text).agent_id
                     life += 1
     except OSError as error:
         raise RunDirectoryError(

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from harness.archive.archive import RunArchive
 from harness.checker import (
     _all_committed,
     _distributed,
@@ -16,7 +17,7 @@ from harness.checker import (
     uniform_chain,
 )
 from harness.checker._figures import figures
-from harness.checker.evidence import Evidence
+from harness.checker.evidence import Evidence, gather
 from harness.checker.judgement import Judgement
 from harness.checker.records import cross_examine
 from harness.checker.records._doubt import in_doubt
@@ -41,7 +42,11 @@ BESIDE: dict[str, Callable[[Evidence], Judgement]] = {
 
 @dataclass(frozen=True)
 class Result:
-    """`characteristics` by number; `beside` the judgements beside them, by key."""
+    """The verdict on a run.
+
+    `characteristics` holds the judgement of each characteristic by its number, "1" to "6". `beside` holds the
+    judgements `steps`, `records` and `liveness`. `figures` has the figures of run.json by name; None means not known.
+    """
 
     characteristics: dict[str, Judgement]
     figures: dict[str, float | int | None]
@@ -73,8 +78,12 @@ class Result:
         }
 
 
-def check(evidence: Evidence) -> Result:
-    """Decide all six characteristics from the evidence, and what is judged beside them."""
+def check(run: Evidence | RunArchive) -> Result:
+    """Decide the six characteristics (Section 4.3), and the judgements `steps`, `records` and `liveness`.
+
+    An archive is read first. A damaged file raises no error: a sentence on it is in `Result.errors`.
+    """
+    evidence = gather(run) if isinstance(run, RunArchive) else run
     chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}
     if evidence.record is not None and evidence.record.outcome == "not supported":
         reason = evidence.record.outcome_detail or "not supported by an agent"

@@ -14,7 +14,7 @@ MAX_EVIDENCE = 50
 
 @dataclass(frozen=True)
 class Finding:
-    """One piece of evidence: which agent, which block if any, and what was seen where."""
+    """One piece of evidence: the agent, the block if there is one, and what was seen where."""
 
     agent_id: int
     detail: str
@@ -26,7 +26,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What was judged, how, and why: `reason` is a sentence, and `evidence` the first of what speaks for it."""
+    """A verdict with its reason, one sentence, and the first pieces of evidence."""
 
     name: str
     verdict: Verdict

@@ -14,7 +14,6 @@ from harness.run.parallel import cores
 from harness.scenario import Scenario
 from harness.sweep import explore
 
-SEEDS = 1000
 _DURATION = re.compile(r"(\d{1,9}(?:\.\d{1,6})?)(s|m|h|)")
 _UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
 LONGEST_S = 31 * 86400.0
@@ -29,7 +28,7 @@ def explore_command(
         ),
     ],
     seeds: Annotated[
-        int | None, typer.Option(min=1, help=f"How many seeds to play at most; {SEEDS} if not given.")
+        int | None, typer.Option(min=1, help=f"How many seeds to play at most; {explore.SEEDS} if not given.")
     ] = None,
     first_seed: Annotated[
         int | None, typer.Option(min=0, help="The first of them; 0, or that of RUN, if not given.")
@@ -75,8 +74,8 @@ def explore_command(
     if first_seed is None:
         first_seed = own_seed or 0
     with explore.watching(console) as watcher:
-        seeds_asked = range(first_seed, first_seed + (seeds or SEEDS))
-        explored = explore.explore(request, str(scenario), seeds_asked, jobs or cores(), out, watcher=watcher)
+        seeds_asked = range(first_seed, first_seed + (seeds or explore.SEEDS))
+        explored = explore.explore(request, seeds_asked, out, source=str(scenario), jobs=jobs, watcher=watcher)
     for line in explore.in_words(explored):
         console.print(line, highlight=False, soft_wrap=True, markup=False)
     for seed, reason in explored.searched.failed.items():

@@ -10,7 +10,7 @@ from harness.backend_names import BackendName
 from harness.commands.terminal import complain, end_sweep, print_lines
 from harness.run.parallel import cores
 from harness.sweep import matrix
-from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table, results_file
+from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table
 from harness.sweep.matrix import nights as nights_of_matrix
 from harness.sweep.matrix.matrix_run import compared, on_cluster, on_cores
 from harness.sweep.matrix.nights import load_baseline
@@ -54,8 +54,7 @@ def matrix_command(
         spread = on_cores(request, jobs or cores(), shown=True)
     else:
         spread = on_cluster(request, scheduler, shown=True)
-    with results_file.opened(directory, request) as ended:
-        finished = matrix.run_matrix(request, ended, spread, covers=coverage)
+    finished = matrix.run_matrix(request, directory, spread, covers=coverage)
     if baseline is not None:
         finished = compared(finished, baseline, str(against))
     earlier = None

@@ -4,8 +4,10 @@ import asyncio
 import platform
 import signal
 import sys
+import threading
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -15,7 +17,7 @@ from typing import Any
 
 from harness import checker, report
 from harness.archive.archive import RunArchive
-from harness.archive.directory import RunDirectory
+from harness.archive.directory import RunDirectory, default_path
 from harness.archive.run_record import RogueInjection, RunRecord, Survival
 from harness.backend_names import BackendName
 from harness.checker.injections import account
@@ -28,7 +30,7 @@ from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
-from harness.play.progress import Progress
+from harness.play.progress import Progress, Silent
 from harness.play.request_socket import listening
 from harness.scenario import Scenario
 from harness.scenario.scenario_file import to_yaml
@@ -59,9 +61,11 @@ PACKAGES = ("ucp-harness", "pymavlink")
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: where it is, how it ended, what was found, and the exit status of the command line.
+    """A finished run: its directory, outcome, record, verdict, and the exit status of the command line.
 
-    `timer_lag` is that of the agents' timers, of processes only, and if enough of them tell.
+    `result` is the verdict, `record` the content of run.json, `report` the path of report.html, and `wall_s` the wall
+    time in seconds. `timer_lag` is the lateness of the agents' timers; it is None in virtual time, or if too few are
+    on record.
     """
 
     directory: Path
@@ -79,20 +83,27 @@ class Run:
 def run(
     scenario: Scenario,
     seed: int,
-    out: Path,
-    progress: Progress,
+    out: Path | None = None,
+    progress: Progress | None = None,
     backend: BackendName = "process",
     *,
     delivers_all: bool = False,
     interventions: Interventions | None = None,
 ) -> Run:
-    """Play `scenario` and judge it, into the new or empty directory `out`. Raises HarnessError if it cannot even begin.
+    """Play a scenario, check it, and write the run directory.
 
-    With `interventions`, which are of this very scenario, somebody may have things happen to it while it goes on.
+    seed: 0 or more. It fixes events, faults and everything else that the harness draws.
+    out: the run directory, new or empty. Without it, a new directory under `runs/`.
+    progress: where the state of the swarm is shown during the run. Without it, nothing is shown.
+    backend: `process` plays in network namespaces, `docker` in containers, `sim` in virtual time.
+    delivers_all: in virtual time, traces also record messages that have no effect, as traces of processes do.
+    interventions: faults that the user requests during the run. They belong to this scenario.
 
-    With `delivers_all` traces have also what cannot matter to who heard it, as those of processes always
-    have. Ctrl-C and SIGTERM end the mission early; what there is is exported and checked all the same.
+    Ctrl-C and SIGTERM end the mission early. The run is then exported and checked as far as it went. The function also
+    works inside a running event loop, for example in a notebook. Raises HarnessError if the run cannot start: the
+    scenario does not suit the backend, the machine lacks something, or `out` is not empty.
     """
+    out = out or default_path(scenario.name)
     chosen = BACKENDS[backend]
     chosen.refuse(scenario)
     recording = Recording(scenario, seed, out, backend)
@@ -102,9 +113,13 @@ def run(
         story = partial(_by_hand, interventions, recording.directory)
         options |= {"told": interventions.readies_all, "pace": interventions.pace}
         interventions.taken_down = partial(recording.take_down_by_hand, interventions)
+    interrupted = asyncio.Event()
     try:
-        played = asyncio.run(
-            _until_interrupted(chosen, scenario, seed, recording.directory, progress, story, **options)
+        played = _outcome_of(
+            _until_interrupted(
+                interrupted, chosen, scenario, seed, recording.directory, progress or Silent(), story, **options
+            ),
+            interrupted,
         )
     except HarnessError as error:
         recording.fail(error)
@@ -211,7 +226,30 @@ async def _by_hand(hand: Interventions, directory: RunDirectory, swarm: mission.
         await hand.story(swarm, scenario)
 
 
+def _outcome_of(run: Coroutine[Any, Any, RunOutcome], interrupted: asyncio.Event) -> RunOutcome:
+    """Run a coroutine to its end, in another thread if this thread already runs an event loop, as a notebook does."""
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return asyncio.run(run)
+    runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
+    loop = runner.get_loop()
+
+    def in_thread() -> RunOutcome:
+        with runner:
+            return runner.run(run)
+
+    with ThreadPoolExecutor(1, "ucp-run") as thread:
+        playing = thread.submit(in_thread)
+        try:
+            return playing.result()
+        except KeyboardInterrupt:
+            loop.call_soon_threadsafe(interrupted.set)
+            return playing.result()
+
+
 async def _until_interrupted(
+    interrupted: asyncio.Event,
     backend: Backend,
     scenario: Scenario,
     seed: int,
@@ -220,9 +258,9 @@ async def _until_interrupted(
     story: mission.Story,
     **options: Any,
 ) -> RunOutcome:
-    interrupted = asyncio.Event()
     loop = asyncio.get_running_loop()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    heard = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    before = {number: signal.getsignal(number) for number in heard}
     for number in before:
         loop.add_signal_handler(number, interrupted.set)
     try:

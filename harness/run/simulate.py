@@ -34,7 +34,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Simulated:
-    """A simulated run, judged."""
+    """A run in memory: its outcome (`played`), the evidence, and the verdict (`result`)."""
 
     played: RunOutcome
     evidence: Evidence
@@ -44,12 +44,15 @@ class Simulated:
 def simulate(
     scenario: Scenario, seed: int, *, tracing: bool = False, deliver_all: bool = False, again: bool = False
 ) -> Simulated:
-    """Play `scenario` in virtual time and judge it, all in memory.
+    """Play a scenario in virtual time and check it, all in memory, without a run directory.
 
-    Without `tracing` characteristic 1 cannot be judged, and 2 and 3 only at the end. `deliver_all` delivers even what
-    changes nothing. Agents that are not ours are given their inputs again if the run is bad, or if asked for: the same
-    seed has to mean the same. Raises ScenarioError for a scenario that needs real processes, and HarnessError for such
-    an agent that fails, or cannot do it.
+    seed: 0 or more. The same scenario and seed give the same run.
+    tracing: record handler runs. Without them characteristic 1 cannot be judged, and 2 and 3 only at the end.
+    deliver_all: also deliver messages that have no effect.
+    again: give other agents than ours their input a second time, and compare. If the run is bad, this always happens.
+
+    Raises ScenarioError if the scenario needs real processes, and HarnessError if an agent fails or behaves
+    differently when it gets the same input again.
     """
     return simulate_in_memory(InMemory(tracing), scenario, seed, again=again, deliver_all=deliver_all)
 

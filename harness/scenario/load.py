@@ -49,8 +49,12 @@ MAX_SCENARIO_BYTES = 8 * 1024 * 1024
 """A flight of two hours with twenty vehicles, word for word, is half of that."""
 
 
-def load_scenario(path: Path) -> Scenario:
-    """Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed."""
+def load_scenario(path: Path | str) -> Scenario:
+    """Load a scenario from a YAML file, or from the library by its name, such as "loss_15".
+
+    Raises ScenarioError, whose one sentence names the file, the key, the value and what is allowed.
+    """
+    path = Path(path)
     document = read_yaml(path, "scenario")
     if "scenario" in document:
         raise ScenarioError(f"{path}: this is a matrix, which `ucp-harness matrix {path}` plays")

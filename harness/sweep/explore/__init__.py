@@ -12,6 +12,6 @@ guided/      instead of seed after seed: scenarios changed, and kept where they 
 """
 
 from harness.sweep.explore._explore_text import in_words, watching
-from harness.sweep.explore._exploring import MAX_RUNS, Explored, Violation, Watcher, explore
+from harness.sweep.explore._exploring import MAX_RUNS, SEEDS, Explored, Violation, Watcher, explore
 
-__all__ = ["MAX_RUNS", "Explored", "Violation", "Watcher", "explore", "in_words", "watching"]
+__all__ = ["MAX_RUNS", "SEEDS", "Explored", "Violation", "Watcher", "explore", "in_words", "watching"]

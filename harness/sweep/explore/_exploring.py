@@ -7,7 +7,7 @@ from pathlib import Path
 from harness.checker.judgement import Judgement
 from harness.errors import INTERRUPTED, VIOLATED
 from harness.run.finding import Judge, claim, evidence_lines, simulated, write
-from harness.run.parallel import Failed, sweep
+from harness.run.parallel import Failed, cores, sweep
 from harness.run.simulate import same_twice
 from harness.scenario import Scenario
 from harness.sweep.explore._recording import Recording, record
@@ -55,6 +55,8 @@ def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: 
 
 
 MAX_RUNS = 5000
+SEEDS = 1000
+"""Number of seeds that are played unless the caller or the user gives another."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,11 @@ class Shrunk:
 
 @dataclass
 class Explored:
-    """`interrupted`: by Ctrl-C, in the search or while shrinking. `shrunk` is None if no run violated anything."""
+    """The result of an exploration.
+
+    `shrunk` is the smallest scenario found; it is None if no run violated anything. `interrupted` says whether Ctrl-C
+    ended the search or the shrinking.
+    """
 
     searched: Searched
     shrunk: Shrunk | None = None
@@ -94,20 +100,28 @@ class Watcher:
 
 def explore(
     scenario: Scenario,
-    source: str,
-    seeds: range,
-    jobs: int,
+    seeds: range = range(SEEDS),
     out: Path | None = None,
     *,
+    source: str | None = None,
+    jobs: int | None = None,
     judge: Judge = simulated,
     max_runs: int = MAX_RUNS,
     watcher: Watcher | None = None,
 ) -> Explored:
-    """Play `scenario`, which `source` names for people, with `seeds`, and shrink the first run that violates.
+    """Play a scenario in virtual time with one seed after another, and shrink the first run that violates.
 
-    Raises HarnessError if the scenario cannot be played, the file cannot be written, or an agent is not the same twice.
+    out: the new file of the smallest scenario. Without it, a new file under `runs/`.
+    source: the name of the scenario in that file. Without it, the scenario's `name`.
+    jobs: number of runs at the same time. Without it, the number of cores.
+    judge: plays and checks one run.
+    max_runs: number of runs after which shrinking stops.
+    watcher: functions that are called when a violation is found and when it becomes smaller.
+
+    Raises HarnessError if the scenario cannot be played, the file cannot be written, or an agent behaves differently in
+    two runs of the same seed.
     """
-    watcher = watcher or Watcher()
+    watcher, jobs, source = watcher or Watcher(), jobs or cores(), source or scenario.name
     path = claim(out, scenario.name)
     if scenario.foreign:
         same_twice(scenario, seeds[0])

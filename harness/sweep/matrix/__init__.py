@@ -2,9 +2,10 @@
 
 _matrix_file.py       what is asked: the matrix file       _estimate.py   a mean or a share with its 95 % interval
 _estimate.py     what is measured of each run         _cell.py       all runs at one point, summed up
-_cell_play.py        one run                              results_file.py    results.jsonl, from which a matrix goes on
+_cell_play.py        one run                              _results_file.py    results.jsonl, from which a matrix goes on
 matrix_run.py         all of them                          _cluster.py    spread over a Dask cluster
 matrix_record.py      matrix.json                          nights.py, _comparison.py   beside an earlier night
+matrix_frame.py   its runs as a DataFrame
 matrix_outputs.py     the files                            matrix_summary.py  matrix_outputs.py  _matrix_picture.py
 _cell_scenarios.py   some of them
 report/        report.html                          nights.py     what its trend is drawn from

@@ -152,11 +152,12 @@ class Matrix(Model):
         return _each_once(seeds)
 
 
-def load_matrix(path: Path, backend: BackendName | None = None) -> Matrix:
-    """`backend` comes before the file's word.
+def load_matrix(path: Path | str, backend: BackendName | None = None) -> Matrix:
+    """Load a matrix from a YAML file; `backend`, if given, replaces the file's.
 
-    Raises ScenarioError: one sentence that names the file, the key, the value and what is allowed.
+    Raises ScenarioError, whose one sentence names the file, the key, the value and what is allowed.
     """
+    path = Path(path)
     document = read_yaml(path, "matrix")
     if "scenario" not in document and document.keys() & (Scenario.model_fields.keys() - Matrix.model_fields.keys()):
         raise ScenarioError(

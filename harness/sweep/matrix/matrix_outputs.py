@@ -8,7 +8,7 @@ report.html   all of it for people, one file
 summary.md    table and findings in Markdown
 junit.xml     a test case a cell
 
-results.jsonl, from which all of it is made, is written while runs end (results_file.py); runs/ has the run
+results.jsonl, from which all of it is made, is written while runs end (_results_file.py); runs/ has the run
 directories that were kept of runs as processes, cells/ the scenarios with which any run can be played again.
 """
 
@@ -61,7 +61,7 @@ def write(finished: Finished, directory: Path, nights: Nights | None = None) -> 
     try:
         write_json_atomically(directory / "matrix.json", record.to_json())
         write_atomically(directory / "matrix.csv", to_csv(_cell_row(cell) for cell in record.cells))
-        write_atomically(directory / "runs.csv", to_csv(_run_rows(finished.runs)))
+        write_atomically(directory / "runs.csv", to_csv(run_rows(finished.runs)))
         write_atomically(directory / "matrix.svg", draw(record))
         write_scenarios(record.matrix, directory)
         write_atomically(directory / "report.html", to_html(finished, directory, nights))
@@ -84,7 +84,8 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
     return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in JUDGED}
 
 
-def _run_rows(runs: Sequence[Run]) -> Iterable[dict[str, Any]]:
+def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
+    """Yield a row of `runs.csv` for each run: point, seed, figures, verdicts, and why it has none."""
     figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
     for run in runs:
         yield {

@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
+from harness.archive.directory import default_path
 from harness.errors import InterruptedRunError, ScenarioError
 from harness.run.parallel import Failed, cores, sweep
 from harness.run.run import versions
@@ -16,8 +18,8 @@ from harness.sweep.matrix._cluster import cluster
 from harness.sweep.matrix._comparison import Comparison, compare
 from harness.sweep.matrix._matrix_coverage import Tally
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
+from harness.sweep.matrix._results_file import Results, opened
 from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
-from harness.sweep.matrix.results_file import Results
 
 Outcomes = Iterator[tuple[Task, Run | Failed]]
 Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
@@ -26,7 +28,7 @@ Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManage
 
 @dataclass(frozen=True)
 class Finished:
-    """A matrix that is over, also if it was interrupted: the runs that ended, by point and then seed as in the file."""
+    """A finished or interrupted matrix: its record, and the runs that ended, by point and then by seed."""
 
     record: MatrixRecord
     runs: list[Run]
@@ -50,13 +52,28 @@ def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
 
 
 def run_matrix(
-    matrix: Matrix, results: Results, spread: Spread, judge: Judge = simulated, *, covers: bool = False
+    matrix: Matrix,
+    out: Path | None = None,
+    spread: Spread | None = None,
+    judge: Judge = simulated,
+    *,
+    covers: bool = False,
 ) -> Finished:
-    """Play what `results` has not, add it there, and sum up all. Ctrl-C ends it early, with all that had ended.
+    """Play every run of a matrix and sum up each point.
 
-    Raises HarnessError if it cannot be played. `judge` plays what virtual time is asked for. `covers`: how much of the
-    protocol runs try is told, too.
+    out: the directory of `results.jsonl`. It is new or empty, or holds earlier results of the same matrix; runs in it
+        are not played again. Without it, a new directory under `runs/`.
+    spread: how runs are distributed. Without it, they use all cores of this machine.
+    judge: plays and checks one run in virtual time.
+    covers: also measure which share of the protocol's states the runs reach, which takes longer.
+
+    Ctrl-C ends the matrix early, with the runs that have ended. Raises HarnessError if it cannot be played.
     """
+    with opened((out or default_path(matrix.name)).absolute(), matrix) as results:
+        return _run_missing(matrix, results, spread or on_cores(matrix, cores()), judge, covers)
+
+
+def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge, covers: bool) -> Finished:
     started = time.monotonic()
     play = Player(matrix, results.directory / "runs", judge, covers)
     tasks = [task for task in matrix.tasks if task not in results.runs]

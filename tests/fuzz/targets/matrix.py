@@ -8,8 +8,8 @@ from harness.errors import HarnessError
 from harness.scenario.load import FOLDER
 from harness.sweep.matrix._comparison import compare
 from harness.sweep.matrix._matrix_file import Matrix, load_matrix
+from harness.sweep.matrix._results_file import FILE, opened
 from harness.sweep.matrix.nights import load_baseline
-from harness.sweep.matrix.results_file import FILE, opened
 from tests.fuzz.finding import require, sound
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 

@@ -33,7 +33,7 @@ def one_commit_is_lost(asked: Scenario, seed: int) -> Result:
 
 def find(out: Path, asked: Scenario = LOSSY, jobs: int = 1, **options: Any) -> Explored:
     options = {"judge": one_commit_is_lost, **options}
-    return explore(asked, "lossy.yaml", range(20), jobs, out, **options)
+    return explore(asked, range(20), out, source="lossy.yaml", jobs=jobs, **options)
 
 
 def test_all_that_is_irrelevant_is_left_out(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from harness.scenario import Scenario
 from harness.sweep.matrix import Finished, Matrix, run_matrix
 from harness.sweep.matrix._cell_play import Judge
 from harness.sweep.matrix.matrix_run import on_cores
-from harness.sweep.matrix.results_file import opened
 
 CHARACTERISTICS = ("1", "2", "3", "4", "5", "6")
 
@@ -26,8 +25,8 @@ def matrix(
 
 def played(asked: Matrix, jobs: int, judge: Judge, directory: Path | None = None) -> Finished:
     """Into `directory`, or one that nobody looks into."""
-    with tempfile.TemporaryDirectory() as folder, opened(directory or Path(folder), asked) as results:
-        return run_matrix(asked, results, on_cores(asked, jobs), judge)
+    with tempfile.TemporaryDirectory() as folder:
+        return run_matrix(asked, directory or Path(folder), on_cores(asked, jobs), judge)
 
 
 def judge(scenario: Scenario, seed: int) -> Result:

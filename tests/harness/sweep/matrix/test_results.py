@@ -11,7 +11,7 @@ from harness.checker import Result
 from harness.errors import MachineError, RunDirectoryError
 from harness.scenario import Scenario
 from harness.sweep.matrix import MatrixRecord
-from harness.sweep.matrix.results_file import FILE, opened
+from harness.sweep.matrix._results_file import FILE, opened
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
 Count = list[tuple[object, int]]

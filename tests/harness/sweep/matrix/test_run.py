@@ -15,7 +15,7 @@ from docs.generate.matrix_thesis import table as thesis_table
 from harness.checker import Result
 from harness.errors import MachineError
 from harness.scenario import Scenario
-from harness.sweep.matrix import MatrixRecord, matrix_outputs, matrix_table, results_file, run_matrix
+from harness.sweep.matrix import MatrixRecord, _results_file, matrix_outputs, matrix_table, run_matrix
 from harness.sweep.matrix._matrix_picture import PANELS, draw
 from harness.sweep.matrix.matrix_run import on_cores
 from harness.sweep.matrix.matrix_summary import to_markdown
@@ -174,16 +174,14 @@ def test_the_thesis_page_has_a_place_for_the_table_and_every_rate() -> None:
 
 def test_how_much_was_tried_is_told_if_asked_for_and_of_what_was_played_only(tmp_path: Path) -> None:
     asked = matrix(loss=(0.0, 1.0), seeds=2, scenario={"duration_s": 60, "agents": 2})
-    with results_file.opened(tmp_path / "out", asked) as ended:
-        record = run_matrix(asked, ended, on_cores(asked, 1), covers=True).record
+    record = run_matrix(asked, tmp_path / "out", on_cores(asked, 1), covers=True).record
     assert record.tried is not None
     assert record.tried.runs == 4
     assert record.tried.all_cells["untold"] is None
     assert [cell.loss for cell in record.tried.cells] == [0.0, 1.0]
     assert MatrixRecord.model_validate(record.to_json()) == record
     assert "Tried by 4 runs" in to_markdown(record)
-    assert "reached" not in (tmp_path / "out" / results_file.FILE).read_text()
-    with results_file.opened(tmp_path / "out", asked) as ended:
-        again = run_matrix(asked, ended, on_cores(asked, 1), covers=True).record
+    assert "reached" not in (tmp_path / "out" / _results_file.FILE).read_text()
+    again = run_matrix(asked, tmp_path / "out", on_cores(asked, 1), covers=True).record
     assert again.tried is not None
     assert again.tried.all_cells["untold"] == "4 of 4 runs were played before, and not looked at"
