@@ -10,7 +10,10 @@ wrong; 3: this machine cannot do it; 130: interrupted."""
 
 
 class HarnessError(Exception):
-    """The base of all errors that the harness reports; never shown with a traceback."""
+    """The base of all errors that the harness raises for its users. The message is one sentence with the way out.
+
+    `exit_status` is the exit status of the command line.
+    """
 
     exit_status = WRONG_REQUEST
     details: Sequence[str] = ()
@@ -18,7 +21,7 @@ class HarnessError(Exception):
 
 
 class ScenarioError(HarnessError):
-    """The scenario file is not one that can be run."""
+    """A scenario or matrix is wrong, or does not suit what is to be done with it."""
 
 
 class ExportError(HarnessError):
@@ -38,7 +41,7 @@ class FieldError(HarnessError):
 
 
 class MachineError(HarnessError):
-    """This machine cannot do what was asked."""
+    """This machine cannot do what the user asked for, for example because a package is missing."""
 
     exit_status = CANNOT_HERE
 

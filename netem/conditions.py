@@ -24,11 +24,11 @@ __all__ = ["Delay", "Distribution", "GilbertElliott", "LinkConditions", "Network
 
 @dataclass(frozen=True)
 class NetworkConditions:
-    """The conditions between all vehicles at one time.
+    """The conditions of all links at one time.
 
-    The most specific holds, whole: `links` (sender and receiver -> conditions, in this direction), then
-    `receivers` (vehicle ID -> conditions of all that is sent to it), then `default`.
-    `partition` are disjoint groups of vehicle IDs; empty means that nothing is cut.
+    For a packet, the first match counts as a whole: `links` (by sender and receiver), then `receivers` (by receiving
+    vehicle), then `default`. `partition` holds disjoint groups of vehicle IDs that cannot reach each other; empty
+    means no partition.
     """
 
     default: LinkConditions = field(default_factory=LinkConditions)

@@ -92,7 +92,7 @@ class LabProcess:
 
 
 class Lab:
-    """See the module. Made by `Lab.open` only."""
+    """A private network of real processes, in Linux namespaces. Create it with `Lab.open`."""
 
     def __init__(self, vehicles: tuple[int, ...], process: asyncio.subprocess.Process, channel: Channel) -> None:
         self._process = process

@@ -24,10 +24,10 @@ MAX_LIMIT = 100_000
 
 @dataclass(frozen=True)
 class GilbertElliott:
-    """Loss in bursts: `loss gemodel p r 1-h 1-k`. Every value is a probability, 0..1.
+    """Loss in bursts, as netem's `loss gemodel p r 1-h 1-k`. Each value is a probability, 0 to 1.
 
-    A link is in a good or a bad state and begins in the good one. A packet is lost with the probability of
-    the state that it finds; then it is drawn whether the state changes, `p` from good to bad, `r` back.
+    A link is in a good or a bad state and starts in the good one. A packet is lost with the probability of the current
+    state. Then the state may change: with probability `p` from good to bad, with probability `r` from bad to good.
     """
 
     p: float
@@ -61,11 +61,11 @@ class GilbertElliott:
 
 @dataclass(frozen=True)
 class Delay:
-    """How long packets take, in seconds: 0..60 on average.
+    """The delay of packets in seconds: 0 to 60 on average.
 
-    `jitter_s` is how far a uniform delay strays to either side, and the standard deviation of the others
-    (drawn from netem's tables). It is `mean_s` at most: a uniform delay is then never below 0, and of the
-    others only the end of the tail would be, which is 0, as netem has it.
+    `jitter_s` is the greatest deviation of a uniform delay, and the standard deviation of the other distributions,
+    which are drawn from netem's tables. It is at most `mean_s`, so a uniform delay is never negative. Negative delays
+    in the tail of the other distributions become 0, as in netem.
     """
 
     mean_s: float
@@ -100,24 +100,23 @@ class Delay:
 
 @dataclass(frozen=True)
 class LinkConditions:
-    """What happens to packets on the way to one receiver, from everybody or from one sender.
+    """The conditions of packets on their way to one receiver, from all senders or from one.
 
-    `loss` is the probability, 0..1, that a packet is dropped, drawn for each packet on its own, or a model
-    of bursts. `duplicate` is the probability that a packet is there twice, drawn together with its loss: of
-    one that is both lost and duplicated one copy is left; else the second copy has lots of its own, loss
-    among them, but is not duplicated again. `reorder` is the probability that a packet overtakes: it is sent
-    at once, without delay, which needs a delay. A delay of 0 is none.
+    `loss` is the probability, 0 to 1, that a packet is lost, drawn for each packet, or a model of bursts. `duplicate`
+    is the probability that a packet arrives twice. It is drawn together with the loss: if a packet is both lost and
+    duplicated, one copy remains. Otherwise the second copy has its own draws, among them loss, and is not duplicated
+    again. `reorder` is the probability that a packet overtakes: it is sent at once, without delay. It needs a delay
+    above 0.
 
-    `corrupt` is the probability that one bit of a packet flips. The checksum of UDP finds it, so for its
-    receiver the message is lost. (netem flips bits of the whole Ethernet frame. An error in its 12 bytes of
-    addresses is below every checksum that a veth pair has, and a broadcast mostly arrives nevertheless.)
+    `corrupt` is the probability that one bit of a packet flips. The receiver's UDP checksum finds the error, so the
+    message is lost. (netem flips bits of the whole Ethernet frame. No checksum of a veth pair covers the 12 bytes of
+    addresses, and a broadcast mostly arrives in spite of such an error.)
 
-    `rate` is in bits per second of Ethernet frames, which are 42 bytes longer than a UDP datagram's data;
-    every link, one sender to one receiver, has it for itself. A packet leaves when it has had its delay and
-    the one before has left, and the rate then takes its time: packets keep their order, and jitter never
-    makes one wait less than those before it. `limit` is how many packets may wait on a link, be it for delay
-    or for rate, of which it needs one; what comes when it is reached is lost. What overtakes waits for
-    neither, and a corrupted packet takes its place like any other.
+    `rate` is in bits per second of Ethernet frames, which are 42 bytes longer than the data of a UDP datagram. Each
+    link from one sender to one receiver has the whole rate. A packet leaves after its delay and after the packet
+    before it, and then takes its time at the rate, so packets keep their order. `limit` is the number of packets that
+    may wait on a link for delay or rate, at least 1. A packet that arrives at a full link is lost. Packets that
+    overtake do not wait, and corrupted packets take their place like any other.
     """
 
     loss: float | GilbertElliott = 0.0

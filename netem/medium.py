@@ -55,7 +55,7 @@ class RandomDraws(Protocol):
 
 
 class Medium:
-    """What `vehicles` hear of each other. Conditions are perfect until `apply`."""
+    """The network between `vehicles` in virtual time. Conditions are perfect until `apply`."""
 
     def __init__(self, vehicles: Sequence[int], seed: int) -> None:
         self._vehicles = tuple(vehicles)

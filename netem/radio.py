@@ -24,7 +24,7 @@ STEPS = 100
 
 @dataclass(frozen=True)
 class Place:
-    """Where a vehicle is: metres north, east and up from one point that all share."""
+    """The position of a vehicle: metres north, east and up from an origin that all vehicles share."""
 
     north_m: float
     east_m: float
@@ -47,10 +47,10 @@ class Radio(Protocol):
 
 @dataclass(frozen=True)
 class HardRange:
-    """All or nothing at `range_m`, the disc of most simulators.
+    """A radio that reaches every vehicle within `range_m` metres and none beyond, the disc model of most simulators.
 
-    The default is what tables of IEEE 802.11 give as the range outdoors of 802.11n, the radio of the ARSENL swarm
-    (Section 2.5 of the thesis).
+    The default is the outdoor range that tables give for IEEE 802.11n, the radio of the ARSENL swarm (Section 2.5 of
+    the thesis).
     """
 
     range_m: float = 250.0
@@ -66,16 +66,16 @@ class HardRange:
 class LogDistance:
     """Log-distance path loss with log-normal shadowing (Rappaport, Wireless Communications, 2nd ed., 4.9 and 4.9.2).
 
-    At d metres the mean received power is power_dbm - PL(1 m) - 10 exponent log10(d), with the free-space loss of
-    Friis over the first metre. Shadowing strays from it by a normal distribution with deviation `shadowing_db`, and a
-    message is lost when that leaves less than `sensitivity_dbm`: the probability is Q(margin / shadowing_db). Each
-    message is drawn for on its own, as if the shadows changed from one to the next.
+    At d metres the mean received power is power_dbm - PL(1 m) - 10 exponent log10(d), where PL(1 m) is the free-space
+    loss of Friis over the first metre. Shadowing is a normal deviation from it with standard deviation `shadowing_db`.
+    A message is lost when the received power is below `sensitivity_dbm`, with probability Q(margin / shadowing_db).
+    Each message is drawn independently.
 
     The defaults: 100 mW, the limit for 2.4 GHz in Europe (ETSI EN 300 328); the sensitivity that IEEE 802.11-2020
-    demands at 6 Mb/s, the lowest OFDM rate (Table 17-18); exponent 2.32 and 3 dB of shadowing, from the middle of what
-    campaigns with small UAVs measured, 2.0 to 2.6 and 2.6 to 5.3 dB (collected by Khawaja et al., A Survey of
-    Air-to-Ground Propagation Channel Modeling for Unmanned Aerial Vehicles, IEEE Communications Surveys & Tutorials
-    21(3), 2019). 1 % of the messages is then lost at 231 m, half of them at 462 m, and 99 % at 924 m.
+    demands at 6 Mb/s, the lowest OFDM rate (Table 17-18); exponent 2.32 and 3 dB of shadowing. The last two are from
+    the middle of the values measured with small UAVs, 2.0 to 2.6 and 2.6 to 5.3 dB (collected by Khawaja et al., A
+    Survey of Air-to-Ground Propagation Channel Modeling for Unmanned Aerial Vehicles, IEEE Communications Surveys &
+    Tutorials 21(3), 2019). Then 1 % of the messages are lost at 231 m, 50 % at 462 m, and 99 % at 924 m.
     """
 
     exponent: float = 2.32

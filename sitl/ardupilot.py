@@ -60,9 +60,9 @@ _ELF_NAMES = {number: name for machines in _ELF_MACHINES.values() for number, na
 
 @dataclass(frozen=True)
 class ArduPilot:
-    """The `VehicleKind` of real vehicles: an executable, `defaults` that lie beside it, and how it is set up.
+    """The `VehicleKind` of ArduPilot SITL: an executable, its files of default parameters, and its setup.
 
-    `missing` are default parameters of its frame that do not.
+    `defaults` are the files that lie beside the executable. `missing` are those that its frame needs and that do not.
     """
 
     binary: Path

@@ -43,7 +43,7 @@ MAX_DELAY_S = 0.25  # a sleep that takes longer than it should by more was no sl
 
 @dataclass(frozen=True)
 class Embedded:
-    """The `VehicleKind` that needs nothing but this package."""
+    """The `VehicleKind` of the embedded vehicle, which needs no other program."""
 
     vehicle_type: VehicleType = "copter"
     setup: Setup = USUAL_SETUP

@@ -37,7 +37,7 @@ ASK_AGAIN_S = 2.0  # of our time without a position, after which telemetry is as
 
 
 class Pilot:
-    """Flies one vehicle. Use it in one event loop."""
+    """The pilot of one vehicle: commands it over MAVLink. Use it in one event loop only."""
 
     def __init__(
         self,

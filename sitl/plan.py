@@ -78,7 +78,7 @@ Leg = TakeOff | GoTo | Loiter | Land
 
 @dataclass(frozen=True)
 class Plan:
-    """One to MAX_LEGS legs in order."""
+    """A flight plan: 1 to MAX_LEGS legs in order."""
 
     legs: tuple[Leg, ...]
 

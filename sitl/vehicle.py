@@ -30,7 +30,7 @@ MAX_SYSID = 255  # MAVLink: u8 system ID, 0 is "everybody"
 
 
 class VehicleError(Exception):
-    """Something about a vehicle that its user can understand and mend; the message is one sentence and the way out."""
+    """The base of all errors of `sitl`: one sentence for the user on the cause and the way out."""
 
 
 class NoBinaryError(VehicleError):
@@ -99,7 +99,7 @@ class Home:
 
 @dataclass(frozen=True)
 class Launch:
-    """How to start one vehicle, in its own directory and network namespace."""
+    """The command that starts one vehicle in its own directory and network namespace."""
 
     argv: list[str]
     pilot_port: int = PILOT_PORT
@@ -109,7 +109,7 @@ class Launch:
 
 
 class VehicleKind(Protocol):
-    """A kind of vehicle: prepares a vehicle's directory and says how to start it."""
+    """A kind of vehicle. It prepares a vehicle's directory and returns the command that starts the vehicle."""
 
     @property
     def name(self) -> str: ...

@@ -1,1 +1,61 @@
-"""The Uniform Chain Protocol: blocks, chain, messages, and the 20 event handlers of Algorithms 1-20."""
+"""The Uniform Chain Protocol: blocks, chain, messages, and the 20 event handlers of Algorithms 1-20.
+
+`__all__` lists the public names. A name is imported at its first use, because every agent process imports this package
+and should load only what it needs.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ucp.agent import Agent
+    from ucp.block import Block, InceptionBlock
+    from ucp.chain import Chain
+    from ucp.events import LoggableEvent, decode_events
+    from ucp.export import export_chain
+    from ucp.messages import Datagram, MalformedDatagramError, decode, encode
+    from ucp.settings import Settings
+    from ucp.trace import HandlerRun
+    from ucp.trigger import Trigger
+
+__all__ = [
+    "Agent",
+    "Block",
+    "Chain",
+    "Datagram",
+    "HandlerRun",
+    "InceptionBlock",
+    "LoggableEvent",
+    "MalformedDatagramError",
+    "Settings",
+    "Trigger",
+    "decode",
+    "decode_events",
+    "encode",
+    "export_chain",
+]
+
+_NAMES_OF = {
+    "ucp.agent": ("Agent",),
+    "ucp.block": ("Block", "InceptionBlock"),
+    "ucp.chain": ("Chain",),
+    "ucp.events": ("LoggableEvent", "decode_events"),
+    "ucp.export": ("export_chain",),
+    "ucp.messages": ("Datagram", "MalformedDatagramError", "decode", "encode"),
+    "ucp.settings": ("Settings",),
+    "ucp.trace": ("HandlerRun",),
+    "ucp.trigger": ("Trigger",),
+}
+"""The imports above, as they are done at the first use of a name."""
+_MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
+
+if not TYPE_CHECKING:  # a type checker would accept any name
+
+    def __getattr__(name: str) -> object:
+        if name not in _MODULE_OF:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from importlib import import_module
+
+        return getattr(import_module(_MODULE_OF[name]), name)
+
+    def __dir__() -> list[str]:
+        return __all__

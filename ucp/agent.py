@@ -111,10 +111,15 @@ HANDLERS: dict[str, EventHandler[Any]] = {
 
 
 class Agent:
-    """An agent as whoever drives it sees it; `state` is to look at.
+    """A UCP agent without I/O: the caller passes input and time, and sends what the agent returns.
 
-    `handlers` are wrong ones, which make a wrong agent (`ucp.quirks`). With `seal` event data is sealed. Raises
-    ValueError for an agent ID or roster that is impossible.
+    `agent_id` is 1 to 65535. `roster` holds the IDs of all agents. `initial_data` is the data of the inception block,
+    the same for all agents of a mission. `handlers` replace handlers by wrong ones (see `ucp.quirks`). `seal` encrypts
+    event data. With `tracing`, `trace` returns each handler run. All times are mission seconds; `state` is read-only.
+
+    Call `receive_datagram(data, now)` and `add_event(event, now)` for input, and `handle_timer(now)` when
+    `next_timer()` is due. After each call, broadcast what `datagrams_to_send()` returns. Raises ValueError for an
+    impossible ID or roster.
     """
 
     def __init__(

@@ -45,9 +45,10 @@ def next_chain_hash(chain_hash: bytes, block_hash: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One completed block; `block_hash` is computed (eq. 3.1 over eq. 3.5).
+    """A completed block (Section 3.4).
 
-    `timestamp_us` is that of the newest event (Section 4.2); `event_data` is a run of loggable events.
+    `agent_id` is the agent that completed the block. `timestamp_us` is the time of its newest event in microseconds
+    (Section 4.2). `event_data` holds its encoded events. `block_hash`, 32 bytes, is computed (eq. 3.1 over eq. 3.5).
     """
 
     agent_id: int

@@ -9,7 +9,10 @@ from ucp.block import Block, InceptionBlock, next_chain_hash
 
 
 class Chain:
-    """`len(chain)` and iteration count the blocks above the inception block, oldest first."""
+    """An agent's chain: an inception block and the blocks committed after it.
+
+    `len(chain)` and iteration leave the inception block out. Iteration starts at the oldest block.
+    """
 
     def __init__(self, inception: InceptionBlock) -> None:
         self.inception = inception

@@ -36,7 +36,10 @@ class MalformedEventsError(ValueError):
 
 @dataclass(unsafe_hash=True, slots=True)
 class LoggableEvent:
-    """Nobody changes it; that nobody could would make it take three times as long to make."""
+    """An event that a vehicle logs (Section 3.1).
+
+    Treat it as immutable. It is not frozen, because creating a frozen object takes three times as long.
+    """
 
     timestamp_us: int
     event_id: int
@@ -55,7 +58,10 @@ class LoggableEvent:
 
 
 def decode_events(event_data: bytes) -> list[LoggableEvent]:
-    """The events of a block, oldest first. Raises MalformedEventsError, naming the offset, for anything else."""
+    """Return the events in a block's event data, oldest first.
+
+    Raises MalformedEventsError with the offset of the error.
+    """
     events = []
     offset = 0
     while offset < len(event_data):

@@ -13,9 +13,10 @@ SCHEMA = "ucp-chain-export/1"
 def export_chain(
     state: AgentState, exported_at_us: int, signatures: Mapping[bytes, bytes] | None = None
 ) -> dict[str, Any]:
-    """An agent's export. Blocks of the chain are oldest first, of the deque front first, of the stack top last.
+    """Return an agent's chain export, a JSON document of schema `ucp-chain-export/1`.
 
-    `signatures` are their makers', by block hash, in a secured mission.
+    The chain is listed from its oldest block, the deque from its front, and the reconcile stack to its top.
+    `signatures` are the makers' signatures by block hash, in a secured mission.
     """
     inception = state.chain.inception
 

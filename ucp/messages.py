@@ -38,7 +38,7 @@ MAX_DATAGRAM_BYTES = 1472
 
 
 class MalformedDatagramError(ValueError):
-    """Not one well-formed message. `reason` is one of a few fixed words, for counting."""
+    """A datagram is not one well-formed message. `reason` is one of a few fixed texts, for counting."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -271,7 +271,7 @@ def datagram_bytes(message: Message) -> int:
 
 
 class Datagram(NamedTuple):
-    """What a datagram says."""
+    """A decoded datagram: the sender's agent ID, its sequence number, and the message."""
 
     sender: int
     sequence: int
@@ -282,14 +282,17 @@ class Datagram(NamedTuple):
 
 
 def encode(sender: int, sequence: int, message: Message) -> bytes:
-    """One datagram, at most MAX_DATAGRAM_BYTES long. `sequence` wraps at 2**32."""
+    """Return the datagram of a message, at most MAX_DATAGRAM_BYTES long.
+
+    `sender` is an agent ID. `sequence` counts the sender's datagrams and wraps at 2**32.
+    """
     body = message.body()
     code = TYPE_CODES[type(message)]
     return HEADER.pack(MAGIC, VERSION, code, sender, sequence & 0xFFFFFFFF, len(body)) + body
 
 
 def decode(datagram: bytes) -> Datagram:
-    """What one datagram says. Raises MalformedDatagramError for anything else."""
+    """Return the content of a datagram. Raises MalformedDatagramError if it is not one well-formed message."""
     if len(datagram) < HEADER.size:
         raise MalformedDatagramError("truncated")
     if len(datagram) > MAX_DATAGRAM_BYTES:

@@ -69,7 +69,7 @@ PLAYED = {
 
 @dataclass(frozen=True)
 class Limits:
-    """When to give up: memory of all processes, and time; and on how many cores to look."""
+    """When a proof gives up: bytes of memory of all processes, and seconds. `cores` is the number of processes."""
 
     most_bytes: float = 4e9
     most_s: float = float("inf")
@@ -86,11 +86,13 @@ class Limits:
 
 @dataclass
 class Proof:
-    """What came out. `liveness` is None if it was not looked at: not all states are known, or the network is `any`.
+    """The result of a proof.
 
-    `whole_ended` is how looking at the whole graph ended, if that was begun.
-
-    `way` is what an agent did that has a flaw in the network `any`, where nothing shows that all of it fits together.
+    `complete` says whether all states within the bounds were explored. `flaw` is a violation, and `example` a scenario
+    that shows it. `exit_status` is 0 if every claim holds, 1 if one does not, and 4 if a limit was reached first.
+    `liveness` is None if it was not examined: some states are unknown, or the network is `any`. `whole_ended` is how
+    the examination of the whole graph ended. `way` lists the steps of an agent to a flaw in the network `any`, where
+    no run is known to show it.
     """
 
     bounds: Bounds
@@ -181,9 +183,14 @@ def prove(
     *,
     watch: Callable[[Progress], None] = lambda progress: None,
 ) -> Proof:
-    """Look at everything within `bounds`; what is found is written to `out`, or to a new file under `runs`.
+    """Explore every state that agents can reach within `bounds`, and check each one.
 
-    Raises HarnessError if nothing can be written, or if the agent does what a reduction must not meet.
+    limits: when to give up.
+    out: the new file of the scenario that shows a violation. Without it, a new file under `runs/`.
+    watch: called with the progress every now and then.
+
+    Raises HarnessError if the file cannot be written, or if an agent does something that state reduction does not
+    allow.
     """
     try:
         if bounds.network == "any":

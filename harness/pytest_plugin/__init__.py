@@ -15,8 +15,8 @@ from harness.backend_names import BACKEND_NAMES
 from harness.pytest_plugin._stash import TRIAL
 
 if TYPE_CHECKING:
-    from harness.pytest_plugin._findings import Findings
-    from harness.pytest_plugin._swarm_in_test import SwarmInTest
+    from harness.pytest_plugin.findings import Findings
+    from harness.pytest_plugin.swarm_in_test import Swarm
 
 MARKERS = (
     "swarm(agents=5, backend='sim', seed=1, ...): what the fixture `swarm` is; any key of a scenario",
@@ -92,7 +92,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 @pytest.fixture
-def swarm(request: pytest.FixtureRequest) -> Iterator[SwarmInTest]:
+def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
     """Agents to tell what happens, sentence by sentence: five of them, without loss, unless a marker says otherwise."""
     from harness.pytest_plugin._fixtures import swarm_for
 

@@ -9,11 +9,11 @@ import pytest
 from harness.backend_names import BACKEND_NAMES, BackendName
 from harness.errors import ScenarioError
 from harness.play.progress import Silent
-from harness.pytest_plugin._findings import Findings
 from harness.pytest_plugin._judged_run import Trial, discard, new_directory, one_sentence
 from harness.pytest_plugin._options import Options
 from harness.pytest_plugin._stash import TRIAL
-from harness.pytest_plugin._swarm_in_test import SwarmInTest
+from harness.pytest_plugin.findings import Findings
+from harness.pytest_plugin.swarm_in_test import Swarm
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import parse
@@ -21,7 +21,7 @@ from harness.scenario.load import parse
 DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
 
 
-def swarm_for(node: pytest.Item) -> Iterator[SwarmInTest]:
+def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
     """The swarm of a test. `Trial` ends and judges it, or it ends here if the test does not come to its end."""
     with one_sentence():
         options = Options.of(node.config)
@@ -32,7 +32,7 @@ def swarm_for(node: pytest.Item) -> Iterator[SwarmInTest]:
         options.refuse(backend)
         scenario = options.laid_over(parse(keys))
         directory = new_directory(node, options)
-        swarm = SwarmInTest(scenario, seed, backend, directory)
+        swarm = Swarm(scenario, seed, backend, directory)
     trial = node.stash[TRIAL] = Trial(scenario, swarm.finish)
     try:
         yield swarm

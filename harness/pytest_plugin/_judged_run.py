@@ -13,8 +13,8 @@ import pytest
 
 from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, MachineError, RunDirectoryError
-from harness.pytest_plugin._findings import JudgementInTest
 from harness.pytest_plugin._options import Options
+from harness.pytest_plugin.findings import JudgementInTest
 from harness.report.agent_programs import in_sentence, programs
 from harness.run.run import Run
 from harness.scenario import Scenario

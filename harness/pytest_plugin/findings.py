@@ -51,7 +51,7 @@ class JudgementInTest:
 
 @dataclass(frozen=True, repr=False)
 class Findings:
-    """Of the run in `directory`, at its end or by now."""
+    """The value of the fixture `scenario`: the run directory and the verdict, at the end of the run or during it."""
 
     directory: Path
     result: Result

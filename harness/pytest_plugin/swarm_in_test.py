@@ -20,8 +20,8 @@ from harness.play.backend import Backend
 from harness.play.backends import BACKENDS
 from harness.play.mission import RunOutcome, Sought
 from harness.play.progress import Silent
-from harness.pytest_plugin._findings import Findings, JudgementInTest
 from harness.pytest_plugin._live_story import Sentence, Told
+from harness.pytest_plugin.findings import Findings, JudgementInTest
 from harness.run.run import Recording, Run
 from harness.scenario import Scenario
 from harness.scenario.faults import ASKED_FOR
@@ -46,12 +46,13 @@ class _Block(AbstractContextManager[None]):
             self._undo()
 
 
-class SwarmInTest:
-    """Agents on any backend, told what happens. Times are mission seconds, agents are named by their IDs.
+class Swarm:
+    """The value of the fixture `swarm`: agents on any backend that a test controls.
 
-    Between two sentences virtual time stands still; real processes go on, and what is due then comes with the next.
-    What a test asks between two sentences is answered as of one moment. A sentence that cannot be is a ScenarioError,
-    and leaves everything as it is. Raises HarnessError if it cannot begin.
+    Times are mission seconds, and agents are named by their IDs. Between two calls virtual time stands still. Real
+    processes go on, and faults that are due in the meantime happen at the next call. Queries between two actions are
+    answered from one moment. An impossible action raises ScenarioError and changes nothing. Raises HarnessError if the
+    run cannot start.
     """
 
     def __init__(self, scenario: Scenario, seed: int, backend: BackendName, out: Path) -> None:

@@ -1,0 +1,98 @@
+"""Tables of a run for notebooks: its handler runs and its blocks, as polars DataFrames.
+
+Each batch of records becomes columns before the next is read, so memory holds the finished columns and one batch.
+`DataFrame.write_parquet` keeps a large table in a file.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from itertools import islice
+from typing import Any, TypeVar
+
+from harness.archive.archive import HeldBlock, RecordedRun, RunArchive
+from harness.present.polars import pl
+from ucp.trigger import MessageTrigger, Trigger
+
+BATCH = 20_000
+"""Records that are in memory at the same time."""
+
+Record = TypeVar("Record")
+Columns = Mapping[str, tuple[Any, Callable[[Record], Any]]]
+"""Name of a column -> its type, and its value of a record."""
+
+_NAME = pl.Categorical
+"""Text with few different values."""
+
+_HANDLER_RUN: Columns[RecordedRun] = {
+    "agent": (pl.Int64, lambda each: each.agent_id),
+    "life": (pl.Int64, lambda each: each.life),
+    "line": (pl.Int64, lambda each: each.line),
+    "t_s": (pl.Float64, lambda each: each.run.t),
+    "handler": (_NAME, lambda each: each.run.handler),
+    "algorithm": (pl.Int64, lambda each: each.run.algorithm),
+    "branch": (_NAME, lambda each: each.run.branch),
+    "trigger": (_NAME, lambda each: each.run.trigger.kind),
+    "subject": (_NAME, lambda each: str(each.run.trigger.subject)),
+    "sender": (pl.Int64, lambda each: _sender(each.run.trigger)),
+    "operations": (pl.List(_NAME), lambda each: [operation for operation, _ in each.run.changes]),
+    "blocks": (pl.List(pl.String), lambda each: [block for _, block in each.run.changes]),
+    "sent": (pl.List(_NAME), lambda each: [sent.message for sent in each.run.sent]),
+    "chain": (pl.Int64, lambda each: each.run.state.chain),
+    "deque": (pl.Int64, lambda each: each.run.state.deque),
+    "stack": (pl.Int64, lambda each: each.run.state.stack),
+    "reconciling": (pl.Boolean, lambda each: each.run.state.reconciling),
+    "idle": (pl.Boolean, lambda each: each.run.state.idle),
+    "top": (pl.String, lambda each: each.run.state.top),
+}
+
+_BLOCK: Columns[HeldBlock] = {
+    "holder": (pl.Int64, lambda each: each.holder),
+    "place": (_NAME, lambda each: each.place),
+    "position": (pl.Int64, lambda each: each.position),
+    "agent": (pl.Int64, lambda each: each.block.agent_id),
+    "timestamp_us": (pl.UInt64, lambda each: each.block.timestamp_us),
+    "event_bytes": (pl.Int64, lambda each: len(each.block.event_bytes)),
+    "block_hash": (pl.String, lambda each: each.block.block_hash),
+    "chain_hash": (pl.String, lambda each: each.block.chain_hash),
+}
+
+
+def handler_runs_frame(archive: RunArchive) -> pl.DataFrame:
+    """Return a table with one row for each handler run of a run.
+
+    `agent`, `life` and `line` say where the run stands: the agent's ID, 1 until its first restart, and the line in its
+    trace. `t_s` is the time in mission seconds. `handler`, `algorithm` (1 to 20) and `branch` say what ran, and
+    `trigger` why: `message`, `event`, `timer`, `local`, `operator` or `boot`. `subject` is the name of the message or
+    timer, the event's ID and so on; `sender` is the agent that sent the message. `operations` and `blocks` are two
+    lists of equal length: each change (`complete`, `chain+`, `deque-` and so on) and the hash of its block. `sent`
+    lists the names of the messages sent. `chain`, `deque` and `stack` are lengths after the run; `reconciling`,
+    `idle` and `top`, the top chain hash, are the state after the run.
+
+    Raises RunDirectoryError if a trace is damaged, and MachineError without the extra `data`.
+    """
+    return _frame(archive.handler_runs(), _HANDLER_RUN)
+
+
+def blocks_frame(archive: RunArchive) -> pl.DataFrame:
+    """Return a table with one row for each block that an agent holds at the end of a run.
+
+    `holder` is the agent that holds the block, `place` where it holds it (`chain`, `deque` or `stack`), and `position`
+    counts from 0. `agent` is the agent that completed the block, `timestamp_us` the time of its newest event in
+    microseconds, and `event_bytes` the size of its event data. Hashes are hexadecimal; `chain_hash` is null outside the
+    chain.
+
+    Raises MachineError without the extra `data`.
+    """
+    return _frame(archive.blocks(), _BLOCK)
+
+
+def _frame(records: Iterator[Record], columns: Columns[Record]) -> pl.DataFrame:
+    schema = {name: of_type for name, (of_type, _) in columns.items()}
+    frames = [pl.DataFrame(schema=schema)]
+    while batch := list(islice(records, BATCH)):
+        values = {name: [value(each) for each in batch] for name, (_, value) in columns.items()}
+        frames.append(pl.DataFrame(values, schema=schema))
+    return pl.concat(frames)
+
+
+def _sender(trigger: Trigger) -> int | None:
+    return trigger.sender if isinstance(trigger, MessageTrigger) else None

@@ -1,0 +1,32 @@
+"""The runs of a matrix as a polars DataFrame, for notebooks."""
+
+from harness.present.polars import pl
+from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS
+from harness.sweep.matrix.matrix_outputs import run_rows
+from harness.sweep.matrix.matrix_run import Finished
+
+_TYPES = {
+    "agents": pl.Int64,
+    "backend": pl.String,
+    "seed": pl.Int64,
+    **{f"characteristic_{number}": pl.String for number in CHARACTERISTICS},
+    **dict.fromkeys(BESIDE, pl.String),
+    "failed": pl.String,
+    "unsupported": pl.String,
+}
+"""Types of the columns that are not figures."""
+
+
+def matrix_frame(finished: Finished) -> pl.DataFrame:
+    """Return a table with one row for each run of a matrix, with the columns of `runs.csv`.
+
+    `loss` (0 to 1), `agents`, `backend` and `seed` say which run it is. The figures of run.json follow, such as
+    `mutual_chain`, `distinct_chains` and `messages`; a figure that is not known is null. `characteristic_1` to
+    `characteristic_6`, `steps`, `records` and `liveness` are verdicts. A run without a verdict has the reason in
+    `failed` or `unsupported`.
+
+    Raises MachineError without the extra `data`.
+    """
+    rows = list(run_rows(finished.runs))
+    names = dict.fromkeys(name for row in rows for name in row)
+    return pl.DataFrame(rows, schema={name: _TYPES.get(name, pl.Float64) for name in names})
