@@ -1,10 +1,12 @@
 """The documentation: a site without warnings that loads nothing from elsewhere, and examples that do what they say."""
 
+import importlib
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -75,3 +77,25 @@ def test_a_scenario_that_a_page_shows_is_one(page: Path) -> None:
 @pytest.mark.lab
 def test_every_command_of_the_tutorial_prints_what_it_shows(tmp_path: Path) -> None:
     assert play(REPOSITORY / "docs" / "tutorial.md", tmp_path) > 10
+
+
+def test_the_public_names_are_on_their_page(site: Path) -> None:
+    page = (site / "api.html").read_text()
+    for module in ("harness.api", "ucp", "netem", "sitl"):
+        for name in importlib.import_module(module).__all__:
+            assert f'id="{module}.{name}"' in page, (module, name)
+
+
+def test_python_of_the_notebook_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(
+        r"^```python\n(.*?)^```", (REPOSITORY / "docs/notebook.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    names: dict[str, Any] = {}
+    for block in blocks:
+        exec(block, names)  # noqa: S102  (our own page)
+    assert names["runs"].height == 15
+    assert names["by_loss"]["messages_per_block"].is_sorted()
+    assert names["handled"].height > 1000
+    assert set(names["late"].columns) == {"agent", "handler"}
+    assert names["late"].height < names["handled"].height

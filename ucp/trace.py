@@ -102,19 +102,19 @@ class StateSummary:
 
 @dataclass(slots=True)
 class HandlerRun:
-    """One run of one of the 20 handlers.
+    """A run of one of the 20 handlers (Algorithms 1 to 20), as a trace records it.
 
-    t: mission seconds.
-    trigger: why the handler ran.
-    changes: (operation, block hash); operations are `complete`, and `chain`, `deque`, `stack` with + or -.
-    state: what holds after the run.
-    input: what came with the trigger: the datagram as it was received; the event as a block has it; the blocks that
-        were found on disk, in the order in which `changes` names them, a length (u16) before each.
-    tally: what the handler counts in, after the run: {"yes": n, "no": n}, or of Algorithms 12 and 14
-        {block hash, or "" for Is Top Of Chain: [count, timestamp in microseconds]}; of Algorithm 15
-        {block hash: count} of the chosen block.
-    started: timers that the run started, and their durations in mission seconds.
-    sealed: event data of a block that it completed, if it is sealed.
+    - `t`: mission seconds.
+    - `trigger`: why the handler ran.
+    - `changes`: (operation, block hash); operations are `complete`, and `chain`, `deque`, `stack` with + or -.
+    - `state`: what holds after the run.
+    - `input`: what came with the trigger: the datagram as it was received; the event as a block has it; the blocks
+      that were found on disk, in the order in which `changes` names them, a length (u16) before each.
+    - `tally`: what the handler counts in, after the run: {"yes": n, "no": n}, or of Algorithms 12 and 14 {block hash,
+      or "" for Is Top Of Chain: [count, timestamp in microseconds]}; of Algorithm 15 {block hash: count} of the chosen
+      block.
+    - `started`: timers that the run started, and their durations in mission seconds.
+    - `sealed`: event data of a block that it completed, if it is sealed.
     """
 
     t: float

@@ -185,9 +185,9 @@ def prove(
 ) -> Proof:
     """Explore every state that agents can reach within `bounds`, and check each one.
 
-    limits: when to give up.
-    out: the new file of the scenario that shows a violation. Without it, a new file under `runs/`.
-    watch: called with the progress every now and then.
+    - `limits`: when to give up.
+    - `out`: the new file of the scenario that shows a violation. Without it, a new file under `runs/`.
+    - `watch`: called with the progress every now and then.
 
     Raises HarnessError if the file cannot be written, or if an agent does something that state reduction does not
     allow.

@@ -30,22 +30,23 @@ class BoundsError(HarnessError):
 class Bounds:
     """The bounds of a proof: `agents` agents (1 to 9) that complete `blocks` blocks in all (1 to 9).
 
-    network: `lossless`; `lossy`, where any agent may lose any message; `any`, where messages may also be late,
-        repeated and out of order.
-    faults: some of `reboot` and `death`, each at most once, and `duplicate`.
-    timers_any: timers may expire in any order, whatever their durations.
-    coincidences: the maximum number of moments that are equal by chance. None means any number.
-    settings: protocol settings of all agents, by name.
-    quirks: mistakes of all agents, by name (see `ucp.quirks`).
-    reduced: treat states that behave alike as one state.
-    steps: compare each step of the agents with the step of a correct agent.
-    stagger: by timer, the seconds by which each agent's timer is longer than the timer of the agent before it.
-    captured: the ID of an agent whose keys an attacker has. From some moment on, the attacker sends in its name.
-    lies: the maximum number of messages that the attacker sends, unless the network is `any`. Each is received by any
-        of the agents.
-    clocks_any: any of two blocks may be the older one, drawn at each comparison.
-    losses: the maximum number of lost messages that would have had an effect. None means any number.
-    crossing: messages of several agents may cross. If false, all consequences of an action end before the next action.
+    - `network`: `lossless`; `lossy`, where any agent may lose any message; `any`, where messages may also be late,
+      repeated and out of order.
+    - `faults`: some of `reboot` and `death`, each at most once, and `duplicate`.
+    - `timers_any`: timers may expire in any order, whatever their durations.
+    - `coincidences`: the maximum number of moments that are equal by chance. None means any number.
+    - `settings`: protocol settings of all agents, by name.
+    - `quirks`: mistakes of all agents, by name (see `ucp.quirks`).
+    - `reduced`: treat states that behave alike as one state.
+    - `steps`: compare each step of the agents with the step of a correct agent.
+    - `stagger`: by timer, the seconds by which each agent's timer is longer than the timer of the agent before it.
+    - `captured`: the ID of an agent whose keys an attacker has. From some moment on, the attacker sends in its name.
+    - `lies`: the maximum number of messages that the attacker sends, unless the network is `any`. Each is received by
+      any of the agents.
+    - `clocks_any`: any of two blocks may be the older one, drawn at each comparison.
+    - `losses`: the maximum number of lost messages that would have had an effect. None means any number.
+    - `crossing`: messages of several agents may cross. If false, all consequences of an action end before the next
+      action.
 
     Raises BoundsError for values or combinations that are impossible.
     """

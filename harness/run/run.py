@@ -92,12 +92,12 @@ def run(
 ) -> Run:
     """Play a scenario, check it, and write the run directory.
 
-    seed: 0 or more. It fixes events, faults and everything else that the harness draws.
-    out: the run directory, new or empty. Without it, a new directory under `runs/`.
-    progress: where the state of the swarm is shown during the run. Without it, nothing is shown.
-    backend: `process` plays in network namespaces, `docker` in containers, `sim` in virtual time.
-    delivers_all: in virtual time, traces also record messages that have no effect, as traces of processes do.
-    interventions: faults that the user requests during the run. They belong to this scenario.
+    - `seed`: 0 or more. It fixes events, faults and everything else that the harness draws.
+    - `out`: the run directory, new or empty. Without it, a new directory under `runs/`.
+    - `progress`: where the state of the swarm is shown during the run. Without it, nothing is shown.
+    - `backend`: `process` plays in network namespaces, `docker` in containers, `sim` in virtual time.
+    - `delivers_all`: in virtual time, traces also record messages that have no effect, as traces of processes do.
+    - `interventions`: faults that the user requests during the run. They belong to this scenario.
 
     Ctrl-C and SIGTERM end the mission early. The run is then exported and checked as far as it went. The function also
     works inside a running event loop, for example in a notebook. Raises HarnessError if the run cannot start: the

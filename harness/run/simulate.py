@@ -46,10 +46,11 @@ def simulate(
 ) -> Simulated:
     """Play a scenario in virtual time and check it, all in memory, without a run directory.
 
-    seed: 0 or more. The same scenario and seed give the same run.
-    tracing: record handler runs. Without them characteristic 1 cannot be judged, and 2 and 3 only at the end.
-    deliver_all: also deliver messages that have no effect.
-    again: give other agents than ours their input a second time, and compare. If the run is bad, this always happens.
+    - `seed`: 0 or more. The same scenario and seed give the same run.
+    - `tracing`: record handler runs. Without them characteristic 1 cannot be judged, and 2 and 3 only at the end.
+    - `deliver_all`: also deliver messages that have no effect.
+    - `again`: give other agents than ours their input a second time, and compare. If the run is bad, this always
+      happens.
 
     Raises ScenarioError if the scenario needs real processes, and HarnessError if an agent fails or behaves
     differently when it gets the same input again.

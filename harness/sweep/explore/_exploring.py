@@ -111,12 +111,12 @@ def explore(
 ) -> Explored:
     """Play a scenario in virtual time with one seed after another, and shrink the first run that violates.
 
-    out: the new file of the smallest scenario. Without it, a new file under `runs/`.
-    source: the name of the scenario in that file. Without it, the scenario's `name`.
-    jobs: number of runs at the same time. Without it, the number of cores.
-    judge: plays and checks one run.
-    max_runs: number of runs after which shrinking stops.
-    watcher: functions that are called when a violation is found and when it becomes smaller.
+    - `out`: the new file of the smallest scenario. Without it, a new file under `runs/`.
+    - `source`: the name of the scenario in that file. Without it, the scenario's `name`.
+    - `jobs`: number of runs at the same time. Without it, the number of cores.
+    - `judge`: plays and checks one run.
+    - `max_runs`: number of runs after which shrinking stops.
+    - `watcher`: functions that are called when a violation is found and when it becomes smaller.
 
     Raises HarnessError if the scenario cannot be played, the file cannot be written, or an agent behaves differently in
     two runs of the same seed.

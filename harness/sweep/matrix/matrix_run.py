@@ -61,11 +61,11 @@ def run_matrix(
 ) -> Finished:
     """Play every run of a matrix and sum up each point.
 
-    out: the directory of `results.jsonl`. It is new or empty, or holds earlier results of the same matrix; runs in it
-        are not played again. Without it, a new directory under `runs/`.
-    spread: how runs are distributed. Without it, they use all cores of this machine.
-    judge: plays and checks one run in virtual time.
-    covers: also measure which share of the protocol's states the runs reach, which takes longer.
+    - `out`: the directory of `results.jsonl`. It is new or empty, or holds earlier results of the same matrix; runs in
+      it are not played again. Without it, a new directory under `runs/`.
+    - `spread`: how runs are distributed. Without it, they use all cores of this machine.
+    - `judge`: plays and checks one run in virtual time.
+    - `covers`: also measure which share of the protocol's states the runs reach, which takes longer.
 
     Ctrl-C ends the matrix early, with the runs that have ended. Raises HarnessError if it cannot be played.
     """
