@@ -152,7 +152,7 @@ class Agent:
             self.replace_handlers(handlers)
 
     def replace_handlers(self, wrong: Iterable[EventHandler[Any]]) -> None:
-        """From now on run these handlers in the place of those of the same name, and otherwise the good ones."""
+        """Replace the handlers of these names by wrong ones; all others become the correct ones."""
         handlers = HANDLERS | {handler.name: handler for handler in wrong}
         self._on_message = {message: handlers[handler.name] for message, handler in ON_MESSAGE.items()}
         self._on_timer = {timer: handlers[handler.name] for timer, handler in ON_TIMER.items()}
@@ -161,7 +161,7 @@ class Agent:
     # Inputs
 
     def receive_datagram(self, data: bytes, now: float) -> None:
-        """Handle whatever arrived on the broadcast port. Never raises; what is hostile is counted in `dropped`."""
+        """Handle a datagram from the broadcast port. Never raises; `dropped` counts hostile datagrams."""
         try:
             sender, sequence, message = decode(data)
         except MalformedDatagramError as malformed:
@@ -172,9 +172,9 @@ class Agent:
     def receive_message(
         self, sender: int, sequence: int, message: Message, now: float, datagram: Recorded | None = None
     ) -> None:
-        """Handle a decoded message, if it is another agent's on the roster and carries only the roster's blocks.
+        """Handle a decoded message from another agent on the roster, with blocks of agents on the roster only.
 
-        `datagram` is what it was decoded from, for the trace.
+        `datagram` is the encoded message, for the trace. Other messages are counted in `dropped`.
         """
         if reason := why_not_handled(self.agent_id, self.roster, sender, message):
             self._drop(now, reason, datagram)
@@ -189,19 +189,19 @@ class Agent:
             self._run_triggered()
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
-        """Log an event. Raises ValueError if it is larger than the mission's largest event."""
+        """Log an event. Raises ValueError if it is larger than `max_event_bytes`."""
         self.check_size(event)
         came = Recorded(None, event) if self._tracing else None
         self._handle(now, EventTrigger(event.event_id), came, self._on_local_event["Build Data Block"], event)
 
     def check_size(self, event: LoggableEvent) -> None:
-        """Raises ValueError if the event is larger than the mission's largest."""
+        """Raise ValueError if the event is larger than `max_event_bytes`."""
         largest = self.state.settings.max_event_bytes
         if event.encoded_bytes > largest:
             raise ValueError(f"an event of {event.encoded_bytes} bytes is more than max_event_bytes {largest}")
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` has something to do next, in mission seconds; None if no timer runs."""
+        """Return the mission second of the next timer, when `handle_timer` is due; None if no timer runs."""
         timer = self._soonest()
         return None if timer is None else timer.deadline
 
@@ -215,9 +215,9 @@ class Agent:
         return soonest
 
     def answers_nobody_until(self) -> float | None:
-        """An agent that reconciles answers nobody, and stops only when a timer of the reconcile ends: when that is.
+        """Return the mission second until which the agent answers no message, because it reconciles.
 
-        In mission seconds; None if it does not reconcile, or no such timer runs.
+        That is when the running timer of its reconcile expires. None if it does not reconcile, or no such timer runs.
         """
         if self.state.reconcile_in_progress:
             for timer in self.state.reconcile_timers:
@@ -226,20 +226,20 @@ class Agent:
         return None
 
     def handle_timer(self, now: float) -> None:
-        """Run the handlers of all timers that have expired at `now`, the earliest first."""
+        """Run the handlers of all timers that have expired by `now`, earliest first."""
         while (timer := self._soonest()) is not None and timer.deadline is not None and timer.deadline <= now:
             self.end_timer(timer, now)
 
     def end_timer(self, timer: Timer, now: float) -> None:
-        """Run the handler of a timer that runs: it ends at `now`, however late."""
+        """End a running timer at `now`, and run its handler."""
         timer.stop()
         self._handle(now, TimerTrigger(timer.name), None, self._on_timer[timer.name])
 
     def boot(self, recovered: StoredState, now: float) -> None:
-        """Go on from what a former life left on its vehicle's disk; before any other input.
+        """Restore the state that an earlier life stored on disk. Call it before any other input.
 
-        Timers, votes and the block being built are gone. A reconcile that was going on ends as if nobody had answered
-        (Algorithm 20): what is left of the stack goes back on top, and then the deque's front is proposed again.
+        Timers, votes and the current block are lost. A reconcile in progress ends as if no agent had answered
+        (Algorithm 20): the rest of the stack goes back onto the chain, then the deque's front is proposed again.
         """
         core = self._core
         core.now = now
@@ -248,11 +248,11 @@ class Agent:
         self._handle(now, BootTrigger(len(core.chain)), came, self._on_local_event["Reconcile Finalize"])
 
     def begin_reconcile(self, now: float) -> None:
-        """Reconcile because the operator asks (a final reconcile at the depot, Section 5.1)."""
+        """Start a reconcile by the operator's command (a final reconcile at the depot, Section 5.1)."""
         self._handle(now, OperatorTrigger("reconcile"), None, self._on_local_event["Reconcile Begin"])
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
-        """What to broadcast, in order, as (sequence, message); empties the outbox."""
+        """Return the messages to broadcast, in order, as (sequence, message), and empty the outbox."""
         return [(sequence, message) for sequence, message, _ in self._taken_from_outbox()]
 
     def _taken_from_outbox(self) -> list[tuple[int, Message, Recorded | None]]:
@@ -262,11 +262,11 @@ class Agent:
         return outbox
 
     def datagrams_to_send(self) -> list[bytes]:
-        """What to broadcast, in order; empties the outbox."""
+        """Return the datagrams to broadcast, in order, and empty the outbox."""
         return [encode(self.agent_id, sequence, message) for sequence, message in self.messages_to_send()]
 
     def trace(self) -> list[Entry]:
-        """The handler runs and dropped datagrams since the last call, in order."""
+        """Return the handler runs and dropped datagrams since the last call, in order."""
         trace, self._trace = self._trace, []
         return trace
 

@@ -60,7 +60,7 @@ class Block:
         object.__setattr__(self, "block_hash", hash_digest(self.block_data()))
 
     def block_data(self) -> bytes:
-        """BD_n (eq. 3.5), which is also what a message carries of it."""
+        """Return BD_n (eq. 3.5), the encoding of the block in messages."""
         return BLOCK_HEADER.pack(self.agent_id, self.timestamp_us) + self.event_data
 
 

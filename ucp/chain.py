@@ -32,12 +32,12 @@ class Chain:
         return block_hash in self._block_of_hash
 
     def with_chain_hashes(self) -> Iterator[tuple[Block, bytes]]:
-        """Each block above the inception block with its chain hash, oldest first."""
+        """Yield each block above the inception block with its chain hash, oldest first."""
         return zip(self._blocks, self._chain_hashes[1:], strict=True)
 
     @property
     def top_timestamp_us(self) -> int:
-        """Timestamp of the top block; 0 for the inception block."""
+        """The timestamp of the top block in microseconds; 0 for the inception block."""
         return self._blocks[-1].timestamp_us if self._blocks else 0
 
     def get(self, block_hash: bytes) -> Block | None:
@@ -47,12 +47,12 @@ class Chain:
         return chain_hash in self._height_of_chain_hash
 
     def successor(self, chain_hash: bytes) -> Block | None:
-        """The block on top of the one with `chain_hash`; None at the top of the chain. KeyError if not contained."""
+        """Return the block above the one with `chain_hash`, None at the top. Raises KeyError if it is not there."""
         height = self._height_of_chain_hash[chain_hash]
         return self._blocks[height] if height < len(self._blocks) else None
 
     def append(self, block: Block) -> None:
-        """Commit `block` on top (eq. 3.2). ValueError if the chain holds it already."""
+        """Commit `block` on top (eq. 3.2). Raises ValueError if the chain holds it already."""
         if block.block_hash in self._block_of_hash:
             raise ValueError(f"block {block.block_hash.hex()} is in the chain already")
         chain_hash = next_chain_hash(self.top_chain_hash, block.block_hash)
@@ -63,7 +63,7 @@ class Chain:
         self.top_chain_hash = chain_hash
 
     def pop(self) -> Block:
-        """Remove and return the top block. IndexError at the inception block, which is never popped."""
+        """Remove and return the top block. Raises IndexError at the inception block."""
         if not self._blocks:
             raise IndexError("the inception block is never popped")
         block = self._blocks.pop()

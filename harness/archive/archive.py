@@ -89,32 +89,32 @@ class RunArchive:
 
     @property
     def recorded(self) -> bool:
-        """Whether run.json is there, and anything of it can be read."""
+        """Whether run.json exists and can be read at least in part."""
         return self._record_file is not None and self._record_file.error is None
 
     @property
     def record(self) -> RunRecord:
-        """What can be used of run.json; nothing is known where it is missing or damaged."""
+        """The readable content of run.json. Fields are empty where it is missing or damaged."""
         return self._record_file.record if self._record_file else RunRecord()
 
     @property
     def judged_record(self) -> JudgedRecord | None:
-        """What a judgement needs of run.json; None if it is not there, or not all of that is sound."""
+        """The part of run.json that a judgement needs; None if any of that is missing or damaged."""
         return self._record_file.judged if self._record_file else None
 
     @property
     def record_error(self) -> RunDirectoryError | None:
-        """Why nothing of run.json can be read, if it is there."""
+        """The reason why nothing of an existing run.json can be read, else None."""
         return self._record_file.error if self._record_file else None
 
     @property
     def record_problems(self) -> list[str]:
-        """A sentence on each thing that is wrong with run.json, what a judgement needs first."""
+        """A sentence for each error in run.json; errors in what a judgement needs come first."""
         return self._record_file.problems if self._record_file else []
 
     @cached_property
     def origin(self) -> RunRecord:
-        """The record of the run that the exports come from, even if not its directory was named but files in it."""
+        """The record of the run that the exports come from, also if only files in its directory were given."""
         if self.directory is not None:
             return self.record
         beside = dict.fromkeys(path.parent for file in self._export_files for path in (file.parent, file))
@@ -127,12 +127,12 @@ class RunArchive:
 
     @cached_property
     def roster(self) -> list[int]:
-        """The agents that the run is known to have had: by its record, else by the files that they left."""
+        """The IDs of the agents: those in the record, else those that left files."""
         names = (path.name.partition(".")[0] for directory in self._agents for path in directory.glob("*.*.json*"))
         return self.record.known_agents or sorted({int(name) for name in names if _AGENT_ID.fullmatch(name)})
 
     def forget_record(self) -> None:
-        """The record has been written anew: it is read once more when it is asked for."""
+        """Read run.json again at its next use, because it has been rewritten."""
         for name in ("_record_file", "origin", "roster"):
             self.__dict__.pop(name, None)
 
@@ -140,12 +140,12 @@ class RunArchive:
 
     @cached_property
     def exports(self) -> Exports:
-        """Those of the agents as the run, or whoever brought them home, left them; `errors` tell of unusable files."""
+        """The chain exports by agent; `errors` has a sentence for each unusable file."""
         return read_exports(self._export_files)
 
     @cached_property
     def before_final_reconcile(self) -> dict[int, Export]:
-        """The exports that a final reconcile found, by agent; none if there was no such thing."""
+        """The chain exports before the final reconcile, by agent; empty without a final reconcile."""
         return self._before_final_reconcile.by_agent
 
     @cached_property
@@ -155,11 +155,11 @@ class RunArchive:
 
     @cached_property
     def traces(self) -> dict[int, Trace]:
-        """The trace of each agent, the lowest ID first."""
+        """The trace of each agent, in order of IDs. All traces are then in memory."""
         return self._read_traces[0]
 
     def trace_lines(self, agent_id: int) -> Iterator[Line]:
-        """The handler runs of an agent's trace as they stand in it. Raises RunDirectoryError, where it is damaged."""
+        """Yield the lines of an agent's handler runs. Raises RunDirectoryError at a damaged line."""
         assert self.directory is not None
         return read_lines(agents_directory(self.directory) / f"{agent_id}{SUFFIX}")
 
@@ -186,7 +186,7 @@ class RunArchive:
 
     @cached_property
     def large(self) -> bool:
-        """Whether the traces are so large together that nobody looks at all of them at once."""
+        """Whether the traces together are larger than LARGE_BYTES."""
         return sum(path.stat().st_size for path in self._trace_files if path.is_file()) > LARGE_BYTES
 
     @cached_property
@@ -236,7 +236,7 @@ class RunArchive:
 
     @cached_property
     def public_keys(self) -> "PublicKeys | None":
-        """Those of a secured mission, beside the run's record or beside the exports; None without, or if unusable."""
+        """The public keys of a secured mission; None if there are none, or if they cannot be used."""
         return self._public_keys[0]
 
     @cached_property
@@ -261,23 +261,23 @@ class RunArchive:
     # What was going on around them
 
     def network(self, vehicles: Collection[int]) -> Connectivity:
-        """Who could reach whom among `vehicles`; nothing is known of exports that came without a run."""
+        """Return which of `vehicles` could reach each other when. Empty for exports without a run."""
         return read_connectivity(self._in_directory(NETWORK_FILE), vehicles)
 
     def link_losses(self, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
-        """From when on which links among `vehicles` lose how much, 0..1: first all, then those that changed."""
+        """Yield times and the loss, 0 to 1, of links among `vehicles`: first all links, then changed ones."""
         return read_link_losses(self._in_directory(NETWORK_FILE), vehicles)
 
     def tracks(self, vehicles: Collection[int]) -> Tracks:
-        """Where the vehicles were."""
+        """Return the positions of the vehicles over time."""
         return read_tracks(self._in_directory(TRACKS_FILE), vehicles)
 
     def injected(self, model: type[Record]) -> Iterable[Record]:
-        """What a rogue node sent, each datagram as `model`."""
+        """Return the datagrams that a rogue node sent, each as a `model`."""
         return JsonLines(self._in_directory(ROGUE_FILE), model)
 
     def conditions(self, model: type[Record]) -> list[Record] | None:
-        """What was taken down of network and faults, each change as `model`; None if there is no such file."""
+        """Return the recorded changes of network and faults, each as a `model`; None without a record."""
         path = self._in_directory(NETWORK_FILE)
         return [*JsonLines(path, model)] if path is not None and path.is_file() else None
 
@@ -285,13 +285,13 @@ class RunArchive:
 
     @property
     def problems(self) -> list[str]:
-        """A sentence that names the file for each that cannot be used, or not wholly."""
+        """A sentence for each damaged or unusable file, with its name."""
         before = self._before_final_reconcile.errors
         return [*self.record_problems, *self._read_traces[1], *self._public_keys[1], *self.exports.errors, *before]
 
     @property
     def gaps(self) -> list[str]:
-        """A sentence for each thing that a whole run leaves and that is not here, or cut off."""
+        """A sentence for each file of a complete run that is missing or cut off."""
         return [*self._read_traces[2], *self._missing()]
 
     def _missing(self) -> Iterator[str]:
@@ -311,7 +311,7 @@ class RunArchive:
             yield f"{TRACKS_FILE} is missing: where the vehicles were is not known"
 
     def within(self, sentence: str) -> str:
-        """A sentence as it is said in the run directory: files by their names there."""
+        """Return a sentence with file names relative to the run directory."""
         return sentence if self.directory is None else sentence.replace(f"{self.directory}{os.sep}", "")
 
     def _in_directory(self, name: str) -> Path | None:

@@ -60,7 +60,7 @@ class Findings:
         return f"<run in {self.directory}>"
 
     def characteristic(self, number: int) -> JudgementInTest:
-        """Raises ScenarioError for a number that is not 1 to 6."""
+        """Return the verdict on a characteristic. Raises ScenarioError for a number that is not 1 to 6."""
         __tracebackhide__ = True
         characteristic = self.result.characteristics.get(str(number))
         if characteristic is None:
@@ -68,7 +68,7 @@ class Findings:
         return JudgementInTest.of(str(number), characteristic)
 
     def judgement(self, key: str) -> JudgementInTest:
-        """What is judged beside the characteristics. Raises ScenarioError for a key that is none of them."""
+        """Return the verdict on `steps`, `records` or `liveness`. Raises ScenarioError for another key."""
         __tracebackhide__ = True
         judgement = self.result.beside.get(key)
         if judgement is None:
@@ -77,11 +77,11 @@ class Findings:
 
     @property
     def figures(self) -> dict[str, float | int | None]:
-        """As in run.json: `mutual_chain`, `distinct_chains`, `reconciles`, ..."""
+        """The figures of run.json, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
         return self.result.figures
 
     def chain(self, agent: int) -> list[str]:
-        """The names of the blocks in the agent's chain, such as "4.11", the oldest first.
+        """Return the names of the blocks in the agent's chain, such as "4.11", oldest first.
 
         Raises ScenarioError if the agent has left no chain.
         """
@@ -94,5 +94,5 @@ class Findings:
 
     @property
     def report(self) -> Path:
-        """Where the report is once the test has ended, if it failed or `--ucp-keep` was given."""
+        """The path of the report. It exists after the test, if the test failed or with `--ucp-keep`."""
         return self.directory / "report.html"

@@ -91,7 +91,7 @@ class Swarm:
     # The network
 
     def partition(self, *groups: list[int], for_s: float | None = None) -> AbstractContextManager[None]:
-        """Cut the groups from each other; agents that none of them names form one more together.
+        """Cut the groups of agents off from each other. Agents in no group form another group.
 
         `with swarm.partition([1, 2]):` heals at the end of its block.
         """
@@ -105,20 +105,21 @@ class Swarm:
         return _Block(partial(self._act, lambda swarm: self._told.undo(swarm, at_s)))
 
     def heal(self) -> None:
-        """Undo the partition."""
+        """End the partition."""
         __tracebackhide__ = True
         self._change(heal=True)
 
     def loss(self, probability: float, for_s: float | None = None) -> AbstractContextManager[None]:
-        """From now on every receiver loses each message with this probability.
+        """Let every receiver lose each message with this probability, 0 to 1.
 
-        Here and below: for good, for so many mission seconds, or `with swarm.loss(0.5):` for a block.
+        This and the conditions below last for `for_s` mission seconds, or until the end of a `with` block
+        (`with swarm.loss(0.5):`), or for the rest of the run.
         """
         __tracebackhide__ = True
         return self._for_a_block(loss=probability, for_s=for_s)
 
     def network(self, for_s: float | None = None, **keys: Any) -> AbstractContextManager[None]:
-        """From now on these keys of a scenario's `network` count: `network(delay=0.2, receivers={3: {"loss": 1}})`."""
+        """Set keys of a scenario's `network`: `network(delay=0.2, receivers={3: {"loss": 1}})`."""
         __tracebackhide__ = True
         return self._for_a_block(network=keys, for_s=for_s)
 
@@ -131,18 +132,18 @@ class Swarm:
         for_s: float | None = None,
         **keys: Any,
     ) -> AbstractContextManager[None]:
-        """From now on what goes from one to the other meets this: `link(1, 2, loss=0.9)`; `both`: and back."""
+        """Set the conditions from one agent to another: `link(1, 2, loss=0.9)`; with `both`, also the way back."""
         __tracebackhide__ = True
         if not keys:
             raise ScenarioError("a link needs what is other on it than elsewhere, such as loss=0.9")
         return self.network(for_s, links=[{"from": sender, "to": receiver, "both": both, **keys}])
 
     def hold(self, message: str | None = None, **which: Any) -> AbstractContextManager[None]:
-        """From now on messages that match are on their way and do not arrive before `release`: virtual time alone.
+        """Delay matching messages until `release`, in virtual time only.
 
-        They match as those of a scenario's fate do, by `message`, `sender`, `receiver`, `block` and `count`; what is
-        not said may be any. The end of `with swarm.hold("Commit Block", sender=2):` releases them, and so does that of
-        the test.
+        Messages match by `message`, `sender`, `receiver`, `block` and `count`, as in a scenario's `fates`. A criterion
+        that is not given matches all. The end of `with swarm.hold("Commit Block", sender=2):` releases the messages,
+        and so does the end of the test.
         """
         __tracebackhide__ = True
         words = _of_message(message, which)
@@ -150,16 +151,17 @@ class Swarm:
         return _Block(partial(self._act, lambda swarm: self._told.let_go(swarm, number)))
 
     def release(self, message: str | None = None, **which: Any) -> None:
-        """Let go of what was held by these words, or of everything that is held."""
+        """Deliver the messages that `hold` delays by these criteria, or all delayed messages."""
         __tracebackhide__ = True
         self._act(lambda swarm: self._told.release(swarm, **_of_message(message, which)))
 
     # The agents
 
     def __getattr__(self, verb: str) -> Callable[..., None]:
-        """Each fault is a verb, with the further keys of its timeline entry: `kill(2, 4)`, `reboot(3, down_s=10)`.
+        """Return the method of a fault or an injection; it takes the keys of its timeline entry.
 
-        And so is each injection: `replay("Commit Block", sender=2, count=3)`, `flood(for_s=10, per_s=50)`.
+        Faults: `kill(2, 4)`, `reboot(3, down_s=10)`. Injections: `replay("Commit Block", sender=2, count=3)`,
+        `flood(for_s=10, per_s=50)`.
         """
         __tracebackhide__ = True
         fault = next((kind for kind in ASKED_FOR if kind.what == verb), None)
@@ -192,24 +194,24 @@ class Swarm:
         return float(self._hear(_now))
 
     def run_for(self, seconds: float) -> None:
-        """Let the mission go on for so long."""
+        """Let the mission go on for `seconds` mission seconds."""
         __tracebackhide__ = True
         if not 0 <= seconds < math.inf:
             raise ScenarioError(f"a mission does not go on for {seconds:g} s")
         self._act(lambda swarm: self._told.until(swarm, swarm.now() + seconds))
 
     def run_until(self, mission_s: float) -> None:
-        """Let the mission go on until then, which is not over yet."""
+        """Let the mission go on until `mission_s`, a mission second in the future."""
         __tracebackhide__ = True
         self._act(lambda swarm: self._told.from_now_until(swarm, mission_s))
 
     def wait_for(
         self, handler: str, branch: str | None = None, agent: int | None = None, limit_s: float = 1800.0
     ) -> int:
-        """Let the mission go on until an agent runs this handler, with this branch; the agent's ID.
+        """Let the mission go on until an agent runs this handler, with this branch if given. Return the agent's ID.
 
-        What was told last may have it run at once. Names are those of traces (ucp/contract/HANDLERS.md). Raises
-        AssertionError if nobody runs it within `limit_s`.
+        A run that the last action caused counts. Names are those of traces (ucp/contract/HANDLERS.md). Raises
+        AssertionError if no agent runs it within `limit_s` mission seconds.
         """
         __tracebackhide__ = True
         if not 0 <= limit_s < math.inf:
@@ -223,10 +225,10 @@ class Swarm:
         return int(found)
 
     def wait_idle(self, limit_s: float = 1800.0) -> None:
-        """Let the mission go on until what was told last has sunk in.
+        """Let the mission go on until all agents are idle after the last action.
 
-        That is, until each agent that runs has put a block of its own to the vote since, and all are idle. Raises
-        AssertionError if that takes longer than `limit_s`.
+        Each running agent must also have proposed a block of its own since that action. Raises AssertionError if this
+        takes longer than `limit_s` mission seconds.
         """
         __tracebackhide__ = True
         played = self._act(lambda swarm: self._told.until_idle(swarm, limit_s))
@@ -235,41 +237,41 @@ class Swarm:
         self._seen = self._judge_by_now(played)
 
     def final_reconcile(self) -> None:
-        """The end of the mission: no more events, no more conditions, and one agent after another reconciles."""
+        """End the mission: stop events, lift all conditions, and let one agent after another reconcile."""
         __tracebackhide__ = True
         self._act(lambda swarm: self._told.end(swarm, reconcile_finally=True))
 
     # What there is by now
 
     def characteristic(self, number: int) -> JudgementInTest:
-        """The verdict as things stand: `holds`, `verdict`, `reason` and `evidence`."""
+        """Return the verdict by now on a characteristic, 1 to 6: `holds`, `verdict`, `reason` and `evidence`."""
         __tracebackhide__ = True
         return self._findings().characteristic(number)
 
     def judgement(self, key: str) -> JudgementInTest:
-        """`steps`, `records` or `liveness`, as things stand."""
+        """Return the verdict by now on `steps`, `records` or `liveness`."""
         __tracebackhide__ = True
         return self._findings().judgement(key)
 
     @property
     def figures(self) -> dict[str, float | int | None]:
-        """As in run.json: `mutual_chain`, `distinct_chains`, `reconciles`, ..."""
+        """The figures of run.json by now, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
         __tracebackhide__ = True
         return self._findings().figures
 
     def chain(self, agent: int) -> list[str]:
-        """The names of the blocks in the agent's chain, such as "4.11", the oldest first."""
+        """Return the names of the blocks in the agent's chain, such as "4.11", oldest first."""
         __tracebackhide__ = True
         return self._findings().chain(agent)
 
     @property
     def directory(self) -> Path:
-        """That of the run."""
+        """The run directory."""
         return self._recording.directory.path
 
     @property
     def report(self) -> Path:
-        """Where the report is once the test has ended, if it failed or `--ucp-keep` was given."""
+        """The path of the report. It exists after the test, if the test failed or with `--ucp-keep`."""
         return self.directory / "report.html"
 
     def _findings(self) -> Findings:
