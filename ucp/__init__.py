@@ -12,21 +12,58 @@ if TYPE_CHECKING:
     from ucp.chain import Chain
     from ucp.events import LoggableEvent, decode_events
     from ucp.export import export_chain
-    from ucp.messages import Datagram, MalformedDatagramError, decode, encode
+    from ucp.messages import (
+        BlockAddRequest,
+        BlockAddResponse,
+        BlockResponse,
+        ChainContainQuery,
+        ChainContainResponse,
+        ChainHashSuccessorQuery,
+        CommitBlock,
+        Datagram,
+        MalformedDatagramError,
+        NextInSequenceResponse,
+        RequestForBlock,
+        decode,
+        encode,
+    )
     from ucp.settings import Settings
     from ucp.trace import HandlerRun
-    from ucp.trigger import Trigger
+    from ucp.trigger import (
+        BootTrigger,
+        EventTrigger,
+        LocalTrigger,
+        MessageTrigger,
+        OperatorTrigger,
+        TimerTrigger,
+        Trigger,
+    )
 
 __all__ = [
     "Agent",
     "Block",
+    "BlockAddRequest",
+    "BlockAddResponse",
+    "BlockResponse",
+    "BootTrigger",
     "Chain",
+    "ChainContainQuery",
+    "ChainContainResponse",
+    "ChainHashSuccessorQuery",
+    "CommitBlock",
     "Datagram",
+    "EventTrigger",
     "HandlerRun",
     "InceptionBlock",
+    "LocalTrigger",
     "LoggableEvent",
     "MalformedDatagramError",
+    "MessageTrigger",
+    "NextInSequenceResponse",
+    "OperatorTrigger",
+    "RequestForBlock",
     "Settings",
+    "TimerTrigger",
     "Trigger",
     "decode",
     "decode_events",
@@ -40,10 +77,32 @@ _NAMES_OF = {
     "ucp.chain": ("Chain",),
     "ucp.events": ("LoggableEvent", "decode_events"),
     "ucp.export": ("export_chain",),
-    "ucp.messages": ("Datagram", "MalformedDatagramError", "decode", "encode"),
+    "ucp.messages": (
+        "BlockAddRequest",
+        "BlockAddResponse",
+        "BlockResponse",
+        "ChainContainQuery",
+        "ChainContainResponse",
+        "ChainHashSuccessorQuery",
+        "CommitBlock",
+        "Datagram",
+        "MalformedDatagramError",
+        "NextInSequenceResponse",
+        "RequestForBlock",
+        "decode",
+        "encode",
+    ),
     "ucp.settings": ("Settings",),
     "ucp.trace": ("HandlerRun",),
-    "ucp.trigger": ("Trigger",),
+    "ucp.trigger": (
+        "BootTrigger",
+        "EventTrigger",
+        "LocalTrigger",
+        "MessageTrigger",
+        "OperatorTrigger",
+        "TimerTrigger",
+        "Trigger",
+    ),
 }
 """The imports above, as they are done at the first use of a name."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.api import HarnessError, MachineError, Matrix, RunArchive, check, load_scenario, run, run_matrix
+from harness.api import HarnessError, MachineError, Matrix, RunArchive, Swarm, check, load_scenario, run, run_matrix
 
 PUBLIC = ("harness.api", "ucp", "netem", "sitl")
 NAMES = [(module, name) for module in PUBLIC for name in importlib.import_module(module).__all__]
@@ -95,6 +95,11 @@ def test_matrix_from_a_dict_runs_into_a_new_directory(tmp_path: Path, monkeypatc
     finished = run_matrix(Matrix.model_validate(keys))
     assert [(each.loss, each.seed) for each in finished.runs] == [(0, 1), (0, 2), (0.5, 1), (0.5, 2)]
     assert [*tmp_path.glob("runs/*small*/results.jsonl")]
+
+
+def test_fixture_swarm_has_the_public_type(swarm: Swarm) -> None:
+    swarm.run_for(10)
+    assert isinstance(swarm, Swarm)
 
 
 def test_errors_have_one_base() -> None:

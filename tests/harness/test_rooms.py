@@ -108,6 +108,10 @@ def test_few_files_of_the_harness_are_in_no_room() -> None:
     assert len([*(REPOSITORY / "harness").glob("*.py")]) <= LOOSE_AT_MOST
 
 
+def test_no_module_imports_the_public_api() -> None:
+    assert [module for module in modules() if "harness.api" in imports(module)] == []
+
+
 def test_no_room_imports_a_private_module_of_another() -> None:
     past_the_door = [
         (module, name)
