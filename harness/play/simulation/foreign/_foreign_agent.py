@@ -17,7 +17,7 @@ from harness.play.agent_control import Status
 from harness.play.command_line import last_words, of_a_shell
 from harness.play.simulation._simulated_agent import Outgoing, Stored
 from harness.play.simulation.foreign._answer import Answer, AnswerError, LacksError, RefusedError, read_answer
-from harness.play.simulation.foreign._virtual_program import NoAnswerError, Program
+from harness.play.simulation.foreign._virtual_program import Program, ProgramFailedError
 from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError, Outcome
 from ucp.events import LoggableEvent
 from ucp.messages import Datagram, Message
@@ -265,7 +265,7 @@ class ForeignAgent:
             program.tell(given)
             said = program.answer()
             answer = read_answer(said, tracing=self._tracing)
-        except NoAnswerError as error:
+        except ProgramFailedError as error:
             if error.status in NO_VIRTUAL_TIME and not self.record.exchanges:
                 raise self._has_no_virtual_time(error.status) from None
             raise self._failure(error.outcome, f"{error} when it was given {what} at {now:g} s") from None

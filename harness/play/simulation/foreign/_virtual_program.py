@@ -37,8 +37,8 @@ _PR_SET_PDEATHSIG = 1
 _LIBC = CDLL(None)
 
 
-class NoAnswerError(Exception):
-    """A program ended, hung, or said what is no line: what it did, in words that follow "agent 3"."""
+class ProgramFailedError(Exception):
+    """A program ended, hung, or wrote an invalid line. The message completes a sentence that starts with "agent 3"."""
 
     def __init__(self, outcome: Outcome, what: str, status: int | None = None) -> None:
         super().__init__(what)
@@ -90,9 +90,9 @@ class Program:
         return self._process.poll() is None
 
     def tell(self, line: bytes) -> None:
-        """Write a line. Raises NoAnswerError."""
+        """Write a line. Raises ProgramFailedError."""
         if self._said:
-            raise NoAnswerError("crashed", f"wrote what nobody asked for: {_shown(self._said)}")
+            raise ProgramFailedError("crashed", f"wrote what nobody asked for: {_shown(self._said)}")
         self.owes_an_answer = True
         try:
             written = os.write(self._in, line)
@@ -104,7 +104,7 @@ class Program:
             self._write(memoryview(line)[written:])
 
     def answer(self) -> bytes:
-        """The next line that it says, with its end. Raises NoAnswerError."""
+        """The next line that it says, with its end. Raises ProgramFailedError."""
         limit_s = ANSWER_LIMIT_S if self._answered else START_LIMIT_S
         if not self._said:
             if not self._readable.poll(limit_s * 1000):
@@ -125,7 +125,7 @@ class Program:
         length = len(self._said)
         while b"\n" not in pieces[-1]:
             if length > MAX_ANSWER_BYTES:
-                raise NoAnswerError("crashed", f"answers with a line of more than {MAX_ANSWER_BYTES >> 20} MiB")
+                raise ProgramFailedError("crashed", f"answers with a line of more than {MAX_ANSWER_BYTES >> 20} MiB")
             left_s = deadline - time.monotonic()
             if left_s <= 0 or not self._readable.poll(left_s * 1000):
                 raise _hung(limit_s)
@@ -146,12 +146,12 @@ class Program:
             left_s = deadline - time.monotonic()
             events = dict(ready.poll(max(0.0, left_s) * 1000))
             if not events:
-                raise NoAnswerError("hung", f"did not read what it was given within {ANSWER_LIMIT_S:g} s")
+                raise ProgramFailedError("hung", f"did not read what it was given within {ANSWER_LIMIT_S:g} s")
             if self._out in events:
                 heard = os.read(self._out, CHUNK_BYTES)
                 self._said += heard
                 if not heard or len(self._said) > MAX_ANSWER_BYTES:
-                    raise self._ended() if not heard else NoAnswerError("crashed", "writes without an end")
+                    raise self._ended() if not heard else ProgramFailedError("crashed", "writes without an end")
             if self._in in events:
                 with suppress(BlockingIOError):
                     try:
@@ -159,14 +159,14 @@ class Program:
                     except BrokenPipeError:
                         raise self._ended() from None
 
-    def _ended(self) -> NoAnswerError:
+    def _ended(self) -> ProgramFailedError:
         try:
             status = self._process.wait(MOMENT_S)
         except subprocess.TimeoutExpired:
-            return NoAnswerError("crashed", "closed its standard input or output and did not end")
+            return ProgramFailedError("crashed", "closed its standard input or output and did not end")
         if status < 0:
-            return NoAnswerError("crashed", f"was ended by {signal.Signals(-status).name}")
-        return NoAnswerError("crashed", f"ended by itself with status {status}", status)
+            return ProgramFailedError("crashed", f"was ended by {signal.Signals(-status).name}")
+        return ProgramFailedError("crashed", f"ended by itself with status {status}", status)
 
     def where_it_logs(self) -> str:
         """Where its log is, or what it said last, as the end of a sentence."""
@@ -218,8 +218,8 @@ class Program:
         self._errors.close()
 
 
-def _hung(limit_s: float) -> NoAnswerError:
-    return NoAnswerError("hung", f"did not answer within {limit_s:g} s (with a whole line, flushed)")
+def _hung(limit_s: float) -> ProgramFailedError:
+    return ProgramFailedError("hung", f"did not answer within {limit_s:g} s (with a whole line, flushed)")
 
 
 def _passing_file() -> IO[bytes]:

@@ -14,7 +14,7 @@ from typing import Any
 from harness.errors import VIOLATED, HarnessError
 from harness.play.simulation.foreign._answer import shown
 from harness.play.simulation.foreign._foreign_agent import LifeRecord
-from harness.play.simulation.foreign._virtual_program import NoAnswerError, Program
+from harness.play.simulation.foreign._virtual_program import Program, ProgramFailedError
 
 OF_ITSELF = (
     "it reads a clock, draws random numbers, or has something else of its own, such as the order of a hash table"
@@ -80,7 +80,7 @@ def _given_to(program: Program, record: LifeRecord) -> str | None:
         try:
             program.tell(line)
             again = program.answer()
-        except NoAnswerError as error:
+        except ProgramFailedError as error:
             return f"given {_input(line)} again, it {error}"
         if again != answer:
             return f"given {_input(line)} again, it answers {_difference(answer, again)}"
