@@ -56,6 +56,21 @@ class UnsupportedError(MachineError):
         return cls(f"not supported by agent {agent_id} ({shlex.join(command)}): {why}")
 
 
+class AgentFailedError(HarnessError):
+    """An agent under test crashed, hung, did not start, or gave an invalid answer.
+
+    `outcome` says which, in a word. `detail` completes a sentence that starts with "agent 3".
+    """
+
+    exit_status = VIOLATED
+
+    def __init__(self, agent_id: int, outcome: str, detail: str) -> None:
+        super().__init__(f"agent {agent_id} {detail}")
+        self.agent_id = agent_id
+        self.outcome = outcome
+        self.detail = detail
+
+
 class InterruptedRunError(HarnessError):
     """The user asked to stop."""
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from harness.archive.directory import default_path
 from harness.checker import Result
 from harness.checker.judgement import Finding, Judgement
-from harness.errors import MachineError, RunDirectoryError
+from harness.errors import AgentFailedError, MachineError, RunDirectoryError
 from harness.gc_pause import gc_paused
-from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.scenario.verdict_names import CHARACTERISTICS

@@ -14,10 +14,10 @@ from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
 from harness.checker.evidence import InjectedDatagram, RogueTraffic
+from harness.errors import AgentFailedError
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
-from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.play.simulation.incarnations import Incarnation
 from harness.play.simulation.run_files import header
 from harness.play.simulation.simulation import Simulation

@@ -56,11 +56,11 @@ SLACK_S, SLACK_WALL_S = 1.0, 0.15
 SHOWN = 12
 
 
-class NoAgentError(HarnessError):
+class NotStartedError(HarnessError):
     """The agent does not start."""
 
 
-class AgentFailedError(HarnessError):
+class ReplayFailedError(HarnessError):
     """The agent ends by itself, or does not do as it is told."""
 
 
@@ -192,7 +192,7 @@ def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
 def play_live(record: Record, command: Sequence[str], place: Path, *, speedup: float) -> list[Difference]:
     """What the agent says otherwise than the record.
 
-    Raises MachineError, NoAgentError, AgentFailedError; FieldError if the record is in words that nobody knows.
+    Raises MachineError, NotStartedError, ReplayFailedError; FieldError if the record is in words that nobody knows.
     """
     if unknown := first_of(unknown_words(record.trace.runs), ("trigger", "handler", "branch", "timer")):
         raise FieldError(f"{record.path}: {unknown}, so nobody knows what is to be played; give another record")
@@ -264,9 +264,9 @@ class _Air:
                 return
             except AgentSilentError:
                 if agent.returncode is not None:
-                    raise NoAgentError(f"the agent ended with {agent.end}: {_last_line(log)}") from None
+                    raise NotStartedError(f"the agent ended with {agent.end}: {_last_line(log)}") from None
                 if time.monotonic() > deadline:
-                    raise NoAgentError(f"the agent did not answer within {START_LIMIT_S:g} s") from None
+                    raise NotStartedError(f"the agent did not answer within {START_LIMIT_S:g} s") from None
                 await asyncio.sleep(0.02)
 
     async def _fly(self, lab: Lab, control: AgentControl, agent: LabProcess, log: Path) -> list[tuple[float, Message]]:
@@ -300,7 +300,7 @@ class _Air:
         commanding.cancel()
         await peers.terminate(GRACE_S)
         if done:
-            raise AgentFailedError(f"the agent ended by itself with {agent.end}: {_last_line(log)}")
+            raise ReplayFailedError(f"the agent ended by itself with {agent.end}: {_last_line(log)}")
         ending.cancel()
         return _heard(heard, self._record.agent_id)
 
@@ -313,7 +313,7 @@ class _Air:
         try:
             await control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
         except (AgentSilentError, AgentRefusedError) as error:
-            raise AgentFailedError(f"the agent does not {command}: {error}") from None
+            raise ReplayFailedError(f"the agent does not {command}: {error}") from None
 
     def _wall_s(self, epoch_us: int, mission_s: float) -> float:
         """From now on until then."""

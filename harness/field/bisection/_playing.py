@@ -10,7 +10,7 @@ from harness import checker
 from harness.archive.archive import RunArchive
 from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED, WRONG_REQUEST, HarnessError, InterruptedRunError
 from harness.field.bisection._bisected import Subject
-from harness.field.bisection._live_replay import AgentFailedError, NoAgentError, play_live
+from harness.field.bisection._live_replay import NotStartedError, ReplayFailedError, play_live
 from harness.field.bisection.code_state import ROOT, Ended, run_python
 from harness.field.bisection.outcome import Difference, OfAgent, Outcome, of_run
 from harness.field.replay import open_record
@@ -158,9 +158,9 @@ class Workshop:
         words = _words(command, code)
         try:
             said = play_live(record, words, place, speedup=self._speedup or SPEEDUP)
-        except NoAgentError as error:
+        except NotStartedError as error:
             raise CannotBeTriedError(str(error)) from None
-        except AgentFailedError as error:
+        except ReplayFailedError as error:
             return Outcome(subject=self.subject.in_words, crashed=str(error))
         return Outcome(subject=self.subject.in_words, agents={record.agent_id: OfAgent(differences=said)})
 

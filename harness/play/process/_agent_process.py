@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from harness.archive.directory import RunDirectory
 from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
-from harness.errors import VIOLATED, HarnessError, MachineError, ScenarioError, UnsupportedError
+from harness.errors import AgentFailedError, HarnessError, MachineError, ScenarioError, UnsupportedError
 from harness.play._vehicle_keys import Handed
 from harness.play.agent_control import (
     AgentControl,
@@ -54,17 +54,6 @@ def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
         return [sys.executable, "-P", "-m", "ucp.node"]
     of_whom = f" of agent {agent_id}" if isinstance(scenario.agent_command, dict) else ""
     return located(command, f"`agent_command`{of_whom}")
-
-
-class AgentFailedError(HarnessError):
-    """An agent crashed, hung, or did not start: the thing under test failed."""
-
-    exit_status = VIOLATED
-
-    def __init__(self, agent_id: int, outcome: str, detail: str, log: Path) -> None:
-        super().__init__(f"agent {agent_id} {detail}; its log is {log}")
-        self.agent_id = agent_id
-        self.outcome = outcome
 
 
 @dataclass
@@ -404,7 +393,8 @@ class AgentProcess:
 
     def _failed(self, outcome: str, detail: str) -> AgentFailedError:
         self.outcome, self.detail = outcome, detail
-        return AgentFailedError(self.agent_id, outcome, detail, self._log.relative_to(self._rundir.path))
+        log = self._log.relative_to(self._rundir.path)
+        return AgentFailedError(self.agent_id, outcome, f"{detail}; its log is {log}")
 
 
 def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:

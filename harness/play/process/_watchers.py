@@ -6,8 +6,7 @@ from collections.abc import AsyncIterator, Awaitable, Coroutine
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
-from harness.errors import HarnessError, InterruptedRunError
-from harness.play.process._agent_process import AgentFailedError
+from harness.errors import AgentFailedError, HarnessError, InterruptedRunError
 
 T = TypeVar("T")
 

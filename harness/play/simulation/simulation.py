@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from harness.errors import ScenarioError
+from harness.errors import AgentFailedError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.agent_control import Status
 from harness.play.mission import RunOutcome, Sought
@@ -34,9 +34,9 @@ from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
     from harness.play._pace import Pace
+    from harness.play.simulation.foreign._failure import AgentLacksError
     from harness.play.simulation.foreign._foreign_agent import LifeRecord
     from harness.play.simulation.foreign._virtual_program import Programs
-    from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
 
 ENGINE = "virtual time"
 BREATH_S = 20.0

@@ -6,13 +6,13 @@ from contextlib import asynccontextmanager, closing, contextmanager
 from typing import TYPE_CHECKING
 
 from harness.archive.directory import RunDirectory
-from harness.errors import InterruptedRunError, MachineError, ScenarioError
+from harness.errors import AgentFailedError, InterruptedRunError, MachineError, ScenarioError
 from harness.play._ground_station_check import refuse_what_no_ground_station_sees
 from harness.play._pace import Pace
 from harness.play.backend import Backend
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
-from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError
+from harness.play.simulation.foreign._failure import AgentLacksError
 from harness.play.simulation.run_files import OnDisk
 from harness.play.simulation.simulation import Simulation, no_vehicles
 from harness.scenario import Scenario

@@ -9,7 +9,7 @@ from harness.archive.run_record import Cycle
 from harness.checker import Result
 from harness.checker.judgement import Judgement
 from harness.checker.recurring_cycles import cycle_of
-from harness.play.simulation.foreign.failure import AgentFailedError
+from harness.errors import AgentFailedError
 from harness.proof.bounds import Bounds
 from harness.run.finding import ended_by, evidence_lines, write
 from harness.run.simulate import simulate

@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any
 
 from harness.checker import Result
+from harness.errors import AgentFailedError
 from harness.play.simulation.fate_script import Decided, FateScript, NameOf
-from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.run.finding import ended_by
 from harness.run.simulate import InMemory, simulate_in_memory
 from harness.scenario import Scenario

@@ -4,8 +4,9 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from harness.errors import AgentFailedError
+from harness.play.simulation.foreign._failure import AgentLacksError, Outcome
 from harness.play.simulation.foreign._foreign_agent import ForeignAgent
-from harness.play.simulation.foreign.failure import AgentFailedError, AgentLacksError, Outcome
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle
 from ucp.secure.envelope import REVOCATION, read_clear

@@ -24,7 +24,7 @@ from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
 from harness.play.command_line import LOOKED_AT_BYTES, last_words, last_words_in
-from harness.play.simulation.foreign.failure import Outcome
+from harness.play.simulation.foreign._failure import Outcome
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0

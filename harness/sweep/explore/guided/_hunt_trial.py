@@ -17,8 +17,8 @@ from harness.checker import Evidence, Result
 from harness.checker.evidence import Watch
 from harness.checker.recurring_cycles import cycle_of
 from harness.checker.uniform_chain import common_prefix
+from harness.errors import AgentFailedError
 from harness.gc_pause import gc_paused
-from harness.play.simulation.foreign.failure import AgentFailedError
 from harness.proof.coverage import Reached, Watcher
 from harness.proof.coverage.simulated import simulate_watched
 from harness.run.finding import ended_by

@@ -3,21 +3,9 @@
 from collections.abc import Sequence
 from typing import Literal
 
-from harness.errors import VIOLATED, HarnessError, UnsupportedError
+from harness.errors import UnsupportedError
 
 Outcome = Literal["crashed", "hung", "not supported"]
-
-
-class AgentFailedError(HarnessError):
-    """An agent crashed, hung, or answered what is no answer: the thing under test failed."""
-
-    exit_status = VIOLATED
-
-    def __init__(self, agent_id: int, outcome: Outcome, detail: str) -> None:
-        super().__init__(f"agent {agent_id} {detail}")
-        self.agent_id = agent_id
-        self.outcome = outcome
-        self.detail = detail
 
 
 class AgentLacksError(UnsupportedError):
