@@ -1,6 +1,7 @@
 """What arrives on the port: accepted is what its own writer makes, byte for byte, and scapy reads the same."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from scapy.config import conf
@@ -14,10 +15,23 @@ from ucp.messages import MAX_DATAGRAM_BYTES, MalformedDatagramError, datagram_by
 from ucp.scapy import LAYERS, UCP
 from ucp.telemetry import describe
 
-conf.debug_dissector = True  # else scapy hides what its layers raise
-
 
 def run(data: bytes) -> None:
+    with _scapy_raises():
+        _run(data)
+
+
+@contextmanager
+def _scapy_raises() -> Iterator[None]:
+    """Let scapy raise the errors of its layers, which it hides by default."""
+    conf.debug_dissector, before = True, conf.debug_dissector
+    try:
+        yield
+    finally:
+        conf.debug_dissector = before
+
+
+def _run(data: bytes) -> None:
     packet = UCP(data) if data else None
     require(packet is None or bytes(packet) == data, "scapy gives other bytes back")
     try:
