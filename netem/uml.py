@@ -21,7 +21,6 @@ kills the group and removes its directory as soon as the caller closes its end o
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import shlex
 import shutil
@@ -238,9 +237,12 @@ class _Guest:
                 ended = self._process.poll() is not None
                 chunk = word.read()
                 received += chunk
-                came = [_copy(stdout, sys.stdout.buffer), _copy(stderr, sys.stderr.buffer)]
-                self.up = self.up or bool(received)
-                if chunk or any(came):
+                printed, complained = stdout.read(), stderr.read()
+                # The command's first output can precede the first beat, and the caller may act on it at once.
+                self.up = self.up or bool(received or printed or complained)
+                _write(sys.stdout.buffer, printed)
+                _write(sys.stderr.buffer, complained)
+                if chunk or printed or complained:
                     heard = time.monotonic()
                 elif (status := _last_word(received)) is not None:
                     return status
@@ -266,12 +268,10 @@ class _Guest:
         os.close(self._lifeline)
 
 
-def _copy(source: io.FileIO, target: BinaryIO) -> bool:
-    """Write what is new in a growing file; whether anything was."""
-    if data := source.read():
+def _write(target: BinaryIO, data: bytes) -> None:
+    if data:
         target.write(data)
         target.flush()
-    return bool(data)
 
 
 def _last_word(received: bytes) -> int | None:

@@ -23,6 +23,13 @@ from netem import uml
 waiting = "trap 'echo Ctrl-C; exit 130' INT; echo here; while :; do sleep 0.1; done"
 sys.exit(uml.run(["sh", "-c", waiting], cwd=Path("/"), env={"PATH": uml.SYSTEM_PATH}))
 """
+LATE_BEAT = """
+from netem import uml
+beats = "while echo; do sleep {beat_s}; done"
+assert beats in uml._COMMAND
+uml._COMMAND = uml._COMMAND.replace(beats, "while sleep {beat_s}; do echo; done")
+"""
+"""Make the guest beat only BEAT_S seconds after the command has started."""
 
 
 @pytest.mark.uml
@@ -62,8 +69,9 @@ def test_a_shell_reaches_inside_and_an_interrupted_run_is_exported_and_judged(tm
 
 @pytest.mark.uml
 @pytest.mark.whoever
-def test_sigterm_reaches_the_command_as_ctrl_c(tmp_path: Path) -> None:
-    with _Started(tmp_path, sys.executable, "-c", WAITING) as started:
+@pytest.mark.parametrize("before", ["", LATE_BEAT], ids=["beating", "output-before-first-beat"])
+def test_sigterm_reaches_the_command_as_ctrl_c(tmp_path: Path, before: str) -> None:
+    with _Started(tmp_path, sys.executable, "-c", before + WAITING) as started:
         started.wait_for("here")
         started.process.terminate()
         rest, _ = started.process.communicate(timeout=DEADLINE_S)
