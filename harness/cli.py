@@ -1,7 +1,7 @@
-"""The command line: which commands there are; each is imported when it is called.
+"""The command line: the list of commands, in panels.
 
 Exit status 0: ran, and no characteristic is violated. 1: at least one is violated, or an agent failed. 2: the request
-was wrong. 3: this machine cannot do it. 4: `prove` could not look at everything. 130: interrupted.
+was wrong. 3: this machine cannot do it. 4: `prove` reached a limit. 130: interrupted.
 """
 
 import errno
@@ -11,7 +11,7 @@ import sys
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -22,129 +22,115 @@ from harness.gc_pause import gc_paused
 MAX_NAME = 200
 """More of a file's name is not shown."""
 
+
+class Command(NamedTuple):
+    """A command: its panel in the help, the place of its function, and its summary."""
+
+    panel: str
+    where: str
+    summary: str
+    """The first paragraph of the command's own help. At most 62 characters, which fill a line of a terminal."""
+
+
 COMMANDS = {
-    "run": (
-        "harness.commands.run:run_command",
-        "Play a scenario, check the six characteristics, write a report.",
+    "run": Command("run", "harness.commands.run:run_command", "Play a scenario, judge it, and write a report."),
+    "scenarios": Command(
+        "run", "harness.commands.runs:scenarios_command", "List the scenarios that come with the harness."
     ),
-    "scenarios": (
-        "harness.commands.runs:scenarios_command",
-        "List the scenarios that come along: `ucp-harness run loss_15` plays one.",
+    "tell": Command(
+        "run", "harness.commands.tell:tell_command", "Cause an event in an active run, or control virtual time."
     ),
-    "runs": (
-        "harness.commands.runs:runs_command",
-        "List what was run, the newest first, with its verdict; or open a report in the browser.",
+    "shell": Command(
+        "run", "harness.commands.shell:shell_command", "Open a shell in the network of a vehicle of an active run."
     ),
-    "watch": (
-        "harness.commands.watch:watch_command",
-        "Show a run as a film in the browser: map, links, chains, votes and reconciles along time.",
+    "runs": Command(
+        "look", "harness.commands.runs:runs_command", "List past runs with their verdicts, or open a report."
     ),
-    "tell": (
-        "harness.commands.tell:tell_command",
-        "Have something happen now to a run that goes on; in virtual time pause, step, go on; or see how it stands.",
+    "check": Command(
+        "look", "harness.commands.report:check_command", "Judge chain exports and traces by the six characteristics."
     ),
-    "shell": (
-        "harness.commands.shell:shell_command",
-        "Open a shell in the network of a vehicle whose run goes on (ping, tcpdump, ip); without one, list what runs.",
+    "report": Command("look", "harness.commands.report:report_command", "Write the report files of a run again."),
+    "watch": Command("look", "harness.commands.watch:watch_command", "Show a recorded run as a film in the browser."),
+    "chain": Command(
+        "look", "harness.commands.chain:chain_command", "Print each agent's chain, or write its positions as a map."
     ),
-    "check": (
-        "harness.commands.report:check_command",
-        "Decide the six characteristics from exported chains, and from traces beside them.",
-    ),
-    "report": (
-        "harness.commands.report:report_command",
-        "Write report.html, report.md, junit.xml and chains.svg again, also of a run that was killed half-way.",
-    ),
-    "diff": (
-        "harness.commands.diff:diff_command",
-        "Say where two runs part: exit status 0 if they do not, 1 if they do.",
-    ),
-    "import": (
-        "harness.commands.import_:import_command",
-        "Bring records of any kind into one directory that `check`, `replay`, `reconstruct` and `packets` read.",
-    ),
-    "replay": (
-        "harness.commands.replay:replay_command",
-        "Feed what one agent saw into the reference core, step by step: exit status 1 if it did anything else.",
-    ),
-    "chain": (
-        "harness.commands.chain:chain_command",
-        "Print each agent's chain, block by block; or put what the vehicles logged on a map.",
-    ),
-    "export": (
-        "harness.commands.export:export_command",
-        "Write tracks, links, chains, handler runs, MAVLink and logs of a run for other tools.",
-    ),
-    "packets": (
+    "packets": Command(
+        "look",
         "harness.commands.packets:packets_command",
-        "Print each datagram, who received it and who lost it, and what was answered to it, from a run's captures.",
+        "Print each captured datagram, its receivers and its answers.",
     ),
-    "mission": (
-        "harness.commands.mission:app",
-        "Make the mission files of a swarm, and compare those on its vehicles.",
+    "diff": Command("look", "harness.commands.diff:diff_command", "Find where two runs first differ."),
+    "export": Command(
+        "look", "harness.commands.export:export_command", "Write a run for Foxglove, PlotJuggler, Perfetto or ROS 2."
     ),
-    "keys": (
-        "harness.commands.keys:app",
-        "Make the keys of a secure mission, hand out what each vehicle gets, and take it back.",
+    "mission": Command("field", "harness.commands.mission:app", "Make the mission files of a swarm, and compare them."),
+    "keys": Command(
+        "field", "harness.commands.keys:app", "Make, distribute, inspect and revoke keys of a secure mission."
     ),
-    "consolidate": (
-        "harness.commands.consolidate:consolidate_command",
-        "Merge what vehicles brought home into one record: every event once, who holds what, what was lost with whom.",
+    "import": Command(
+        "field", "harness.commands.import_:import_command", "Convert records of any kind into one directory."
     ),
-    "reconstruct": (
+    "consolidate": Command(
+        "field", "harness.commands.consolidate:consolidate_command", "Merge the chains of all vehicles into one record."
+    ),
+    "replay": Command(
+        "field", "harness.commands.replay:replay_command", "Feed an agent's trace to the reference core, and compare."
+    ),
+    "reconstruct": Command(
+        "field",
         "harness.commands.reconstruct:reconstruct_command",
-        "Make a scenario that flies what came home again, in virtual time: exit status 1, and where, if it cannot.",
+        "Make a scenario that reproduces a recorded flight.",
     ),
-    "bisect": (
-        "harness.commands.bisect:bisect_command",
-        "Play a scenario or record at commit after commit; name the first at which its outcome changes.",
+    "matrix": Command(
+        "many", "harness.commands.matrix:matrix_command", "Play a scenario over many loss rates and seeds."
     ),
-    "again": (
-        "harness.commands.again:app",
-        "Play a scenario or record once more: exit status 0 as it was, 1 changed, 125 cannot be tried, 128 stop.",
-    ),
-    "conformance": (
-        "harness.commands.conformance:conformance_command",
-        "Test one agent alone, its peers played by the harness: thousands of generated cases, over UDP.",
-    ),
-    "matrix": (
-        "harness.commands.matrix:matrix_command",
-        "Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated.",
-    ),
-    "explore": (
+    "explore": Command(
+        "many",
         "harness.commands.explore:explore_command",
-        "Play seed after seed in virtual time until a characteristic is violated; then find the smallest such run.",
+        "Play seeds until one violates a characteristic, and shrink it.",
     ),
-    "coverage": (
-        "harness.commands.coverage:coverage_command",
-        "Say which share of all local states, inputs and branches runs have tried, of any agents that leave traces.",
+    "bisect": Command(
+        "many", "harness.commands.bisect:app", "Find the commit that changes how a scenario or record plays."
     ),
-    "prove": (
-        "harness.commands.prove:prove_command",
-        "Look at every state that the agents can come to within bounds: is any wrong, or without a way out?",
-    ),
-    "validate": (
-        "harness.commands.validate:validate_command",
-        "Hold recorded runs against the specification in TLA+, step by step: exit status 1 if an agent did otherwise.",
-    ),
-    "scale": (
+    "scale": Command(
+        "many",
         "harness.commands.scale:scale_command",
-        "Fit how messages, bytes and time grow with agents and blocks, in the simulation; by default about 4 minutes.",
+        "Fit how messages, bytes and time grow with agents and blocks.",
     ),
-    "clean": (
-        "harness.commands.doctor:clean_command",
-        "Remove the containers of runs on Docker that are over; those of a run that goes on, and all others, stay.",
+    "prove": Command(
+        "prove",
+        "harness.commands.prove:prove_command",
+        "Explore all states that a small swarm can reach within bounds.",
     ),
-    "doctor": (
+    "conformance": Command(
+        "prove",
+        "harness.commands.conformance:conformance_command",
+        "Test one agent alone with thousands of generated cases.",
+    ),
+    "validate": Command(
+        "prove", "harness.commands.validate:validate_command", "Compare recorded runs with the TLA+ specification."
+    ),
+    "coverage": Command(
+        "prove",
+        "harness.commands.coverage:coverage_command",
+        "Report the share of all local states that runs reached.",
+    ),
+    "doctor": Command(
+        "this machine",
         "harness.commands.doctor:doctor_command",
-        "Say what this machine can do, and what would let it do more; with --measure, whether it does as asked.",
+        "Report what this machine can do, and how to enable the rest.",
     ),
-    "sitl": (
-        "harness.commands.sitl:app",
-        "Install ArduPilot's SITL binaries, and say which there are.",
+    "sitl": Command("this machine", "harness.commands.sitl:app", "Install and list ArduPilot's SITL binaries."),
+    "clean": Command(
+        "this machine", "harness.commands.doctor:clean_command", "Remove the Docker containers of runs that have ended."
     ),
 }
-"""Where each is, and what it does: the first line of its own help."""
+"""All commands in the order of the help. A command's module is imported when the command is called."""
+
+OLD_NAMES = {
+    "again": "`ucp-harness bisect --once`",
+}
+"""Commands that had another name, and what to run instead."""
 
 
 class Commands(TyperGroup):
@@ -153,12 +139,14 @@ class Commands(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in COMMANDS:
             self.add_command(loaded(args[0]), args[0])
+        elif args and args[0] in OLD_NAMES and not ctx.resilient_parsing:
+            raise HarnessError(f"`{args[0]}` is now {OLD_NAMES[args[0]]}: run that")
         return super().resolve_command(ctx, args)
 
 
 def loaded(name: str) -> Any:
     """The command in full, or the group of commands."""
-    module, _, attribute = COMMANDS[name][0].partition(":")
+    module, _, attribute = COMMANDS[name].where.partition(":")
     with gc_paused():
         command = getattr(import_module(module), attribute)
     if isinstance(command, TyperCommand):
@@ -171,8 +159,8 @@ def loaded(name: str) -> Any:
 
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, pretty_exceptions_enable=False)
-for _name, (_, _summary) in COMMANDS.items():
-    app.command(_name, help=_summary)(lambda: None)
+for _name, _command in COMMANDS.items():
+    app.command(_name, help=_command.summary, rich_help_panel=_command.panel)(lambda: None)
 
 
 def _print_version(wanted: bool) -> None:
@@ -184,7 +172,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _harness(
     of_itself: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Say which version this is.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Test harness for the Uniform Chain Protocol."""

@@ -14,9 +14,12 @@ if TYPE_CHECKING:
     from ucp.secure.opening import Opener
     from ucp.secure.sealing import Depot
 
+RARE = "Rare options"
+"""The help shows this panel of options below the others."""
+
 BundleOption = Annotated[
     Path | None,
-    typer.Option("--bundle", help="Opens what a secured mission sealed: any vehicle's, of `ucp-harness keys bundle`."),
+    typer.Option("--bundle", help="Key bundle of any vehicle, to read a secured mission."),
 ]
 
 
@@ -39,9 +42,7 @@ def opener_of(bundle: Path | None) -> "Opener | None":
 
 DepotKey = Annotated[
     Path | None,
-    typer.Option(
-        "--depot-key", help="Opens event data that is sealed to the depot: its key, of `ucp-harness keys new`."
-    ),
+    typer.Option("--depot-key", help="Depot key from `keys new`, to read sealed event data."),
 ]
 
 

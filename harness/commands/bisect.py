@@ -1,58 +1,212 @@
-"""`ucp-harness bisect`: at which commit did it change?"""
+"""`ucp-harness bisect`: find the commit that changes an outcome, or try one state of the code for `git bisect run`."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.text import Text
+from typer.core import TyperCommand
+from typer.exceptions import TyperException
 
-from harness.commands.terminal import print_json
-from harness.field.bisection import Found, Workshop, bisect, subject_of
-from harness.field.bisection.code_state import interrupted_by_sigterm
+from harness.commands._shared_options import RARE
+from harness.commands.terminal import complain, print_json
+from harness.errors import HarnessError, InterruptedRunError, MachineError
+from harness.field.bisection import (
+    CannotBeTriedError,
+    Found,
+    Outcome,
+    Workshop,
+    bisect,
+    differences,
+    subject_of,
+)
+from harness.field.bisection.code_state import ROOT, interrupted_by_sigterm
+from harness.field.bisection.outcome import read
+from ucp.agent_files import write_atomically
 
 NOT_FOUND = 1
+CHANGED, CANNOT_BE_TRIED, STOP = 1, 125, 128
+"""Exit statuses of --once, as `git bisect run` defines them. It stops at 128 and above."""
 FILES_SHOWN = 12
 CHANGES_SHOWN = 8
+ONCE = "With --once"
 
 
+class MistakenError(typer.BadParameter):
+    """A mistake in the arguments of --once."""
+
+    exit_code = STOP
+
+
+class BisectCommand(TyperCommand):
+    """With --once, a mistake in the arguments ends with STOP, because it is no statement about a commit."""
+
+    def make_context(self, info_name: str | None, args: list[str], *rest: Any, **options: Any) -> Any:
+        once = "--once" in args
+        try:
+            return super().make_context(info_name, args, *rest, **options)
+        except (typer.Exit, typer.Abort):
+            raise
+        except TyperException as error:
+            if not once:
+                raise
+            raise MistakenError(str(error), getattr(error, "ctx", None)) from None
+
+
+_app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@_app.command("bisect", cls=BisectCommand)
 def bisect_command(
     subject: Annotated[
-        Path, typer.Argument(metavar="SCENARIO|RUN|RECORD", help="A scenario, a run in virtual time, or field records.")
+        Path, typer.Argument(metavar="SCENARIO|RUN|RECORD", help="Scenario, run in virtual time, or field records.")
     ],
-    good: Annotated[str, typer.Option(metavar="REV", help="A commit at which it was as it should be.")],
-    bad: Annotated[str, typer.Option(metavar="REV", help="A commit at which it no longer is.")] = "HEAD",
-    repository: Annotated[Path, typer.Option(metavar="DIR", help="The git repository of the commits.")] = Path(),
-    seed: Annotated[int | None, typer.Option(min=0, help="Of a scenario; its own first seed if not given.")] = None,
-    agent: Annotated[int | None, typer.Option(metavar="ID", help="Whose record, of several; all if not given.")] = None,
-    agent_command: Annotated[
-        str | None,
-        typer.Option(help="Play as processes, with this agent; {code} is where the commit is checked out."),
+    good: Annotated[str | None, typer.Option(metavar="REV", help="Commit with the expected outcome.")] = None,
+    bad: Annotated[str, typer.Option(metavar="REV", help="Commit with the changed outcome.")] = "HEAD",
+    repository: Annotated[
+        Path, typer.Option(metavar="DIR", help="Git repository; with --once any directory with the code.")
+    ] = Path(),
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of a scenario; its first seed if not given.")] = None,
+    agent: Annotated[
+        int | None, typer.Option(metavar="ID", help="Agent whose record to play; all agents if not given.")
     ] = None,
-    speedup: Annotated[float | None, typer.Option(help="Of processes, instead of the scenario's.")] = None,
-    limit_s: Annotated[float, typer.Option(min=1, help="A commit that takes longer cannot be tried.")] = 600.0,
-    as_json: Annotated[bool, typer.Option("--json", help="What came out, as JSON on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    once: Annotated[
+        bool, typer.Option("--once", rich_help_panel=ONCE, help="Try one state of the code, for `git bisect run`.")
+    ] = False,
+    expect: Annotated[
+        Path | None,
+        typer.Option(metavar="OUTCOME", rich_help_panel=ONCE, help="Outcome to compare with, written by --out."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="OUTCOME", rich_help_panel=ONCE, help="Write the outcome to this file.")
+    ] = None,
+    agent_command: Annotated[
+        list[str] | None,
+        typer.Option(
+            rich_help_panel=RARE,
+            help="Play processes of this agent; {code} stands for the code directory.",
+        ),
+    ] = None,
+    speedup: Annotated[
+        float | None, typer.Option(rich_help_panel=RARE, help="Speedup of processes, instead of the scenario's.")
+    ] = None,
+    limit_s: Annotated[
+        float, typer.Option(min=1, rich_help_panel=RARE, help="Seconds after which a commit is given up and skipped.")
+    ] = 600.0,
 ) -> None:
-    """Play a scenario or record at commit after commit; name the first at which its outcome changes."""
+    """Find the commit that changes how a scenario or record plays.
+
+    Exit status 0: the commit is found. 1: both ends have the same outcome, or only commits that cannot be tried are
+    left.
+
+    With --once, the command tries the code in --repository. Exit status 0: the outcome is as expected (of records: as
+    recorded). 1: it changed. 125: this code cannot be tried. 128: the request is wrong.
+    """
+    asked = _Asked(subject, seed, agent, agent_command or [None], speedup, limit_s)
     console = Console(stderr=as_json, highlight=False)
+    if once:
+        if good is not None:
+            raise MistakenError("--good is for a search, and --once tries one state of the code: leave one of them out")
+        _try_once(console, asked, repository.resolve(), expect, out, as_json)
+    elif good is None:
+        raise typer.BadParameter("name a commit with the expected outcome by --good, or try one state by --once")
+    elif expect is not None or out is not None or len(asked.commands) > 1:
+        raise typer.BadParameter("--expect, --out and several --agent-command are for --once: leave them out")
+    else:
+        _search(console, asked, repository.resolve(), good, bad, as_json)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """The subject to play, and the way to play it."""
+
+    subject: Path
+    seed: int | None
+    agent: int | None
+    commands: Sequence[str | None]
+    speedup: float | None
+    limit_s: float
+
+    def workshops(self, directory: Path) -> list[Workshop]:
+        """Return one workshop for each agent command. Raises HarnessError."""
+        asked = subject_of(self.subject, self.seed, self.agent)
+        workshops = []
+        for number, command in enumerate(self.commands):
+            plays = directory / f"plays-{number}"
+            plays.mkdir()
+            workshops.append(Workshop(asked, plays, limit_s=self.limit_s, command=command, speedup=self.speedup))
+        return workshops
+
+
+def _search(console: Console, asked: _Asked, repository: Path, good: str, bad: str, as_json: bool) -> None:
     with interrupted_by_sigterm(), TemporaryDirectory(prefix="ucp-harness-bisect-") as directory:
-        asked = subject_of(subject, seed, agent)
-        plays = Path(directory) / "plays"
-        plays.mkdir()
-        workshop = Workshop(asked, plays, limit_s=limit_s, command=agent_command, speedup=speedup)
+        (workshop,) = asked.workshops(Path(directory))
 
         def tell(line: str) -> None:
             console.print(Text(line), style="dim", soft_wrap=True)
 
-        tell(f"{asked.in_words}, between {good} and {bad}")
-        found = bisect(workshop, repository.resolve(), good, bad, Path(directory), tell)
+        tell(f"{workshop.subject.in_words}, between {good} and {bad}")
+        found = bisect(workshop, repository, good, bad, Path(directory), tell)
     if as_json:
         print_json(found.to_json())
     else:
         _show(console, found, good, bad)
     if len(found.first) != 1:
         raise typer.Exit(NOT_FOUND)
+
+
+def _try_once(
+    console: Console, asked: _Asked, code: Path, expect: Path | None, out: Path | None, as_json: bool
+) -> None:
+    outcomes: list[Outcome] = []
+    try:
+        with interrupted_by_sigterm(), TemporaryDirectory(prefix="ucp-harness-bisect-") as directory:
+            workshops = asked.workshops(Path(directory))
+            before = read(expect) if expect is not None else None
+            for command, workshop in zip(asked.commands, workshops, strict=True):
+                outcome, _ = workshop.play(code)
+                console.print(Text(f"{command or code}: {outcome.sentence}"), soft_wrap=True)
+                outcomes.append(outcome)
+    except CannotBeTriedError as error:
+        complain(f"{code} cannot be tried: {error}; --repository names another directory, {ROOT} is the installed one")
+        raise typer.Exit(CANNOT_BE_TRIED) from None
+    except InterruptedRunError:
+        raise
+    except HarnessError as error:
+        complain(str(error))
+        raise typer.Exit(STOP) from None
+    if out is not None:
+        _keep(out, outcomes[0])
+    if as_json:
+        print_json([outcome.model_dump(mode="json") for outcome in outcomes])
+    changes = _changes(before, outcomes)
+    for sentence in changes:
+        console.print(Text(sentence), soft_wrap=True)
+    if changes:
+        raise typer.Exit(CHANGED)
+
+
+def _changes(before: Outcome | None, outcomes: Sequence[Outcome]) -> list[str]:
+    """Return the differences from the expected outcome, from the record, or from the first outcome."""
+    first, *others = outcomes
+    if before is not None:
+        return [sentence for outcome in outcomes for sentence in differences(before, outcome)]
+    if first.of_records:
+        others = list(outcomes)
+        first = first.as_recorded()
+    return [sentence for outcome in others for sentence in differences(first, outcome)]
+
+
+def _keep(path: Path, outcome: Outcome) -> None:
+    try:
+        write_atomically(path, outcome.model_dump_json(indent=1) + "\n")
+    except OSError as error:
+        raise MachineError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def _show(console: Console, found: Found, good: str, bad: str) -> None:
@@ -79,3 +233,6 @@ def _show(console: Console, found: Found, good: str, bad: str) -> None:
         lines.append(f"the runs part first at {run.at_s:.3f} s, with agent {found.parting.first}: {where}")
     for line in lines:
         console.print(Text(line), soft_wrap=True)
+
+
+app = typer.main.get_command(_app)

@@ -17,17 +17,19 @@ from harness.report.logbook.positions import Track, flown, tracks
 
 
 def chain_command(
-    paths: Annotated[list[Path], typer.Argument(help="A run directory, or chain exports from anywhere.")],
-    agent: Annotated[int | None, typer.Option(help="Only what this agent's export holds.")] = None,
-    decode: Annotated[bool, typer.Option("--decode", help="Each event in words.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="The chains as JSON on standard output.")] = False,
+    paths: Annotated[list[Path], typer.Argument(help="Run directory, or chain exports.")],
+    agent: Annotated[int | None, typer.Option(help="Only the chain in this agent's export.")] = None,
+    decode: Annotated[bool, typer.Option("--decode", help="Print each event in words.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the chains as JSON.")] = False,
     geojson_file: Annotated[
-        Path | None, typer.Option("--geojson", help="Instead, write the vehicles' positions there; must be new.")
+        Path | None, typer.Option("--geojson", help="Write positions as GeoJSON instead; must be new.")
     ] = None,
-    kml_file: Annotated[Path | None, typer.Option("--kml", help="The same for Google Earth; must be new.")] = None,
+    kml_file: Annotated[
+        Path | None, typer.Option("--kml", help="Write positions for Google Earth instead; must be new.")
+    ] = None,
     depot_key: DepotKey = None,
 ) -> None:
-    """Print each agent's chain, block by block; or put what the vehicles logged on a map."""
+    """Print each agent's chain, or write its positions as a map."""
     archive = RunArchive(*paths)
     whole = logbook.read(archive, depot_of(depot_key))
     shown = whole if agent is None else whole.only(agent)

@@ -29,30 +29,35 @@ class ConformanceRequestError(HarnessError):
 def conformance_command(
     command: Annotated[
         list[str] | None,
-        typer.Argument(metavar="-- COMMAND...", help="The agent, as ucp/contract/CONTRACT.md starts it."),
+        typer.Argument(metavar="-- COMMAND...", help="Command that starts the agent; see ucp/contract/CONTRACT.md."),
     ] = None,
     only: Annotated[
-        str | None, typer.Option(metavar="ALG", help="One Algorithm: 13, or receive_request_next_in_sequence.")
+        str | None, typer.Option(metavar="ALG", help="Test one Algorithm, by number (13) or by handler name.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The results, as JSON on standard output.")] = False,
-    junit: Annotated[Path | None, typer.Option(metavar="FILE", help="The results as JUnit XML; must be new.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
+    junit: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the results as JUnit XML; must be new.")
+    ] = None,
     keep: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where failures are put, with vector and capture; must be new."),
+        typer.Option(metavar="DIR", help="Directory for vectors and captures of failures; must be new."),
     ] = None,
-    virtual: Annotated[bool, typer.Option("--virtual", help="In virtual time: COMMAND --virtual, in seconds.")] = False,
+    virtual: Annotated[bool, typer.Option("--virtual", help="Test in virtual time, with COMMAND --virtual.")] = False,
     matrix: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Test all agents of a YAML file: name: [program, argument, ...]."),
+        typer.Option(metavar="FILE", help="Test all agents of a YAML file of names and commands."),
     ] = None,
-    page: Annotated[
-        Path, typer.Option(metavar="FILE", help="The page of --matrix, agents x Algorithms; must be new.")
-    ] = Path("conformance.html"),
+    page: Annotated[Path, typer.Option(metavar="FILE", help="Page for the results of --matrix; must be new.")] = Path(
+        "conformance.html"
+    ),
     write: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Only write the generated vectors, as JSON lines; must be new.")
+        Path | None, typer.Option(metavar="FILE", help="Write the generated vectors, and test nothing; must be new.")
     ] = None,
 ) -> None:
-    """Test one agent alone, its peers played by the harness: thousands of generated cases, over UDP."""
+    """Test one agent alone with thousands of generated cases.
+
+    The harness plays the agent's peers over UDP.
+    """
     refuse_existing(path for path in (junit, keep, write) if path is not None)
     if only is not None and only not in HANDLERS and only not in map(str, TITLES):
         raise ConformanceRequestError(f"--only {only[:60]}: there are Algorithms 1 to 20, by number or by handler")

@@ -29,26 +29,30 @@ RECORD = ".jsonl"
 
 
 def consolidate_command(
-    paths: Annotated[list[Path], typer.Argument(help="Chain exports, and directories of them; whatever came home.")],
+    paths: Annotated[list[Path], typer.Argument(help="Chain exports, and directories of them.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The record, ucp-consolidated/1, as NAME.jsonl; must be new.")
+        Path | None, typer.Option("--out", "-o", help="File for the record, NAME.jsonl; must be new.")
     ] = None,
     html_file: Annotated[
-        Path | None, typer.Option("--html", help="A page with a map, and all along time; must be new.")
+        Path | None, typer.Option("--html", help="Page with a map and a timeline; must be new.")
     ] = None,
     kml_file: Annotated[Path | None, typer.Option("--kml", help="Tracks for Google Earth; must be new.")] = None,
-    geojson_file: Annotated[Path | None, typer.Option("--geojson", help="Tracks for maps; must be new.")] = None,
-    csv_file: Annotated[Path | None, typer.Option("--csv", help="A row for each event; must be new.")] = None,
+    geojson_file: Annotated[Path | None, typer.Option("--geojson", help="Tracks as GeoJSON; must be new.")] = None,
+    csv_file: Annotated[
+        Path | None, typer.Option("--csv", help="Table with a row for each event; must be new.")
+    ] = None,
     final_reconcile: Annotated[
         bool,
         typer.Option(
             "--reconcile",
-            help="Also let the exports reconcile with each other, into NAME.reconciled/.",
+            help="Also reconcile the exports, and write NAME.reconciled/.",
         ),
     ] = False,
     depot_key: DepotKey = None,
 ) -> None:
-    """Merge what vehicles brought home into one record: every event once, who holds what, what was lost with whom.
+    """Merge the chains of all vehicles into one record.
+
+    The record has each event once, the vehicles that hold it, and the events that were lost with a vehicle.
 
     Exit status 0: all was usable. 1: a file was left out, or an export was edited or damaged, or chains that were to be
     reconciled did not become one. 2: nothing was usable.

@@ -22,18 +22,16 @@ OF_BLOCKS = {*EVENT_FILLS_BLOCK, "max_event_bytes"}
 
 
 def coverage_command(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run directories, or directories of what agents left.")
-    ],
-    agents: Annotated[int, typer.Option(help="Share of what exists with so many agents,")] = 3,
-    blocks: Annotated[int, typer.Option(help="who complete so many blocks in all,")] = 3,
-    network: Annotated[str, typer.Option(help="on this network: lossless, lossy or any,")] = "lossy",
-    faults: Annotated[str, typer.Option(help="with these: reboot, death, duplicate, with commas between.")] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run directories, or directories of traces.")],
+    agents: Annotated[int, typer.Option(help="Number of agents in the state space to compare with.")] = 3,
+    blocks: Annotated[int, typer.Option(help="Number of blocks that these agents complete in all.")] = 3,
+    network: Annotated[str, typer.Option(help="Network of these agents: lossless, lossy or any.")] = "lossy",
+    faults: Annotated[str, typer.Option(help="Faults: reboot, death and duplicate, separated by commas.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Say which share of all local states, inputs and branches runs have tried, of any agents that leave traces.
+    """Report the share of all local states that runs reached.
 
-    What exists is looked up by `prove` within the bounds that are given.
+    The state space of `prove` within the given bounds counts as all.
     """
     reached = Reached()
     settings: dict[str, Any] | None = None

@@ -21,11 +21,14 @@ OURS = "all agents ran the harness's own"
 
 
 def diff_command(
-    run_a: Annotated[Path, typer.Argument(help="A run directory.")],
-    run_b: Annotated[Path, typer.Argument(help="Another, of the same agents.")],
-    as_json: Annotated[bool, typer.Option("--json", help="The differences as JSON on standard output.")] = False,
+    run_a: Annotated[Path, typer.Argument(help="First run directory.")],
+    run_b: Annotated[Path, typer.Argument(help="Second run directory, with the same agents.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
 ) -> None:
-    """Say where two runs part: exit status 0 if they do not, 1 if they do."""
+    """Find where two runs first differ.
+
+    Exit status 0: the runs do not differ. 1: they differ.
+    """
     difference = compare(run_a, run_b)
     if as_json:
         print_json({"a": str(run_a), "b": str(run_b), **difference.to_json()})

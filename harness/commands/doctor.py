@@ -15,13 +15,15 @@ from harness.play.machine.uml_kernel import Kernel, run_inside
 
 
 def doctor_command(
-    as_json: Annotated[bool, typer.Option("--json", help="The findings as JSON on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     measure: Annotated[
-        bool, typer.Option("--measure", help="Also what the network really does to packets; up to a minute.")
+        bool, typer.Option("--measure", help="Also measure what the network does to packets; up to a minute.")
     ] = False,
-    kernel: Annotated[Kernel, typer.Option(help="Of which kernel: this machine's, or User Mode Linux.")] = Kernel.host,
+    kernel: Annotated[
+        Kernel, typer.Option(help="Kernel to examine: this machine's, or User Mode Linux.")
+    ] = Kernel.host,
 ) -> None:
-    """Say what this machine can do, and what would let it do more; with --measure, whether it does as asked."""
+    """Report what this machine can do, and how to enable the rest."""
     if kernel is Kernel.uml:
         asked = {"--json": as_json, "--measure": measure}
         raise typer.Exit(run_inside(["doctor", *(option for option, wanted in asked.items() if wanted)]))
@@ -55,7 +57,10 @@ def doctor_command(
 
 
 def clean_command() -> None:
-    """Remove the containers of runs on Docker that are over; those of a run that goes on, and all others, stay."""
+    """Remove the Docker containers of runs that have ended.
+
+    Containers of active runs and of other programs stay.
+    """
     from harness.play.containers.docker_engine import Engine
     from harness.play.containers.ownership import clean
 

@@ -14,6 +14,7 @@ from harness.run.parallel import cores
 from harness.scenario import Scenario
 from harness.sweep import explore
 
+HUNT = "Hunt for new states"
 _DURATION = re.compile(r"(\d{1,9}(?:\.\d{1,6})?)(s|m|h|)")
 _UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
 LONGEST_S = 31 * 86400.0
@@ -24,42 +25,48 @@ def explore_command(
         Path,
         typer.Argument(
             metavar="SCENARIO|RUN",
-            help="A scenario's file (YAML), or the name of one that comes along; or a run, from its seed on.",
+            help="Scenario (name or YAML file), or run directory to start from.",
         ),
     ],
     seeds: Annotated[
-        int | None, typer.Option(min=1, help=f"How many seeds to play at most; {explore.SEEDS} if not given.")
+        int | None, typer.Option(min=1, help=f"Maximum number of seeds; {explore.SEEDS} if not given.")
     ] = None,
-    first_seed: Annotated[
-        int | None, typer.Option(min=0, help="The first of them; 0, or that of RUN, if not given.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="File of the smallest run; must be new.")] = None,
-    secured: Annotated[bool, typer.Option("--secured", help="With fresh keys, if the scenario has none.")] = False,
+    first_seed: Annotated[int | None, typer.Option(min=0, help="First seed; that of RUN or 0 if not given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File for the smallest run with a violation; must be new.")] = None,
+    secured: Annotated[
+        bool, typer.Option("--secured", help="Secure the mission with fresh keys if it has none.")
+    ] = False,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
+        int | None, typer.Option(min=1, help="Number of parallel runs; one for each core if not given.")
     ] = None,
     for_time: Annotated[
         str | None,
         typer.Option(
             "--for",
             metavar="TIME",
-            help="New: hunt for so long (90s, 30m, 8h): keep runs that reach something new, and change them.",
+            rich_help_panel=HUNT,
+            help="Hunt for this time, such as 90s, 30m or 8h.",
         ),
     ] = None,
     runs: Annotated[
-        int | None, typer.Option(min=1, help="New: hunt for so many runs; the same ones for the same --first-seed.")
+        int | None,
+        typer.Option(min=1, rich_help_panel=HUNT, help="Hunt for this number of runs, determined by --first-seed."),
     ] = None,
     corpus: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="New: where a hunt keeps runs and findings, and goes on the next time."),
+        typer.Option(
+            metavar="DIR", rich_help_panel=HUNT, help="Directory of runs and findings, which later hunts continue."
+        ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="New: what a hunt came to as JSON.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", rich_help_panel=HUNT, help="Print the result of the hunt as JSON.")
+    ] = False,
 ) -> None:
-    """Play seed after seed in virtual time until a characteristic is violated; then find the smallest such run.
+    """Play seeds until one violates a characteristic, and shrink it.
 
-    With --for or --runs it hunts instead: it changes events, fates, timings, partitions, deaths, settings, and keeps
-    what reaches new local states. Each run ends in a liveness phase. Findings are new, ongoing, rare or resolved
-    since the last time with the same --corpus.
+    With --for or --runs the command hunts instead. It changes events, fates, timings, partitions, deaths and settings,
+    and keeps runs that reach new local states. Each run ends in a liveness phase. Findings are new, ongoing, rare or
+    resolved compared with the previous hunt in the same --corpus.
     """
     if for_time is not None or runs is not None:
         if seeds is not None or out is not None:

@@ -16,19 +16,22 @@ Write = Callable[[Recording, Path, Callable[[float], None]], int]
 
 
 def export_command(
-    run: Annotated[Path, typer.Argument(help="A run directory, or one that `import` made.")],
+    run: Annotated[Path, typer.Argument(help="Run directory, or a directory made by `import`.")],
     mcap: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="For Foxglove, Lichtblick and PlotJuggler; must be new.")
+        Path | None, typer.Option(metavar="FILE", help="File for Foxglove, Lichtblick and PlotJuggler; must be new.")
     ] = None,
-    perfetto: Annotated[Path | None, typer.Option(metavar="FILE", help="For ui.perfetto.dev; must be new.")] = None,
+    perfetto: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="File for ui.perfetto.dev; must be new.")
+    ] = None,
     rosbag: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="A bag for ROS 2, which `import` reads again; must be new.")
+        Path | None, typer.Option(metavar="DIR", help="Bag for ROS 2, which `import` can read; must be new.")
     ] = None,
     depot_key: DepotKey = None,
 ) -> None:
-    """Write tracks, links, chains, handler runs, MAVLink and logs of a run for other tools.
+    """Write a run for Foxglove, PlotJuggler, Perfetto or ROS 2.
 
-    What could not be read is said here, and in the files.
+    The files hold tracks, links, chains, handler runs, MAVLink and logs. Unreadable records are reported in the files
+    and on standard error.
     """
     formats = ((mcap, "messages", _mcap), (perfetto, "events", _perfetto), (rosbag, "messages", _rosbag))
     asked = [(path, counted, writer) for path, counted, writer in formats if path is not None]

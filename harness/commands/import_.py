@@ -27,18 +27,19 @@ ADAPTERS: dict[Format, type[Adapter]] = {Format.CSV: CommaSeparated, Format.ROSB
 
 
 def import_command(
-    sources: Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files and directories, of any kind mixed.")],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="An empty directory, or a new one.")],
+    sources: Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files and directories of any kind.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Output directory; must be new or empty.")],
     adapter: Annotated[
-        str | None, typer.Option(metavar="MODULE:CLASS", help="What reads a format of your own: see docs/adapters.md.")
+        str | None, typer.Option(metavar="MODULE:CLASS", help="Adapter for a format of your own; see docs/adapters.md.")
     ] = None,
     format_: Annotated[
-        Format | None, typer.Option("--format", help="What all sources are; else each is recognised by its content.")
+        Format | None, typer.Option("--format", help="Format of all sources; detected from each if not given.")
     ] = None,
 ) -> None:
-    """Bring records of any kind into one directory that `check`, `replay`, `reconstruct` and `packets` read.
+    """Convert records of any kind into one directory.
 
-    Everything usable is used; what is left out is named here and in import.json.
+    `check`, `replay`, `reconstruct` and `packets` read this directory. Everything usable is converted. The command and
+    import.json name the sources that are left out.
     """
     if adapter is not None and format_ is not None:
         raise FieldError("--adapter and --format are two ways to say the same: give one of them")

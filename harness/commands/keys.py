@@ -19,27 +19,26 @@ except ModuleNotFoundError:
 
 SEVERAL_MISSIONS = 1
 
-app = typer.Typer(
-    no_args_is_help=True, help="Make the keys of a secure mission, hand out what each vehicle gets, and take it back."
-)
+app = typer.Typer(no_args_is_help=True, help="Make, distribute, inspect and revoke keys of a secure mission.")
 
-HomeArgument = Annotated[Path, typer.Argument(metavar="HOME", help="The directory of the mission's keys.")]
+HomeArgument = Annotated[Path, typer.Argument(metavar="HOME", help="Directory of the mission's keys.")]
 
 
 @app.command("new")
 def new_command(
     home: HomeArgument,
-    agents: Annotated[str, typer.Option(help="The roster: a number of agents, or their IDs, as 10,28,32.")],
+    agents: Annotated[str, typer.Option(help="Number of agents, or their IDs, such as 10,28,32.")],
     sealed: Annotated[
-        bool, typer.Option("--sealed/--open", help="Whether event data is sealed to a depot key, made here, too.")
+        bool, typer.Option("--sealed/--open", help="Seal event data to a new depot key, or leave it open.")
     ] = True,
     epoch_s: Annotated[
         float, typer.Option(min=1, max=MAX_EPOCH_S, help="Mission seconds after which vehicles forget a group secret.")
     ] = DEFAULT_EPOCH_S,
 ) -> None:
-    """Make the keys of a mission: the authority's, the depot's, and each vehicle's, in a new directory.
+    """Make the keys of a mission in a new directory.
 
-    Nobody else can enter it. Of all that is in it, public.json alone is not secret.
+    The keys are those of the authority, the depot and each vehicle. Other users cannot read the directory. All files
+    in it are secret except public.json.
     """
     agent_ids = parse({"name": "keys", "agents": roster_of(agents)}).roster
     made = Home.new(home, agent_ids, seals=sealed, epoch_s=epoch_s)
@@ -50,26 +49,24 @@ def new_command(
 def bundle_command(
     home: HomeArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Directory for the bundles, one file for each vehicle.")],
-    agents: Annotated[
-        list[int] | None, typer.Option("--agent", help="Of this vehicle alone; may be repeated. Without it, of all.")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace bundles that are there.")] = False,
+    agents: Annotated[list[int] | None, typer.Option("--agent", help="Only this vehicle; may be repeated.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing bundles.")] = False,
 ) -> None:
-    """Write what each vehicle is given: its own key, the group secret, and all public keys.
+    """Write the key bundle of each vehicle.
 
-    A vehicle that is revoked is given nothing.
+    A bundle holds the vehicle's own key, the group secret, and all public keys. A revoked vehicle gets no bundle.
     """
     print_lines(map(str, Home(home).write_bundles(out, agents, overwrite=overwrite)))
 
 
 @app.command("inspect")
 def inspect_command(
-    paths: Annotated[list[Path], typer.Argument(help="Files of keys, or directories of them.")],
-    as_json: Annotated[bool, typer.Option("--json", help="All that is not secret as JSON on standard output.")] = False,
+    paths: Annotated[list[Path], typer.Argument(help="Key files, or directories of them.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON.")] = False,
 ) -> None:
-    """Say what files of keys are, and of which mission, without a secret.
+    """Print kind and mission of key files, without secrets.
 
-    Exit status 0: all are sound, and of one mission. 1: they are of several. 2: one cannot be used.
+    Exit status 0: all files are valid and belong to one mission. 1: they belong to several. 2: one is not usable.
     """
     told = [facts for path in paths for facts in inspect(path)]
     if as_json:
@@ -85,15 +82,16 @@ def inspect_command(
 @app.command("revoke")
 def revoke_command(
     home: HomeArgument,
-    agents: Annotated[list[int], typer.Argument(help="IDs of the vehicles whose keys are taken back.")],
+    agents: Annotated[list[int], typer.Argument(help="IDs of the vehicles to revoke.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Write the message there, too, for whoever sends it; must be new."),
+        typer.Option("--out", "-o", help="Also write the revocation message to this file; must be new."),
     ] = None,
 ) -> None:
-    """Take keys back: write the authority's message, which says all vehicles that are revoked so far.
+    """Revoke the keys of vehicles.
 
-    It is no secret. Whichever vehicle is given it tells all others that it hears.
+    The command writes the authority's message, which names all vehicles revoked so far. The message is not secret. A
+    vehicle that receives it passes it on to the vehicles in its range.
     """
     if out is not None:
         refuse_existing([out])

@@ -18,32 +18,35 @@ from harness.sweep.matrix.nights import load_baseline
 
 def matrix_command(
     file: Annotated[Path, typer.Argument(metavar="MATRIX", help="Matrix file (YAML).")],
-    backend: Annotated[
-        BackendName | None, typer.Option(help="What plays the runs, instead of the file's word.")
-    ] = None,
+    backend: Annotated[BackendName | None, typer.Option(help="Backend of all runs, instead of the file's.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Directory of the results: new or empty, or of this matrix, which then goes on.")
+        Path | None, typer.Option(help="Directory of results: new, empty, or that of a matrix to continue.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="matrix.json on standard output, no table.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print matrix.json instead of the table.")] = False,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
+        int | None, typer.Option(min=1, help="Number of parallel runs; one for each core if not given.")
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="TCP://HOST:PORT", help="Dask scheduler, whose workers play the runs.")
+        str | None, typer.Option(metavar="TCP://HOST:PORT", help="Dask scheduler whose workers play the runs.")
     ] = None,
     against: Annotated[
-        Path | None, typer.Option(metavar="BASELINE", help="An earlier matrix.json: exit 1 if a figure is worse.")
+        Path | None, typer.Option(metavar="BASELINE", help="Earlier matrix.json; exit status 1 if a figure is worse.")
     ] = None,
     coverage: Annotated[
-        bool, typer.Option("--coverage", help="Also say how much of the protocol the runs have tried; takes longer.")
+        bool, typer.Option("--coverage", help="Also report how much of the protocol the runs reached; slower.")
     ] = False,
-    secured: Annotated[bool, typer.Option("--secured", help="With fresh keys, if the scenario has none.")] = False,
+    secured: Annotated[
+        bool, typer.Option("--secured", help="Secure the mission with fresh keys if it has none.")
+    ] = False,
     nights: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Keep this night there, and draw the trend of those that are there."),
+        typer.Option(metavar="DIR", help="Keep this night in DIR, and draw the trend of all nights in it."),
     ] = None,
 ) -> None:
-    """Play a scenario over loss rates and many seeds: figures with 95 % intervals, and what was violated."""
+    """Play a scenario over many loss rates and seeds.
+
+    The report has figures with 95 % intervals, and each violation.
+    """
     request = matrix.load_matrix(file, backend)
     if secured:
         request = request.model_copy(update={"scenario": request.scenario.secured()})

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from harness.commands._shared_options import roster_of
+from harness.commands._shared_options import RARE, roster_of
 from harness.commands.terminal import complain, print_json, print_lines
 from harness.errors import WRONG_REQUEST, MachineError
 from harness.field.depot.mission_comparison import compare
@@ -25,45 +25,55 @@ if TYPE_CHECKING:
 
 DIFFERENT = 1
 
-app = typer.Typer(no_args_is_help=True, help="Make the mission files of a swarm, and compare those on its vehicles.")
+app = typer.Typer(no_args_is_help=True, help="Make the mission files of a swarm, and compare them.")
 
 
 @app.command("new")
 def new_command(
     out: Annotated[Path, typer.Option("--out", "-o", help="Directory for the files, one for each vehicle.")],
-    agents: Annotated[
-        str | None, typer.Option(help="The roster: a number of agents, or their IDs, as 10,28,32.")
-    ] = None,
+    agents: Annotated[str | None, typer.Option(help="Number of agents, or their IDs, such as 10,28,32.")] = None,
     scenario: Annotated[
-        Path | None, typer.Option(help="A scenario whose name, roster, settings and events are taken.")
+        Path | None, typer.Option(help="Scenario with the name, roster, settings and events to use.")
     ] = None,
-    name: Annotated[str | None, typer.Option(help="What the mission is called.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the mission.")] = None,
     initial_data: Annotated[
         str | None,
-        typer.Option(help="BD_0, as text or @FILE; without it the mission's name and the time at which it was made."),
+        typer.Option(rich_help_panel=RARE, help="Content of BD_0, as text or @FILE; name and time if not given."),
     ] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--setting", help="KEY=VALUE of ucp/settings.py, as vote_timeout_s=8.")
+        list[str] | None,
+        typer.Option(
+            "--setting", rich_help_panel=RARE, help="Protocol setting, such as vote_timeout_s=8; may be repeated."
+        ),
     ] = None,
     events: Annotated[
         list[str] | None,
-        typer.Option("--event", help="KEY=VALUE of the events, as source=random or log=mode,position."),
+        typer.Option("--event", rich_help_panel=RARE, help="Event option, such as log=mode,position; may be repeated."),
     ] = None,
     subnet: Annotated[
-        str | None, typer.Option(help="Vehicle 7 is its 7th address; without it 10.77.x.y, of 10.76.0.0/14.")
+        str | None,
+        typer.Option(rich_help_panel=RARE, help="Subnet, such as 10.1.0.0/16, where vehicle 7 has address 7."),
     ] = None,
     addresses: Annotated[
-        list[str] | None, typer.Option("--address", help="ID=ADDRESS of a vehicle that has another.")
+        list[str] | None,
+        typer.Option(
+            "--address", rich_help_panel=RARE, help="Other address of a vehicle, such as 7=10.1.0.9; may be repeated."
+        ),
     ] = None,
-    broadcast: Annotated[str | None, typer.Option(help="Without it that of the subnet.")] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="UDP port.")] = PORT,
+    broadcast: Annotated[
+        str | None, typer.Option(rich_help_panel=RARE, help="Broadcast address; that of the subnet if not given.")
+    ] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, rich_help_panel=RARE, help="UDP port of all agents.")] = PORT,
     keys: Annotated[
         Path | None,
-        typer.Option(metavar="HOME", help="Keys, of `keys new`: the mission is secured, with each vehicle's bundle."),
+        typer.Option(metavar="HOME", help="Directory from `keys new`; makes the mission secured."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of these names.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
-    """Write a mission file for each vehicle, all with one inception block, and a manifest of what they share."""
+    """Write a mission file for each vehicle, and a manifest.
+
+    All files have the same inception block. The manifest holds the parts that all files share.
+    """
     asked = _scenario(scenario, agents, name)
     home, data = None if keys is None else _home(keys), _initial_data(initial_data, asked)
     if home is not None:
@@ -92,11 +102,14 @@ def new_command(
 @app.command("verify")
 def verify_command(
     paths: Annotated[
-        list[Path], typer.Argument(help="Mission files, chain exports, traces, a manifest, or directories of them.")
+        list[Path], typer.Argument(help="Mission files, exports, traces, manifests, or directories of them.")
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="The differences as JSON on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
 ) -> None:
-    """Say whether all carry the same mission: exit status 0 if they do, 1 if they differ, 2 if nothing is usable."""
+    """Check that all files belong to the same mission.
+
+    Exit status 0: they do. 1: they differ. 2: no file is usable.
+    """
     comparison = compare(paths)
     if as_json:
         print_json(comparison.to_json())

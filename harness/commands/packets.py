@@ -22,27 +22,31 @@ from harness.errors import WRONG_REQUEST
 
 
 def packets_command(
-    paths: Annotated[list[Path], typer.Argument(metavar="CAPTURE", help="A run directory, or captures of any kind.")],
+    paths: Annotated[list[Path], typer.Argument(metavar="CAPTURE", help="Run directory, or captures of any kind.")],
     follow: Annotated[
-        str | None, typer.Option(metavar="BLOCK", help="The life of one block: 3.12, or the beginning of its hash.")
+        str | None, typer.Option(metavar="BLOCK", help="Follow one block: 3.12, or the start of its hash.")
     ] = None,
-    lost: Annotated[
-        bool, typer.Option("--lost", help="Only what did not reach everybody, and how much of all.")
-    ] = False,
-    sender: Annotated[int | None, typer.Option("--from", metavar="ID", help="Only what this vehicle sent.")] = None,
+    lost: Annotated[bool, typer.Option("--lost", help="Only datagrams that a vehicle lost, with loss rates.")] = False,
+    sender: Annotated[
+        int | None, typer.Option("--from", metavar="ID", help="Only datagrams that this vehicle sent.")
+    ] = None,
     receiver: Annotated[
-        int | None, typer.Option("--to", metavar="ID", help="Only what reached this vehicle, or should have.")
+        int | None, typer.Option("--to", metavar="ID", help="Only datagrams that this vehicle received or lost.")
     ] = None,
     message: Annotated[
         str | None, typer.Option(metavar="NAME", help="Only messages of this name, such as Commit Block.")
     ] = None,
     between: Annotated[
-        tuple[float, float] | None, typer.Option(metavar="S1 S2", help="Only what was sent in these mission seconds.")
+        tuple[float, float] | None,
+        typer.Option(metavar="S1 S2", help="Only datagrams sent between these mission seconds."),
     ] = None,
     bundle: BundleOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The same as JSON on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the datagrams as JSON.")] = False,
 ) -> None:
-    """Print each datagram, who received it and who lost it, and what was answered to it, from a run's captures."""
+    """Print each captured datagram, its receivers and its answers.
+
+    Vehicles that lost the datagram are named, too.
+    """
     selection = Selection(sender, receiver, message, between)
     captures = read_captures(capture_files(paths), opener_of(bundle))
     if captures.used:

@@ -9,6 +9,7 @@ import yaml
 from rich.console import Console
 
 from harness import proof as prove
+from harness.commands._shared_options import RARE
 from harness.commands.terminal import Watcher, complain, print_json
 from harness.errors import INTERRUPTED
 from harness.proof import Bounds, BoundsError, Limits, Progress, specification
@@ -17,75 +18,94 @@ from harness.run.parallel import cores, terminated_is_interrupted
 GIGABYTE = 1e9
 TIMERS = ("duration", "any")
 CLOCKS = ("agreed", "any")
+LIMITS, WRONG = "Limits", "Wrong or captured agents"
 
 
 def prove_command(
-    agents: Annotated[int, typer.Option(help="How many agents there are.")] = 2,
-    blocks: Annotated[int, typer.Option(help="How many blocks they complete in all, anybody at any moment.")] = 3,
-    network: Annotated[
-        str, typer.Option(help="lossless; lossy: anybody may lose any message; any: late, twice, in any order.")
-    ] = "lossy",
-    faults: Annotated[
-        str, typer.Option(help="Of reboot, death (each once, at any moment) and duplicate, with commas between.")
-    ] = "",
+    agents: Annotated[int, typer.Option(help="Number of agents.")] = 2,
+    blocks: Annotated[int, typer.Option(help="Number of blocks that the agents complete in all.")] = 3,
+    network: Annotated[str, typer.Option(help="lossless, lossy, or any (late, repeated, in any order).")] = "lossy",
+    faults: Annotated[str, typer.Option(help="Faults: reboot, death and duplicate, separated by commas.")] = "",
     timers: Annotated[
         str,
-        typer.Option(help="When timers end: by duration; any: in whatever order."),
+        typer.Option(rich_help_panel=RARE, help="Order in which timers expire: by duration, or any."),
     ] = "duration",
     coincidences: Annotated[
         int | None,
-        typer.Option(help="How many moments, at most, are the same by chance; without it any number."),
+        typer.Option(rich_help_panel=RARE, help="Maximum number of chance coincidences; no limit if not given."),
     ] = None,
     clocks: Annotated[
         str,
-        typer.Option(help="Which of two blocks is the older: agreed, the one completed first; any: either, each time."),
+        typer.Option(rich_help_panel=RARE, help="Which of two blocks is older: agreed by all agents, or any."),
     ] = "agreed",
     losses: Annotated[
         int | None,
-        typer.Option(help="How often, at most, an agent loses a message; without it any number."),
+        typer.Option(rich_help_panel=RARE, help="Maximum number of lost messages; no limit if not given."),
     ] = None,
     no_crossing: Annotated[
-        bool, typer.Option("--no-crossing", help="All that comes of one act is heard before anybody else acts.")
+        bool,
+        typer.Option(
+            "--no-crossing",
+            rich_help_panel=RARE,
+            help="Deliver all messages of one action before the next action.",
+        ),
     ] = False,
     settings: Annotated[
-        list[str] | None, typer.Option(metavar="KEY=VALUE", help="A setting of all agents; may be repeated.")
+        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Protocol setting of all agents; may be repeated.")
     ] = None,
     stagger: Annotated[
         list[str] | None,
-        typer.Option(metavar="TIMER=SECONDS", help="How much longer each next agent's timer runs; may be repeated."),
+        typer.Option(
+            metavar="TIMER=SECONDS",
+            rich_help_panel=RARE,
+            help="Extra timer seconds of each next agent; may be repeated.",
+        ),
     ] = None,
     quirk: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="A mistake that all agents make; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE", rich_help_panel=WRONG, help="Deliberate mistake of all agents; may be repeated."
+        ),
     ] = None,
     captured: Annotated[
         int | None,
-        typer.Option(metavar="ID", help="Somebody has this agent's keys, and says anything with them."),
+        typer.Option(metavar="ID", rich_help_panel=WRONG, help="Agent whose keys an attacker holds."),
     ] = None,
     lies: Annotated[
-        int | None, typer.Option(help="How many messages that are, each heard by any; any number with --network any.")
+        int | None,
+        typer.Option(rich_help_panel=WRONG, help="Number of messages that the attacker sends; 1 if not given."),
     ] = None,
-    whole: Annotated[
-        bool, typer.Option("--whole", help="Take no two states for one, though they behave alike.")
-    ] = False,
+    whole: Annotated[bool, typer.Option("--whole", rich_help_panel=RARE, help="Disable state reduction.")] = False,
     steps: Annotated[
-        bool, typer.Option("--steps", help="Hold each step of wrong agents (--quirk) against that of a right one, too.")
+        bool,
+        typer.Option(
+            "--steps", rich_help_panel=WRONG, help="Also compare each step of --quirk agents with a right agent."
+        ),
     ] = False,
     second_opinion: Annotated[
         bool,
-        typer.Option("--second-opinion", help="Look at the specification in TLA+, too: are its states the same?"),
+        typer.Option(
+            "--second-opinion", rich_help_panel=RARE, help="Compare the states with those of the TLA+ specification."
+        ),
     ] = False,
     cores_: Annotated[
-        int | None, typer.Option("--cores", help="How many processes look at states; as many as there are cores.")
+        int | None,
+        typer.Option("--cores", rich_help_panel=LIMITS, help="Number of processes; one for each core if not given."),
     ] = None,
-    memory: Annotated[float, typer.Option(help="Gigabytes of all processes at which to give up.")] = 4.0,
-    for_s: Annotated[float | None, typer.Option("--for", help="Seconds after which to give up.")] = None,
-    out: Annotated[Path | None, typer.Option(help="File of the scenario that shows what was found; new.")] = None,
+    memory: Annotated[
+        float, typer.Option(rich_help_panel=LIMITS, help="Maximum memory of all processes, in gigabytes.")
+    ] = 4.0,
+    for_s: Annotated[
+        float | None,
+        typer.Option("--for", rich_help_panel=LIMITS, help="Maximum run time in seconds; no limit if not given."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="File for the scenario that shows a violation; must be new.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Look at every state that the agents can come to within bounds: is any wrong, or without a way out?
+    """Explore all states that a small swarm can reach within bounds.
 
-    Exit status 0: everything holds. 1: something does not, and a scenario shows it. 4: a bound was reached before
-    everything had been looked at. 130: interrupted.
+    Exit status 0: all properties hold. 1: a property is violated, and a scenario shows it. 4: a limit of time or memory
+    was reached before all states were explored. 130: interrupted.
     """
     if timers not in TIMERS:
         raise BoundsError(f"--timers must be one of {', '.join(TIMERS)}, not {timers!r}")

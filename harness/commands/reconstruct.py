@@ -15,14 +15,18 @@ from harness.field.reconstruct import reconstruct, write
 
 def reconstruct_command(
     paths: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="What came home: directories and files; run directories too.")
+        list[Path], typer.Argument(metavar="DIR...", help="Records of a flight: directories, files, run directories.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The scenario; must be new.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Scenario file; must be new.")],
     bundle: BundleOption = None,
     depot_key: DepotKey = None,
-    as_json: Annotated[bool, typer.Option("--json", help="What came of it, as JSON on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Make a scenario that flies what came home again, in virtual time: exit status 1, and where, if it cannot."""
+    """Make a scenario that reproduces a recorded flight.
+
+    The scenario plays in virtual time. Exit status 0: it reproduces all chains. 1: it does not, and the first place
+    where it fails is printed. 2: nothing is usable.
+    """
     if out.exists():
         raise RunDirectoryError(f"{out} exists: choose another --out, nothing is overwritten")
     with Console(stderr=True).status("reading what came home") as status:

@@ -20,23 +20,26 @@ from harness.field.replay.replay_names import Names
 
 def replay_command(
     record: Annotated[
-        Path, typer.Argument(metavar="RECORD", help="A trace, a run directory, or a directory of field files.")
+        Path, typer.Argument(metavar="RECORD", help="Trace, run directory, or directory of field records.")
     ],
-    agent: Annotated[int | None, typer.Option(metavar="ID", help="Whose record; without it, all of them.")] = None,
-    until: Annotated[float | None, typer.Option(metavar="S", help="Play up to this mission second.")] = None,
-    step: Annotated[bool, typer.Option("--step", help="Stop at the start, and ask what to do.")] = False,
+    agent: Annotated[
+        int | None, typer.Option(metavar="ID", help="Agent whose trace to replay; all agents if not given.")
+    ] = None,
+    until: Annotated[float | None, typer.Option(metavar="S", help="Stop at this mission second.")] = None,
+    step: Annotated[bool, typer.Option("--step", help="Stop at the first step, and read commands.")] = False,
     breaks: Annotated[
         list[str] | None,
-        typer.Option(
-            "--break", metavar="HANDLER|LINE|BLOCK", help="Stop there, and ask what to do; as often as wanted."
-        ),
+        typer.Option("--break", metavar="HANDLER|LINE|BLOCK", help="Stop there, and read commands; may be repeated."),
     ] = None,
     debug: Annotated[
-        bool, typer.Option("--debug", help="At each --break call the debugger, right before the handler runs.")
+        bool, typer.Option("--debug", help="Call the debugger at each --break, before the handler runs.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="What differs, as JSON on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
 ) -> None:
-    """Feed what one agent saw into the reference core, step by step: exit status 1 if it did anything else."""
+    """Feed an agent's trace to the reference core, and compare.
+
+    Exit status 0: the agent did the same as the core. 1: it did not. 2: no step could be replayed.
+    """
     if until is not None and not until >= 0:
         raise typer.BadParameter(f"--until {until:g} is no mission second: it is 0 or more")
     if as_json and (step or breaks):

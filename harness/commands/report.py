@@ -16,8 +16,11 @@ from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, MachineError, R
 from harness.report.agent_programs import programs
 
 
-def report_command(run: Annotated[Path, typer.Argument(help="A run directory.")]) -> None:
-    """Write report.html, report.md, junit.xml and chains.svg again, also of a run that was killed half-way."""
+def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) -> None:
+    """Write the report files of a run again.
+
+    The files are report.html, report.md, junit.xml and chains.svg. The run may have been killed.
+    """
     left = report.read_source(RunArchive(run, skim=True))
     try:
         page = report.write(left)
@@ -39,10 +42,10 @@ def _missing(left: report.ReportSource) -> Iterator[str]:
 
 
 def check_command(
-    paths: Annotated[list[Path], typer.Argument(help="A run directory, or chain exports from anywhere.")],
-    as_json: Annotated[bool, typer.Option("--json", help="The verdict as JSON on standard output.")] = False,
+    paths: Annotated[list[Path], typer.Argument(help="Run directory, or chain exports.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
 ) -> None:
-    """Decide the six characteristics from exported chains, and from traces beside them."""
+    """Judge chain exports and traces by the six characteristics."""
     archive = RunArchive(*paths)
     evidence = checker.gather(archive)
     result, survived = checker.check(evidence), survival(evidence)

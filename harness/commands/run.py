@@ -14,6 +14,7 @@ from harness.archive.directory import default_path
 from harness.archive.playable import scenario_of
 from harness.archive.run_record import CapturedFrames
 from harness.backend_names import BackendName
+from harness.commands._shared_options import RARE
 from harness.commands.terminal import complain, show_programs, show_result, show_rogue, show_survival
 from harness.commands.watch import PORT, show_address
 from harness.errors import HarnessError, ScenarioError
@@ -40,45 +41,53 @@ def run_command(
         Path,
         typer.Argument(
             metavar="SCENARIO|RUN",
-            help="A scenario's file (YAML), or the name of one that comes along; or a run, to play once more.",
+            help="Scenario (name or YAML file), or run directory to play again.",
         ),
     ],
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of all that we draw; drawn itself if not given, or that of RUN.")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Random seed; that of RUN or a new one if not given.")] = None,
     speedup: Annotated[float | None, typer.Option(help="Mission seconds per second of wall time.")] = None,
     vehicles: Annotated[Vehicles | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
     backend: Annotated[
-        BackendName, typer.Option(help="Real processes in a private network, the same in containers, or virtual time.")
+        BackendName, typer.Option(help="Processes in private networks, containers, or virtual time.")
     ] = "process",
     gcs: Annotated[
         str | None,
-        typer.Option(metavar="HOST:PORT", help="A ground station, by UDP, that sees and commands all vehicles."),
+        typer.Option(
+            metavar="HOST:PORT", rich_help_panel=RARE, help="UDP address of a ground station for all vehicles."
+        ),
     ] = None,
     capture: Annotated[
-        bool, typer.Option("--capture", help="Keep each frame that a vehicle sent or got, in capture/<ID>.pcapng.")
+        bool, typer.Option("--capture", help="Record each vehicle's frames in capture/ID.pcapng.")
     ] = False,
-    secured: Annotated[bool, typer.Option("--secured", help="With fresh keys, if the scenario has none.")] = False,
+    secured: Annotated[
+        bool, typer.Option("--secured", help="Secure the mission with fresh keys if it has none.")
+    ] = False,
     image_from_host: Annotated[
-        bool, typer.Option("--image-from-host", help="Containers of this machine's own files: no image is built.")
+        bool,
+        typer.Option(
+            "--image-from-host",
+            rich_help_panel=RARE,
+            help="Run containers from this machine's files, and build no image.",
+        ),
     ] = False,
     by_hand: Annotated[
         bool,
-        typer.Option("--by-hand", help="Have `ucp-harness tell` say what happens; virtual time stands still at first."),
+        typer.Option("--by-hand", help="Take events from `ucp-harness tell`; virtual time starts paused."),
     ] = False,
     watch: Annotated[
-        bool, typer.Option("--watch", help="Show the run in the browser while it goes on, and as a film afterwards.")
+        bool, typer.Option("--watch", help="Show the run in the browser, live and then as a film.")
     ] = False,
     watch_port: Annotated[int, PORT] = 0,
     out: Annotated[Path | None, typer.Option(help="Run directory; must be new or empty.")] = None,
     emit_compose: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Run nothing: write a docker compose file to start by hand.")
+        Path | None,
+        typer.Option(metavar="FILE", rich_help_panel=RARE, help="Write a docker compose file, and run nothing."),
     ] = None,
     kernel: Annotated[
-        Kernel, typer.Option(help="This machine's kernel, or User Mode Linux: it has netem, and needs no rights.")
+        Kernel, typer.Option(rich_help_panel=RARE, help="This machine's kernel, or User Mode Linux, which has netem.")
     ] = Kernel.host,
 ) -> None:
-    """Play a scenario, check the six characteristics, write a report."""
+    """Play a scenario, judge it, and write a report."""
     console = Console()
     asked, own_seed = scenario_of(scenario)
     request = _with_options(asked, speedup, vehicles, gcs, capture, image_from_host)

@@ -19,12 +19,14 @@ from harness.scenario.verdict_names import BAD_IN_WORDS, Kind, kind_of
 
 
 def runs_command(
-    folder: Annotated[Path, typer.Argument(help="The folder of run directories.")] = RUNS,
-    most: Annotated[int, typer.Option("--last", min=1, help="List so many.")] = 20,
-    opened: Annotated[int | None, typer.Option("--open", min=1, metavar="N", help="Open the Nth one's report.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The list as JSON on standard output.")] = False,
+    folder: Annotated[Path, typer.Argument(help="Folder of run directories.")] = RUNS,
+    most: Annotated[int, typer.Option("--last", min=1, help="Maximum number of runs to list.")] = 20,
+    opened: Annotated[
+        int | None, typer.Option("--open", min=1, metavar="N", help="Open the report of run N of the list.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
-    """List what was run, the newest first, with its verdict; or open a report in the browser."""
+    """List past runs with their verdicts, or open a report."""
     runs = list(past_runs(folder, max(most, opened or 0)))
     if opened is not None:
         _open(runs, opened, folder)
@@ -96,7 +98,10 @@ def _document(run: PastRun) -> dict[str, Any]:
 
 
 def scenarios_command() -> None:
-    """List the scenarios that come along: `ucp-harness run loss_15` plays one."""
+    """List the scenarios that come with the harness.
+
+    For example, `ucp-harness run loss_15` plays one of them.
+    """
     table = Table.grid(padding=(0, 2))
     for name in load.names():
         table.add_row(Text(name, style="bold", no_wrap=True), Text(load.opening(name)))

@@ -21,7 +21,7 @@ def scale_command(
     seeds: Annotated[int, typer.Option(help="Runs of each size.")] = model.SEEDS,
     settle: Annotated[float, typer.Option(help="Minutes to finish after the mission.")] = model.SETTLE_MINUTES,
     agent_command: Annotated[
-        str | None, typer.Option(help="Measure this agent, driven by lines (COMMAND --virtual), instead of ours.")
+        str | None, typer.Option(help="Measure this agent, driven by lines (COMMAND --virtual).")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Directory of the results; must be new or empty.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="scale.json on standard output, no table.")] = False,
@@ -29,7 +29,7 @@ def scale_command(
         int | None, typer.Option(min=1, help="Runs at the same time; as many as cores if not given.")
     ] = None,
 ) -> None:
-    """Fit how messages, bytes and time grow with agents and blocks, in the simulation; by default about 4 minutes."""
+    """Fit how messages, bytes and time grow with agents and blocks."""
     request = scale.read_request(agents, minutes, loss, seeds, settle, agent_command)
     directory = (out or default_path("scale")).absolute()
     claim(directory)

@@ -14,13 +14,18 @@ from harness.play.machine.uml_kernel import enter, runs_inside
 
 
 def shell_command(
-    run: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="A run directory whose run goes on.")] = None,
-    vehicle: Annotated[int | None, typer.Argument(metavar="[VEHICLE]", min=1, help="Whose network.")] = None,
+    run: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="Directory of an active run.")] = None,
+    vehicle: Annotated[
+        int | None, typer.Argument(metavar="[VEHICLE]", min=1, help="Vehicle whose network to enter.")
+    ] = None,
     command: Annotated[
-        list[str] | None, typer.Argument(metavar="[-- COMMAND...]", help="Run this instead of a shell.")
+        list[str] | None, typer.Argument(metavar="[-- COMMAND...]", help="Command to run instead of a shell.")
     ] = None,
 ) -> None:
-    """Open a shell in the network of a vehicle whose run goes on (ping, tcpdump, ip); without one, list what runs."""
+    """Open a shell in the network of a vehicle of an active run.
+
+    Use ping, tcpdump or ip there. Without RUN the command lists the active runs.
+    """
     runs, inside = running(), runs_inside()
     if run is None:
         for path, vehicles in runs.items():

@@ -22,7 +22,7 @@ from sitl.firmware import RequestError, install
 from sitl.installed import all_installed, current, install_command, sha256
 from sitl.vehicle import VEHICLE_TYPES, VehicleError, VehicleType
 
-app = typer.Typer(no_args_is_help=True, help="Install ArduPilot's SITL binaries, and say which there are.")
+app = typer.Typer(no_args_is_help=True, help="Install and list ArduPilot's SITL binaries.")
 
 Vehicle = Annotated[VehicleType, typer.Option(help="Type of vehicle.")]
 
@@ -35,11 +35,14 @@ def install_into_cache(
         str | None,
         typer.Option(
             envvar="UCP_SITL_URL",
-            help="A mirror of firmware.ardupilot.org and raw.githubusercontent.com, with their paths.",
+            help="Mirror of firmware.ardupilot.org and raw.githubusercontent.com.",
         ),
     ] = None,
 ) -> None:
-    """Fetch ArduPilot's SITL binary for Linux, on x86_64 or ARM, with its default parameters, into the cache."""
+    """Download a SITL binary and its default parameters.
+
+    The binary is for Linux on x86_64 or ARM, and goes into the user's cache.
+    """
     console = Console()
     try:
         with _Bar(console, BINARIES[vehicle]) as bar:
@@ -57,7 +60,7 @@ def install_into_cache(
 
 @app.command("path")
 def print_path(vehicle: Vehicle = "copter") -> None:
-    """Print the directory of the installed binary, as ARDUPILOT_SITL wants it."""
+    """Print the directory of the binary, for ARDUPILOT_SITL."""
     try:
         installed = current(vehicle, os.environ)
     except VehicleError as error:
@@ -69,9 +72,12 @@ def print_path(vehicle: Vehicle = "copter") -> None:
 
 @app.command("list")
 def list_binaries(
-    as_json: Annotated[bool, typer.Option("--json", help="The list as JSON on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
-    """List the binaries that ARDUPILOT_SITL, PATH and the cache offer, in the order in which a run looks."""
+    """List the available SITL binaries, first choice first.
+
+    A run searches ARDUPILOT_SITL, then PATH, then the cache.
+    """
     offers = [offer for vehicle in VEHICLE_TYPES for offer in _offers(vehicle)]
     if as_json:
         sys.stdout.write(json.dumps([asdict(offer) for offer in offers], indent=1) + "\n")

@@ -29,12 +29,17 @@ _WHAT_THERE_IS = (
 
 
 def tell_command(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Its directory; it goes on, by `run --by-hand`.")],
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Directory of an active run, started with `run --by-hand`.")
+    ],
     sentence: Annotated[
-        list[str] | None, typer.Argument(metavar="[SENTENCE]", help="Such as `partition 1 2 | 3`, or `step 10`.")
+        list[str] | None, typer.Argument(metavar="[SENTENCE]", help="Command such as `partition 1 2 | 3` or `step 10`.")
     ] = None,
 ) -> None:
-    """Have something happen now to a run that goes on; in virtual time pause, step, go on; or see how it stands."""
+    """Cause an event in an active run, or control virtual time.
+
+    Virtual time can pause, step and go on. Without SENTENCE the command prints the state of the run.
+    """
     try:
         if not sentence:
             _show(asyncio.run(ask_run(run, command="state")))

@@ -14,17 +14,18 @@ from harness.scenario import load_scenario
 def validate_command(
     runs: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="RUN...", help="Run directories, directories of what agents left, or traces."),
+        typer.Argument(metavar="RUN...", help="Run directories, directories of traces, or traces."),
     ] = None,
     scenario: Annotated[
-        Path | None, typer.Option(help="And a scenario to be played in virtual time, a file or its name,")
+        Path | None, typer.Option(help="Scenario (name or YAML file) to play and validate as well.")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="with so many seeds.")] = 1000,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for --scenario.")] = 1000,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Hold recorded runs against the specification in TLA+, step by step: exit status 1 if an agent did otherwise.
+    """Compare recorded runs with the TLA+ specification.
 
-    2: something could not be looked at. 3: TLC is not here. 130: interrupted, and what is said is of what came before.
+    Exit status 0: each step is as specified. 1: an agent deviates. 2: a record is not readable. 3: TLC is not
+    installed. 130: interrupted; the result covers the runs before.
     """
     if not runs and scenario is None:
         raise typer.BadParameter("name runs, or a --scenario to play")

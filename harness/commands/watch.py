@@ -17,16 +17,16 @@ from harness.report.live.server_process import require_packages
 if TYPE_CHECKING:
     from harness.report.live.feed import Feed
 
-PORT = typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0 is a free one.")
+PORT = typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0 selects a free one.")
 
 
 def watch_command(
-    run: Annotated[Path, typer.Argument(help="A run directory, also of a run that was killed, or one `import` made.")],
+    run: Annotated[Path, typer.Argument(help="Run directory, or a directory made by `import`.")],
     port: Annotated[int, PORT] = 0,
 ) -> None:
-    """Show a run as a film in the browser: map, links, chains, votes and reconciles along time.
+    """Show a recorded run as a film in the browser.
 
-    Ctrl-C ends it.
+    The film shows map, links, chains, votes and reconciles. Ctrl-C ends the command.
     """
     require_packages()
     from harness.report.live.feed import Feed

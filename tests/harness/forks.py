@@ -107,8 +107,8 @@ def _serve(channel: socket.socket) -> None:
     atexit.register(ending)  # before all others, so it is called after them
     from harness.cli import COMMANDS
 
-    for where, _ in COMMANDS.values():
-        import_module(where.partition(":")[0])
+    for command in COMMANDS.values():
+        import_module(command.where.partition(":")[0])
     del sys.modules["harness.cli"]  # it runs as __main__, as with `python -m`
     gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)

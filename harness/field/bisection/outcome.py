@@ -159,4 +159,4 @@ def read(path: Path) -> Outcome:
     except OSError as error:
         raise RunDirectoryError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValidationError, RecursionError):
-        raise RunDirectoryError(f"{path}: not an outcome; `ucp-harness again ... --out` writes one") from None
+        raise RunDirectoryError(f"{path}: not an outcome; `ucp-harness bisect --once ... --out` writes one") from None

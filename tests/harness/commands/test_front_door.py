@@ -1,17 +1,21 @@
 """The command line opens at once: it lists its commands without importing them, and completes what is typed."""
 
 import os
+import re
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Iterator
 from importlib import import_module
 from importlib.metadata import version
 from inspect import getdoc
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
 
-from harness.cli import COMMANDS
+from harness.cli import COMMANDS, OLD_NAMES, loaded
 from tests.harness.command import COMMAND, harness, sentences, write_scenario
 from tests.harness.mission import CONNECTED, fly, write_run
 
@@ -42,12 +46,66 @@ print(*(name for name in sys.modules if name.startswith("pymavlink")))
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_list_says_what_a_commands_own_help_says(name: str) -> None:
-    where, summary = COMMANDS[name]
+    _, where, summary = COMMANDS[name]
     module, _, attribute = where.partition(":")
     command = getattr(import_module(module), attribute)
     own = command.info.help if isinstance(command, typer.Typer) else getattr(command, "help", None) or getdoc(command)
     assert own is not None
     assert own.split("\n\n")[0].replace("\n", " ") == summary
+
+
+def panels(*command: str) -> dict[str, str]:
+    """Return the panels of a command's help at 80 columns: title, and text."""
+    shown = harness(*command, "--help", env={**os.environ, "COLUMNS": "80"}).stdout
+    return dict(re.findall(r"╭─ ([^─]+) ─+╮\n(.*?)╰─", shown, re.DOTALL))
+
+
+def test_each_command_is_one_line_of_its_panel_and_of_no_other() -> None:
+    shown = panels()
+    assert [*shown] == ["Options", "run", "look", "field", "many", "prove", "this machine"]
+    listed = {title: re.findall(r"^│ (\S.*?) +│$", text, re.MULTILINE) for title, text in shown.items()}
+    del listed["Options"]
+    for name, (panel, _, summary) in COMMANDS.items():
+        in_panels = [title for title, lines in listed.items() if f"{name:<11}  {summary}" in lines]
+        assert in_panels == [panel], name
+    assert sum(map(len, listed.values())) == len(COMMANDS)
+
+
+def commands_of(command: Any, *names: str) -> Iterator[tuple[str, Any]]:
+    yield " ".join(names), command
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from commands_of(inner, *names, name)
+
+
+OPTIONS_IN_A_PANEL = 11
+"""One more than the options of `run` in its first panel that are not rare."""
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_option_has_one_line_of_help_and_no_panel_is_long(name: str) -> None:
+    for command_name, command in commands_of(loaded(name), name):
+        in_panel = Counter[str | None]()
+        for parameter in command.params:
+            help_text = parameter.help or ""
+            assert re.fullmatch(r"[^\n]{4,67}\.", help_text), f"{command_name} {parameter.name}: {help_text!r}"
+            in_panel[parameter.rich_help_panel] += 1
+        assert max(in_panel.values(), default=0) <= OPTIONS_IN_A_PANEL, command_name
+
+
+def test_prove_shows_rare_options_below_common_ones() -> None:
+    shown = panels("prove")
+    assert [*shown] == ["Options", "Rare options", "Wrong or captured agents", "Limits"]
+    assert all(option in shown["Options"] for option in ("--agents", "--blocks", "--network", "--faults", "--out"))
+    assert "--whole" in shown["Rare options"] and "--memory" in shown["Limits"]
+
+
+@pytest.mark.parametrize("name", OLD_NAMES)
+def test_an_old_name_answers_with_the_new_one(name: str) -> None:
+    refused = harness(name, "my.yaml", "--seed", "3")
+    assert refused.returncode == 2
+    assert sentences(refused.stderr) == [f"`{name}` is now {OLD_NAMES[name]}: run that"]
+    new = re.match(r"`ucp-harness (\w+)", OLD_NAMES[name])
+    assert new is not None and new[1] in COMMANDS and name not in COMMANDS
 
 
 def test_version() -> None:

@@ -73,7 +73,7 @@ COMMANDS: list[tuple[Sequence[str], int, str]] = [
     (("export", "RUN", "--mcap", "OUT"), 0, "event data is sealed to the depot: positions are not known"),
     (("export", "RUN", "--perfetto", "OUT", "--depot-key", "HOME"), 0, "events"),
     (("import", "RUN", "--out", "OUT"), 0, "3 trace(s)"),
-    (("again", "RUN"), 0, "characteristic 4 violated"),
+    (("bisect", "--once", "RUN"), 0, "characteristic 4 violated"),
     (("reconstruct", "RUN", "--out", "OUT"), 0, "reproduces all 3 chains"),
 ]
 

@@ -100,14 +100,14 @@ def test_what_cannot_be_tried_is_skipped_and_what_is_alike_is_no_finding(reposit
     assert "there is no commit 'last-week'; `git log` lists them" in sentences(unknown.stderr)[0]
 
 
-def test_git_itself_bisects_with_again(repository: Path, records: Path, tmp_path: Path) -> None:
+def test_git_itself_bisects_with_once(repository: Path, records: Path, tmp_path: Path) -> None:
     clone = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(repository), str(clone))
     git(clone, "bisect", "start", "HEAD", "HEAD~5")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    again = [sys.executable, "-P", "-m", "harness.cli", "again", str(records), "--agent", "1"]
+    once = [sys.executable, "-P", "-m", "harness.cli", "bisect", "--once", str(records), "--agent", "1"]
     run = subprocess.run(
-        ["git", "bisect", "run", *again], cwd=clone, env=environment, capture_output=True, text=True, timeout=120
+        ["git", "bisect", "run", *once], cwd=clone, env=environment, capture_output=True, text=True, timeout=120
     )
     assert "is the first bad commit" in run.stdout and "broken" in run.stdout, run.stdout + run.stderr
 
@@ -116,22 +116,22 @@ def test_exit_statuses_are_those_that_git_bisect_run_takes(repository: Path, sce
     git(repository, "worktree", "add", "--quiet", "--detach", str(tmp_path / "good"), "HEAD~5")
     kept = tmp_path / "outcome.json"
     try:
-        good = harness("again", scenario, "--code", tmp_path / "good", "--out", kept)
+        good = harness("bisect", "--once", scenario, "--repository", tmp_path / "good", "--out", kept)
         assert good.returncode == 0, good.stderr
-        same = harness("again", scenario, "--code", tmp_path / "good", "--expect", kept)
+        same = harness("bisect", "--once", scenario, "--repository", tmp_path / "good", "--expect", kept)
         assert same.returncode == 0, same.stdout
-        changed = harness("again", scenario, "--code", repository, "--expect", kept)
+        changed = harness("bisect", "--once", scenario, "--repository", repository, "--expect", kept)
         assert changed.returncode == 1 and "deviates" in changed.stdout
     finally:
         git(repository, "worktree", "remove", "--force", str(tmp_path / "good"))
-    nothing = harness("again", scenario, "--code", tmp_path)
+    nothing = harness("bisect", "--once", scenario, "--repository", tmp_path)
     assert (
         nothing.returncode == 125
-        and "cannot be tried: there is no ucp/ in it; --code names another state" in nothing.stderr
+        and "cannot be tried: there is no ucp/ in it; --repository names another directory" in nothing.stderr
     )
     for mistake in (["--sed", 3], ["--expect", scenario], ["--expect", tmp_path / "none.json"], ["--agent", 1]):
-        assert harness("again", scenario, "--code", repository, *mistake).returncode == 128
-    assert harness("again", tmp_path / "none.yaml", "--code", repository).returncode == 128
+        assert harness("bisect", "--once", scenario, "--repository", repository, *mistake).returncode == 128
+    assert harness("bisect", "--once", tmp_path / "none.yaml", "--repository", repository).returncode == 128
 
 
 def test_interrupted_it_leaves_nothing_behind(repository: Path, scenario: Path, tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_interrupted_it_leaves_nothing_behind(repository: Path, scenario: Path, 
         stderr=subprocess.PIPE,
         text=True,
     )
-    while not list((tmp_path / "scratch").glob("ucp-harness-bisect-*/plays/play-1/run")):
+    while not list((tmp_path / "scratch").glob("ucp-harness-bisect-*/plays-0/play-1/run")):
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)

@@ -44,16 +44,16 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.whoever
 def test_a_right_agent_says_what_is_in_the_record_and_a_wrong_one_does_not(records: Path, tmp_path: Path) -> None:
     options = ["--agent", 2, "--speedup", 10, "--agent-command"]
-    right = harness("again", records, *options, RIGHT)
+    right = harness("bisect", "--once", records, *options, RIGHT)
     assert right.returncode == 0, right.stdout + right.stderr
     assert "agent 2: as recorded" in right.stdout
     (tmp_path / "wrong.py").write_text(WRONG)
-    wrong = harness("again", records, *options, f"{PYTHON} -P {shlex.quote(str(tmp_path / 'wrong.py'))}")
+    wrong = harness("bisect", "--once", records, *options, f"{PYTHON} -P {shlex.quote(str(tmp_path / 'wrong.py'))}")
     assert wrong.returncode == 1, wrong.stdout + wrong.stderr
     assert "approve False); the record sent Block Add Response" in wrong.stdout
-    none = harness("again", records, *options, "no-such-agent")
+    none = harness("bisect", "--once", records, *options, "no-such-agent")
     assert none.returncode == 125
-    ending = harness("again", records, *options, f"{PYTHON} -c 'raise SystemExit(3)'")
+    ending = harness("bisect", "--once", records, *options, f"{PYTHON} -c 'raise SystemExit(3)'")
     assert ending.returncode == 125 and "the agent ended with status 3" in ending.stderr
 
 
