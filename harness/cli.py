@@ -133,6 +133,12 @@ OLD_NAMES = {
 """Commands that had another name, and what to run instead."""
 
 
+class OldNameError(HarnessError):
+    """The command has another name. `git bisect run` stops at this status, and would take 2 for a bad commit."""
+
+    exit_status = 128
+
+
 class Commands(TyperGroup):
     """All commands, of which only the one that is called is there in full."""
 
@@ -140,7 +146,7 @@ class Commands(TyperGroup):
         if args and args[0] in COMMANDS:
             self.add_command(loaded(args[0]), args[0])
         elif args and args[0] in OLD_NAMES and not ctx.resilient_parsing:
-            raise HarnessError(f"`{args[0]}` is now {OLD_NAMES[args[0]]}: run that")
+            raise OldNameError(f"`{args[0]}` is now {OLD_NAMES[args[0]]}: run that")
         return super().resolve_command(ctx, args)
 
 
