@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
+from harness.json_schemas import texts
 from harness.scenario.load import parse
 from tests.pages import play
 
@@ -42,6 +43,13 @@ def test_every_page_and_what_it_links_to_is_on_the_site(site: Path) -> None:
         for target in re.findall(r'(?:href|src)="(?!https?:)([^"#:]+)', page.read_text()):
             if not target.startswith(("/", "data")) and page.name != "404.html":
                 assert (page.parent / target).is_file(), (page, target)  # a folder is no page without a server
+
+
+def test_site_has_every_schema_and_a_page_that_links_to_it(site: Path) -> None:
+    page = (site / "schemas.html").read_text()
+    for path, text in texts().items():
+        assert (site / path).read_text() == text
+        assert f'href="{path}"' in page
 
 
 def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:

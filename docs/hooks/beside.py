@@ -1,7 +1,8 @@
 """Pages that stand beside what they are about, in the source tree, as pages of the site.
 
 The README is its start. What a page links to comes along, under the path that it has in the repository; of a folder
-that is its README, and a folder without one is named, not linked.
+that is its README, and a folder without one is named, not linked. The JSON Schemas are no files of the repository: this
+hook generates them at the paths that the pages link to.
 """
 
 import os
@@ -15,9 +16,12 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from harness.json_schemas import texts
+
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 HOME = "index.md"
+SCHEMAS = {ROOT / path: text for path, text in texts().items()}
 
 _FENCED = re.compile(r"(^(?:```|~~~).*?^(?:```|~~~)$|^(?: {4,}|\t).*?$)", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\((?P<target>[^)\s#:]+)(?P<anchor>#[^)\s]*)?\)")
@@ -31,13 +35,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     while waiting:
         page = waiting.pop()
         for target in _targets(page):
-            if target not in there:
+            if target not in there and target not in SCHEMAS:
                 there.add(target)
                 if target.suffix == ".md":
                     waiting.append(target)
     for path in sorted(there):
         if files.get_file_from_path(_uri(path)) is None:
             files.append(File.generated(config, _uri(path), abs_src_path=str(path)))
+    for path, text in SCHEMAS.items():
+        files.append(File.generated(config, _uri(path), content=text))
     return files
 
 
@@ -79,6 +85,8 @@ def _targets(page: Path) -> list[Path]:
 def _resolved(page: Path, target: str) -> Path | None:
     """The file that is meant; None for a folder without a README. Raises PluginError if there is neither."""
     path = Path(os.path.normpath(page.parent / target))
+    if path in SCHEMAS:
+        return path
     if not path.exists():
         raise PluginError(f"{page.relative_to(ROOT)} links to {target}, which is not there")
     if path.is_dir():

@@ -10,8 +10,8 @@ from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 from pydantic import BaseModel
 
+from harness.json_schemas import generate
 from harness.scenario import Scenario
-from harness.schemas import generate
 
 MARK = "<!-- keys -->"
 

@@ -87,9 +87,7 @@ def test_running_agent_does_not_import_the_contract() -> None:
 
 
 def test_table_names_every_room() -> None:
-    assert {path.parent.name for path in (REPOSITORY / "harness").glob("*/__init__.py")} - {"schemas"} == {
-        *rooms_in_order()
-    }
+    assert {path.parent.name for path in (REPOSITORY / "harness").glob("*/__init__.py")} == {*rooms_in_order()}
 
 
 def test_room_imports_only_rooms_above_it() -> None:

@@ -1,12 +1,41 @@
-"""The JSON Schemas in the repository are those of the code."""
+"""Each JSON Schema has a digest in schemas.sha256, so that a schema changes only on purpose."""
 
-import json
+import hashlib
+from pathlib import Path
 
-import pytest
+from jsonschema import Draft202012Validator
 
-from harness.schemas import MODELS, generate, path
+from harness import json_schemas
+
+DIGESTS = Path(__file__).with_name("schemas.sha256")
+"""Lines as `sha256sum` writes them: a digest, two spaces, a path."""
+
+WHAT_TO_DO = """A JSON Schema has changed. To see the change, run from the top of the repository:
+
+    git worktree add /tmp/before "$(git log -1 --format=%H -- tests/harness/schemas.sha256)"
+    (cd /tmp/before && "$OLDPWD/.venv/bin/python" -m harness.json_schemas /tmp/schemas-before)
+    .venv/bin/python -m harness.json_schemas /tmp/schemas-now
+    diff -ru /tmp/schemas-before /tmp/schemas-now
+    git worktree remove /tmp/before
+
+If the change is intended, record the new digests:
+
+    (cd /tmp/schemas-now && find * -type f | LC_ALL=C sort | xargs sha256sum) >tests/harness/schemas.sha256
+"""
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_the_schema_is_up_to_date(name: str) -> None:
-    assert json.loads(path(name).read_text()) == generate(name), "run `python -m harness.schemas`"
+def test_every_schema_has_the_recorded_digest() -> None:
+    texts = json_schemas.texts()
+    lines = [f"{hashlib.sha256(texts[path].encode()).hexdigest()}  {path}" for path in sorted(texts)]
+    assert DIGESTS.read_text(encoding="ascii").splitlines() == lines, WHAT_TO_DO
+
+
+def test_every_schema_of_the_harness_is_valid() -> None:
+    for name in json_schemas.MODELS:
+        Draft202012Validator.check_schema(json_schemas.generate(name))
+
+
+def test_program_writes_each_schema_at_its_path(tmp_path: Path) -> None:
+    json_schemas.write_all(tmp_path)
+    written = {path.relative_to(tmp_path).as_posix(): path.read_text() for path in tmp_path.rglob("*.json")}
+    assert written == json_schemas.texts()
