@@ -1,8 +1,8 @@
 """JSON Schemas of the documents that other programs read and write.
 
 Pydantic generates the schemas of the harness from its models. `ucp.contract.schemas` builds the schemas of the agent
-contract. Git has neither, because both follow from the code; `tests/harness/schemas.sha256` has their digests. The wheel
-and the site contain the schemas as files. To write them into a folder:
+contract. Git has neither, because both follow from the code. `tests/harness/schemas.sha256` has their digests. The
+wheel and the site contain the schemas as files. To write them into a folder:
 
     python -m harness.json_schemas FOLDER
 """
@@ -47,7 +47,7 @@ def generate(name: str) -> dict[str, Any]:
 
 
 def texts() -> dict[str, str]:
-    """Return the text of every schema of the harness and of the agent contract, by its path in the wheel and the site."""
+    """Return the text of each schema of the harness and of the agent contract, by its path in the wheel."""
     documents = {f"harness/schemas/{name}.schema.json": generate(name) for name in MODELS}
     documents |= {f"ucp/contract/schemas/{name}.schema.json": schemas.generate(name) for name in schemas.DOCUMENTS}
     return {path: json.dumps(document, indent=1) + "\n" for path, document in documents.items()}
