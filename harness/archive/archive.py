@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from harness.archive._jsonlines import JsonLines, Record
+from harness.archive.bounded_file import JsonLines, Record
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, Link, read_connectivity, read_link_losses
 from harness.archive.directory import PUBLIC_KEYS_FILE, ROGUE_FILE
 from harness.archive.exports import (

@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from harness.archive._jsonlines import JsonLines
+from harness.archive.bounded_file import JsonLines
 from harness.archive.tracks import MissionSeconds
 from harness.scenario.faults import named
 from netem.conditions import NetworkConditions

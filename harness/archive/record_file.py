@@ -1,13 +1,122 @@
-"""Reads run.json as it is: whole, half written by a run that was killed, of another version, or edited."""
+"""Read run.json whatever its state: whole, half written, of another version, or edited.
+
+What does not fit is taken out, the smallest part that can be spared, until the rest fits: of a list with one wrong
+entry the others are left, and of an entry that lacks a key nothing.
+"""
 
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from harness.archive.lenient_model import fit
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
 from harness.archive.run_record import SCHEMA, JudgedRecord, RunRecord
 from harness.errors import RunDirectoryError
+
+Model = TypeVar("Model", bound=BaseModel)
+Place = tuple[dict[Any, Any] | list[Any], Any]
+"""A part of a document: what holds it, and its key or index there."""
+
+MAX_ROUNDS = 100
+"""Each round takes a part out of whatever is wrong: more than parts are within each other are not needed."""
+MAX_MISFITS = 20_000
+MAX_NAME = 80
+UNKNOWN = "extra_forbidden"
+HALF_A_CHARACTER = "string_unicode"
+MISSING = "missing"
+OF_A_MODEL = "model_type"
+"""Error types of pydantic."""
+NOT_AN_OBJECT = "input should be an object"
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """`key` of the document has something that is wrong: the first is `where`, and `more` follow."""
+
+    key: str
+    where: str
+    what: str
+    more: int
+
+    def __str__(self) -> str:
+        more = f" (and {self.more} more)" if self.more else ""
+        return f"`{self.where}` is wrong: {self.what}{more}"
+
+
+def fit(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[Misfit]]:
+    """What fits `model`, all of whose keys have defaults, and what was taken out of `document` because it does not.
+
+    Keys that the model does not know are passed over, and half a character in a text becomes a question mark. Raises
+    ValueError if more than `MAX_MISFITS` things are wrong.
+    """
+    misfits: dict[str, Misfit] = {}
+    for _ in range(MAX_ROUNDS):
+        try:
+            return model.model_validate(document), list(misfits.values())
+        except ValidationError as error:
+            if error.error_count() > MAX_MISFITS:
+                raise ValueError(f"{error.error_count()} things are wrong with it") from None
+            errors = error.errors(include_url=False, include_context=False, include_input=False)
+        for misfit in _by_key(document, errors):
+            misfits.setdefault(misfit.key, misfit)
+        places = [(problem, _place(document, problem["loc"])[0]) for problem in errors]
+        _take_out([place for problem, place in places if not _mended(place, problem)])
+    return model(), list(misfits.values())
+
+
+def _by_key(document: dict[str, Any], errors: Sequence[ErrorDetails]) -> Iterator[Misfit]:
+    by_key: dict[str, dict[str, str]] = {}
+    for problem in errors:
+        if problem["type"] not in (UNKNOWN, HALF_A_CHARACTER):
+            _, steps = _place(document, problem["loc"])
+            steps += problem["loc"][-1:] if problem["type"] == MISSING else ()
+            where = ".".join(str(step)[:MAX_NAME] for step in steps)
+            what = NOT_AN_OBJECT if problem["type"] == OF_A_MODEL else problem["msg"].lower()
+            by_key.setdefault(str(problem["loc"][0]), {}).setdefault(where, what)
+    for key, wrong in by_key.items():
+        where, what = next(iter(wrong.items()))
+        yield Misfit(key, where, what, len(wrong) - 1)
+
+
+def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, list[int | str]]:
+    """The innermost part on the way to an error, and the way there.
+
+    Steps that the document does not have say which type was tried.
+    """
+    place: Place = document, loc[0]
+    here: Any = document
+    way = []
+    for step in loc:
+        in_list = isinstance(here, list) and isinstance(step, int) and step < len(here)
+        if in_list or (isinstance(here, dict) and step in here):
+            place, here = (here, step), here[step]
+            way.append(step)
+    return place, way
+
+
+def _mended(place: Place, problem: ErrorDetails) -> bool:
+    """Text with half a character in it is as good with a question mark there."""
+    holder, key = place
+    if problem["type"] == HALF_A_CHARACTER and isinstance(text := holder[key], str):
+        holder[key] = text.encode(errors="replace").decode()
+        return bool(holder[key] != text)
+    return False
+
+
+def _take_out(places: Sequence[Place]) -> None:
+    """A part of a list does not move the others before they are taken out."""
+    lists: dict[int, tuple[list[Any], set[int]]] = {}
+    for holder, key in places:
+        if isinstance(holder, dict):
+            holder.pop(key, None)
+        else:
+            lists.setdefault(id(holder), (holder, set()))[1].add(key)
+    for holder, indices in lists.values():
+        holder[:] = [part for index, part in enumerate(holder) if index not in indices]
+
 
 MAX_BYTES = 64 * 1024 * 1024
 MAX_VALUES = 2_000_000

@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from harness.archive._jsonlines import JsonLines
+from harness.archive.bounded_file import JsonLines
 
 TRACKS_FILE = "tracks.jsonl"
 

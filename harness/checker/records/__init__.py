@@ -11,27 +11,24 @@ from dataclasses import dataclass
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.records import (
-    _algorithms,
     _captures_vs_traces,
-    _completed_blocks,
     _conditions_vs_network,
     _counters,
     _export_vs_trace,
     _headers,
     _heard_vs_sent,
-    _trace_consistency,
 )
 from harness.checker.records.contradiction import Contradiction
 
 NAME = "every record"
 
 COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
-    _headers.compare,
-    _algorithms.compare,
-    _trace_consistency.compare,
-    _counters.compare,
-    _export_vs_trace.compare,
-    _completed_blocks.compare,
+    _headers.compare_headers,
+    _headers.compare_algorithms,
+    _export_vs_trace.compare_with_itself,
+    _counters.compare_counters_of_run,
+    _export_vs_trace.compare_export,
+    _counters.compare_completed_blocks,
     _heard_vs_sent.compare,
     _conditions_vs_network.compare,
     _captures_vs_traces.compare_counters,

@@ -1,4 +1,4 @@
-"""An export against its agent's trace: the trace must have led to it when it was made.
+"""Compare a trace with itself, and an export with the trace that must have led to it.
 
 An export says when that was. What a trace has until then ends in a state, whose top chain hash stands for all blocks of
 the chain and their order.
@@ -10,9 +10,10 @@ from dataclasses import astuple
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Life
+from harness.checker._trace_replay import Life, Sight
 from harness.checker.evidence import Evidence
-from harness.checker.records.contradiction import ROUNDED_S, Contradiction, mission_s, of_agent
+from harness.checker.judgement import Finding
+from harness.checker.records.contradiction import ROUNDED_S, Contradiction, mission_s, of_agent, slack_s
 from ucp.trace import StateSummary
 
 FIELDS = {
@@ -25,7 +26,7 @@ FIELDS = {
 }
 
 
-def compare(evidence: Evidence) -> Iterator[Contradiction]:
+def compare_export(evidence: Evidence) -> Iterator[Contradiction]:
     """An export is a state to which its trace has led, in all that it holds and in its order."""
     for agent_id, export in evidence.exports.items():
         trace = evidence.traces.get(agent_id)
@@ -126,3 +127,42 @@ def _contents(agent_id: int, export: Export, life: Life) -> Iterator[Contradicti
             yield of_agent(
                 agent_id, f"its export has other blocks in the {place} than its trace, or in another order", touches
             )
+
+
+def compare_with_itself(evidence: Evidence) -> Iterator[Contradiction]:
+    """What does not fit in each life of an agent, and from one life to the next."""
+    for agent_id, lives in evidence.lives.items():
+        for life in lives:
+            yield from _in_life(evidence, agent_id, life)
+        yield from _between_lives(evidence, agent_id, lives)
+
+
+def _in_life(evidence: Evidence, agent_id: int, life: Life) -> Iterator[Contradiction]:
+    for sights, touches in (
+        (life.impossible, "3"),
+        (life.otherwise, "3"),
+        (life.another_top, "4"),
+        (life.flags, None),
+        (life.back_in_time, None),
+        (life.out_of_sequence, "1"),
+    ):
+        for sight in sights:
+            yield Contradiction(finding(evidence, agent_id, sight), touches)
+
+
+def finding(evidence: Evidence, agent_id: int, sight: Sight) -> Finding:
+    """The sight as evidence, with the block's name for people."""
+    block = sight.block_hash
+    return Finding(agent_id, f"{sight.where}: {sight.what}", evidence.name(block) if block else None, block)
+
+
+def _between_lives(evidence: Evidence, agent_id: int, lives: list[Life]) -> Iterator[Contradiction]:
+    slack = slack_s(evidence.traces[agent_id])
+    now = 0.0
+    for life in lives:
+        if life.runs and life.runs[0].t < now - slack:
+            what = f"a life begins at {life.runs[0].t:g} s, before the one before it has ended, at {now:g} s"
+            line, run = next(life.numbered())
+            sight = Sight(line, run, what)
+            yield Contradiction(finding(evidence, agent_id, sight))
+        now = life.runs[-1].t if life.runs else now

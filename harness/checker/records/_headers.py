@@ -1,4 +1,4 @@
-"""The headers of all traces against each other and the run's record: one mission has one roster and one clock.
+"""Compare the headers of all traces, and the number of each handler's Algorithm with its name.
 
 Timers differ between agents as far as the scenario staggers them: they are compared less what an agent's place adds.
 """
@@ -8,12 +8,13 @@ from typing import Any
 
 from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
+from ucp.agent import HANDLERS
 
 WORDS = {"epoch_us": "mission second 0", "initial_data": "the inception block's data"}
 MAX_VALUE = 40
 
 
-def compare(evidence: Evidence) -> Iterator[Contradiction]:
+def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
     """All name one mission: its roster, settings, clock and inception block."""
     first: dict[str, tuple[object, str]] = {}
     if evidence.record is not None:
@@ -51,3 +52,16 @@ def _in_common(evidence: Evidence, agent_id: int) -> dict[str, object]:
 def _short(value: object) -> str:
     text = str(value)
     return text if len(text) <= MAX_VALUE else f"{text[:MAX_VALUE]}..."
+
+
+ALGORITHM = {name: handler.algorithm for name, handler in HANDLERS.items()}
+
+
+def compare_algorithms(evidence: Evidence) -> Iterator[Contradiction]:
+    """A handler that is known has its number. What it did is judged by its name."""
+    for agent_id, trace in evidence.traces.items():
+        said = dict.fromkeys((run.handler, run.algorithm) for run in trace.runs)
+        for handler, number in said:
+            if handler in ALGORITHM and number != ALGORITHM[handler]:
+                detail = f"its trace has {handler} as Algorithm {number}, and that is Algorithm {ALGORITHM[handler]}"
+                yield of_agent(agent_id, detail)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from harness.checker._trace_replay import Sight
 from harness.checker.evidence import Evidence, Sending
-from harness.checker.records._trace_consistency import finding
+from harness.checker.records._export_vs_trace import finding
 from harness.checker.records.contradiction import Contradiction, slack_s
 from ucp.messages import BlockResponse, CommitBlock
 from ucp.trace import HandlerRun, Recorded

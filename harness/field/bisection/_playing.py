@@ -9,10 +9,9 @@ from pathlib import Path
 from harness import checker
 from harness.archive.archive import RunArchive
 from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED, WRONG_REQUEST, HarnessError, InterruptedRunError
-from harness.field.bisection._bisected import Subject
 from harness.field.bisection._live_replay import NotStartedError, ReplayFailedError, play_live
 from harness.field.bisection.code_state import ROOT, Ended, run_python
-from harness.field.bisection.outcome import Difference, OfAgent, Outcome, of_run
+from harness.field.bisection.outcome import Difference, OfAgent, Outcome, Subject, of_run
 from harness.field.replay import open_record
 from harness.scenario import Scenario
 

@@ -28,7 +28,7 @@ from harness.archive.exports import (
     ExportedBlock,
     ExportedInception,
 )
-from harness.archive.lenient_model import fit
+from harness.archive.record_file import fit
 from harness.archive.traces import read_trace
 from harness.archive.vocabulary import unknown_words
 from harness.errors import ExportError

@@ -3,7 +3,7 @@
 reached.py   what agents came to in runs: local states, with inputs, and branches
 _share.py  what there is within bounds, by `harness.proof`
 _share.py     the one of the other: as JSON, and in words
-simulated.py a run in virtual time that is watched while it is judged
+reached.py a run in virtual time that is watched while it is judged
 """
 
 from harness.proof.coverage._share import Existing, Share, existing, in_words, to_json

@@ -1,4 +1,4 @@
-"""What agents came to in runs: local states, inputs that made a difference there, branches of handlers.
+"""Local states, inputs and branches that runs reached, collected while a simulated run is judged.
 
 The steps of an agent are those that the step judge's reference core follows (`harness.checker.steps`): agents of
 another make count as ours do, and recorded runs as simulated ones.
@@ -8,10 +8,13 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from harness.checker.evidence import Evidence
+from harness.checker.evidence import Evidence, Watch
 from harness.checker.steps import check
 from harness.checker.steps.recorded_inputs import decoded
+from harness.play.simulation.simulation import Simulation
 from harness.proof.model._shape import Held, Shape, shape_of
+from harness.run.simulate import InMemory, Simulated, simulate_in_memory
+from harness.scenario import Scenario
 from ucp.agent import HANDLERS
 from ucp.state import AgentState
 from ucp.trace import HandlerRun
@@ -123,3 +126,19 @@ def reached_in(evidence: Evidence) -> Reached:
     if judgement.verdict == "not applicable":
         watcher.reached.untold = judgement.reason
     return watcher.reached
+
+
+def simulate_watched(scenario: Scenario, seed: int, watch: Watch, **options: Any) -> Simulated:
+    """As `simulate` with traces; everything is delivered, so that branches in which nothing happens are seen, too."""
+    return simulate_in_memory(_Watched(watch), scenario, seed, deliver_all=True, **options)
+
+
+class _Watched(InMemory):
+    def __init__(self, watch: Watch) -> None:
+        super().__init__(tracing=True)
+        self._watch = watch
+
+    def evidence(self, simulation: Simulation) -> Evidence:
+        evidence = super().evidence(simulation)
+        evidence.watch = self._watch
+        return evidence

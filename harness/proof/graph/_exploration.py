@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from harness.proof._progress_bar import LOOK_EVERY, Budget, Ended, GivenUpError, Progress
-from harness.proof.graph._expansion import Expansion, cycles_left_alone, expanded
-from harness.proof.graph._packed_states import Followers, States
+from harness.proof.graph._expansion import Expansion, Followers, States, cycles_left_alone, expanded
 from harness.proof.graph._workers import Crew
 from harness.proof.model._flaws import Flaw
 from harness.proof.model._global_states import State, Swarm

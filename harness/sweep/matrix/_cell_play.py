@@ -12,7 +12,7 @@ from harness.gc_pause import gc_paused
 from harness.play.backends import BACKENDS
 from harness.play.progress import Silent
 from harness.proof.coverage import Reached, Watcher, reached_in
-from harness.proof.coverage.simulated import simulate_watched
+from harness.proof.coverage.reached import simulate_watched
 from harness.run.run import run
 from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run

@@ -9,8 +9,7 @@ import pytest
 
 from harness import checker
 from harness.archive.archive import RunArchive
-from harness.archive.lenient_model import fit
-from harness.archive.record_file import MAX_VALUES, DamagedRecordError, RecordFile, read_record
+from harness.archive.record_file import MAX_VALUES, DamagedRecordError, RecordFile, fit, read_record
 from harness.archive.run_record import RunRecord
 from harness.play.progress import Silent
 from harness.run.run import run

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from harness.archive import _jsonlines
+from harness.archive import bounded_file
 from harness.archive.directory import TRACKS_FILE
 from harness.archive.tracks import Fix, read_tracks
 
@@ -78,8 +78,8 @@ def test_a_damaged_line_is_left_out_and_said(tmp_path: Path, damaged: str) -> No
 
 
 def test_reading_ends_at_its_bounds_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_jsonlines, "MAX_BYTES", 3 * 1024 * 1024)
-    monkeypatch.setattr(_jsonlines, "MAX_LINE_BYTES", 1024 * 1024)
+    monkeypatch.setattr(bounded_file, "MAX_LINES_BYTES", 3 * 1024 * 1024)
+    monkeypatch.setattr(bounded_file, "MAX_LINE_BYTES", 1024 * 1024)
     tracks = read_tracks(tracks_file(tmp_path, GOOD, "x" * 1024 * 1024, GOOD), [1, 2])
     assert len(tracks.by_vehicle[1]) == 1
     assert tracks.problems == ["tracks.jsonl: what follows 1 MiB without a line's end is left out"]
@@ -89,7 +89,7 @@ def test_reading_ends_at_its_bounds_and_says_so(tmp_path: Path, monkeypatch: pyt
         "tracks.jsonl: 3 lines are left out, damaged or of no meaning",
         "tracks.jsonl: what is beyond 50000 lines or 3 MiB is left out",
     ]
-    monkeypatch.setattr(_jsonlines, "MAX_LINES", 2)
+    monkeypatch.setattr(bounded_file, "MAX_LINES", 2)
     assert len(read_tracks(tracks_file(tmp_path, GOOD, GOOD), [1, 2]).by_vehicle[1]) == 2
     tracks = read_tracks(tracks_file(tmp_path, GOOD, GOOD, GOOD), [1, 2])
     assert len(tracks.by_vehicle[1]) == 2

@@ -11,7 +11,7 @@ from scapy.layers.l2 import Ether
 from scapy.packet import Packet
 from scapy.utils import rdpcap
 
-from harness.archive.lenient_model import fit
+from harness.archive.record_file import fit
 from harness.archive.run_record import InjectedMessages, RunRecord
 from harness.errors import ScenarioError
 from harness.play.process.process_preflight import on_the_air

@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.proof.graph._packed_states import Followers, States
+from harness.proof.graph._expansion import Followers, States
 from harness.proof.model._known_states import DEAD
 
 

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from harness.archive.archive import RunArchive
-from harness.archive.lenient_model import fit
+from harness.archive.record_file import fit
 from harness.archive.run_record import RunRecord
 from harness.report import write_report
 from harness.report._run_summary import to_junit

@@ -30,7 +30,7 @@ def test_each_agent_is_told_timers_of_its_own_and_records_agree() -> None:
     assert not simulated.result.bad
     trace = simulated.evidence.traces[7]
     trace.header.settings["vote_timeout_s"] = 10.0
-    assert len([*_headers.compare(simulated.evidence)]) == 1
+    assert len([*_headers.compare_headers(simulated.evidence)]) == 1
 
 
 def test_agents_in_step_get_out_of_step() -> None:

@@ -20,7 +20,7 @@ from harness.checker.uniform_chain import common_prefix
 from harness.errors import AgentFailedError
 from harness.gc_pause import gc_paused
 from harness.proof.coverage import Reached, Watcher
-from harness.proof.coverage.simulated import simulate_watched
+from harness.proof.coverage.reached import simulate_watched
 from harness.run.finding import ended_by
 from harness.scenario import Scenario
 from harness.sweep.explore._recording import Logged, record
