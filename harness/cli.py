@@ -82,7 +82,7 @@ COMMANDS = {
         "Make a scenario that reproduces a recorded flight.",
     ),
     "matrix": Command(
-        "many", "harness.commands.matrix:matrix_command", "Play a scenario over many loss rates and seeds."
+        "many", "harness.commands.matrix:matrix_command", "Play a scenario over loss rates, swarm sizes and many seeds."
     ),
     "explore": Command(
         "many",
@@ -91,11 +91,6 @@ COMMANDS = {
     ),
     "bisect": Command(
         "many", "harness.commands.bisect:app", "Find the commit that changes how a scenario or record plays."
-    ),
-    "scale": Command(
-        "many",
-        "harness.commands.scale:scale_command",
-        "Fit how messages, bytes and time grow with agents and blocks.",
     ),
     "prove": Command(
         "prove",
@@ -129,6 +124,7 @@ COMMANDS = {
 
 OLD_NAMES = {
     "again": "`ucp-harness bisect --once`",
+    "scale": "`ucp-harness matrix growth_matrix`",
 }
 """Commands that had another name, and what to run instead."""
 

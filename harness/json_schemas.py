@@ -23,7 +23,6 @@ from harness.field.depot.record_lines import ConsolidatedLine
 from harness.field.replay.replay_document import ReplayDocument
 from harness.scenario import Scenario
 from harness.sweep.matrix import MatrixRecord
-from harness.sweep.scale import ScaleRecord
 from ucp.contract import schemas
 
 MODELS: dict[str, type[BaseModel]] = {
@@ -36,7 +35,6 @@ MODELS: dict[str, type[BaseModel]] = {
     "ucp-packets-1": PacketsRecord,
     "ucp-replay-1": ReplayDocument,
     "ucp-run-1": RunRecord,
-    "ucp-scale-1": ScaleRecord,
 }
 
 

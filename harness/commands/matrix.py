@@ -1,4 +1,4 @@
-"""`ucp-harness matrix`: a scenario over loss rates, numbers of agents, backends and seeds."""
+"""`ucp-harness matrix`: a scenario over loss rates, numbers of agents, mission lengths, backends and seeds."""
 
 from pathlib import Path
 from typing import Annotated
@@ -43,9 +43,10 @@ def matrix_command(
         typer.Option(metavar="DIR", help="Keep this night in DIR, and draw the trend of all nights in it."),
     ] = None,
 ) -> None:
-    """Play a scenario over many loss rates and seeds.
+    """Play a scenario over loss rates, swarm sizes and many seeds.
 
-    The report has figures with 95 % intervals, and each violation.
+    Mission lengths and backends can vary, too. The report has figures with 95 % intervals, and each violation. With
+    three or more swarm sizes or mission lengths, it also has power laws of how figures grow.
     """
     request = matrix.load_matrix(file, backend)
     if secured:

@@ -22,7 +22,6 @@ from harness.scenario.verdict_names import CHARACTERISTICS, Kind
 
 if TYPE_CHECKING:
     from harness.sweep.matrix.matrix_record import MatrixRecord
-    from harness.sweep.scale.record import ScaleRecord
 
 STYLES: dict[Kind, str] = {"good": "green", "bad": "bold red", "unknown": "yellow"}
 MARKS: dict[Kind, str] = {"good": "✔", "bad": "✘", "unknown": "-"}
@@ -63,7 +62,7 @@ def show_rogue(console: Console, injected: list[RogueInjection]) -> None:
         console.print(injections.in_words(injection), highlight=False, soft_wrap=True)
 
 
-def end_sweep(record: "MatrixRecord | ScaleRecord", table: RenderableType | None, picture: Path) -> NoReturn:
+def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Path) -> NoReturn:
     """Show what came out, as JSON if there is no table, and exit."""
     if table is None:
         print_json(record.to_json())

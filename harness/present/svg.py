@@ -146,13 +146,20 @@ def name(x: float, y: float, anchor: str, number: int, text: str) -> Markup:
     )
 
 
-def document(height: float, heading: str, about: str, description: str, panels: Iterable[Markup], foot: str) -> str:
-    """A file of its own, which refers to nothing. `description` says in words what it shows."""
+def document(
+    height: float, heading: str, about: str, description: str, panels: Iterable[Markup], foot: str, *, ids: str = ""
+) -> str:
+    """Return a file of its own, which refers to nothing.
+
+    `description` describes the picture in words. `ids` is a prefix that makes the IDs unique on a page with several
+    pictures.
+    """
     return str(
         Markup(
             '<svg xmlns="http://www.w3.org/2000/svg" class="chart" role="img" width="{w}" height="{h}"'
-            ' viewBox="0 0 {w} {h}" aria-labelledby="title desc" font-family="{font}" font-size="13" fill="none">'
-            '<title id="title">{heading}</title><desc id="desc">{description}</desc><style>{style}</style>'
+            ' viewBox="0 0 {w} {h}" aria-labelledby="{ids}title {ids}desc" font-family="{font}"'
+            ' font-size="13" fill="none">'
+            '<title id="{ids}title">{heading}</title><desc id="{ids}desc">{description}</desc><style>{style}</style>'
             '<rect class="ground" width="100%" height="100%" fill="{ground}"/>\n'
             '<text x="{x}" y="32" font-size="20" font-weight="600" fill="{ink}">{title}</text>'
             '<text class="quiet" x="{x}" y="54" fill="{quiet}">{about}</text>\n{panels}'
@@ -160,6 +167,7 @@ def document(height: float, heading: str, about: str, description: str, panels: 
         ).format(
             w=WIDTH,
             h=height,
+            ids=ids,
             font=FONT,
             heading=heading,
             description=description,

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from harness.scenario.network import DelaySeconds, Disturbance, NetworkLayer, NetworkValues, Where, laid_over, of_whom
+from harness.scenario._network import DelaySeconds, Disturbance, NetworkLayer, NetworkValues, Where, laid_over, of_whom
 from harness.scenario.strict_model import Instant, Model, Probability, Seconds, VehicleId
 
 MAX_STEPS = 10_000

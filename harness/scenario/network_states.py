@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
+from harness.scenario._network import NetworkModel, NetworkValues, Where, conditions_of, laid_over, of_whom
 from harness.scenario._schedule import UNTOUCHED, Layer, Schedule
-from harness.scenario.network import NetworkModel, NetworkValues, Where, conditions_of, laid_over, of_whom
 from harness.scenario.timeline import TimelineEntry
 from netem.conditions import NetworkConditions
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
+from harness.scenario._network import NetworkModel
 from harness.scenario._schedule import NEEDED, Schedule
 from harness.scenario.agent_options import (
     AgentCommand,
@@ -25,7 +26,6 @@ from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.injection import ScriptedDatagram
-from harness.scenario.network import NetworkModel
 from harness.scenario.network_states import Step, refuse_ambiguity, steps
 from harness.scenario.strict_model import MAX_AGENTS, Data, Lateness, Model, Seconds, VehicleKey
 from harness.scenario.timeline import TimelineEntry

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
 from pydantic import ValidationInfo, create_model, field_validator, model_validator
 
+from harness.scenario._network import Disturbance
 from harness.scenario.faults import ASKED_FOR, Agents, Fault
 from harness.scenario.injection import (
     INJECTIONS,
@@ -17,7 +18,6 @@ from harness.scenario.injection import (
     Lie,
     Replay,
 )
-from harness.scenario.network import Disturbance
 from harness.scenario.strict_model import Instant, Seconds
 
 NETWORK_KEYS = ("loss", "partition", "heal", "network")

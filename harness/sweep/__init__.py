@@ -1,1 +1,1 @@
-"""Many runs: matrices, exploration of seeds, and growth with the number of agents."""
+"""Many runs: matrices with their fits of growth, and exploration of seeds."""

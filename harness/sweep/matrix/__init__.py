@@ -1,17 +1,33 @@
-"""The matrix: one scenario over loss rates, numbers of agents, backends and many seeds, on all cores or a Dask cluster.
+"""The matrix: one scenario over loss rates, numbers of agents, mission lengths, backends and seeds.
 
-_matrix_file.py       what is asked: the matrix file       _estimate.py   a mean or a share with its 95 % interval
-_estimate.py     what is measured of each run         _cell.py       all runs at one point, summed up
-_cell_play.py        one run                              _results_file.py    results.jsonl, from which a matrix goes on
-matrix_run.py         all of them                          _cluster.py    spread over a Dask cluster
-matrix_record.py      matrix.json                          nights.py, _comparison.py   beside an earlier night
-matrix_frame.py   its runs as a DataFrame
-matrix_outputs.py     the files                            matrix_summary.py  matrix_outputs.py  _matrix_picture.py
-_cell_scenarios.py   some of them
-report/        report.html                          nights.py     what its trend is drawn from
-matrix_table.py       the table on the terminal
-../../../docs/generate/matrix_thesis.py      ../../../docs/matrix-thesis.md: the figures beside what Section 4.3
-observed ../../../docs/matrix-nightly.md     a matrix every night, on a build server
+The runs use all cores of this machine or a Dask cluster.
+
+_matrix_file.py      the matrix file
+matrix_run.py        all runs of a matrix
+_cell_play.py        one run
+_cell.py             all runs at one point, summed up
+_estimate.py         the metrics of a run, and a mean or a share with its 95 % interval
+_growth_metrics.py   further metrics, if the matrix has three sizes of swarm or mission
+_growth.py           power laws fitted to the runs
+_power_law.py        the fit of one power law
+_matrix_coverage.py  how much of the protocol the runs have tried
+_results_file.py     results.jsonl, from which an interrupted matrix goes on
+_cluster.py          the runs on a Dask cluster
+matrix_record.py     matrix.json
+matrix_outputs.py    all other files
+matrix_summary.py    summary.md
+_matrix_picture.py   matrix.svg
+_growth_picture.py   growth.svg
+_cell_scenarios.py   the scenario of each cell
+report/              report.html
+matrix_table.py      the table on the terminal
+_growth_table.py     the tables of growth
+matrix_frame.py      the runs as a DataFrame
+nights.py            earlier nights of a matrix
+_comparison.py       the difference from an earlier night
+
+../../../docs/matrix-nightly.md explains a matrix on a build server. ../../../docs/generate/ has the programs that write
+the results of two matrices into ../../../docs/matrix-thesis.md and ../../../docs/complexity.md.
 """
 
 from harness.sweep.matrix._matrix_file import Matrix, load_matrix

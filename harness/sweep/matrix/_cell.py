@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
 from harness.scenario.verdict_names import JUDGED, Verdict, kind_of
+from harness.sweep.matrix import _growth_metrics
 from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, estimate_share
 from harness.sweep.matrix._matrix_file import Point, Task
 
@@ -20,10 +21,11 @@ class Placed(BaseModel):
     loss: float
     agents: int
     backend: BackendName
+    duration_s: float | None = None
 
     @property
     def point(self) -> Point:
-        return Point(self.loss, self.agents, self.backend)
+        return Point(self.loss, self.agents, self.backend, self.duration_s)
 
 
 class Run(Placed):
@@ -71,12 +73,14 @@ class Cell(Placed):
         return estimate_share(finished, finished + told.get("not finished", 0) + told.get("never finishes", 0))
 
 
-def sum_up(point: Point, runs: Sequence[Run]) -> Cell:
+def sum_up(point: Point, runs: Sequence[Run], *, grows: bool = False) -> Cell:
+    """Sum up the runs of a cell. `grows`: also estimate the metrics of growth."""
     failed = sum(run.failed is not None for run in runs)
     unsupported = sum(run.unsupported is not None for run in runs)
     judged = [run for run in runs if run.judged]
     estimates = {metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS}
-    before = {metric.name: metric.estimate(run.figures for run in judged) for metric in BEFORE_FINAL_RECONCILE}
+    further = BEFORE_FINAL_RECONCILE + (_growth_metrics.METRICS if grows else ())
+    known = {metric.name: metric.estimate(run.figures for run in judged) for metric in further}
     verdicts = {key: {run.seed: run.verdicts[key] for run in judged if key in run.verdicts} for key in JUDGED}
     bad = {key: [seed for seed in by_seed if kind_of(by_seed[seed]) == "bad"] for key, by_seed in verdicts.items()}
     return Cell(
@@ -84,7 +88,7 @@ def sum_up(point: Point, runs: Sequence[Run]) -> Cell:
         runs=len(runs),
         failed=failed,
         unsupported=unsupported,
-        estimates=estimates | {name: estimate for name, estimate in before.items() if estimate.n},
+        estimates=estimates | {name: estimate for name, estimate in known.items() if estimate.n},
         verdicts={key: dict(Counter(by_seed.values())) for key, by_seed in verdicts.items() if by_seed},
         violated={key: seeds for key, seeds in bad.items() if seeds},
     )

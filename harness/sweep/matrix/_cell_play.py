@@ -10,15 +10,17 @@ from harness.checker import Result, gather
 from harness.errors import VIOLATED, HarnessError, InterruptedRunError, UnsupportedError
 from harness.gc_pause import gc_paused
 from harness.play.backends import BACKENDS
+from harness.play.mission import RunOutcome
 from harness.play.progress import Silent
 from harness.proof.coverage import Reached, Watcher, reached_in
 from harness.proof.coverage.reached import simulate_watched
 from harness.run.run import run
 from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._growth_metrics import growth_figures
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 
-Judge = Callable[[Scenario, int], Result]
+Judge = Callable[[Scenario, int], tuple[RunOutcome, Result]]
 """Plays a scenario with a seed, and judges it."""
 
 
@@ -29,20 +31,21 @@ class RunFailedError(HarnessError):
 
 
 @gc_paused()
-def simulated(scenario: Scenario, seed: int) -> Result:
-    """With traces, so that all of it is judged, every step, too."""
+def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> tuple[RunOutcome, Result]:
+    """Play in virtual time. Every step is judged if `tracing`."""
     from harness.run.simulate import simulate
 
-    return simulate(scenario, seed, tracing=True).result
+    run = simulate(scenario, seed, tracing=tracing)
+    return run.played, run.result
 
 
 @gc_paused()
-def watched(scenario: Scenario, seed: int, reached: Reached) -> Result:
-    """As `simulated`, and adds to what was reached."""
+def watched(scenario: Scenario, seed: int, reached: Reached) -> tuple[RunOutcome, Result]:
+    """Play as `simulated` does with traces, and add to what was reached."""
     watcher = Watcher()
-    result = simulate_watched(scenario, seed, watcher.step).result
+    run = simulate_watched(scenario, seed, watcher.step)
     reached.add(watcher.reached)
-    return result
+    return run.played, run.result
 
 
 def _same_twice(scenario: Scenario, seed: int) -> None:
@@ -69,22 +72,25 @@ class Player:
                 _same_twice(scenario, task.seed)
             reached = Reached() if self.covers else None
             if not in_memory:
-                result = self._for_real(scenario, task, reached)
+                played, result = self._for_real(scenario, task, reached)
             elif reached is not None:
-                result = watched(scenario, task.seed, reached)
+                played, result = watched(scenario, task.seed, reached)
             else:
-                result = self.judge(scenario, task.seed)
+                played, result = self.judge(scenario, task.seed)
         except UnsupportedError as error:
             return Run(**task.point._asdict(), seed=task.seed, unsupported=str(error))
         verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}
-        return Run(**task.point._asdict(), seed=task.seed, figures=result.figures, verdicts=verdicts, reached=reached)
+        figures = dict(result.figures)
+        if self.matrix.grows:
+            figures |= growth_figures(scenario, played.mission_s, figures)
+        return Run(**task.point._asdict(), seed=task.seed, figures=figures, verdicts=verdicts, reached=reached)
 
     def refuse(self, points: Iterable[Point]) -> None:
         """Raises HarnessError if a backend, or this machine, cannot play these: before hours of others have gone by."""
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
-    def _for_real(self, scenario: Scenario, task: Task, reached: Reached | None) -> Result:
+    def _for_real(self, scenario: Scenario, task: Task, reached: Reached | None) -> tuple[RunOutcome, Result]:
         """Raises UnsupportedError, or RunFailedError, which names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # of a run that was broken off
@@ -102,7 +108,7 @@ class Player:
             reached.add(reached_in(gather(RunArchive(directory))))
         if not finished.result.bad and self.matrix.keep == "violated":
             shutil.rmtree(directory)
-        return finished.result
+        return finished.played, finished.result
 
 
 def directory_name(task: Task) -> str:

@@ -1,5 +1,6 @@
-"""The matrix file: which scenario, at which loss rates, with how many agents, by which backends, with which seeds."""
+"""The matrix file: a scenario and its axes (loss rates, numbers of agents, mission lengths, backends) and seeds."""
 
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -10,24 +11,29 @@ from harness.backend_names import BackendName
 from harness.errors import ScenarioError
 from harness.play.backends import BACKENDS
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
-from harness.scenario.strict_model import MAX_AGENTS, Model, Probability
+from harness.scenario.scenario import MAX_DURATION_S
+from harness.scenario.strict_model import MAX_AGENTS, Model, Probability, Seconds
 from ucp.short_value import shown
 
 MAX_SEEDS = 10_000
 MAX_SEED = 2**32 - 1
+SIZES_FOR_GROWTH = 3
+"""Numbers of agents, or mission lengths, from which on a matrix fits growth: two points fit any law."""
 
 
 class Point(NamedTuple):
-    """Where a cell stands in the matrix."""
+    """The place of a cell in the matrix. `duration_s` is None if the matrix has no axis of mission lengths."""
 
     loss: float
     agents: int
     backend: BackendName
+    duration_s: float | None = None
 
     @property
     def file_name(self) -> str:
-        """What its files and directories are called; those of all backends."""
-        return f"loss-{self.loss}-agents-{self.agents}"
+        """The name of the cell's files and directories, which is the same for all backends."""
+        length = "" if self.duration_s is None else f"-duration-{self.duration_s}"
+        return f"loss-{self.loss}-agents-{self.agents}{length}"
 
 
 class Task(NamedTuple):
@@ -38,12 +44,14 @@ class Task(NamedTuple):
 
 
 class Matrix(Model):
-    """A scenario, played by each `backend` with each number of `agents` at each rate of `loss` with each of `seeds`.
+    """A scenario, played by each `backend` for each `duration_s` with each number of `agents` at each rate of `loss`
+    with each of `seeds`.
 
-    `loss` takes the place of the scenario's `network.loss`, and `agents`, if given, of its `agents`, which therefore
-    have to stay unset: two words for one thing could differ. Whatever else the scenario says of the network (receivers
-    that differ, its timeline) holds in every cell. Every cell has the same seeds, so the same blocks are built at the
-    same times at every loss: cells differ by their loss, not by their luck (common random numbers).
+    `loss` replaces the scenario's `network.loss`. `agents` and `duration_s`, if given, replace the scenario's keys of
+    the same name. The scenario must leave a replaced key unset, because two values for one thing could differ.
+    Everything else in the scenario (receivers that differ, its timeline) applies to every cell. Every cell has the same
+    seeds, so the same blocks are built at the same times at every loss (common random numbers). A difference between
+    two such cells is therefore an effect of the loss.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
@@ -58,10 +66,17 @@ class Matrix(Model):
         | None
     ) = None
     """One number or several; the scenario's if not given."""
+    duration_s: (
+        Annotated[list[Annotated[Seconds, Field(le=MAX_DURATION_S)]], Field(min_length=1, max_length=100)] | None
+    ) = None
+    """One mission length or several; the scenario's if not given."""
     backend: Annotated[list[BackendName], Field(min_length=1, default_factory=lambda: ["sim"])]
     """One or several."""
     keep: Literal["violated", "all"] = "violated"
     """Of which runs as processes the directories are kept: those that violated a characteristic or failed, or all."""
+    traces: bool = True
+    """Whether agents write traces in virtual time. Without traces, large swarms take a fifth of the time and far less
+    memory, but the checker judges neither characteristic 1 nor steps and records. Processes always write traces."""
 
     @property
     def needs_processes(self) -> bool:
@@ -75,7 +90,10 @@ class Matrix(Model):
     @property
     def points(self) -> list[Point]:
         agents = self.agents or [len(self.scenario.roster)]
-        return [Point(loss, number, backend) for backend, number, loss in product(self.backend, agents, self.loss)]
+        return [
+            Point(loss, number, backend, duration_s)
+            for backend, duration_s, number, loss in product(self.backend, self.duration_axis, agents, self.loss)
+        ]
 
     @property
     def tasks(self) -> list[Task]:
@@ -84,40 +102,70 @@ class Matrix(Model):
     def scenario_at(self, point: Point) -> Scenario:
         network = self.scenario.network.model_copy(update={"loss": point.loss})
         agents = point.agents if self.agents else self.scenario.agents
-        return self.scenario.model_copy(update={"network": network, "agents": agents})
+        duration_s = self.scenario.duration_s if point.duration_s is None else point.duration_s
+        return self.scenario.model_copy(update={"network": network, "agents": agents, "duration_s": duration_s})
+
+    @property
+    def duration_axis(self) -> Sequence[float | None]:
+        """The values of `duration_s` of the cells: None alone if the matrix has no such axis."""
+        return self.duration_s or [None]
+
+    @property
+    def lengths(self) -> list[float]:
+        """The mission lengths, in seconds."""
+        return self.duration_s or [self.scenario.duration_s]
+
+    @property
+    def grows_with_agents(self) -> bool:
+        """Whether there are enough numbers of agents to fit growth."""
+        return len(self.agents or ()) >= SIZES_FOR_GROWTH
+
+    @property
+    def grows_with_length(self) -> bool:
+        """Whether there are enough mission lengths to fit growth."""
+        return len(self.duration_s or ()) >= SIZES_FOR_GROWTH
+
+    @property
+    def grows(self) -> bool:
+        return self.grows_with_agents or self.grows_with_length
 
     @model_validator(mode="before")
     @classmethod
     def _scenario_takes_from_the_matrix(cls, document: Any) -> Any:
-        """Its name, and the first number of agents, so that what it says of single agents has a meaning."""
+        """Give the scenario the matrix's name, first number of agents and first mission length.
+
+        The keys of the scenario that name single agents or times are checked with these values.
+        """
         if not isinstance(document, dict):
             return document
-        scenario, agents = document.get("scenario"), document.get("agents")
+        scenario = document.get("scenario")
         if isinstance(scenario, Scenario):
             scenario = scenario.model_dump(exclude_unset=True)
         if not isinstance(scenario, dict):
             return document
         if "name" in document:
             scenario = {"name": document["name"], **scenario}
-        if agents:
-            first = agents[0] if isinstance(agents, list) else agents
-            if scenario.get("agents", first) != first:
-                its_agents = shown(scenario["agents"])
-                raise ValueError(
-                    f"`scenario` sets agents to {its_agents}, which the matrix's `agents` is for: remove it there"
-                )
-            scenario = {**scenario, "agents": first}
+        for axis in ("agents", "duration_s"):
+            if values := document.get(axis):
+                first = values[0] if isinstance(values, list) else values
+                if scenario.get(axis, first) != first:
+                    raise ValueError(
+                        f"`scenario` sets {axis} to {shown(scenario[axis])}, which the matrix's `{axis}` is for: "
+                        "remove it there"
+                    )
+                scenario = {**scenario, axis: first}
         return {**document, "scenario": scenario}
 
     @model_validator(mode="after")
-    def _scenario_fits_every_number_of_agents(self) -> "Matrix":
-        for agents in self.agents or ():
+    def _scenario_fits_every_size(self) -> "Matrix":
+        axes = {axis: values for axis in ("agents", "duration_s") if (values := getattr(self, axis))}
+        document = self.scenario.model_dump()
+        for size in product(*axes.values()) if axes else ():
             try:
-                Scenario.model_validate({**self.scenario.model_dump(), "agents": agents})
+                Scenario.model_validate({**document, **dict(zip(axes, size, strict=True))})
             except ValidationError as error:
-                raise ValueError(
-                    f"`agents` has {agents}, for which `scenario` is wrong: {explain(error, Scenario)}"
-                ) from None
+                which = " and ".join(f"`{axis}` has {value:g}" for axis, value in zip(axes, size, strict=True))
+                raise ValueError(f"{which}, for which `scenario` is wrong: {explain(error, Scenario)}") from None
         return self
 
     @field_validator("scenario")
@@ -129,12 +177,12 @@ class Matrix(Model):
             )
         return scenario
 
-    @field_validator("agents", "backend", mode="before")
+    @field_validator("agents", "duration_s", "backend", mode="before")
     @classmethod
     def _one_or_several(cls, value: Any) -> Any:
         return value if value is None or isinstance(value, list) else [value]
 
-    @field_validator("loss", "agents", "backend")
+    @field_validator("loss", "agents", "duration_s", "backend")
     @classmethod
     def _each_once(cls, values: list[Any] | None) -> list[Any] | None:
         return values and _each_once(values)
@@ -159,7 +207,8 @@ def load_matrix(path: Path | str, backend: BackendName | None = None) -> Matrix:
     """
     path = Path(path)
     document = read_yaml(path, "matrix")
-    if "scenario" not in document and document.keys() & (Scenario.model_fields.keys() - Matrix.model_fields.keys()):
+    of_matrix = Matrix.model_fields.keys() if "loss" in document else {"name", "about"}
+    if "scenario" not in document and document.keys() & (Scenario.model_fields.keys() - of_matrix):
         raise ScenarioError(
             f"{path}: this is a scenario; a matrix names one, `scenario: {path.name}`, and `loss`, a list"
         )

@@ -1,8 +1,8 @@
 """matrix.svg: how the swarm fares as the loss grows, six small panels side by side over the same axis.
 
-With several numbers of agents or backends, six panels for each of them, one below the other. Lines are means, bands
-their 95 % intervals, a dot each loss that was measured. Two lines in a panel also differ by their dashes and are named
-where they are.
+With several numbers of agents, mission lengths or backends, six panels for each of them, one below the other. Lines
+are means, bands their 95 % intervals, and dots the losses that were measured. Two lines in a panel also differ by their
+dashes, and their names stand beside them.
 """
 
 import math
@@ -17,7 +17,7 @@ from harness.present.svg import Area, Axis, n
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import BY_NAME, Estimate
 from harness.sweep.matrix.matrix_record import MatrixRecord
-from harness.sweep.matrix.matrix_table import say, series, series_name
+from harness.sweep.matrix.matrix_table import say, say_lengths, series, series_name
 
 COLUMNS = 3
 HEAD, SERIES_HEAD, PANEL_HEIGHT, FOOT = 74, 26, 218, 26
@@ -134,7 +134,7 @@ def _about(record: MatrixRecord) -> str:
     agents = sorted({point.agents for point in record.matrix.points})
     simulated = "simulated " if in_virtual_time(record.backend) else ""
     parts = [
-        f"{', '.join(map(str, agents))} agents, {text.duration(record.matrix.scenario.duration_s)}",
+        f"{', '.join(map(str, agents))} agents, {say_lengths(record.matrix)}",
         f"{text.value(record.runs)} {simulated}runs",
     ]
     if record.outcome == "interrupted":

@@ -20,10 +20,10 @@ _TYPES = {
 def matrix_frame(finished: Finished) -> pl.DataFrame:
     """Return a table with one row for each run of a matrix, with the columns of `runs.csv`.
 
-    `loss` (0 to 1), `agents`, `backend` and `seed` say which run it is. The figures of run.json follow, such as
-    `mutual_chain`, `distinct_chains` and `messages`; a figure that is not known is null. `characteristic_1` to
-    `characteristic_6`, `steps`, `records` and `liveness` are verdicts. A run without a verdict has the reason in
-    `failed` or `unsupported`.
+    `loss` (0 to 1), `agents`, `backend` and `seed` say which run it is. So does `duration_s`, if it is an axis of the
+    matrix. The figures of run.json follow, such as `mutual_chain`, `distinct_chains` and `messages`; a figure that is
+    not known is null. `characteristic_1` to `characteristic_6`, `steps`, `records` and `liveness` are verdicts. A run
+    without a verdict has the reason in `failed` or `unsupported`.
 
     Raises MachineError without the extra `data`.
     """

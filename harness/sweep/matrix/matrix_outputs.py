@@ -2,8 +2,9 @@
 
 matrix.json   all of it, schema `ucp-matrix/1`
 matrix.csv    one row a cell
-runs.csv      one row a run: loss, agents, backend, seed, figures, verdicts
+runs.csv      one row a run: loss, agents, backend, mission length if it is an axis, seed, figures, verdicts
 matrix.svg    the picture
+growth.svg    how figures grow with the swarm or the mission, if the matrix has three sizes of one of them
 report.html   all of it for people, one file
 summary.md    table and findings in Markdown
 junit.xml     a test case a cell
@@ -24,6 +25,8 @@ from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS, JUDGED
 from harness.sweep.matrix._cell import Cell, Run
 from harness.sweep.matrix._cell_scenarios import write_scenarios
 from harness.sweep.matrix._estimate import METRICS
+from harness.sweep.matrix._growth_picture import draw_growth
+from harness.sweep.matrix._matrix_file import Point
 from harness.sweep.matrix._matrix_picture import draw
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
@@ -63,6 +66,8 @@ def write(finished: Finished, directory: Path, nights: Nights | None = None) -> 
         write_atomically(directory / "matrix.csv", to_csv(_cell_row(cell) for cell in record.cells))
         write_atomically(directory / "runs.csv", to_csv(run_rows(finished.runs)))
         write_atomically(directory / "matrix.svg", draw(record))
+        if record.matrix.grows:
+            write_atomically(directory / "growth.svg", draw_growth(record))
         write_scenarios(record.matrix, directory)
         write_atomically(directory / "report.html", to_html(finished, directory, nights))
         write_atomically(directory / "summary.md", to_markdown(record))
@@ -73,7 +78,7 @@ def write(finished: Finished, directory: Path, nights: Nights | None = None) -> 
 
 def _cell_row(cell: Cell) -> dict[str, Any]:
     row: dict[str, Any] = {
-        **cell.point._asdict(),
+        **_place(cell.point),
         "runs": cell.runs,
         "failed": cell.failed,
         "unsupported": cell.unsupported,
@@ -84,12 +89,17 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
     return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in JUDGED}
 
 
+def _place(point: Point) -> dict[str, Any]:
+    """Return the columns that name a cell. A matrix without an axis of mission lengths has no column for them."""
+    return {axis: value for axis, value in point._asdict().items() if value is not None}
+
+
 def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
     """Yield a row of `runs.csv` for each run: point, seed, figures, verdicts, and why it has none."""
     figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
     for run in runs:
         yield {
-            **run.point._asdict(),
+            **_place(run.point),
             "seed": run.seed,
             **{name: run.figures.get(name) for name in figures},
             **{f"characteristic_{number}": run.verdicts.get(number) for number in CHARACTERISTICS},

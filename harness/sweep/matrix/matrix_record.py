@@ -8,6 +8,7 @@ from harness.backend_names import BackendName
 from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED
 from harness.sweep.matrix._cell import Cell, Placed
 from harness.sweep.matrix._comparison import Comparison
+from harness.sweep.matrix._growth import Growth
 from harness.sweep.matrix._matrix_coverage import Tried
 from harness.sweep.matrix._matrix_file import Matrix
 
@@ -44,6 +45,8 @@ class MatrixRecord(BaseModel):
     against: Comparison | None = None
     tried: Tried | None = None
     """How much of the protocol the runs have tried, if that was asked for."""
+    growths: list[Growth] = []
+    """Power laws, if the matrix has several sizes of swarm or mission."""
 
     @property
     def runs(self) -> int:

@@ -12,10 +12,12 @@ from harness.archive.directory import default_path
 from harness.errors import InterruptedRunError, ScenarioError
 from harness.run.parallel import Failed, cores, sweep
 from harness.run.run import versions
+from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run, sum_up
 from harness.sweep.matrix._cell_play import Judge, Player, simulated
 from harness.sweep.matrix._cluster import cluster
 from harness.sweep.matrix._comparison import Comparison, compare
+from harness.sweep.matrix._growth import growths
 from harness.sweep.matrix._matrix_coverage import Tally
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 from harness.sweep.matrix._results_file import Results, opened
@@ -55,7 +57,7 @@ def run_matrix(
     matrix: Matrix,
     out: Path | None = None,
     spread: Spread | None = None,
-    judge: Judge = simulated,
+    judge: Judge | None = None,
     *,
     covers: bool = False,
 ) -> Finished:
@@ -64,12 +66,13 @@ def run_matrix(
     - `out`: the directory of `results.jsonl`. It is new or empty, or holds earlier results of the same matrix; runs in
       it are not played again. Without it, a new directory under `runs/`.
     - `spread`: how runs are distributed. Without it, they use all cores of this machine.
-    - `judge`: plays and checks one run in virtual time.
+    - `judge`: plays and checks one run in virtual time. Without it, the simulation.
     - `covers`: also measure which share of the protocol's states the runs reach, which takes longer.
 
     Ctrl-C ends the matrix early, with the runs that have ended. Raises HarnessError if it cannot be played.
     """
     with opened((out or default_path(matrix.name)).absolute(), matrix) as results:
+        judge = judge or partial(simulated, tracing=matrix.traces)
         return _run_missing(matrix, results, spread or on_cores(matrix, cores()), judge, covers)
 
 
@@ -77,6 +80,8 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
     started = time.monotonic()
     play = Player(matrix, results.directory / "runs", judge, covers)
     tasks = [task for task in matrix.tasks if task not in results.runs]
+    if matrix.grows:  # the longest first, so that at the end no core waits for another's long run
+        tasks.sort(key=lambda task: _effort(matrix.scenario_at(task.point)), reverse=True)
     play.refuse(dict.fromkeys(task.point for task in tasks))
     interrupted, tally = False, Tally() if covers else None
     try:
@@ -91,6 +96,7 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
     by_point: dict[Point, list[Run]] = defaultdict(list)
     for run in runs:
         by_point[run.point].append(run)
+    cells = [sum_up(point, its_runs, grows=matrix.grows) for point, its_runs in by_point.items()]
     record = MatrixRecord(
         matrix=matrix,
         backend=matrix.backend[0] if len(matrix.backend) == 1 else "several",
@@ -98,10 +104,11 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
         started_at=results.started_at,
         wall_s=round(time.monotonic() - started, 1),
         outcome="interrupted" if interrupted else "completed",
-        cells=[sum_up(point, its_runs) for point, its_runs in by_point.items()],
+        cells=cells,
         failed=[_without_result(run, run.failed) for run in runs if run.failed is not None],
         unsupported=[_without_result(run, run.unsupported) for run in runs if run.unsupported is not None],
         tried=None if tally is None else tally.tried(matrix, len(runs)),
+        growths=growths(matrix, cells, runs) if matrix.grows else [],
     )
     return Finished(record, runs)
 
@@ -111,6 +118,12 @@ def compared(finished: Finished, baseline: MatrixRecord, path: str) -> Finished:
     changes = list(compare(baseline.cells, finished.record.cells))
     comparison = Comparison(baseline=path, started_at=baseline.started_at, changes=changes)
     return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
+
+
+def _effort(scenario: Scenario) -> float:
+    """Estimate the cost of a run, in no unit. All agents hear each other, and many agents settle slowly."""
+    agents = len(scenario.roster)
+    return agents**2 * (scenario.duration_s + min(scenario.settle.limit_s, 30 * agents))
 
 
 def _without_result(run: Run, reason: str) -> RunWithoutResult:

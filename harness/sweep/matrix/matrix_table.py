@@ -1,4 +1,4 @@
-"""The matrix on the terminal: for each cell the means, and below them their 95 % intervals; then what went wrong."""
+"""The matrix on the terminal: the means of each cell above their 95 % intervals, then growth, then what went wrong."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -8,6 +8,7 @@ from rich.text import Text
 
 from harness.present import text as words
 from harness.scenario.verdict_names import BAD_IN_WORDS, CHARACTERISTICS
+from harness.sweep.matrix import _growth_table
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._comparison import Change
 from harness.sweep.matrix._estimate import BY_NAME, METRICS, Estimate, Metric
@@ -27,7 +28,8 @@ def render(record: MatrixRecord) -> RenderableType:
     notes = (Text(note, style="red") for note in troubles_of_all(record))
     lacking = (Text(note, style="yellow") for note in unsupported_of_all(record))
     better = (Text(note, style="green") for note in improvements(record))
-    return Group(*parts, Text(explanation(record) + unjudged(record), style="dim"), *notes, *lacking, *better)
+    explained = Text(explanation(record) + unjudged(record), style="dim")
+    return Group(*parts, explained, *_growth_table.render(record), *notes, *lacking, *better)
 
 
 def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
@@ -46,18 +48,21 @@ def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
 
 
 def series(record: MatrixRecord) -> list[list[Cell]]:
-    """The cells of each backend and number of agents, which differ by their loss alone."""
+    """Return groups of cells that differ by their loss alone."""
     groups: dict[tuple[object, ...], list[Cell]] = {}
     for cell in record.cells:
-        groups.setdefault((cell.backend, cell.agents), []).append(cell)
+        groups.setdefault((cell.backend, cell.duration_s, cell.agents), []).append(cell)
     return list(groups.values())
 
 
 def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
-    """What tells the cells apart: the loss, and the axes that have several values. Each with its words for a point."""
+    """Return the axes that tell cells apart (the loss, and all axes with several values), each as a function that names
+    a point's value."""
     named: dict[str, Callable[[Point], str]] = {"loss": lambda point: words.percent(point.loss)}
     if len(matrix.agents or ()) > 1:
         named["agents"] = lambda point: str(point.agents)
+    if len(matrix.lengths) > 1:
+        named["length"] = lambda point: words.duration(point.duration_s or 0.0)
     if len(matrix.backend) > 1:
         named["backend"] = lambda point: point.backend
     return named
@@ -73,8 +78,13 @@ def series_name(matrix: Matrix, point: Point) -> list[str]:
     named = axes(matrix)
     return [
         *([f"{point.agents} agents"] if "agents" in named else []),
-        *([point.backend] if "backend" in named else []),
+        *([named[axis](point) for axis in ("length", "backend") if axis in named]),
     ]
+
+
+def say_lengths(matrix: Matrix) -> str:
+    """The mission lengths: "600 s, 1200 s"."""
+    return ", ".join(map(words.duration, matrix.lengths))
 
 
 def say(metric: Metric, estimate: Estimate) -> str:

@@ -53,7 +53,8 @@ def _results(directory: Path, data: bytes) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    yield (FOLDER / "thesis_matrix.yaml").read_bytes()
+    for path in sorted(FOLDER.glob("*_matrix.yaml")):
+        yield path.read_bytes()
     yield b"name: Short\nloss: [0, 0.5]\nagents: [2, 3]\nseeds: [1, 2]\nscenario: {duration_s: 60}\n"
     with TemporaryDirectory() as directory:
         played(matrix(), 1, judge, Path(directory))

@@ -128,7 +128,7 @@ def test_what_is_no_run_directory_is_status_2(run_dir: Path, what: str) -> None:
     if what == "no run":
         (run_dir / "agents").mkdir(parents=True)
     if what == "another record":
-        edit(run_dir / "run.json", lambda record: record.update(schema="ucp-scale/1"))
+        edit(run_dir / "run.json", lambda record: record.update(schema="ucp-matrix/1"))
     done = harness("report", run_dir)
     assert (done.returncode, done.stdout) == (2, "")
     (said,) = sentences(done.stderr)

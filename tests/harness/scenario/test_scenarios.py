@@ -375,7 +375,7 @@ RECONCILED = [
 
 
 def test_every_scenario_of_the_library_claims_something() -> None:
-    assert {path.stem for path in SCENARIOS.glob("*.yaml")} - {MATRIX.stem} == set(CLAIMS)
+    assert {path.stem for path in SCENARIOS.glob("*.yaml") if not path.stem.endswith("_matrix")} == set(CLAIMS)
 
 
 @pytest.mark.parametrize(("name", "seed"), PLAYED)

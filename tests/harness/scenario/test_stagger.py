@@ -13,9 +13,9 @@ from harness.proof.graph._exploration import explore
 from harness.proof.model._global_states import Swarm
 from harness.proof.questions._convergence import look
 from harness.run.simulate import simulate
+from harness.scenario._network import NetworkModel
 from harness.scenario.agent_options import Stagger
 from harness.scenario.load import load_scenario, parse
-from harness.scenario.network import NetworkModel
 from tests.harness.play.test_recurrence import in_step
 from tests.harness.scenario.test_scenarios import SCENARIOS
 

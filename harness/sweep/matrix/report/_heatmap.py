@@ -97,9 +97,9 @@ class Tile:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Of one backend: a row for each number of agents, a column for each loss."""
+    """The cells of one backend and mission length: a row for each number of agents, a column for each loss."""
 
-    backend: str
+    name: str
     losses: list[str]
     rows: list[tuple[str, list[Tile]]]
 
@@ -124,14 +124,15 @@ def heatmap(record: MatrixRecord, figure: Figure) -> Heatmap:
     scale = _scale(figure, record)
     points = record.matrix.points
     grids = []
-    for backend in record.matrix.backend:
-        agents = list(dict.fromkeys(point.agents for point in points))
+    agents = list(dict.fromkeys(point.agents for point in points))
+    for backend, duration_s in dict.fromkeys((point.backend, point.duration_s) for point in points):
         rows = []
         for number in agents:
-            its_points = [Point(loss, number, backend) for loss in record.matrix.loss]
+            its_points = [Point(loss, number, backend, duration_s) for loss in record.matrix.loss]
             tiles = [_tile(record, figure, point, cells.get(point), scale) for point in its_points]
             rows.append((f"{number} agents" if number > 1 else "1 agent", tiles))
-        grids.append(Grid(backend, [words.percent(loss) for loss in record.matrix.loss], rows))
+        name = backend if duration_s is None else f"{backend}, {words.duration(duration_s)}"
+        grids.append(Grid(name, [words.percent(loss) for loss in record.matrix.loss], rows))
     lowest, highest = (say_mean(figure.metric, Estimate(n=1, mean=bound)) for bound in scale)
     return Heatmap(figure, lowest, highest, grids)
 

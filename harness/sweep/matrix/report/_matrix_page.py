@@ -9,17 +9,19 @@ from harness.present import svg, text
 from harness.report import html
 from harness.report.agent_programs import asked_for
 from harness.scenario.verdict_names import JUDGED
+from harness.sweep.matrix import _growth_table
+from harness.sweep.matrix._growth_picture import draw_growth
 from harness.sweep.matrix._matrix_picture import draw, series_of
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
 from harness.sweep.matrix.matrix_summary import tried_in_words, verdict
-from harness.sweep.matrix.matrix_table import explanation, improvements, name_of, troubles, unjudged
+from harness.sweep.matrix.matrix_table import explanation, improvements, name_of, say_lengths, troubles, unjudged
 from harness.sweep.matrix.nights import Nights
 from harness.sweep.matrix.report import _heatmap, _trend
 from harness.sweep.matrix.report._drilldown import drilldown
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
-_STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
+_STYLE, _GROWTH_STYLE = (_TEMPLATE.with_name(f"{name}.css").read_text(encoding="utf-8") for name in ("page", "growth"))
 
 
 def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -> str:
@@ -29,7 +31,14 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
     drawn = _trend.nights_drawn(nights.records, record, len(shown)) if nights else []
     return html.render(
         _TEMPLATE,
-        styles=[html.PAGE_STYLE + _heatmap.STYLE + _STYLE + _choosing(shown), svg.STYLE],
+        styles=[
+            html.PAGE_STYLE
+            + _heatmap.STYLE
+            + _STYLE
+            + (_GROWTH_STYLE if record.matrix.grows else "")
+            + _choosing(shown),
+            svg.STYLE,
+        ],
         record=record,
         headline=(verdict(record), _kind(record)),
         summary=_summary(record),
@@ -52,6 +61,9 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
         trends=[(figure, _trend.trend(drawn, record, figure)) for figure in shown] if len(drawn) > 1 else [],
         series=series_of(record),
         picture=Markup(draw(record)),  # noqa: S704 - it has escaped what is not ours
+        growth=list(_growth_table.grown(record)),
+        growth_table=_growth_table,
+        growth_picture=Markup(draw_growth(record)) if record.matrix.grows else None,  # noqa: S704 - as above
     )
 
 
@@ -76,7 +88,7 @@ def _summary(record: MatrixRecord) -> list[str]:
     agents = list(dict.fromkeys(point.agents for point in matrix.points))
     return [
         f"{', '.join(map(str, agents))} agents",
-        f"{text.duration(matrix.scenario.duration_s)} mission",
+        f"{say_lengths(matrix)} mission",
         f"{len(matrix.loss)} loss rates" if len(matrix.loss) > 1 else f"{text.percent(matrix.loss[0])} loss",
         f"{len(matrix.seed_list)} seeds" if len(matrix.seed_list) > 1 else f"seed {matrix.seed_list[0]}",
         f"backend {', '.join(matrix.backend)}",

@@ -64,7 +64,7 @@ def test_a_matrix_looks_at_the_first_seed_of_each_cell(tmp_path: Path) -> None:
     command = small(tmp_path, EXPORT + "import time\nsaid['now'] = time.time_ns()")
     asked = {"name": "m", "loss": [0.0, 0.1], "seeds": 2, "scenario": {**BUSY, "agent_command": command}}
     matrix = Matrix.model_validate({**asked, "backend": ["sim"]})
-    player = Player(matrix, tmp_path, lambda scenario, seed: simulate(scenario, seed, tracing=True).result)
+    player = Player(matrix, tmp_path)
     first, *_ = matrix.tasks
     with pytest.raises(HarnessError, match="is not the same twice"):
         player(first)

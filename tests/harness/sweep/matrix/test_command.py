@@ -44,6 +44,19 @@ def test_it_finds_one_chain_without_loss_and_none_in_common_without_contact(tmp_
     assert (float(alone["uniform"]), float(alone["mutual_share"]), float(alone["copies_mean"])) == (0, 0, 1)
 
 
+def test_matrix_with_three_sizes_prints_and_draws_growth(tmp_path: Path) -> None:
+    scenario = {"duration_s": 600, "events": {"source": "random"}}
+    asked = written(tmp_path, scenario=scenario, agents=[3, 2, 5], seeds=2, loss=[0, 0.15])
+    done = harness("matrix", asked, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "exponent of" in done.stdout
+    assert (tmp_path / "out" / "growth.svg").exists()
+    record = MatrixRecord.model_validate_json((tmp_path / "out" / "matrix.json").read_text())
+    assert [(cell.loss, cell.agents) for cell in record.cells] == [(loss, n) for n in (3, 2, 5) for loss in (0, 0.15)]
+    pair = next(cell for cell in record.cells if (cell.loss, cell.agents) == (0, 2))
+    assert pair.estimates["messages_per_block"].mean == 3, "a request, a response and a commit"
+
+
 def test_json_is_all_that_standard_output_gets(tmp_path: Path) -> None:
     done = harness("matrix", written(tmp_path), "--json", "--jobs", 2, "--out", tmp_path / "out")
     assert done.returncode == 0

@@ -12,7 +12,8 @@ from harness.errors import ScenarioError
 from harness.sweep.matrix import Matrix, load_matrix
 from harness.sweep.matrix._matrix_file import Point
 
-THESIS = Path(__file__).parents[4] / "scenarios" / "thesis_matrix.yaml"
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
+THESIS = SCENARIOS / "thesis_matrix.yaml"
 NIGHTLY = Path(__file__).parents[4] / "docs" / "matrix-nightly.md"
 
 
@@ -29,6 +30,12 @@ def test_the_thesis_matrix_has_the_rates_of_section_4_2() -> None:
     assert matrix.seed_list == list(range(1, 201))
     assert matrix.scenario.name == matrix.name
     assert len(matrix.scenario.roster) == 5
+
+
+def test_growth_matrix_grows_with_agents_and_lengths_and_leaves_no_traces() -> None:
+    matrix = load_matrix(SCENARIOS / "growth_matrix.yaml")
+    assert matrix.grows_with_agents and matrix.grows_with_length
+    assert (len(matrix.tasks), matrix.traces) == (7 * 3 * 2 * 3, False)
 
 
 def test_the_page_on_nights_has_a_matrix_and_a_workflow() -> None:
@@ -62,9 +69,31 @@ def test_cells_are_all_combinations_of_backends_agents_and_losses(tmp_path: Path
     assert len(asked.scenario_at(Point(0.5, 10, "sim")).roster) == 10
 
 
+def test_cells_have_the_mission_lengths_of_the_axis(tmp_path: Path) -> None:
+    asked = load_matrix(written(tmp_path, duration_s=[60, 90.5]))
+    assert asked.points == [Point(loss, 3, "sim", length) for length in (60, 90.5) for loss in (0.0, 0.5)]
+    assert [asked.scenario_at(point).duration_s for point in asked.points] == [60, 60, 90.5, 90.5]
+    assert asked.points[2].file_name == "loss-0.0-agents-3-duration-90.5"
+
+
+def test_without_the_axis_the_length_is_the_scenarios(tmp_path: Path) -> None:
+    asked = load_matrix(written(tmp_path, scenario={"agents": 3, "duration_s": 77}))
+    assert asked.points[0].duration_s is None
+    assert asked.points[0].file_name == "loss-0.0-agents-3"
+    assert asked.scenario_at(asked.points[0]).duration_s == 77
+    assert asked.lengths == [77]
+
+
+def test_growth_needs_three_values_of_an_axis(tmp_path: Path) -> None:
+    two = load_matrix(written(tmp_path, scenario={}, agents=[2, 3], duration_s=[60, 90]))
+    assert not two.grows
+    three = load_matrix(written(tmp_path, duration_s=[60, 90, 120]))
+    assert (three.grows_with_agents, three.grows_with_length, three.grows) == (False, True, True)
+
+
 def test_an_axis_may_be_one_value(tmp_path: Path) -> None:
-    asked = load_matrix(written(tmp_path, scenario={}, agents=7, backend="process"))
-    assert (asked.agents, asked.backend) == ([7], ["process"])
+    asked = load_matrix(written(tmp_path, scenario={}, agents=7, duration_s=60, backend="process"))
+    assert (asked.agents, asked.duration_s, asked.backend) == ([7], [60], ["process"])
 
 
 def test_without_the_axis_agents_are_the_scenarios(tmp_path: Path) -> None:
@@ -89,7 +118,7 @@ def test_a_mistake_in_that_file_names_it(tmp_path: Path) -> None:
 
 
 def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
-    matrix = load_matrix(written(tmp_path, scenario={}, agents=[3, 4]))
+    matrix = load_matrix(written(tmp_path, scenario={}, agents=[3, 4], duration_s=[60, 90.5], traces=False))
     assert Matrix.model_validate_json(matrix.model_dump_json()) == matrix
 
 
@@ -105,7 +134,11 @@ def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
         ({"seeds": "many"}, "`seeds` is 'many': it should be a number of seeds"),
         ({"seeds": [1, -1]}, "`seeds` is [1, -1]: -1 is not a seed: it should be 0..4294967295"),
         ({"seeds": [7, 7]}, "`seeds` is [7, 7]: names 7 twice"),
-        ({"losses": [0.1]}, "`losses` is unknown: there are name, about, scenario, loss, seeds, agents, backend, keep"),
+        (
+            {"losses": [0.1]},
+            "`losses` is unknown: there are name, about, scenario, loss, seeds, agents, duration_s, "
+            "backend, keep, traces",
+        ),
         ({"scenario": {"agents": 0}}, "`scenario.agents` is 0: it should be a number of agents 1..1000"),
         ({"scenario": {"agent": 5}}, "`scenario.agent` is unknown: there are name, about, agents,"),
         ({"scenario": {"network": {"loss": 0.2}}}, "sets network.loss to 0.2, which the matrix's `loss` is for"),
@@ -116,9 +149,34 @@ def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
             {"agents": [5, 3], "scenario": {"clocks": {4: {"drift": 0.1}}}},
             "`agents` has 3, for which `scenario` is wrong: clocks names vehicle 4",
         ),
+        ({"duration_s": [60, 0]}, "`duration_s.1` is 0: it should be greater than 0"),
+        ({"duration_s": [60, -1]}, "`duration_s.1` is -1: it should be greater than 0"),
+        ({"duration_s": []}, "`duration_s` is []: List should have at least 1 item"),
+        ({"duration_s": [60, 60.0]}, "`duration_s` is [60, 60.0]: names 60.0 twice"),
+        ({"duration_s": [60, "Infinity"]}, "`duration_s.1` is 'Infinity': it should be a finite number"),
+        ({"duration_s": [60, "NaN"]}, "`duration_s.1` is 'NaN': it should be a finite number"),
+        ({"duration_s": [60, 1e9]}, "`duration_s.1` is 1000000000.0: it should be less than or equal to"),
+        ({"duration_s": [60, "long"]}, "`duration_s.1` is 'long': it should be a valid number"),
+        (
+            {"duration_s": [60], "scenario": {"duration_s": 90}},
+            "`scenario` sets duration_s to 90, which the matrix's `duration_s` is for: remove it there",
+        ),
+        (
+            {"duration_s": [600, 60], "scenario": {"timeline": [{"at_s": 100, "kill": [1]}]}},
+            "`duration_s` has 60, for which `scenario` is wrong: ",
+        ),
+        (
+            {"agents": [5, 3], "duration_s": [60], "scenario": {"clocks": {4: {"drift": 0.1}}}},
+            "`agents` has 3 and `duration_s` has 60, for which `scenario` is wrong: clocks names vehicle 4",
+        ),
+        ({"traces": 2}, "`traces` is 2: "),
         ({"backend": "kernel"}, "`backend.0` is 'kernel': it should be 'process', 'docker' or 'sim'"),
         ({"keep": "none"}, "`keep` is 'none': it should be 'violated' or 'all'"),
-        ({"delay": [0.1]}, "`delay` is unknown: there are name, about, scenario, loss, seeds, agents, backend, keep"),
+        (
+            {"delay": [0.1]},
+            "`delay` is unknown: there are name, about, scenario, loss, seeds, agents, duration_s, "
+            "backend, keep, traces",
+        ),
         ({"scenario": "nowhere.yaml"}, "nowhere.yaml: there is no such file or scenario"),
         ({"name": None}, "is missing"),
         ({"scenario": None, "timeline": []}, "this is a scenario; a matrix names one, `scenario: "),

@@ -1,8 +1,8 @@
-"""How one thing grows with another: power laws y = a * x^b, by least squares in logarithms.
+"""How one quantity grows with others: power laws y = a * x^b, fitted by least squares in logarithms.
 
-A logarithm exists of values above 0 only; the others are left out and counted. The interval of an exponent is
-Student's, which takes the points' distances from the line for independent and alike. Where the law bends, they are
-not: a low R^2, or different exponents in parts of the range, say so.
+Only a value above 0 has a logarithm. Other points are left out and counted. The interval of an exponent is Student's,
+which assumes that the points scatter around the line independently and equally. Where the growth is no power law, the
+assumption is false. Then R^2 is low, or parts of the range have different exponents.
 """
 
 import math
@@ -16,7 +16,8 @@ from harness.sweep.matrix._estimate import CONFIDENCE, student_quantile
 
 Variable = Literal["agents", "blocks"]
 MAX_INFLATION = 100.0
-"""How much a second variable may inflate the variance of an exponent (1 / (1 - r^2)), before the two are one."""
+"""Largest factor by which a second variable may inflate the variance of an exponent, 1 / (1 - r^2). Above it the two
+variables cannot be told apart."""
 
 
 class Exponent(BaseModel):
@@ -30,9 +31,10 @@ class Exponent(BaseModel):
 
 
 class Law(BaseModel):
-    """y = factor * product of variables, each to its exponent; of `n` points, with `left_out` others that were not > 0.
+    """y = factor * product of the variables, each raised to its exponent.
 
-    `r_squared` is the share of the variance of log y that it explains; null where y does not vary.
+    The law is fitted to `n` points. `left_out` more points have a value that is not above 0. `r_squared` is the share
+    of the variance of log y that the law explains, or null if y does not vary.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -45,9 +47,10 @@ class Law(BaseModel):
 
 
 def fit(names: Sequence[Variable], points: Iterable[tuple[Sequence[float], float]]) -> Law | None:
-    """The law of one variable or of two, from points (values of the variables, y).
+    """Fit a law of one or two variables to points (values of the variables, y).
 
-    None if there are no more points than unknowns, a variable does not vary, or two vary as one (`MAX_INFLATION`).
+    Return None if there are no more points than unknowns, if a variable does not vary, or if two variables cannot be
+    told apart (`MAX_INFLATION`).
     """
     everything = list(points)
     usable = [([*map(math.log, xs)], math.log(y)) for xs, y in everything if y > 0 and min(xs) > 0]
@@ -59,7 +62,7 @@ def fit(names: Sequence[Variable], points: Iterable[tuple[Sequence[float], float
     exponents: dict[Variable, tuple[float, float]] = {}
     for number, (name, column) in enumerate(zip(names, columns, strict=True)):
         others = columns[:number] + columns[number + 1 :]
-        # What no other variable explains of this one is what alone tells about its exponent (Frisch, Waugh, Lovell).
+        # The part of a variable that the other does not explain determines its exponent (Frisch, Waugh, Lovell).
         own = _unexplained(column, others[0]) if others else _centred(column)
         spread = sum(x * x for x in own)
         if spread * MAX_INFLATION <= sum(x * x for x in _centred(column)) or spread < 1e-12:
@@ -93,7 +96,7 @@ def _centred(values: Sequence[float]) -> list[float]:
 
 
 def _unexplained(values: Sequence[float], by: Sequence[float]) -> list[float]:
-    """What is left of `values` after their regression on another variable, which may not vary."""
+    """Return the residuals of the regression of `values` on another variable, which need not vary."""
     if max(by) - min(by) < 1e-12:
         return _centred(values)
     slope, intercept = linear_regression(by, values)
@@ -101,5 +104,5 @@ def _unexplained(values: Sequence[float], by: Sequence[float]) -> list[float]:
 
 
 def _rounded(number: float) -> float:
-    """To six digits: more would promise too much, and differ in the last bits from machine to machine."""
+    """Round to six digits. Further digits mean nothing, and the last bits differ between machines."""
     return float(f"{number:.6g}")

@@ -1,0 +1,84 @@
+"""How the figures of a matrix grow with the number of agents, and with the number of blocks.
+
+A mission's length is not a variable of its own: a longer mission costs more because it has more blocks. The laws
+"over blocks" therefore compare missions of several lengths.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+from pydantic import BaseModel
+
+from harness.backend_names import BackendName
+from harness.sweep.matrix._cell import Cell, Run
+from harness.sweep.matrix._growth_metrics import BY_NAME, FITTED
+from harness.sweep.matrix._matrix_file import Matrix
+from harness.sweep.matrix._power_law import Law, Variable, fit
+
+Load = Literal["any", "below 1", "from 1"]
+
+
+class Growth(BaseModel):
+    """A law of how `metric` grows. Each run is a point.
+
+    The runs have this `backend` and `loss`. They also have this `duration_s`, this number of `agents`, and a cell with
+    this `load`; null stands for all of them.
+    """
+
+    metric: str
+    over: tuple[Variable, ...]
+    backend: BackendName
+    loss: float
+    duration_s: float | None = None
+    agents: int | None = None
+    load: Load = "any"
+    law: Law
+
+
+def overloaded(cell: Cell) -> bool:
+    """Whether agents complete blocks faster than they can commit them."""
+    load = cell.estimates["load"].mean if "load" in cell.estimates else None
+    return load is not None and load >= 1
+
+
+def growths(matrix: Matrix, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Growth]:
+    """Fit laws for each backend and loss.
+
+    Laws over agents hold for one mission length, laws over blocks for one number of agents. Laws over both use all
+    sizes. If some cells have a load below 1 and others have not, laws over agents are also fitted to each side alone.
+    """
+    load_of = {cell.point: "from 1" if overloaded(cell) else "below 1" for cell in cells}
+    found: list[Growth] = []
+
+    def add(over: tuple[Variable, ...], load: Load, **fixed: object) -> None:
+        those = [
+            run
+            for run in runs
+            if run.judged
+            and load in ("any", load_of[run.point])
+            and all(getattr(run, key) == value for key, value in fixed.items())
+        ]
+        for metric in FITTED:
+            if law := fit(over, _points(over, metric, those)):
+                found.append(Growth.model_validate({"metric": metric, "over": over, "load": load, "law": law, **fixed}))
+
+    for backend in matrix.backend:
+        for loss in matrix.loss:
+            place = {"backend": backend, "loss": loss}
+            sides = {load_of[cell.point] for cell in cells if (cell.backend, cell.loss) == (backend, loss)}
+            loads: tuple[Load, ...] = ("any", "below 1", "from 1") if len(sides) == 2 else ("any",)
+            for duration_s in matrix.duration_axis if matrix.grows_with_agents else ():
+                for load in loads:
+                    add(("agents",), load, **place, duration_s=duration_s)
+            for agents in {point.agents: None for point in matrix.points} if matrix.grows_with_length else ():
+                add(("blocks",), "any", **place, agents=agents)
+            for load in loads if matrix.grows_with_agents and matrix.grows_with_length else ():
+                add(("agents", "blocks"), load, **place)
+    return found
+
+
+def _points(over: tuple[Variable, ...], metric: str, runs: Iterable[Run]) -> Iterable[tuple[list[float], float]]:
+    """Yield a point for each run. An unknown value is 0, so that `fit` leaves the run out and counts it."""
+    for run in runs:
+        values = {"agents": run.agents, "blocks": run.figures.get("blocks") or 0.0}
+        yield [values[name] for name in over], BY_NAME[metric].of(run.figures) or 0.0

@@ -1,0 +1,299 @@
+"""growth.svg: small panels on logarithmic axes, where a power law is a straight line.
+
+A dot is the mean of a cell. A line is the law fitted to the cells' runs, and its exponent stands beside it. Lines
+differ by colour and dashes. The legend names the lines over agents, and each exponent over blocks names its line.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from markupsafe import Markup
+
+from harness.backend_names import BackendName
+from harness.present import svg
+from harness.present import text as words
+from harness.present.svg import Area, Axis
+from harness.sweep.matrix._cell import Cell
+from harness.sweep.matrix._estimate import Estimate
+from harness.sweep.matrix._growth import Growth
+from harness.sweep.matrix._growth_metrics import BY_NAME
+from harness.sweep.matrix._growth_table import SYMBOLS, say, say_exponent, say_number
+from harness.sweep.matrix._matrix_file import Matrix
+from harness.sweep.matrix._power_law import Law, Variable
+from harness.sweep.matrix.matrix_record import MatrixRecord
+
+COLUMNS = 3
+HEAD, PANEL_HEIGHT, FOOT = 96, 236, 26
+MOST = 4
+"""Number of lines that a reader can tell apart in a panel. Of more lines, the panel shows these many, evenly chosen."""
+TICK_WIDTH = 24.0
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    title: str
+    metric: str
+    over: Variable = "agents"
+
+    @property
+    def shares(self) -> bool:
+        return BY_NAME[self.metric].unit != "number"
+
+
+PANELS = (
+    Panel("Messages per block", "messages_per_block"),
+    Panel("Messages", "messages"),
+    Panel("Bytes", "bytes"),
+    Panel("Messages per minute", "messages_per_minute"),
+    Panel("Reconciles per block", "reconciles_per_block"),
+    Panel("Blocks per minute, longest chain", "committed_per_minute"),
+    Panel("Runs with one uniform chain", "uniform"),
+)
+ALSO_OVER_BLOCKS = ("messages", "bytes")
+"""Metrics that are also drawn over blocks if the matrix has three numbers of agents and three mission lengths."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """The axes that are the same along a line; None for the axis along which the line runs."""
+
+    backend: BackendName
+    loss: float
+    agents: int | None
+    duration_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line of a panel, with the number of its colour."""
+
+    number: int
+    name: str
+    cells: list[Cell]
+    law: Law | None
+
+
+def draw_growth(record: MatrixRecord) -> str:
+    """Draw the picture as a file of its own."""
+    panels = panels_of(record.matrix)
+    areas = svg.grid(len(panels), COLUMNS, HEAD, PANEL_HEIGHT)
+    drawn = [_panel(record, panel, area) for panel, area in zip(panels, areas, strict=True)]
+    return svg.document(
+        HEAD + math.ceil(len(panels) / COLUMNS) * PANEL_HEIGHT + FOOT,
+        record.matrix.name,
+        _about(record),
+        description(record),
+        [_legend(record), *drawn],
+        _foot(record),
+        ids="growth-",
+    )
+
+
+def panels_of(matrix: Matrix) -> list[Panel]:
+    over_agents = [*PANELS] if matrix.grows_with_agents else []
+    also = [panel for panel in PANELS if not over_agents or panel.metric in ALSO_OVER_BLOCKS]
+    return over_agents + ([replace(panel, over="blocks") for panel in also] if matrix.grows_with_length else [])
+
+
+def description(record: MatrixRecord) -> str:
+    """Describe the picture in words."""
+    if not record.cells:
+        return "No run has ended."
+    parts = []
+    for panel in panels_of(record.matrix):
+        for line in _lines(record, panel):
+            values = (f"{_say(panel, cell)} at {_at(panel, cell)}" for cell in line.cells)
+            about = ", ".join(filter(None, (_title(record, panel), line.name)))
+            power = f" (exponent {say_exponent(line.law.exponents[panel.over])})" if line.law else ""
+            parts.append(f"{about}{power}: {', '.join(values)}.")
+    return " ".join(parts)
+
+
+def _about(record: MatrixRecord) -> str:
+    matrix = record.matrix
+    agents = [point.agents for point in matrix.points]
+    parts = [
+        f"{_range(agents)} agents",
+        f"{_range(matrix.lengths)} s of mission, {matrix.scenario.settle.limit_s:g} s to settle",
+        f"loss {', '.join(map(words.percent, matrix.loss))}",
+        f"{words.value(record.runs)} runs",
+    ]
+    if record.outcome == "interrupted":
+        parts.append(f"interrupted: {words.value(record.runs_asked)} were asked for")
+    return " \u00b7 ".join(parts)
+
+
+def _foot(record: MatrixRecord) -> str:
+    runs = max((cell.runs for cell in record.cells), default=0)
+    dots = f"means of {runs} runs" if runs > 1 else "one run each"
+    return f"Over N agents or B blocks. Dots: {dots}; lines: fitted power laws with their exponents."
+
+
+def _title(record: MatrixRecord, panel: Panel) -> str:
+    if panel.over == "agents":
+        return panel.title
+    one_loss = record.matrix.grows_with_agents and len(record.matrix.loss) > 1
+    return f"{panel.title}, over blocks" + (f" at {words.percent(max(record.matrix.loss))} loss" if one_loss else "")
+
+
+def _legend(record: MatrixRecord) -> Markup:
+    """Name the lines over agents, or the lines over blocks if these are all."""
+    parts = []
+    x = svg.MARGIN + 4.0
+    for line in _lines(record, panels_of(record.matrix)[0]):
+        if line.name:
+            parts.append(
+                Markup('<g class="series {}">{}{}</g>').format(
+                    svg.CLASSES[line.number],
+                    svg.line([(x, 77), (x + 26, 77)], line.number),
+                    svg.name(x + 32, 81, "start", line.number, line.name),
+                )
+            )
+            x += 60 + 7 * len(line.name)
+    return Markup("").join(parts)
+
+
+def _lines(record: MatrixRecord, panel: Panel) -> list[Line]:
+    """Return the lines of a panel.
+
+    A line over agents has one mission length. A line over blocks has one number of agents; beside lines over agents,
+    lines over blocks are drawn at the highest loss alone.
+    """
+    matrix, over_agents = record.matrix, panel.over == "agents"
+    losses = matrix.loss if over_agents or not matrix.grows_with_agents else [max(matrix.loss)]
+    by_place: dict[Place, list[Cell]] = {}
+    for cell in record.cells:
+        if cell.loss in losses:
+            by_place.setdefault(_place_of(cell, panel), []).append(cell)
+    laws = {
+        _place_of(growth, panel): growth.law
+        for growth in record.growths
+        if (growth.metric, growth.over, growth.load) == (panel.metric, (panel.over,), "any")
+    }
+    places = [*by_place]
+    chosen = dict.fromkeys(round(at * (len(places) - 1) / (MOST - 1)) for at in range(MOST)) if places else ()
+    return [
+        Line(
+            number,
+            _name(matrix, losses, places[at]),
+            sorted(by_place[places[at]], key=lambda cell: (cell.agents, cell.duration_s or 0.0)),
+            laws.get(places[at]),
+        )
+        for number, at in enumerate(chosen)
+    ]
+
+
+def _place_of(item: Cell | Growth, panel: Panel) -> Place:
+    along = panel.over == "agents"
+    return Place(item.backend, item.loss, None if along else item.agents, item.duration_s if along else None)
+
+
+def _name(matrix: Matrix, losses: Sequence[float], place: Place) -> str:
+    """Name the axes that tell lines apart."""
+    return ", ".join(
+        [
+            *([f"{words.percent(place.loss)} loss"] if len(losses) > 1 else []),
+            *([f"{place.agents} agents"] if place.agents is not None and len(matrix.agents or ()) > 1 else []),
+            *([words.duration(place.duration_s)] if place.duration_s is not None and len(matrix.lengths) > 1 else []),
+            *([place.backend] if len(matrix.backend) > 1 else []),
+        ]
+    )
+
+
+def _panel(record: MatrixRecord, panel: Panel, area: Area) -> Markup:
+    lines = _lines(record, panel)
+    across, up = _across(panel, lines, area), _up(panel, lines, area)
+    frame = svg.frame(
+        _title(record, panel),
+        across,
+        up,
+        map(say_number, across.ticks),
+        (f"{100 * tick:.0f}\u00a0%" if panel.shares else say_number(tick) for tick in up.ticks),
+    )
+    drawn = [_line(panel, line, across, up) for line in lines]
+    named = record.matrix.grows_with_agents and panel.over == "blocks"
+    exponents = [(line, line.law) for line in lines if line.law]
+    for row, (line, law) in enumerate(reversed(exponents)):
+        prefix = f"{line.name}: " if named and line.name else ""
+        drawn.append(_power(panel, line, law, prefix, across.end - 4, up.start - 8 - 15 * row))
+    return Markup('<g class="panel">{}{}</g>\n').format(frame, Markup("").join(drawn))
+
+
+def _line(panel: Panel, line: Line, across: Axis, up: Axis) -> Markup:
+    """Draw the law, or straight lines between the dots if there is none; and the dots with tooltips."""
+    points = [(x, y, cell) for cell in line.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
+    ends = _ends(panel, line) or [(x, y) for x, y, _ in points]
+    parts = [svg.line([(across(x), up(y)) for x, y in ends], line.number)] if ends else []
+    for x, y, cell in points:
+        about = ", ".join(filter(None, (_at(panel, cell), line.name)))
+        parts.append(svg.dot(across(x), up(y), line.number, f"{about}: {_say(panel, cell)}"))
+    return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[line.number], Markup("").join(parts))
+
+
+def _power(panel: Panel, line: Line, law: Law, prefix: str, x: float, y: float) -> Markup:
+    """Write the exponent of a law into the corner that growth leaves empty."""
+    value, margin = say_exponent(law.exponents[panel.over]).split("\u00b1")
+    text = Markup('{}{}<tspan dy="-4" font-size="10">{}</tspan><tspan dy="4" font-size="10"> \u00b1{}</tspan>').format(
+        prefix, SYMBOLS[panel.over], value, margin
+    )
+    return Markup('<g class="series {}">{}</g>').format(
+        svg.CLASSES[line.number], svg.name(x, y, "end", line.number, text)
+    )
+
+
+def _ends(panel: Panel, line: Line) -> list[tuple[float, float]]:
+    """The ends of a law's line: its values at the first and the last dot."""
+    xs = [x for cell in line.cells if (x := _x(panel, cell)) and _y(panel, cell)]
+    if not line.law or not xs:
+        return []
+    power = line.law.exponents[panel.over].value
+    return [(x, line.law.factor * x**power) for x in (min(xs), max(xs))]
+
+
+def _across(panel: Panel, lines: Sequence[Line], area: Area) -> Axis:
+    """Return the horizontal axis. Over agents, the ticks are their numbers as far as there is room."""
+    xs = sorted({x for line in lines for cell in line.cells if (x := _x(panel, cell))}) or [1.0, 10.0]
+    if panel.over == "blocks":
+        return svg.log_axis(xs[0], xs[-1], area.across)
+    axis = Axis(xs[0] * 0.9, xs[-1] * 1.1, *area.across, (), log=True)
+    ticks: list[float] = []
+    for x in xs:
+        if not ticks or axis(x) - axis(ticks[-1]) >= TICK_WIDTH:
+            ticks.append(x)
+    return replace(axis, ticks=ticks)
+
+
+def _up(panel: Panel, lines: Sequence[Line], area: Area) -> Axis:
+    if panel.shares:
+        return svg.share_axis(area.up)
+    ys = [y for line in lines for cell in line.cells if (y := _y(panel, cell))]
+    ys += [y for line in lines for _, y in _ends(panel, line)]
+    return svg.log_axis(min(ys, default=1.0), max(ys, default=10.0), area.up)
+
+
+def _x(panel: Panel, cell: Cell) -> float | None:
+    """The place of a cell on the horizontal axis, or None if a logarithmic axis cannot show it."""
+    return float(cell.agents) if panel.over == "agents" else _mean("blocks", cell) or None
+
+
+def _y(panel: Panel, cell: Cell) -> float | None:
+    mean = _mean(panel.metric, cell)
+    return mean if mean or panel.shares else None
+
+
+def _mean(metric: str, cell: Cell) -> float | None:
+    return cell.estimates[metric].mean if metric in cell.estimates else None
+
+
+def _at(panel: Panel, cell: Cell) -> str:
+    return f"{say_number(_x(panel, cell) or 0.0)} {panel.over}"
+
+
+def _say(panel: Panel, cell: Cell) -> str:
+    return say(BY_NAME[panel.metric], cell.estimates.get(panel.metric, Estimate(n=0)))
+
+
+def _range(values: Sequence[float]) -> str:
+    first, last = min(values), max(values)
+    return f"{first:g}" if first == last else f"{first:g}\u2013{last:g}"

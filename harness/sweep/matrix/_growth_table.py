@@ -1,0 +1,172 @@
+"""Growth in tables for the terminal, the page and Markdown: the means of each size, and the exponents of laws."""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from harness.present import text as words
+from harness.sweep.matrix._cell import Cell
+from harness.sweep.matrix._estimate import Estimate, Metric
+from harness.sweep.matrix._growth import Growth
+from harness.sweep.matrix._growth_metrics import BY_NAME
+from harness.sweep.matrix._power_law import Exponent, Law, Variable
+from harness.sweep.matrix.matrix_record import MatrixRecord
+
+SYMBOLS: dict[Variable, str] = {"agents": "N", "blocks": "B"}
+UNKNOWN = "\u2013"
+SIZED = (
+    "blocks", "load", "uniform", "finished", "committed_per_minute", "reconciles_per_block", "messages_per_block",
+    "messages", "bytes",
+)  # fmt: skip
+GROWN = ("messages", "bytes", "messages_per_block", "messages_per_minute", "uniform_after_s")
+EXPLANATION = (
+    "load: blocks completed while one vote lasts; from load 1 on, agents complete blocks faster than they can commit "
+    "them. Exponents of N agents and B blocks: least squares in logarithms, a point for each run, with 95\u00a0% "
+    "intervals. n is the number of points, if some runs have no logarithm."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Grown:
+    """Growth at one loss and backend: its cells, and a row of laws by metric for each group of runs and variable."""
+
+    name: str
+    cells: list[Cell]
+    laws: list[tuple[str, Variable, dict[str, Law]]]
+
+
+def grown(record: MatrixRecord) -> Iterator[Grown]:
+    """Yield growth at each backend and loss at which a run has ended; nothing if the matrix does not grow."""
+    for backend in record.matrix.backend if record.matrix.grows else ():
+        for loss in record.matrix.loss:
+            cells = [cell for cell in record.cells if (cell.backend, cell.loss) == (backend, loss)]
+            laws = [growth for growth in record.growths if (growth.backend, growth.loss) == (backend, loss)]
+            name = f"{words.percent(loss)} loss" + (f", {backend}" if len(record.matrix.backend) > 1 else "")
+            if cells:
+                yield Grown(name, cells, _rows(laws))
+
+
+def _rows(growths: Iterable[Growth]) -> list[tuple[str, Variable, dict[str, Law]]]:
+    """Group laws by the runs that they are fitted to: over agents, then over blocks, then over both."""
+    by_row: dict[tuple[float, str, Variable], dict[str, Law]] = {}
+    for growth in growths:
+        for variable in growth.over:
+            key = len(growth.over) + (growth.over[0] == "blocks") / 2, runs_of(growth), variable
+            by_row.setdefault(key, {})[growth.metric] = growth.law
+    return [(name, variable, laws) for (_, name, variable), laws in sorted(by_row.items(), key=lambda item: item[0][0])]
+
+
+def runs_of(growth: Growth) -> str:
+    """Name the runs that a law is fitted to, apart from their backend and loss: "600 s, load < 1", "both"."""
+    names = []
+    if growth.over == ("agents", "blocks"):
+        names.append("both")
+    elif growth.agents is not None:
+        names.append(f"{growth.agents} agents")
+    elif growth.duration_s is not None:
+        names.append(words.duration(growth.duration_s))
+    if growth.load != "any":
+        names.append("load\u00a0" + {"below 1": "<", "from 1": "\u2265"}[growth.load] + "\u00a01")
+    return ", ".join(names)
+
+
+def label(name: str) -> str:
+    """A column's header, with a hyphen where a narrow column may break it."""
+    return "idle at end" if name == "finished" else BY_NAME[name].label
+
+
+def in_one_line(label: str) -> str:
+    return label.replace("- ", "")
+
+
+def size_row(cell: Cell) -> list[str]:
+    """The means of a cell, in the order of `SIZED`."""
+    share = Metric("finished", "", lambda _: None, "share of runs")
+    return [
+        say(share, cell.finished) if name == "finished" else say(BY_NAME[name], cell.estimates.get(name, Estimate(n=0)))
+        for name in SIZED
+    ]
+
+
+def law_row(variable: Variable, laws: dict[str, Law]) -> list[tuple[str, str]]:
+    """The exponents of `variable` in the order of `GROWN`, each with the quality of its law."""
+    return [
+        (say_exponent(law.exponents[variable]), say_quality(law)) if (law := laws.get(name)) else (UNKNOWN, "")
+        for name in GROWN
+    ]
+
+
+def render(record: MatrixRecord) -> Iterator[RenderableType]:
+    """The tables for the terminal."""
+    for part in grown(record):
+        yield Text(f"Growth at {part.name}", style="bold")
+        sizes = _table(["s", "N", *map(label, SIZED)])
+        for cell in part.cells:
+            sizes.add_row(*place(record, cell), *size_row(cell))
+        yield sizes
+        if part.laws:
+            exponents = _table(["exponent of", *map(label, GROWN)])
+            for name, variable, laws in part.laws:
+                cells = law_row(variable, laws)
+                exponents.add_row(f"{SYMBOLS[variable]} {name}".rstrip(), *(exponent for exponent, _ in cells))
+                exponents.add_row("", *(Text(quality, "dim") for _, quality in cells))
+            yield exponents
+        yield Text()
+    if record.matrix.grows:
+        yield Text(EXPLANATION, style="dim")
+
+
+def place(record: MatrixRecord, cell: Cell) -> list[str]:
+    """A cell's mission length in seconds and number of agents."""
+    return [f"{record.matrix.scenario_at(cell.point).duration_s:g}", str(cell.agents)]
+
+
+def say_exponent(exponent: Exponent) -> str:
+    """An exponent and the half of its interval."""
+    margin = (exponent.high - exponent.low) / 2
+    return f"{exponent.value:.2f}\u00b1" + (f"{margin:.2f}".lstrip("0") if margin < 0.995 else f"{margin:.2g}")
+
+
+def say_quality(law: Law) -> str:
+    """The share of the variance that a law explains, and the number of its points if runs were left out."""
+    explained = "" if law.r_squared is None else f"R\u00b2\u00a0{law.r_squared:.2f}".replace("0.", ".")
+    return explained + (f" n\u00a0{law.n}" if law.left_out else "")
+
+
+def say(metric: Metric, estimate: Estimate) -> str:
+    if estimate.mean is None:
+        return UNKNOWN
+    return say_number(estimate.mean) if metric.unit == "number" else f"{100 * estimate.mean:.0f}\u00a0%"
+
+
+def say_number(value: float) -> str:
+    """Three significant digits: 0.012, 7.3, 482, 40.4k, 225M."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    for factor, unit in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= 0.9995 * factor:
+            return f"{_digits(value / factor)}{unit}"
+    return _digits(value)
+
+
+def _digits(value: float) -> str:
+    digits = max(0, 2 - math.floor(math.log10(abs(value)) + 1e-9)) - (abs(value) < 1)
+    text = f"{value:.{min(digits, 6)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def _table(headers: Sequence[str]) -> Table:
+    table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim")
+    for header in headers:
+        left = header == "exponent of"
+        table.add_column(
+            header if left else header.replace(" ", "\n"),
+            justify="left" if left else "right",
+            vertical="bottom",
+            no_wrap=True,
+        )
+    return table
