@@ -6,10 +6,10 @@ Everything comes from the traces. A vote or reconcile that an agent's loss or th
 import math
 from bisect import bisect_right
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Trace
@@ -96,6 +96,21 @@ class Tie:
     branch: str
 
 
+class Begun(NamedTuple):
+    """An agent began a vote, a reconcile or a phase of one.
+
+    `detail` is the hash of the block, the reason of the reconcile, or the name of the phase.
+    """
+
+    what: Literal["vote", "reconcile", "phase"]
+    at_s: float
+    detail: str
+
+
+Step = Begun | Vote | Reconcile | Tie | Commit
+"""What a handler run began, ended or did."""
+
+
 @dataclass(frozen=True, slots=True)
 class Message:
     """A broadcast, numbered by its sender, and the handler runs that it triggered: (agent, mission second)."""
@@ -143,61 +158,83 @@ def history_of(
         every = [runs for runs in lives(trace) if runs]
         for runs, later in zip_longest(every, every[1:]):
             known = [at_s for at_s in falls[agent] if at_s >= runs[-1].t]
-            _Incarnation(agent, history).follow(runs, min([*known, later[0].t if later else end_s]))
+            incarnation = Incarnation(agent)
+            for run in runs:
+                _keep(history, incarnation.take(run))
+            _keep(history, incarnation.end(min([*known, later[0].t if later else end_s])))
     return replace(history, messages=_messages(traces)) if whole else history
 
 
-class _Incarnation:
-    """An agent between its start and its end, while its trace is read."""
+def _keep(history: History, steps: Iterable[Step]) -> None:
+    for step in steps:
+        match step:
+            case Vote():
+                history.votes.append(step)
+            case Reconcile():
+                history.reconciles.append(step)
+            case Tie():
+                history.ties.append(step)
+            case Commit():
+                history.commits.append(step)
 
-    def __init__(self, agent: int, history: History) -> None:
+
+class Incarnation:
+    """The course of an agent between its start and its end, read one handler run after another.
+
+    The report and the live page both use this class, so a vote or a reconcile begins and ends in both at the same
+    time. A reconcile that begins during a vote does not end the vote. The vote ends when its timer expires.
+    """
+
+    def __init__(self, agent: int) -> None:
         self._agent = agent
-        self._history = history
+        self._now_s = 0.0
         self._vote: tuple[str, float] | None = None
         self._reconcile: tuple[str, float] | None = None
         self._phase: tuple[PhaseName, float, int] | None = None
         self._phases: list[Phase] = []
 
-    def follow(self, runs: Iterable[HandlerRun], end_s: float) -> None:
-        now_s = 0.0
-        for run in runs:
-            now_s = run.t
-            if run.handler == "process_next_deque_block" and run.branch == "proposed":
-                self._vote = next((sent.block or "" for sent in run.sent), ""), run.t
-            elif run.handler == "vote_timer_expiration":
-                self._end_vote(run.t, run.branch)
-            elif run.handler == "reconcile_begin" and run.branch == "begun":
-                by = next(iter(run.trigger.to_json().items()), ("", ""))
-                self._reconcile = REASONS.get(str(by[1]), "asked by the operator"), run.t
-            elif self._reconcile is not None:
-                self._go_on(run)
-            self._history.commits.extend(
-                Commit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
-                for operation, block in run.changes
-                if operation == "chain+"
-            )
-        end_s = max(end_s, now_s)
-        self._end_vote(end_s, CUT_SHORT)
-        self._end_reconcile(end_s, done=False)
+    def take(self, run: HandlerRun) -> Iterator[Step]:
+        """Yield the steps of the next handler run."""
+        self._now_s = run.t
+        if run.handler == "process_next_deque_block" and run.branch == "proposed":
+            self._vote = next((sent.block or "" for sent in run.sent), ""), run.t
+            yield Begun("vote", run.t, self._vote[0])
+        elif run.handler == "vote_timer_expiration":
+            yield from self._end_vote(run.t, run.branch)
+        elif run.handler == "reconcile_begin" and run.branch == "begun":
+            self._reconcile = REASONS.get(str(run.trigger.subject), "asked by the operator"), run.t
+            yield Begun("reconcile", run.t, self._reconcile[0])
+        elif self._reconcile is not None:
+            yield from self._go_on(run)
+        for operation, block in run.changes:
+            if operation == "chain+":
+                yield Commit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
 
-    def _end_vote(self, at_s: float, outcome: str) -> None:
+    def end(self, at_s: float) -> Iterator[Step]:
+        """Yield the vote and the reconcile that the end of the incarnation cuts short."""
+        at_s = max(at_s, self._now_s)
+        yield from self._end_vote(at_s, CUT_SHORT)
+        yield from self._end_reconcile(at_s, done=False)
+
+    def _end_vote(self, at_s: float, outcome: str) -> Iterator[Vote]:
         if self._vote is not None:
             block, since_s = self._vote
-            self._history.votes.append(Vote(self._agent, block, since_s, max(at_s, since_s), outcome))
             self._vote = None
+            yield Vote(self._agent, block, since_s, max(at_s, since_s), outcome)
 
-    def _go_on(self, run: HandlerRun) -> None:
-        """A step of the reconcile that is under way."""
+    def _go_on(self, run: HandlerRun) -> Iterator[Step]:
+        """Yield the steps of the reconcile that is under way."""
         if run.branch.startswith("tie:"):
-            self._history.ties.append(Tie(self._agent, run.t, run.branch))
+            yield Tie(self._agent, run.t, run.branch)
         if run.handler == "reconcile_finalize" and run.branch == "done":
-            self._end_reconcile(run.t, done=True)
+            yield from self._end_reconcile(run.t, done=True)
         elif name := PHASES.get(run.handler):
             if self._phase is not None and self._phase[0] == name:
                 self._phase = name, self._phase[1], self._phase[2] + 1
             else:
                 self._end_phase(run.t)
                 self._phase = name, run.t, 1
+                yield Begun("phase", run.t, name)
 
     def _end_phase(self, at_s: float) -> None:
         if self._phase is not None:
@@ -206,13 +243,12 @@ class _Incarnation:
                 self._phases.append(Phase(name, since_s, at_s, rounds))
             self._phase = None
 
-    def _end_reconcile(self, at_s: float, *, done: bool) -> None:
+    def _end_reconcile(self, at_s: float, *, done: bool) -> Iterator[Reconcile]:
         self._end_phase(at_s)
         if self._reconcile is not None:
             reason, since_s = self._reconcile
-            ended_s = max(at_s, since_s)
-            self._history.reconciles.append(Reconcile(self._agent, since_s, ended_s, reason, self._phases, done))
-        self._reconcile, self._phases = None, []
+            phases, self._reconcile, self._phases = self._phases, None, []
+            yield Reconcile(self._agent, since_s, max(at_s, since_s), reason, phases, done)
 
 
 def _messages(traces: Mapping[int, Trace]) -> list[Message]:

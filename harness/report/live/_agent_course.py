@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from harness.archive.history import COMMITTED_BY, LATEST_S, PHASES, REASONS
+from harness.archive.history import COMMITTED_BY, LATEST_S, Begun, Incarnation, Reconcile, Tie, Vote
 from harness.archive.traces import Header, Held, parsed
 from harness.report.live._live_trace import Lives
 from ucp.trace import Commanded, Dropped, Entry, HandlerRun
@@ -67,7 +67,7 @@ class Course:
         self._completed: dict[str, int] = {}
         self._twice: set[str] = set()
         self._idle_without = False
-        self._doing = ""
+        self._incarnation = Incarnation(agent_id)
 
     def read(self, until_s: float, at_most: int) -> bool:
         """Go on until so many lines are read, or all up to then; whether there is more up to then."""
@@ -126,7 +126,8 @@ class Course:
         """A life begins."""
         if self._born:
             self.changes.append(["z", self.at_s, self.agent_id])
-        self._born, self._doing, self._held, self._idle_without = True, "", Held(), False
+        self._born, self._held, self._idle_without = True, Held(), False
+        self._incarnation = Incarnation(self.agent_id)
         self._twice.clear()
 
     def _ran(self, run: HandlerRun) -> None:
@@ -155,25 +156,23 @@ class Course:
             self.changes.append(["c", run.t, self.agent_id, moves, run.state.top[:KEY_LENGTH], how])
 
     def _does(self, run: HandlerRun) -> None:
-        """What it is about: a vote, a phase of a reconcile, or nothing."""
-        handler, branch = run.handler, run.branch
-        if handler == "process_next_deque_block" and branch == "proposed":
-            block = next((sent.block or "" for sent in run.sent), "")
-            self._say(run.t, "voting", block[:KEY_LENGTH])
-        elif handler == "vote_timer_expiration":
-            self._say(run.t, "voted", branch[:80])
-        elif handler == "reconcile_begin" and branch == "begun":
-            self._say(run.t, "reconciling", REASONS.get(str(run.trigger.subject), "asked by the operator"))
-        elif handler == "reconcile_finalize" and branch == "done":
-            self._say(run.t, "reconciled", "")
-        elif run.state.reconciling:
-            if branch.startswith("tie:"):
-                self._say(run.t, "tie", branch[:80])
-            elif (name := PHASES.get(handler)) and name != self._doing:
-                self._say(run.t, name, "")
+        """Report the votes, reconciles and phases that the handler run began or ended."""
+        for step in self._incarnation.take(run):
+            match step:
+                case Begun("vote"):
+                    self._say(run.t, "voting", step.detail[:KEY_LENGTH])
+                case Begun("reconcile"):
+                    self._say(run.t, "reconciling", step.detail)
+                case Begun():
+                    self._say(run.t, step.detail, "")
+                case Vote():
+                    self._say(run.t, "voted", step.outcome[:80])
+                case Reconcile():
+                    self._say(run.t, "reconciled", "")
+                case Tie():
+                    self._say(run.t, "tie", step.branch[:80])
 
     def _say(self, t: float, doing: str, more: str) -> None:
-        self._doing = doing
         self.changes.append(["s", t, self.agent_id, doing, more])
 
     def _hold_against(self, run: HandlerRun) -> None:

@@ -135,7 +135,7 @@ export class Swarm {
 
   s(t, id, doing, more) {
     const agent = this.agents.get(id);
-    if (doing === "tie") return;
+    if (doing === "tie" || (doing === "voted" && this.reconcilingNow(agent))) return;
     if (doing === "reconciling") this.reconciles += 1;
     if (doing === "voting") this.votes += 1;
     agent.doing = doing === "voted" || doing === "reconciled" ? "idle" : doing;
@@ -194,7 +194,7 @@ export class History {
       const [agent, doing, more] = rest;
       if (doing === "voting") this.begin(agent, t, "vote");
       else if (doing === "voted") this.close(agent, t, "vote", more);
-      else if (doing === "reconciling") { this.close(agent, t, "vote", "cut short"); this.begin(agent, t, "reconcile"); }
+      else if (doing === "reconciling") this.begin(agent, t, "reconcile");
       else if (doing === "reconciled") this.close(agent, t, "reconcile", "done");
     } else if (kind === "c" || kind === "z") {
       if (kind === "z") { this.close(rest[0], t, "vote", "cut short"); this.close(rest[0], t, "reconcile", "cut short"); }

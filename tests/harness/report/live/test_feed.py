@@ -8,13 +8,17 @@ from pathlib import Path
 import pytest
 
 from harness.archive.archive import RunArchive
-from harness.archive.traces import SUFFIX
+from harness.archive.history import ends_at, history_of
+from harness.archive.traces import SUFFIX, Trace
 from harness.errors import RunDirectoryError
 from harness.report.live import feed as feeds
-from harness.report.live._agent_course import KEY_LENGTH, Change
+from harness.report.live._agent_course import KEY_LENGTH, Change, Course
 from harness.report.live.change_log import FAR_BEHIND_BYTES, Story
 from harness.report.live.feed import Feed
+from tests.harness.archive.test_history import a_run, a_trace
 from tests.harness.report.live.runs import film, of_kind, played
+from ucp.trace import Sent
+from ucp.trigger import TimerTrigger
 
 
 @pytest.fixture(scope="module")
@@ -157,6 +161,53 @@ def test_what_is_no_run_is_refused_in_a_sentence(tmp_path: Path, run: Path, monk
     monkeypatch.setattr(feeds, "MAX_VEHICLES", 3)
     with pytest.raises(RunDirectoryError, match="at most 3"):
         Feed(run)
+
+
+def intervals(told: list[Change]) -> list[tuple[str, float, float, str]]:
+    """Each vote and reconcile that ended: its kind, its start and end, and its outcome or its reason."""
+    began: dict[tuple[int, str], tuple[float, str]] = {}
+    ended = []
+    for _, at_s, agent, doing, more in of_kind("s", told):
+        if doing in ("voting", "reconciling"):
+            began[agent, doing] = at_s, more
+        elif doing == "voted":
+            ended.append(("vote", began.pop((agent, "voting"))[0], at_s, more))
+        elif doing == "reconciled":
+            start_s, reason = began.pop((agent, "reconciling"))
+            ended.append(("reconcile", start_s, at_s, reason))
+    return sorted(ended)
+
+
+def of_report(traces: dict[int, Trace]) -> list[tuple[str, float, float, str]]:
+    """The same intervals as the report has them."""
+    history = history_of(traces, [], ends_at(traces), whole=False)
+    votes = [("vote", vote.start_s, vote.end_s, vote.outcome) for vote in history.votes]
+    return sorted([*votes, *(("reconcile", one.start_s, one.end_s, one.reason) for one in history.reconciles)])
+
+
+def reconcile_during_a_vote(directory: Path) -> tuple[list[Change], Trace]:
+    """What the feed says of an agent that begins a reconcile before its vote timer expires, and its trace."""
+    trigger = TimerTrigger("vote_timer_expiration")
+    runs = [
+        a_run(1.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")]),
+        a_run(3.0, "reconcile_begin", "begun", trigger=trigger),
+        a_run(3.0, "reconcile_phase_1"),
+        a_run(11.0, "vote_timer_expiration", "approved"),
+        a_run(15.0, "reconcile_finalize", "done"),
+    ]
+    trace = a_trace(1, runs)
+    lines = [trace.header.to_line(), *(run.to_line() for run in runs)]
+    (directory / f"1{SUFFIX}").write_text("".join(lines))
+    course = Course(directory, 1)
+    course.read(100.0, 100)
+    course.close()
+    return course.changes, trace
+
+
+def test_feed_and_report_agree_on_a_reconcile_during_a_vote(tmp_path: Path) -> None:
+    changes, trace = reconcile_during_a_vote(tmp_path)
+    assert intervals(changes) == of_report({1: trace})
+    assert intervals(changes) == [("reconcile", 3.0, 15.0, "vote not approved"), ("vote", 1.0, 11.0, "approved")]
 
 
 def test_a_slow_reader_of_a_live_run_is_not_given_all_of_it() -> None:

@@ -11,7 +11,7 @@ from tests.harness.command import DEADLINE_S
 from tests.harness.report.browser import Browser
 from tests.harness.report.live.pages import page_of, until
 from tests.harness.report.live.runs import film, of_kind, played
-from tests.harness.report.live.test_feed import chains_of
+from tests.harness.report.live.test_feed import chains_of, of_report, reconcile_during_a_vote
 
 HOSTILE = "</title><script>document.title = 'owned'</script><img src=x onerror=\"document.title='owned'\">"
 
@@ -51,6 +51,19 @@ def test_a_film_plays_forward_and_back_and_takes_names_as_text(browser: Browser,
         assert browser.complaints == []
         process.send_signal(signal.SIGINT)
         assert process.wait(DEADLINE_S) == 0
+
+
+def test_page_keeps_a_vote_open_when_a_reconcile_begins(browser: Browser, run: Path, tmp_path: Path) -> None:
+    changes, trace = reconcile_during_a_vote(tmp_path)
+    with page_of("watch", run) as (_, address):
+        browser.show(address, width=1000, scheme="light")
+        until(browser, "watch.story.end")
+        browser.evaluate(
+            "const history = new watch.story.ahead.history.constructor(), swarm = watch.story.ahead;"
+            f"for (const change of {json.dumps(changes)}) {{ swarm.apply(change); history.take(change, swarm); }}"
+            "window.spans = history.spans.map(span => [span.what, span.from, span.to]); true"
+        )
+        assert sorted(browser.evaluate("window.spans")) == [list(one[:3]) for one in of_report({1: trace})]
 
 
 def test_a_film_of_a_run_that_was_killed_says_so(browser: Browser, run: Path, tmp_path: Path) -> None:
