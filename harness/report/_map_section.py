@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.archive.connectivity import QUALITY_LIMITS, Connectivity, quality
+from harness.archive.connectivity import Connectivity, quality
 from harness.archive.tracks import Tracks
 from harness.present import text
 from harness.present.colours import Ink
 from harness.report import map_svg
+from harness.report.facts import link_qualities
 from harness.report.map_parts import MAX_STRETCHES, Division, Extent, Life, divisions, extent, letter, lives, longest
 from harness.scenario.changes import RANGE
 from sitl.vehicle import VehicleType
@@ -170,14 +171,10 @@ def _in_words(losses: Collection[float]) -> str:
 def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
     """What the small maps show beside that: links that lose messages; of several types of vehicles, which is which."""
     drawn = "".join(moment.picture for moment in moments)
-    limits = [0.0, *QUALITY_LIMITS]
     entries = [
-        (
-            map_svg.sample(f"q{which}"),
-            f"link that loses {text.percent(limits[which])} to {text.percent(limits[which + 1])}",
-        )
-        for which in range(1, len(QUALITY_LIMITS))
-        if f" q{which}" in drawn
+        (map_svg.sample(f"q{which}"), words)
+        for which, words in enumerate(link_qualities())
+        if which and f" q{which}" in drawn
     ]
     shapes = sorted(types) if len(types) > 1 else []
     return entries + [(map_svg.sample(vehicle_type), vehicle_type) for vehicle_type in shapes]

@@ -1,7 +1,9 @@
 """Facts of a run that the page and report.md share: settings, end, figures, gaps in captures."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 
+from harness.archive.connectivity import QUALITY_LIMITS
 from harness.archive.exports import Exports
 from harness.archive.run_record import CapturedFrames, RunRecord
 from harness.play.backends import in_virtual_time
@@ -86,3 +88,9 @@ def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
     received = sum(frames.received for frames in captured.values())
     whose = f"vehicle{'s' if len(lacking) > 1 else ''} {', '.join(ranges(lacking))}"
     return f"the capture lacks {dropped} of {received} frames, of {whose}: this machine was too slow to keep up"
+
+
+def link_qualities() -> list[str]:
+    """Return the words of a map's legend for each quality of a link, from 0 on."""
+    limits = map(text.percent, QUALITY_LIMITS)
+    return ["link", *(f"link that loses {low} to {high}" for low, high in pairwise(limits))]

@@ -27,12 +27,14 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.archive import RunArchive
+from harness.archive.connectivity import QUALITY_LIMITS
 from harness.archive.exports import RUN_FILE, agents_directory
 from harness.archive.record_file import read_record
 from harness.archive.run_record import RunRecord
 from harness.errors import RunDirectoryError
 from harness.play.backends import in_virtual_time
 from harness.present.colours import inks
+from harness.report.facts import link_qualities
 from harness.report.live._agent_course import Change, Course, Heard, Sent
 from harness.report.live._surroundings import Around
 from harness.scenario.faults import ASKED_FOR, VehicleFault
@@ -97,6 +99,8 @@ class Feed:
                 "roster": self._roster,
                 "types": [scenario.vehicles.type_of(agent) if scenario else "copter" for agent in self._roster],
                 "inks": [[ink.fill, ink.stroke, ink.text, ink.dashed] for ink in inks(self._roster).values()],
+                "quality_limits": QUALITY_LIMITS,
+                "link_qualities": link_qualities(),
                 "duration_s": scenario.duration_s if scenario else None,
                 "speedup": scenario.speedup if scenario else None,
                 "backend": record.backend,

@@ -37,15 +37,12 @@ export function clock(seconds) {
 
 export const percent = (share) => `${(100 * share).toFixed(share > 0 && share < 0.0995 ? 1 : 0)} %`;
 
-// A link that loses less than the first is of quality 0; who loses everything, of quality 4, has none.
-const QUALITY = [0.05, 0.25, 0.6, 1.0];
-export const quality = (loss) => QUALITY.filter((limit) => loss >= limit).length;
-
+// The strokes of links, by quality. The feed sends the limits of the qualities and their words.
 export const LINKS = [
-  { dash: [], width: 1, alpha: 0.55, colour: "whole", says: "link" },
-  { dash: [9, 3], width: 1, alpha: 0.7, colour: "whole", says: "loses 5 to 25 %" },
-  { dash: [5, 4], width: 1.1, alpha: 0.9, colour: "poor", says: "25 to 60 %" },
-  { dash: [1.5, 4], width: 1.5, alpha: 0.95, colour: "bad", says: "more than 60 %" },
+  { dash: [], width: 1, alpha: 0.55, colour: "whole" },
+  { dash: [9, 3], width: 1, alpha: 0.7, colour: "whole" },
+  { dash: [5, 4], width: 1.1, alpha: 0.9, colour: "poor" },
+  { dash: [1.5, 4], width: 1.5, alpha: 0.95, colour: "bad" },
 ];
 
 export const partColour = (number) => `part${number % 4}`;

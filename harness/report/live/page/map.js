@@ -1,7 +1,7 @@
 // The map: where the vehicles are, what the links between them lose, what is said over them, and who is cut off.
 // Vehicles without places stand in a ring.
 
-import { LINKS, colour, family, font, partColour, prepared, quality, shape } from "./look.js";
+import { LINKS, colour, family, font, partColour, prepared, shape } from "./look.js";
 
 const TRAIL_S = 60;
 const PULSE_WALL_S = 0.7;
@@ -159,7 +159,7 @@ export class SwarmMap {
     if (swarm.parts.length > 1) swarm.parts.forEach((part, number) => { for (const id of part) partOf.set(id, number); });
     const paths = new Map();
     for (const [low, high, there, back] of swarm.links.values()) {
-      const grade = quality((there + back) / 2);
+      const grade = swarm.run.quality_limits.filter((limit) => (there + back) / 2 >= limit).length;
       const [a, b] = [swarm.agents.get(low), swarm.agents.get(high)];
       if (grade > 3 || a.state === "gone" || b.state === "gone") continue;
       const of = grade < 2 && partOf.has(low) ? partColour(partOf.get(low)) : LINKS[grade].colour;

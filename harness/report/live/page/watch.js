@@ -227,7 +227,7 @@ function drawLegend() {
     context.lineWidth = link.width * 1.3;
     context.setLineDash(link.dash);
     context.beginPath(); context.moveTo(0, 7); context.lineTo(26, 7); context.stroke();
-  }, link.says));
+  }, run.link_qualities[grade]));
   for (const [kind, says] of [["vote", "vote"], ["commit", "commit"], ["reconcile", "reconcile"]]) entry((context) => {
     context.strokeStyle = colour(kind);
     context.lineWidth = 2.5;

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from harness.report.facts import link_qualities
 from tests.harness.command import DEADLINE_S
 from tests.harness.report.browser import Browser
 from tests.harness.report.live.pages import page_of, until
@@ -48,6 +49,8 @@ def test_a_film_plays_forward_and_back_and_takes_names_as_text(browser: Browser,
         assert until(browser, "document.querySelectorAll('#events li').length") > 3
         assert browser.evaluate("watch.playhead.swarm.links.get('1-3').slice(2).join()") == "1,1"
         assert browser.evaluate("document.getElementById('map').width") > 100
+        legend = browser.evaluate("document.getElementById('legend').textContent")
+        assert all(words in legend for words in link_qualities())
         assert browser.complaints == []
         process.send_signal(signal.SIGINT)
         assert process.wait(DEADLINE_S) == 0
