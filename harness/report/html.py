@@ -15,7 +15,9 @@ from markupsafe import Markup
 from harness.present import text as words
 
 _HERE = Path(__file__).parent
-PAGE_STYLE = (_HERE / "page.css").read_text(encoding="utf-8")
+PALETTE = (_HERE / "palette.css").read_text(encoding="utf-8")
+"""The colours that a report and the live page share."""
+PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
 
 
 def render(template: Path, *, styles: Sequence[str], script: str = "", **content: Any) -> str:

@@ -20,6 +20,7 @@ from typing import Any
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from harness.errors import MachineError
+from harness.report.html import PALETTE
 from harness.report.live._agent_course import Change
 from harness.report.live.change_log import Story
 
@@ -46,11 +47,12 @@ class _File:
 
 
 def _files() -> Mapping[str, _File]:
-    return {
+    files = {
         str(path.relative_to(_PAGE)): _File(path.read_bytes(), _TYPES[path.suffix])
         for path in sorted(_PAGE.rglob("*"))
         if path.suffix in _TYPES
     }
+    return {"palette.css": _File(PALETTE.encode(), _TYPES[".css"]), **files}
 
 
 class _Page:

@@ -263,7 +263,7 @@ def test_whatever_the_result_holds_there_is_a_report(
 
 def test_template_and_styles_are_in_the_package() -> None:
     shipped = {entry.name for entry in resources.files("harness.report").iterdir()}
-    assert {"page.html.j2", "page.css", "chain_tree.css", "map.css"} <= shipped
+    assert {"page.html.j2", "page.css", "palette.css", "chain_tree.css", "map.css"} <= shipped
 
 
 def test_what_the_mission_left_is_drawn_beside_what_the_final_reconcile_made_of_it(tmp_path: Path) -> None:
