@@ -17,7 +17,7 @@ from harness.conformance.results import TITLES, Results
 from harness.conformance.results_table import progress, render, summary, to_junit
 from harness.conformance.vectors import generate, to_lines
 from harness.errors import HarnessError, MachineError
-from harness.play.command_line import located
+from harness.play.agent_control import located
 from harness.run.parallel import terminated_is_interrupted
 from ucp.agent import HANDLERS
 

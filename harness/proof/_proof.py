@@ -17,13 +17,13 @@ from harness.proof.graph._workers import Crew
 from harness.proof.model._any_sender import collect
 from harness.proof.model._flaws import Flaw
 from harness.proof.model._global_states import AGENTS, ZONE, Swarm
-from harness.proof.model._reduction import ReductionError
+from harness.proof.model._snapshot import ReductionError
 from harness.proof.questions import _convergence as liveness
 from harness.proof.questions import _livelock
 from harness.proof.questions._convergence import Liveness
 from harness.proof.questions._graph_cycles import cycles
 from harness.proof.questions._livelock import Livelock
-from harness.run.finding import claim
+from harness.run.simulate import claim
 
 INCOMPLETE = 4
 """Exit status: a bound was reached before everything had been looked at."""

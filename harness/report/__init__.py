@@ -6,6 +6,6 @@ files.
 """
 
 from harness.report._report_source import ReportSource, read_source
-from harness.report._write_report import write, write_report
+from harness.report._run_page import write, write_report
 
 __all__ = ["ReportSource", "read_source", "write", "write_report"]

@@ -1,4 +1,4 @@
-"""The page: everything that a run left, in one file.
+"""The page of a run, and all files of its report.
 
 The page loads nothing; its Content-Security-Policy allows its own style sheet and the script of its timeline, which
 it can do without, and nothing else.
@@ -9,8 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from harness.archive.archive import RunArchive
 from harness.archive.block_names import name_blocks
 from harness.archive.exports import Export
+from harness.errors import RunDirectoryError
+from harness.gc_pause import gc_paused
 from harness.present.colours import Ink
 from harness.report import (
     _map_section,
@@ -23,10 +26,12 @@ from harness.report import (
     verdict_section,
 )
 from harness.report import _timeline_section as timeline
-from harness.report._report_source import ReportSource
+from harness.report._report_source import ReportSource, read_source
+from harness.report._run_summary import to_junit, to_markdown
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.map_svg import STYLE as MAP_STYLE
+from ucp.agent_files import write_atomically
 
 EVIDENCE_SHOWN = 3
 LONG_TEXT = 240
@@ -102,3 +107,34 @@ def _picture(heading: str, exports: Mapping[int, Export], ink: Mapping[int, Ink]
         "abridged": tree.draw("abridged"),
         "full": tree.draw("full") if tree.hidden else None,
     }
+
+
+@gc_paused()
+def write_report(archive: RunArchive) -> Path:
+    """Write `report.html`, `chains.svg`, `report.md` and `junit.xml` into the run directory; the path of the page.
+
+    Raises RunDirectoryError if there is nothing of a run in the directory, or if the disk refuses the report. What is
+    missing or damaged is said on the page.
+    """
+    return write(read_source(archive))
+
+
+def write(left: ReportSource) -> Path:
+    """As `write_report` does, of what was read."""
+    _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
+    _write(left.run_dir / "report.md", to_markdown(left))
+    _write(left.run_dir / "junit.xml", to_junit(left.record, _chains(left)))
+    page = left.run_dir / "report.html"
+    _write(page, draw(left))
+    return page
+
+
+def _chains(left: ReportSource) -> dict[int, tuple[str, ...]]:
+    return {agent_id: export.chain_of_block_hashes for agent_id, export in left.exports.by_agent.items()}
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        write_atomically(path, text)
+    except OSError as error:
+        raise RunDirectoryError(f"{path}: cannot be written: {error.strerror}") from None

@@ -1,20 +1,23 @@
-"""Scenarios in virtual time, in memory, for sweeps over thousands of runs.
+"""Scenarios in virtual time, in memory: play them, judge them, and state the findings.
 
 The checker is that of any other run; the evidence comes straight from the agents, without files between.
 """
 
-from collections.abc import Coroutine, Iterable, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from harness import checker
+from harness.archive.directory import default_path
 from harness.archive.exports import Export, ExportMaker
 from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import Header, Trace
-from harness.checker import Evidence
+from harness.checker import Evidence, Result
 from harness.checker.evidence import InjectedDatagram, RogueTraffic
-from harness.errors import AgentFailedError
+from harness.checker.judgement import Finding, Judgement
+from harness.errors import AgentFailedError, MachineError, RunDirectoryError
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
@@ -23,13 +26,14 @@ from harness.play.simulation.run_files import header
 from harness.play.simulation.simulation import Simulation
 from harness.play.simulation.virtual_time import VirtualTime
 from harness.scenario import Scenario
+from harness.scenario.verdict_names import CHARACTERISTICS
 from netem.radio import Place
 from ucp.trace import SCHEMA, Entry, in_base64
 
 if TYPE_CHECKING:
     from ucp.secure.secured_agent import SecuredAgent
 
-Result = TypeVar("Result")
+Returned = TypeVar("Returned")
 
 
 @dataclass(frozen=True)
@@ -88,12 +92,12 @@ def same_twice(scenario: Scenario, seed: int) -> None:
         simulate(scenario, seed, tracing=True, again=True)
 
 
-def without_waiting(story: Coroutine[Any, Any, Result]) -> Result:
+def without_waiting(story: Coroutine[Any, Any, Returned]) -> Returned:
     """Run a coroutine that waits for nothing, as virtual time does not, without an event loop."""
     try:
         story.send(None)
     except StopIteration as end:
-        result: Result = end.value
+        result: Returned = end.value
         return result
     raise AssertionError("virtual time waits for nothing")
 
@@ -179,3 +183,69 @@ class InMemory:
             )
             for life in lives
         }
+
+
+EVIDENCE_SHOWN = 5
+
+Judge = Callable[[Scenario, int], Result]
+"""Plays a scenario with a seed, and judges it."""
+
+
+ENDED = "ended"
+"""Key of what an agent is judged by that did not get to the end of its mission."""
+
+
+@gc_paused()
+def simulated(scenario: Scenario, seed: int) -> Result:
+    """With traces, so that all six characteristics are judged; of a run that an agent ended, only that it did."""
+    try:
+        return simulate(scenario, seed, tracing=True).result
+    except AgentFailedError as error:
+        return ended_by(error)
+
+
+def ended_by(error: AgentFailedError) -> Result:
+    """An agent crashed or hung: there is no more to judge, and no less to find and to shrink."""
+    finding = Finding(error.agent_id, f"{error.outcome}: it {error.detail}")
+    judgement = Judgement("every agent to the end", "violated", f"agent {error.agent_id} {error.outcome}", [finding])
+    return Result({}, {}, {ENDED: judgement})
+
+
+def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
+    """What is violated, and how one sees it."""
+    lines = []
+    for key, judgement in violated.items():
+        if key in CHARACTERISTICS:
+            lines.append(f"Characteristic {key}, {judgement.name}, is violated, {judgement.reason}")
+        else:
+            lines.append(f"{judgement.name.capitalize()}: {judgement.verdict}, {judgement.reason}")
+        lines += [f"  agent {finding.agent_id}: {finding.detail}" for finding in judgement.evidence[:EVIDENCE_SHOWN]]
+        if len(judgement.evidence) > EVIDENCE_SHOWN:
+            lines.append(f"  and {len(judgement.evidence) - EVIDENCE_SHOWN} more")
+    return lines
+
+
+def claim(out: Path | None, name: str) -> Path:
+    """Where the file will be: `out`, or a new name under `runs`. Raises RunDirectoryError if there is one already."""
+    if out is not None and out.exists():
+        raise RunDirectoryError(f"{out} exists: choose another --out, nothing is overwritten")
+    path = out or default_path(f"{name} shrunk").with_suffix(".yaml")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunDirectoryError(f"{path.parent} cannot be made: {error.strerror}; choose another --out") from None
+    return path
+
+
+def write(path: Path, text: str) -> Path:
+    """Where it was written: a number is added if somebody was faster. Raises MachineError."""
+    free, number = path, 2
+    while True:
+        try:
+            with free.open("x", encoding="utf-8") as file:
+                file.write(text)
+            return free
+        except FileExistsError:
+            free, number = path.with_stem(f"{path.stem}-{number}"), number + 1
+        except OSError as error:
+            raise MachineError(f"{free} cannot be written: {error.strerror}") from None

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 from harness.scenario._network import NetworkModel, NetworkValues, Where, conditions_of, laid_over, of_whom
-from harness.scenario._schedule import UNTOUCHED, Layer, Schedule
-from harness.scenario.timeline import TimelineEntry
+from harness.scenario.timeline import UNTOUCHED, Layer, Schedule, TimelineEntry
 from netem.conditions import NetworkConditions
 
 Groups = tuple[frozenset[int], ...]

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator, model_validator
 
 from harness.scenario._network import NetworkModel
-from harness.scenario._schedule import NEEDED, Schedule
 from harness.scenario.agent_options import (
     AgentCommand,
     AskedQuirks,
+    Docker,
     Events,
     OfSome,
     Security,
@@ -20,7 +20,6 @@ from harness.scenario.agent_options import (
     staggered,
 )
 from harness.scenario.agent_options import check as check_quirks
-from harness.scenario.docker import Docker
 from harness.scenario.expect import Expect
 from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
@@ -28,7 +27,7 @@ from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.injection import ScriptedDatagram
 from harness.scenario.network_states import Step, refuse_ambiguity, steps
 from harness.scenario.strict_model import MAX_AGENTS, Data, Lateness, Model, Seconds, VehicleKey
-from harness.scenario.timeline import TimelineEntry
+from harness.scenario.timeline import NEEDED, Schedule, TimelineEntry
 from harness.scenario.vehicles import Flight, Vehicles
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError

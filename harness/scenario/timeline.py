@@ -1,10 +1,25 @@
-"""What a scenario changes while it runs: the network, who is alive, and what a rogue node sends."""
+"""The timeline and the schedules of a scenario: changes of the network, faults and injections.
 
-from typing import TYPE_CHECKING, Any, Literal, get_type_hints
+    schedule:
+      - {ramp: {loss: [0, 0.5]}, from_s: 100, until_s: 400}
+      - {repeat: {partition: [[1, 2]]}, every_s: 120, for_s: 30}
+      - {repeat: {network: {links: [{from: 1, to: 2, loss: 0.9}]}}, every_s: 120, for_s: 30}
+      - {nemesis: halves, every_s: 60, for_s: 20, seed: 7}
 
-from pydantic import ValidationInfo, create_model, field_validator, model_validator
+Each is a layer over the network of the scenario and its timeline, and is worked out before the run: every backend plays
+the same. Of the network they say what the timeline says: `loss`, `partition`, or `network` with any of its keys. Where
+layers meet, of each key the later one's value counts, partitions cut all that any of them cuts, and a pair that one of
+them cuts is cut.
+"""
 
-from harness.scenario._network import Disturbance
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from random import Random
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+
+from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
+
+from harness.scenario._network import DelaySeconds, Disturbance, NetworkLayer, NetworkValues, Where, laid_over, of_whom
 from harness.scenario.faults import ASKED_FOR, Agents, Fault
 from harness.scenario.injection import (
     INJECTIONS,
@@ -18,7 +33,7 @@ from harness.scenario.injection import (
     Lie,
     Replay,
 )
-from harness.scenario.strict_model import Instant, Seconds
+from harness.scenario.strict_model import Instant, Model, Probability, Seconds, VehicleId
 
 NETWORK_KEYS = ("loss", "partition", "heal", "network")
 """Keys of an entry that change the network."""
@@ -112,3 +127,209 @@ if TYPE_CHECKING:  # a type checker does not run the code that makes the class
     TimelineEntry = _Entry
 else:
     TimelineEntry = create_model("TimelineEntry", __base__=_Entry, __doc__=_Entry.__doc__, **_keys_of_faults())
+
+
+MAX_STEPS = 10_000
+"""More changes than this are a mistake, or another scenario."""
+
+Groups = Annotated[list[list[VehicleId]], Field(min_length=1)]
+Pairs = frozenset[tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What a schedule makes of the network for a while; nothing: it leaves it alone."""
+
+    values: NetworkValues = field(default_factory=dict)
+    partition: tuple[frozenset[int], ...] = ()
+    cut: Pairs = frozenset()
+    """Directed pairs, sender and receiver, between which nothing passes."""
+
+
+UNTOUCHED = Layer()
+
+Step = tuple[float, str, Layer]
+"""(mission seconds, what in a word or two, the layer from then on)."""
+
+
+class Ramp(Model):
+    """From the first value to the second, in equal steps; `network`: of each number that both name."""
+
+    loss: tuple[Probability, Probability] | None = None
+    delay: tuple[DelaySeconds, DelaySeconds] | None = None
+    network: tuple[NetworkLayer, NetworkLayer] | None = None
+
+    @model_validator(mode="after")
+    def _of_something(self) -> "Ramp":
+        if self.loss is None and self.delay is None and self.network is None:
+            raise ValueError("needs `loss`, `delay` or `network`: [from, to]")
+        if self.network is not None:
+            first, last = ({(where, key): value for where, key, value in _values(end)} for end in self._ends())
+            for where, key in first.keys() ^ last.keys():
+                raise ValueError(f"{key}{of_whom(where)} is in one `network` of the two: from what, or to what?")
+            for (where, key), value in [*first.items(), *last.items()]:
+                if where is None and getattr(self, key, None) is not None:
+                    raise ValueError(f"`{key}` and `network.{key}` are the same thing: leave one of them out")
+                if not isinstance(value, float):
+                    raise ValueError(f"{key}{of_whom(where)} is {value!r}: a ramp goes from one number to another")
+        return self
+
+    def _ends(self) -> tuple[NetworkValues, NetworkValues]:
+        """What `network` is at first, and in the end."""
+        return (self.network[0].whole(), self.network[1].whole()) if self.network else ({}, {})
+
+    def at(self, share: float) -> NetworkValues:
+        """What it has come to after this share of it."""
+        short = {key: ends for key in ("loss", "delay") if (ends := getattr(self, key)) is not None}
+        first, last = (
+            laid_over({None: {key: ends[number] for key, ends in short.items()}}, end)
+            for number, end in enumerate(self._ends())
+        )
+        return {
+            where: {key: value + (last[where][key] - value) * share for key, value in keys.items()}
+            for where, keys in first.items()
+        }
+
+
+def _values(end: NetworkValues) -> Iterator[tuple[Where, str, Any]]:
+    return ((where, key, value) for where, keys in end.items() for key, value in keys.items())
+
+
+class Repeated(Disturbance):
+    """What is done for a while, and undone."""
+
+    partition: Groups | None = None
+    delay: DelaySeconds | None = None
+
+    @model_validator(mode="after")
+    def _of_something(self) -> "Repeated":
+        if all(value is None for value in (self.loss, self.delay, self.partition, self.network)):
+            raise ValueError("needs at least one of `loss`, `delay`, `partition` or `network`")
+        if self.delay is not None and self.network is not None and self.network.delay is not None:
+            raise ValueError("`delay` and `network.delay` are the same thing: leave one of them out")
+        return self
+
+    def changes(self) -> NetworkValues:
+        values = super().changes()
+        return values if self.delay is None else laid_over(values, {None: {"delay": self.delay}})
+
+
+Nemesis = Literal["halves", "isolate", "majorities ring", "bridge", "flapping"]
+
+
+class Schedule(Model):
+    """One of `ramp`, `repeat` or `nemesis`, from `from_s` until `until_s` (the mission's end).
+
+    `ramp`: a step every `every_s`, 10 s if not given; in the end it stays at its second value. `repeat`: every
+    `every_s`, for `for_s`, then undone. `nemesis`: the same with something drawn anew from `seed` each time: `halves`
+    parts the swarm into two random halves, `isolate` cuts off one vehicle, `majorities ring` lets every vehicle hear a
+    majority and no two the same one (Jepsen), `bridge` leaves one vehicle that hears both halves, `flapping` cuts one
+    pair of vehicles from each other.
+    """
+
+    ramp: Ramp | None = None
+    repeat: Repeated | None = None
+    nemesis: Nemesis | None = None
+    from_s: Instant = 0.0
+    until_s: Instant | None = None
+    every_s: Seconds | None = None
+    for_s: Seconds | None = None
+    seed: int = 0
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "Schedule":
+        if sum(kind is not None for kind in (self.ramp, self.repeat, self.nemesis)) != 1:
+            raise ValueError("needs exactly one of `ramp`, `repeat` or `nemesis`")
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(f"until_s {self.until_s:g} is not after from_s {self.from_s:g}")
+        if self.ramp is not None:
+            if self.for_s is not None:
+                raise ValueError("for_s is for `repeat` and `nemesis`: a ramp lasts until until_s")
+        elif self.every_s is None or self.for_s is None:
+            raise ValueError("needs `every_s` and `for_s`")
+        elif self.for_s >= self.every_s:
+            raise ValueError(
+                f"for_s {self.for_s:g} is not less than every_s {self.every_s:g}: it would never be undone"
+            )
+        return self
+
+    def named(self) -> Iterator[tuple[str, int]]:
+        """Every vehicle that is named outside of partitions, with the key that names it."""
+        if self.repeat is not None and self.repeat.network is not None:
+            yield from ((f"repeat.network.{key}", vehicle) for key, vehicle in self.repeat.network.named())
+        for number, end in enumerate((self.ramp.network if self.ramp else None) or ()):
+            yield from ((f"ramp.network.{number}.{key}", vehicle) for key, vehicle in end.named())
+
+    def steps(self, roster: Sequence[int], end_s: float) -> list[Step]:
+        """What happens when, in order. ValueError if it is more than anybody wants."""
+        until = end_s if self.until_s is None else self.until_s
+        every = self.every_s or 10.0
+        if (until - self.from_s) / every > MAX_STEPS:
+            raise ValueError(f"every_s {every:g} is more than {MAX_STEPS} steps")
+        if self.ramp is not None:
+            return _ramp(self.ramp, self.from_s, until, every)
+        rng = Random(f"{self.seed}/{self.nemesis}")
+        steps: list[Step] = []
+        count = 0
+        while (at_s := self.from_s + count * every) < until:
+            steps.append((at_s, self.nemesis or "repeat", self._layer(roster, rng)))
+            steps.append((min(at_s + (self.for_s or 0.0), until), "undone", UNTOUCHED))
+            count += 1
+        return steps
+
+    def _layer(self, roster: Sequence[int], rng: Random) -> Layer:
+        if self.repeat is not None:
+            return Layer(self.repeat.changes(), self.repeat.groups)
+        assert self.nemesis is not None, "a schedule is one of three"
+        return NEMESES[self.nemesis](rng.sample(list(roster), len(roster)))
+
+
+def _ramp(ramp: Ramp, from_s: float, until: float, every: float) -> list[Step]:
+    count = max(1, round((until - from_s) / every))
+    steps: list[Step] = []
+    for number in range(count + 1):
+        share = number / count
+        steps.append((from_s + (until - from_s) * share, "ramp", Layer(ramp.at(share))))
+    return steps
+
+
+def _halves(shuffled: list[int]) -> Layer:
+    return Layer(partition=(frozenset(shuffled[: len(shuffled) // 2]), frozenset(shuffled[len(shuffled) // 2 :])))
+
+
+def _isolate(shuffled: list[int]) -> Layer:
+    return Layer(partition=(frozenset(shuffled[:1]),))
+
+
+def _majorities_ring(shuffled: list[int]) -> Layer:
+    """Each vehicle hears itself and its nearest on the ring, a majority in all; everybody's majority is another."""
+    size = len(shuffled)
+    reach = (size // 2 + 1) // 2
+    heard = {
+        (shuffled[(place + step) % size], shuffled[place]) for place in range(size) for step in range(-reach, reach + 1)
+    }
+    return Layer(cut=frozenset((a, b) for a in shuffled for b in shuffled if a != b and (a, b) not in heard))
+
+
+def _bridge(shuffled: list[int]) -> Layer:
+    _, *rest = shuffled
+    left, right = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+    return Layer(cut=frozenset(pair for a in left for b in right for pair in ((a, b), (b, a))))
+
+
+def _flapping(shuffled: list[int]) -> Layer:
+    pair = shuffled[:2]
+    return Layer(cut=frozenset(((pair[0], pair[1]), (pair[1], pair[0])) if len(pair) == 2 else ()))
+
+
+NEMESES: dict[Nemesis, Callable[[list[int]], Layer]] = {
+    "halves": _halves,
+    "isolate": _isolate,
+    "majorities ring": _majorities_ring,
+    "bridge": _bridge,
+    "flapping": _flapping,
+}
+"""From the vehicles in random order to what becomes of the network."""
+
+NEEDED: dict[Nemesis, int] = {"halves": 2, "isolate": 2, "majorities ring": 4, "bridge": 3, "flapping": 2}
+"""Vehicles without which it would be no fault."""

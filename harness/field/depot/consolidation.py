@@ -1,6 +1,6 @@
 """One ordered record of all that came home: each block once, with where it is held, and what is missing.
 
-Blocks stand in the order of `harness.field.depot._block_order`. A block that an agent was building when it exported
+Blocks stand in the order of `harness.field.depot.record_lines`. A block that an agent was building when it exported
 comes after
 them, unless a completed block begins with the same events: then it is that block, on its way. So every event of every
 block in any chain, deque, reconcile stack or current block is on record exactly once.
@@ -15,9 +15,19 @@ from typing import TYPE_CHECKING
 from harness.archive.block_names import name_blocks
 from harness.archive.event_data import EventData, SealedError
 from harness.archive.exports import Export, ExportedBlock
-from harness.field.depot._block_order import mutual_chain, ordered
 from harness.field.depot.collected_exports import CameHome, all_blocks
-from harness.field.depot.record_lines import Block, ExportUsed, Fork, Header, Held, Lost, Place, Way
+from harness.field.depot.record_lines import (
+    Block,
+    ExportUsed,
+    Fork,
+    Header,
+    Held,
+    Lost,
+    Place,
+    Way,
+    mutual_chain,
+    ordered,
+)
 from harness.gc_pause import gc_paused
 from harness.report.chain_tree import ranges
 from ucp.events import EVENT_FIELDS, EVENT_HEADER_BYTES, LoggableEvent

@@ -1,13 +1,21 @@
-"""What virtual time did, beside what is on record: the same steps, and the same chains at the end?"""
+"""Compare played agents with their records: each agent alone, and the whole flight."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 
 from harness.archive.traces import Trace
-from harness.field.reconstruct._rehearsal import Rehearsal, same_sent
+from harness.checker import Evidence, steps
+from harness.checker.judgement import agents
+from harness.checker.steps.trace_header import CheckedHeader
+from harness.field.ingest import Flight
+from harness.field.reconstruct._agent_inputs import Input, lives_of
+from harness.field.reconstruct._inferring import infer
+from harness.field.reconstruct._other_records import Elsewhere
+from harness.field.reconstruct._rehearsal import Allowed, Parting, Rehearsal, rehearse, same_sent
 from harness.field.reconstruct._timetable import Timetable
 from harness.run.simulate import Simulated
+from ucp.quirks import QUIRKS
 from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
@@ -92,3 +100,114 @@ def _in_words(step: Step | None) -> str:
     sent = ", ".join(sent.message for sent in run.sent)
     words = [f"ran {run.handler} ({run.branch[:60]})", changed and f"changed {changed}", sent and f"sent {sent}"]
     return ", ".join(filter(None, words))
+
+
+Lives = Sequence[Sequence[Input]]
+
+
+class Alone:
+    """`rehearsals` has every agent that can be played, and `why` says of whom it is not all that came home."""
+
+    def __init__(self, flight: Flight, elsewhere: Elsewhere) -> None:
+        self.rehearsals: dict[int, Rehearsal] = {}
+        self.why: dict[int, str] = {}
+        self._flight = flight
+        self._elsewhere = elsewhere
+        self._by_captures: list[int] = []
+        self._remarks: list[str] = []
+
+    @property
+    def remarks(self) -> list[str]:
+        """What was assumed, and what was found."""
+        if not self._by_captures:
+            return self._remarks
+        which = agents(self._by_captures)
+        inferred = f"what reached {which} is from captures and blocks, and when timers ended there is inferred"
+        return [*self._remarks, inferred]
+
+    def rehearse(self, header: CheckedHeader) -> None:
+        """By its trace; or, if that does not lead to its export, by its capture if that says more."""
+        agent_id = header.agent_id
+        rehearsal = self._by_trace(header) if agent_id in self._flight.traces else None
+        if rehearsal is None or not rehearsal.parting:
+            rehearsal = self._by_capture(header, rehearsal)
+        if rehearsal is not None and (rehearsal.played or rehearsal.parting is None):
+            self.rehearsals[agent_id] = rehearsal
+
+    def _by_trace(self, header: CheckedHeader) -> Rehearsal:
+        agent_id = header.agent_id
+        lives, problem = lives_of(self._flight.traces[agent_id], header, self._elsewhere)
+        rehearsal = rehearse(header, lives)
+        if rehearsal.parting is not None:
+            explained = self._with_a_quirk(header, lives, rehearsal.parting)
+            rehearsal = explained or self._with_what_is_not_right(header, lives) or rehearsal
+        elif not rehearsal.to_the_word and (words := self._judged(agent_id)):
+            self._remarks.append(f"agent {agent_id} is wrong to no effect: {words}")
+        if (parting := rehearsal.parting) is not None:
+            words = self._judged(agent_id) or f"trace line {parting.line}, t={parting.at_s:g} s: it {parting.what}"
+            self.why[agent_id] = (
+                f"does not do what the protocol says, and is played up to trace line {parting.line}: {words}"
+            )
+        elif problem is not None:
+            rehearsal.broken_off = True
+            self.why[agent_id] = f"cannot be played to the end of its trace: {problem}"
+        return rehearsal
+
+    def _by_capture(self, header: CheckedHeader, by_trace: Rehearsal | None) -> Rehearsal | None:
+        """The rehearsal that explains more: this one, if it is needed at all."""
+        agent_id = header.agent_id
+        home, captured = self._flight.exports.get(agent_id), self._elsewhere.captured.get(agent_id)
+        if captured is None or home is None or (by_trace and by_trace.chain == list(home.chain_of_block_hashes)):
+            return by_trace
+        inferred = infer(header, captured, self._elsewhere.events(agent_id))
+        by_capture = rehearse(header, inferred.lives)
+        if by_trace is not None and len(by_trace.played) >= len(by_capture.played):
+            return by_trace
+        self.why.pop(agent_id, None)
+        if inferred.problem:
+            self.why[agent_id] = inferred.problem
+            by_capture.broken_off = True
+        self._by_captures.append(agent_id)
+        return by_capture
+
+    def _with_a_quirk(self, header: CheckedHeader, lives: Lives, at: Parting) -> Rehearsal | None:
+        """The rehearsal with a known mistake that explains the whole record, if possible to the word.
+
+        Those of the handlers are tried first that ran where the agent parts from the protocol.
+        """
+        explaining: dict[str, Rehearsal] = {}
+        certain = (quirk for quirk in QUIRKS.values() if not quirk.chance)
+        for quirk in sorted(certain, key=lambda quirk: at.algorithms.isdisjoint(quirk.algorithms)):
+            rehearsal = rehearse(header, lives, {quirk.name: True})
+            if rehearsal.parting is None:
+                explaining[quirk.name] = rehearsal
+                if rehearsal.to_the_word:
+                    break
+        if not explaining:
+            return None
+        name = max(explaining, key=lambda name: explaining[name].to_the_word)
+        self._remarks.append(f"agent {header.agent_id} behaves as with {name}: {QUIRKS[name].sentence}")
+        return explaining[name]
+
+    def _with_what_is_not_right(self, header: CheckedHeader, lives: Lives) -> Rehearsal | None:
+        """The rehearsal of an agent whose mistakes a scenario can do without: its chain comes out all the same."""
+        who = f"agent {header.agent_id}"
+        ignoring = rehearse(header, lives, allowed=Allowed(ignoring=True))
+        if ignoring.parting is None:
+            first = ignoring.ignored[0]
+            many = f"{len(ignoring.ignored)} messages" if len(ignoring.ignored) > 1 else "a message"
+            self._remarks.append(
+                f"{who} did nothing with {many} with which it should have done something, "
+                f"the first on trace line {first.line} ({first.runs[0].handler}): lost on their way here"
+            )
+            return ignoring
+        early = rehearse(header, lives, allowed=Allowed(early_timers=True))
+        if early.parting is None:
+            self._remarks.append(f"{who} had timers end too early by its clock, as if that had been set back")
+            return early
+        return None
+
+    def _judged(self, agent_id: int) -> str | None:
+        """The first step of the agent that the step judge finds wrong, in its words; None if it finds none."""
+        judgement = steps.check(Evidence(self._flight.exports, {agent_id: self._flight.traces[agent_id]}))
+        return next((finding.detail for finding in judgement.evidence if finding.agent_id == agent_id), None)

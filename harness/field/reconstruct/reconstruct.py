@@ -10,11 +10,10 @@ from harness.archive.exports import Export
 from harness.checker.judgement import agents
 from harness.errors import FieldError, MachineError
 from harness.field.ingest import Flight
-from harness.field.reconstruct._comparing import FirstDifference, first_difference
+from harness.field.reconstruct._comparing import Alone, FirstDifference, first_difference
 from harness.field.reconstruct._known_mission import NOTHING, told
 from harness.field.reconstruct._other_records import Elsewhere
 from harness.field.reconstruct._rehearsal import Rehearsal
-from harness.field.reconstruct._single_agent import Alone
 from harness.field.reconstruct._timetable import Timetable, timetable
 from harness.field.reconstruct._timetable_script import scenario_of
 from harness.run.simulate import InMemory, Simulated, simulate_in_memory

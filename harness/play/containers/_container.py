@@ -16,7 +16,7 @@ from docker.types import LogConfig, Mount
 
 from harness.play.containers._images import Image
 from harness.play.containers.docker_engine import Engine
-from harness.scenario.docker import Docker
+from harness.scenario.agent_options import Docker
 from netem.lab import in_words
 
 STDOUT, STDERR = 1, 2

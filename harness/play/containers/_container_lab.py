@@ -30,7 +30,7 @@ from harness.play.containers.ownership import remove
 from harness.play.process._run_lab import Role
 from harness.play.process.process_preflight import network_needs
 from harness.scenario import Scenario
-from harness.scenario.docker import Docker
+from harness.scenario.agent_options import Docker
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import SpawnError

@@ -23,13 +23,17 @@ from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
 from harness.errors import AgentFailedError, HarnessError, MachineError, ScenarioError, UnsupportedError
 from harness.play._vehicle_keys import Handed
 from harness.play.agent_control import (
+    UNSUPPORTED,
     AgentControl,
     AgentRefusedError,
     AgentSilentError,
     AgentUnsupportedError,
     Status,
+    last_words,
+    last_words_in,
+    located,
+    of_a_shell,
 )
-from harness.play.command_line import UNSUPPORTED, last_words, last_words_in, located, of_a_shell
 from harness.play.process._run_lab import MissionLab, Program
 from harness.play.process.agent_mission import mission_file
 from harness.scenario import Scenario

@@ -34,7 +34,7 @@ from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
     from harness.play._pace import Pace
-    from harness.play.simulation.foreign._failure import AgentLacksError
+    from harness.play.simulation.foreign._answer import AgentLacksError
     from harness.play.simulation.foreign._foreign_agent import LifeRecord
     from harness.play.simulation.foreign._virtual_program import Programs
 

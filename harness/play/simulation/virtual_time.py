@@ -12,7 +12,7 @@ from harness.play._pace import Pace
 from harness.play.backend import Backend
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
-from harness.play.simulation.foreign._failure import AgentLacksError
+from harness.play.simulation.foreign._answer import AgentLacksError
 from harness.play.simulation.run_files import OnDisk
 from harness.play.simulation.simulation import Simulation, no_vehicles
 from harness.scenario import Scenario

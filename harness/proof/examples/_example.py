@@ -11,8 +11,7 @@ from harness.checker.judgement import Judgement
 from harness.checker.recurring_cycles import cycle_of
 from harness.errors import AgentFailedError
 from harness.proof.bounds import Bounds
-from harness.run.finding import ended_by, evidence_lines, write
-from harness.run.simulate import simulate
+from harness.run.simulate import ended_by, evidence_lines, simulate, write
 from harness.scenario.load import parse
 from harness.scenario.scenario_file import to_yaml
 

@@ -12,9 +12,18 @@ from harness.proof.model._block_renaming import Blocks, Ordinals
 from harness.proof.model._flaws import FLAWS_OF_STEPS, Flaw
 from harness.proof.model._known_states import DEAD, FIRST, FIRST_OTHER, KnownStates
 from harness.proof.model._real_agents import Agents, end_at_once, end_timer, is_heard, log
-from harness.proof.model._reduction import ReductionError, check_that_nothing_is_lost
 from harness.proof.model._reference_step import Give, Reference
-from harness.proof.model._snapshot import NOW_S, RUNNING_S, End, Snapshot, Step, put_back, take
+from harness.proof.model._snapshot import (
+    NOW_S,
+    RUNNING_S,
+    End,
+    ReductionError,
+    Snapshot,
+    Step,
+    check_that_nothing_is_lost,
+    put_back,
+    take,
+)
 from harness.proof.model._tallies import TALLIES, Tallies
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS

@@ -9,8 +9,7 @@ from typing import Any
 from harness.proof.attacker._security_gate import Gate
 from harness.proof.bounds import Bounds
 from harness.proof.model._known_states import FIRST
-from harness.proof.model._reduction import ReductionError
-from harness.proof.model._snapshot import NOW_S, Snapshot, put_back, take
+from harness.proof.model._snapshot import NOW_S, ReductionError, Snapshot, put_back, take
 from ucp.agent import HANDLERS, Agent
 from ucp.block import Block
 from ucp.clock import MICROSECONDS

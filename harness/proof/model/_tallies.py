@@ -3,8 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from harness.proof.model._known_states import DEAD, KnownStates
-from harness.proof.model._reduction import ReductionError
-from harness.proof.model._snapshot import NAMES_OF_OTHERS, End, Snapshot, Step
+from harness.proof.model._snapshot import NAMES_OF_OTHERS, End, ReductionError, Snapshot, Step
 from ucp.reconcile import most_named
 
 TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from rich.console import Console
 
-from harness.run.finding import ENDED, evidence_lines
+from harness.run.simulate import ENDED, evidence_lines
 from harness.scenario.verdict_names import BAD_IN_WORDS
 from harness.sweep.explore._exploring import Explored, Violation, Watcher
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from harness.checker.judgement import Judgement
 from harness.errors import INTERRUPTED, VIOLATED
-from harness.run.finding import Judge, claim, evidence_lines, simulated, write
 from harness.run.parallel import Failed, cores, sweep
-from harness.run.simulate import same_twice
+from harness.run.simulate import Judge, claim, evidence_lines, same_twice, simulated, write
 from harness.scenario import Scenario
 from harness.sweep.explore._recording import Recording, record
 from harness.sweep.explore._scenario_document import Document, document_of

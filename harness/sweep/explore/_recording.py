@@ -14,8 +14,7 @@ from typing import Any
 from harness.checker import Result
 from harness.errors import AgentFailedError
 from harness.play.simulation.fate_script import Decided, FateScript, NameOf
-from harness.run.finding import ended_by
-from harness.run.simulate import InMemory, simulate_in_memory
+from harness.run.simulate import InMemory, ended_by, simulate_in_memory
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import RandomDraws

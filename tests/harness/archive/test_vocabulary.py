@@ -13,7 +13,7 @@ from harness.checker import Evidence, check
 from harness.checker.survival import in_words, survival
 from harness.field.replay import Player, open_record
 from harness.play.progress import Silent
-from harness.report._write_report import write_report
+from harness.report._run_page import write_report
 from harness.run.run import run
 from harness.run.simulate import simulate
 from tests.harness.command import harness

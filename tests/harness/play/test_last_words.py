@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.play.command_line import CHARACTERS, last_words_in, of_a_shell
+from harness.play.agent_control import CHARACTERS, last_words_in, of_a_shell
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,16 @@
-"""What a line of an agent in virtual time says, once it is known to say it properly."""
+"""An answer of an agent in virtual time, and how such an agent fails."""
 
 import base64
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import ValidationError
 from pydantic_core import from_json
 
 from harness.archive.traces import ASIDE, HANDLER_RUN
+from harness.errors import UnsupportedError
 from ucp.messages import Datagram, MalformedDatagramError, decode
 from ucp.trace import Entry, HandlerRun, Recorded
 
@@ -108,3 +109,17 @@ def shown(value: Any) -> str:
     """As much of something that an agent said as a sentence can hold."""
     text = value.decode(errors="replace").strip() if isinstance(value, bytes) else str(value)
     return repr(text[:SHOWN] + ("..." if len(text) > SHOWN else ""))
+
+
+Outcome = Literal["crashed", "hung", "not supported"]
+
+
+class AgentLacksError(UnsupportedError):
+    """An agent says that it lacks what this mission needs, or cannot be driven in virtual time."""
+
+    outcome: Outcome = "not supported"
+
+    def __init__(self, agent_id: int, command: Sequence[str], words: str) -> None:
+        super().__init__(str(UnsupportedError.of(agent_id, command, words)))
+        self.agent_id = agent_id
+        self.detail = str(self)

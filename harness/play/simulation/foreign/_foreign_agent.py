@@ -14,11 +14,17 @@ from pydantic import ValidationError
 
 from harness.archive.exports import Export
 from harness.errors import AgentFailedError
-from harness.play.agent_control import Status
-from harness.play.command_line import last_words, of_a_shell
+from harness.play.agent_control import Status, last_words, of_a_shell
 from harness.play.simulation._simulated_agent import Outgoing, Stored
-from harness.play.simulation.foreign._answer import Answer, AnswerError, LacksError, RefusedError, read_answer
-from harness.play.simulation.foreign._failure import AgentLacksError, Outcome
+from harness.play.simulation.foreign._answer import (
+    AgentLacksError,
+    Answer,
+    AnswerError,
+    LacksError,
+    Outcome,
+    RefusedError,
+    read_answer,
+)
 from harness.play.simulation.foreign._virtual_program import Program, ProgramFailedError
 from ucp.events import LoggableEvent
 from ucp.messages import Datagram, Message

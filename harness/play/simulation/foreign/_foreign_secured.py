@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from harness.errors import AgentFailedError
-from harness.play.simulation.foreign._failure import AgentLacksError, Outcome
+from harness.play.simulation.foreign._answer import AgentLacksError, Outcome
 from harness.play.simulation.foreign._foreign_agent import ForeignAgent
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle

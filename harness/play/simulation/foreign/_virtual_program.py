@@ -23,8 +23,8 @@ from threading import Lock
 from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
-from harness.play.command_line import LOOKED_AT_BYTES, last_words, last_words_in
-from harness.play.simulation.foreign._failure import Outcome
+from harness.play.agent_control import LOOKED_AT_BYTES, last_words, last_words_in
+from harness.play.simulation.foreign._answer import Outcome
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0

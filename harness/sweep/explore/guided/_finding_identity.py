@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from harness.archive.run_record import Cycle
 from harness.checker import Result
 from harness.checker.judgement import Judgement
-from harness.run.finding import ENDED
+from harness.run.simulate import ENDED
 from harness.scenario import Scenario
 from harness.scenario.verdict_names import CHARACTERISTICS
 from ucp.agent import ON_TIMER

@@ -21,7 +21,7 @@ from harness.errors import AgentFailedError
 from harness.gc_pause import gc_paused
 from harness.proof.coverage import Reached, Watcher
 from harness.proof.coverage.reached import simulate_watched
-from harness.run.finding import ended_by
+from harness.run.simulate import ended_by
 from harness.scenario import Scenario
 from harness.sweep.explore._recording import Logged, record
 from harness.sweep.explore._scenario_document import Document, at, cut_after, document_of, timeline, with_key

@@ -16,10 +16,9 @@ from harness.errors import INTERRUPTED, VIOLATED, HarnessError
 from harness.proof import Bounds
 from harness.proof.coverage import Existing, existing
 from harness.proof.coverage import to_json as coverage_to_json
-from harness.run.finding import evidence_lines, simulated
 from harness.run.parallel import sweep
 from harness.run.run import versions
-from harness.run.simulate import same_twice
+from harness.run.simulate import evidence_lines, same_twice, simulated
 from harness.scenario import Scenario
 from harness.sweep.explore._exploring import smallest_of
 from harness.sweep.explore._recording import record

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.archive.exports import ExportedBlock
-from harness.field.depot._block_order import mutual_chain, ordered
+from harness.field.depot.record_lines import mutual_chain, ordered
 
 LETTERS = "abcdefgh"
 

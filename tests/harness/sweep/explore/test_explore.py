@@ -10,8 +10,7 @@ import pytest
 
 from harness.checker import Result
 from harness.errors import RunDirectoryError
-from harness.run.finding import simulated
-from harness.run.simulate import simulate
+from harness.run.simulate import simulate, simulated
 from harness.scenario import Scenario, load_scenario
 from harness.sweep.explore import Explored, explore
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
