@@ -41,7 +41,7 @@ COMMANDS = {
         "run", "harness.commands.tell:tell_command", "Cause an event in an active run, or control virtual time."
     ),
     "shell": Command(
-        "run", "harness.commands.shell:shell_command", "Open a shell in the network of a vehicle of an active run."
+        "run", "harness.commands.tell:shell_command", "Open a shell in the network of a vehicle of an active run."
     ),
     "runs": Command(
         "look", "harness.commands.runs:runs_command", "List past runs with their verdicts, or open a report."
@@ -50,7 +50,7 @@ COMMANDS = {
         "look", "harness.commands.report:check_command", "Judge chain exports and traces by the six characteristics."
     ),
     "report": Command("look", "harness.commands.report:report_command", "Write the report files of a run again."),
-    "watch": Command("look", "harness.commands.watch:watch_command", "Show a recorded run as a film in the browser."),
+    "watch": Command("look", "harness.commands.report:watch_command", "Show a recorded run as a film in the browser."),
     "chain": Command(
         "look", "harness.commands.chain:chain_command", "Print each agent's chain, or write its positions as a map."
     ),
@@ -103,7 +103,7 @@ COMMANDS = {
         "Test one agent alone with thousands of generated cases.",
     ),
     "validate": Command(
-        "prove", "harness.commands.validate:validate_command", "Compare recorded runs with the TLA+ specification."
+        "prove", "harness.commands.coverage:validate_command", "Compare recorded runs with the TLA+ specification."
     ),
     "coverage": Command(
         "prove",

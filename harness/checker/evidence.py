@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from harness.archive.archive import RunArchive
-from harness.archive.block_names import name_blocks
-from harness.archive.exports import Export
+from harness.archive.exports import Export, name_blocks
 from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_files, read_captures
 from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace

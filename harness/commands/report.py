@@ -1,12 +1,17 @@
-"""`ucp-harness check` and `ucp-harness report`: judge a run again, and write its report again."""
+"""`ucp-harness check`, `report` and `watch`: judge a run again, write its report again, show it as a film."""
 
+import asyncio
+import os
 import sys
+import webbrowser
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from harness import checker, report
 from harness.archive.archive import RunArchive
@@ -14,6 +19,10 @@ from harness.checker.survival import survival
 from harness.commands.terminal import complain, print_json, show_programs, show_result, show_survival
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, MachineError, RunDirectoryError
 from harness.report.agent_programs import programs
+from harness.report.live.server_process import require_packages
+
+if TYPE_CHECKING:
+    from harness.report.live.feed import Feed
 
 
 def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) -> None:
@@ -64,3 +73,45 @@ def check_command(
         raise typer.Exit(CANNOT_HERE)
     if result.errors or not evidence.exports:
         raise typer.Exit(WRONG_REQUEST)
+
+
+PORT = typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0 selects a free one.")
+
+
+def watch_command(
+    run: Annotated[Path, typer.Argument(help="Run directory, or a directory made by `import`.")],
+    port: Annotated[int, PORT] = 0,
+) -> None:
+    """Show a recorded run as a film in the browser.
+
+    The film shows map, links, chains, votes and reconciles. Ctrl-C ends the command.
+    """
+    require_packages()
+    from harness.report.live.feed import Feed
+
+    feed = Feed(run)
+    with closing(feed):
+        try:
+            asyncio.run(_show(feed, run, port))
+        except KeyboardInterrupt:
+            raise typer.Exit(0) from None
+
+
+async def _show(feed: "Feed", run: Path, port: int) -> None:
+    from harness.report.live.change_log import Story
+    from harness.report.live.projector import tell_film
+    from harness.report.live.server import Server
+
+    with closing(Story()) as story:
+        async with Server(story, run, live=False).open(port) as address:
+            show_address(Console(), address)
+            await tell_film(feed, story)
+            await asyncio.Event().wait()
+
+
+def show_address(console: Console, address: str) -> None:
+    """Print the page's address as a link; and open it, for somebody who sits at a desktop."""
+    console.print(Text("watch it at "), Text(address, style=f"link {address}"), sep="", soft_wrap=True)
+    has_desktop = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if console.is_terminal and has_desktop:
+        webbrowser.open(address)

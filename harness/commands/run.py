@@ -15,8 +15,8 @@ from harness.archive.playable import scenario_of
 from harness.archive.run_record import CapturedFrames
 from harness.backend_names import BackendName
 from harness.commands._shared_options import RARE
+from harness.commands.report import PORT, show_address
 from harness.commands.terminal import complain, show_programs, show_result, show_rogue, show_survival
-from harness.commands.watch import PORT, show_address
 from harness.errors import HarnessError, ScenarioError
 from harness.play import progress
 from harness.play.backends import BACKENDS

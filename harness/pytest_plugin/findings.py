@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from harness.archive.archive import RunArchive
-from harness.archive.block_names import name_blocks
+from harness.archive.exports import name_blocks
 from harness.checker import Result
 from harness.checker.judgement import Finding, Judgement
 from harness.errors import ScenarioError

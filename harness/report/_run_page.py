@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.archive import RunArchive
-from harness.archive.block_names import name_blocks
-from harness.archive.exports import Export
+from harness.archive.exports import Export, name_blocks
 from harness.errors import RunDirectoryError
 from harness.gc_pause import gc_paused
 from harness.present.colours import Ink

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.archive.archive import RunArchive
-from harness.archive.block_names import name_blocks
-from harness.archive.exports import Export
+from harness.archive.exports import Export, name_blocks
 from harness.archive.run_record import AgentRecord, RunRecord
 from harness.present import text
 from harness.present.colours import Ink, inks

@@ -18,7 +18,7 @@ from harness.archive.run_record import RunRecord
 from harness.archive.vocabulary import first_of, unknown_words
 from harness.present import text
 from harness.present.colours import Ink
-from harness.report import _timeline_charts, _timeline_cycle, _timeline_lanes, facts
+from harness.report import _timeline_charts, _timeline_lanes, facts
 from harness.report._report_source import ReportSource
 from harness.report._timeline_lanes import OUTCOMES
 from harness.report._timeline_plot import Shade, axis, seconds
@@ -106,7 +106,7 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
         picture.drawing,
         picture.legend,
         [
-            *([_timeline_cycle.row(left.record.cycle, ends_s)] if left.record.cycle else []),
+            *([_timeline_charts.row(left.record.cycle, ends_s)] if left.record.cycle else []),
             *(_timeline_charts.draw(replication_of(traces, faults), faults, shades, ends_s) if all_held else []),
         ],
         axis(ends_s),

@@ -76,7 +76,7 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def marks(inception: Node, names: Mapping[str, str], *, abridged: bool) -> Mark:
-    """What to draw, from the inception block up; `names` are those of `harness.archive.block_names.name_blocks`.
+    """What to draw, from the inception block up; `names` are those of `harness.archive.exports.name_blocks`.
 
     What stands on a block is ordered by the lowest agent ID that it leads to.
     """

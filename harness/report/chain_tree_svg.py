@@ -9,8 +9,7 @@ from typing import Literal
 
 from markupsafe import Markup
 
-from harness.archive.block_names import name_blocks
-from harness.archive.exports import Export
+from harness.archive.exports import Export, name_blocks
 from harness.present import text as words
 from harness.present.colours import Ink
 from harness.report._chain_tree_layout import (

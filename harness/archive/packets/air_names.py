@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from harness.archive.archive import RunArchive
-from harness.archive.block_names import name_blocks
+from harness.archive.exports import name_blocks
 from harness.archive.packets.capture_files import DIRECTORY
 from harness.archive.packets.transmissions import Transmission
 from harness.errors import CaptureError, RunDirectoryError

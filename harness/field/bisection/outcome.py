@@ -8,8 +8,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from harness.archive.archive import RunArchive
-from harness.archive.block_names import name_blocks
-from harness.archive.exports import RUN_FILE, Export
+from harness.archive.exports import RUN_FILE, Export, name_blocks
 from harness.checker import Result
 from harness.errors import RunDirectoryError, ScenarioError
 from harness.scenario import Scenario, load, load_scenario

@@ -12,9 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from harness.archive.block_names import name_blocks
 from harness.archive.event_data import EventData, SealedError
-from harness.archive.exports import Export, ExportedBlock
+from harness.archive.exports import Export, ExportedBlock, name_blocks
 from harness.field.depot.collected_exports import CameHome, all_blocks
 from harness.field.depot.record_lines import (
     Block,

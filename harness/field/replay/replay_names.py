@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from functools import cached_property
 
-from harness.archive.block_names import name_blocks
+from harness.archive.exports import name_blocks
 from harness.archive.traces import Trace
 from harness.checker.steps.recorded_inputs import Blocks, NotOnRecordError, decoded
 from harness.field.replay._agent_record import Record

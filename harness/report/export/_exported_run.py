@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.archive.archive import RunArchive
-from harness.archive.block_names import name_blocks
 from harness.archive.connectivity import Components, Connectivity, Losses, Topology
+from harness.archive.exports import name_blocks
 from harness.archive.history import LATEST_S, History, ends_at, history_of, in_time, possible
 from harness.archive.replication import replication_of
 from harness.archive.run_record import FaultRecord

@@ -4,9 +4,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from harness.archive.archive import RunArchive
-from harness.archive.block_names import name_blocks
 from harness.archive.event_data import EventData
-from harness.archive.exports import SUFFIX, Export
+from harness.archive.exports import SUFFIX, Export, name_blocks
 from harness.archive.run_record import AgentRecord, RunRecord
 from harness.errors import ExportError, RunDirectoryError
 from harness.play.backends import in_virtual_time

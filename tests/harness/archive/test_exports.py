@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.archive.block_names import name_blocks
-from harness.archive.exports import Export, read_export, read_exports
+from harness.archive.exports import Export, name_blocks, read_export, read_exports
 from harness.errors import ExportError
 from tests.harness.mission import edit, fly, write_exports
 from tests.ucp.air import Air

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from harness.archive.block_names import name_blocks
+from harness.archive.exports import name_blocks
 from harness.report.chain_tree import FEWEST_HIDDEN, KEPT_AT_EACH_END, Mark, Node, chain_tree, marks, ranges, wrapped
 from tests.harness.report.runs import Chains, exports
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.archive.block_names import name_blocks
+from harness.archive.exports import name_blocks
 from harness.report._chain_tree_layout import CHARACTER_WIDTH, Layout, Placed, lay_out
 from harness.report.chain_tree import chain_tree, marks
 from tests.harness.report.runs import Chains, exports
