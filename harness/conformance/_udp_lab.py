@@ -24,6 +24,7 @@ from harness.errors import HarnessError, MachineError, UnsupportedError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
 from netem.errors import LabUnavailable, NetemError, SpawnError
 from netem.lab import Lab, LabProcess
+from ucp.features import UNSUPPORTED
 
 AGENTS, PEERS_ON = 1, 2
 """The lab's vehicles."""
@@ -37,8 +38,6 @@ _SO_TIMESTAMPNS = 35
 """Linux; Python has no name for it."""
 _TIMESPEC = struct.Struct("@qq")
 ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
-UNSUPPORTED = 127
-"""With this status ends an agent that lacks a feature that its mission needs."""
 
 
 class NoAgentError(HarnessError):
@@ -279,10 +278,6 @@ class Process:
         self.control.close()
         await self.process.send_signal(signal.SIGKILL)
         await self.process.wait()
-
-    async def terminate(self) -> int:
-        self.control.close()
-        return await self.process.terminate(GRACE_S)
 
 
 def _stamped(ancillary: Sequence[tuple[int, int, bytes]]) -> float:

@@ -53,7 +53,6 @@ def _why_none(program: str) -> str:
     return f"{program} is no program: give a path{from_here}, or a name on PATH"
 
 
-UNSUPPORTED = 127
 LOOKED_AT_BYTES = 4096
 CHARACTERS = 300
 

@@ -11,9 +11,10 @@ from typing import Any
 from harness.conformance._reference_model import PEERS
 from harness.conformance._state_space import VARIANTS
 from harness.conformance._subject import NO_KEYS
-from harness.conformance._udp_lab import UNSUPPORTED, last_line
+from harness.conformance._udp_lab import last_line
 from harness.conformance.cases._bench import INCEPTION, PATIENCE_S, SPEEDUP, Alone, Bench, WrongError, case, must
 from harness.play.agent_control import AgentRefusedError
+from ucp.features import UNSUPPORTED
 from ucp.messages import ChainContainQuery
 
 WRONG_MISSION = 2

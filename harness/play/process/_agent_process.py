@@ -23,7 +23,6 @@ from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
 from harness.errors import AgentFailedError, HarnessError, MachineError, ScenarioError, UnsupportedError
 from harness.play._vehicle_keys import Handed
 from harness.play.agent_control import (
-    UNSUPPORTED,
     AgentControl,
     AgentRefusedError,
     AgentSilentError,
@@ -38,6 +37,7 @@ from harness.play.process._run_lab import MissionLab, Program
 from harness.play.process.agent_mission import mission_file
 from harness.scenario import Scenario
 from netem.errors import SpawnError
+from ucp.features import UNSUPPORTED
 from ucp.trace import HandlerRun
 
 START_LIMIT_S = 30.0

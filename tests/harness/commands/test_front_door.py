@@ -202,6 +202,7 @@ for module in pkgutil.iter_modules(harness.commands.__path__):
         print(module.name, error)
 importlib.import_module("harness.play.simulation.simulation")
 importlib.import_module("harness.report.export._links")
+importlib.import_module("harness.json_schemas")
 """
 
 
