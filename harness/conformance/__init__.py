@@ -1,17 +1,10 @@
-"""Conformance: one agent under test, whose peers the harness plays. Does it do what Algorithms 1-20 say?
+"""Conformance: test one agent alone, while the harness plays its peers. See docs/conformance.md.
 
-_reference_model.py      the reference beside the agent: what must come of an input, and in which state that leaves it
-_alphabet.py   the inputs that there are in a state: each message in the variants that matter, events, timers, commands
-_state_space.py     states as far as they differ to an agent, and the walk over all of them, breadth first
-vectors.py    the generated vectors; vectors.py writes them for others, as _virtual_lines.py spells them
-_tours.py      one agent led through as many vectors as it takes, by the shortest ways
-_suite.py      many tours side by side; what is suspected is tried again, alone
-_subject.py    an agent under test; over UDP (_udp_subject.py, on the air of _udp_lab.py) or in virtual time
-(_virtual_subject.py)
-_observation.py       what is seen of it at one step, and whether that is right
-_blame.py      which branch explains all failures
-cases/        what no state explains, written by hand: malformed datagrams, floods, reboots, wrong missions;
-_handwritten.py plays them
-conformance_run.py        all of that together; results.py, results_table.py, conformance_page.py and _kept_failures.py
-show and keep what came of it
+The reference (`_reference_model`) is the harness's own agent. `_alphabet` lists the inputs that are possible in a
+state, and `_state_space` walks all states breadth first. `vectors` are the pairs of a state and an input, each with
+the shortest path there and the expected output. `_tours` leads one agent through many vectors, and `_suite` runs many
+agents side by side. A suspected failure is tried again, alone, before it counts.
+
+An agent is driven over UDP (`_udp_subject`) or in virtual time (`_virtual_subject`). `_blame` names the handler that
+explains all failures. `cases` holds tests that no state explains, such as floods, reboots and wrong missions.
 """

@@ -1,8 +1,7 @@
-"""The report: what a run directory holds, on one page that needs nothing else; in short as Markdown; as JUnit XML.
+"""The report of a run: one page that loads nothing, a summary in Markdown, and JUnit XML.
 
-`source` is what it is made of, `page` gathers the pictures, `page.html.j2` lays them out, `markdown` and `junit` say
-the same in fewer words, and `write` writes it all. Each picture has its own module and is made of plain values, no
-files.
+`_report_source` reads the run directory, `_run_page` lays out the page, and `_run_summary` writes the short forms. Each
+picture has a module of its own, which draws plain values and reads no files.
 """
 
 from harness.report._report_source import ReportSource, read_source

@@ -1,13 +1,8 @@
-"""Wrong agents: mistakes that an agent can be asked to make, to see what finds them.
+"""Wrong agents: mistakes that an agent makes on request, so that tests show what finds them.
 
-_quirk.py      what a quirk is, and how it takes the place of what is right
-_commit_quirks.py     the quirks of Algorithms 1-6
-_reconcile_quirks.py  the quirks of Algorithms 7-20
-_core_quirks.py       the quirks of what all handlers share
-
-An agent has quirks only if its mission, its scenario or the command `quirk` names them. The thesis's own are among
-them: `ignore_commit` (Section 4.2), and those of its tests and field tests (Sections 4.2 and 4.3) `crash_on_tie`,
-`early_phase3_expiry`, `stale_chain_hash`, `break_off_commit` and `wrong_topic`.
+A quirk replaces a handler, or a helper that handlers use. An agent has quirks only if its mission, its scenario or the
+command `quirk` names them. The thesis's own mistakes are among them: `ignore_commit` (Section 4.2), and `crash_on_tie`,
+`early_phase3_expiry`, `stale_chain_hash`, `break_off_commit` and `wrong_topic` from its tests (Sections 4.2 and 4.3).
 """
 
 from collections.abc import Mapping

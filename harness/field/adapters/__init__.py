@@ -1,11 +1,8 @@
-"""Records of other implementations, brought into the house's formats: by an adapter that knows them.
+"""Import records of other implementations, so that the harness reads them as its own.
 
-adapter.py          what an adapter is, and what it yields
-csv_adapter.py  CSV, one record in a row
-rosbag_adapter.py, bags.py  ROS bags of version 1 and 2
-adapter.py          a user's own adapter, by its name
-written_records.py         reads sources, each by the adapter that knows it
-written_records.py, written_records.py what comes of it: traces, exports, captures, and import.json
+An adapter reads a source and yields observations: lines of traces, exports, datagrams, logged events. CSV files and ROS
+bags have adapters here, and a user can name an adapter of their own. `written_records` writes the observations as
+traces, exports and captures, with `import.json` beside them.
 """
 
 from harness.field.adapters.adapter import Adapter, ChainExport, Datagram, LoggedEvent, Observation, TraceLine, Unusable

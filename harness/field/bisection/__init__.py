@@ -1,14 +1,9 @@
-"""It worked last week: what came of a scenario or a record with another state of the code, or with another agent.
+"""Find the change of the code, or the agent, that changes how a scenario or a record plays.
 
-outcome.py      what is played: a scenario, a run that is played again, or records from the field
-outcome.py      what came of it, and in what two outcomes differ
-code_state.py         a directory with a state of the code, and what runs in it
-_playing.py      the subject, played with a state of the code or with an agent command
-_live_replay.py         a record that is given to an agent as a process, by UDP
-_scripted_peers.py        the process that plays all its peers
-_record_core.py  the process in which another state's core is given records
-code_state.py      the commits between a good one and a bad one, in a clone that nobody else sees
-_bisecting.py    the first commit at which the outcome changes
+A subject is a scenario, a run, or records of a flight (`outcome`). `code_state` checks out a commit in a clone of its
+own, and runs processes with it. `_playing` plays the subject there and returns its outcome. `_bisecting` searches the
+first commit whose outcome differs. Records are given to another commit's core in a process (`_record_core`), or to
+another agent over UDP while its peers are played from a script (`_live_replay`, `_scripted_peers`).
 """
 
 from harness.field.bisection._bisecting import Found, Tried, bisect

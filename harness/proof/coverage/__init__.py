@@ -1,9 +1,7 @@
-"""How much of the protocol was tried: what runs reached, of what exists within bounds. See docs/coverage.md.
+"""Coverage: the share of the protocol's local states, inputs and branches that runs have reached. See docs/coverage.md.
 
-reached.py   what agents came to in runs: local states, with inputs, and branches
-_share.py  what there is within bounds, by `harness.proof`
-_share.py     the one of the other: as JSON, and in words
-reached.py a run in virtual time that is watched while it is judged
+`reached` collects states, inputs and branches from traces, or while a simulated run is judged. `_share` compares them
+with everything that exists within the bounds of `harness.proof`.
 """
 
 from harness.proof.coverage._share import Existing, Share, existing, in_words, to_json

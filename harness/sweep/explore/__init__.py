@@ -1,14 +1,9 @@
-"""Looking for a run that violates a characteristic, and for the smallest one that still does.
+"""Explore seeds until a run violates a characteristic, and shrink that run to a small scenario.
 
-_exploring.py    seed after seed, until a run violates one
-tape.py      what happened in a run by chance, taken down: events, and messages that were lost
-_scenario_document.py  a scenario as a document that can be cut to pieces
-_shrink.py    tries smaller documents, by delta debugging, on all cores
-_smaller.py   what smaller means: fewer agents, events and fates, less time, less chance
-_shrink.py     the smallest one as a scenario file, for people
-_exploring.py       the story: all of these, one after the other
-_explore_text.py     what is said meanwhile, and at the end
-guided/      instead of seed after seed: scenarios changed, and kept where they reach something new
+`_exploring` plays seed after seed in the simulation. `_recording` turns chance into a document: the events that agents
+logged, and the messages that were lost. `_shrink` removes parts of the document (delta debugging) as long as the
+violation stays, in the order of `_smaller`. `guided` explores for whole nights instead: it changes scenarios, and keeps
+those that reach something new.
 """
 
 from harness.sweep.explore._explore_text import in_words, watching

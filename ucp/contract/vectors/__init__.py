@@ -1,11 +1,7 @@
-"""Test vectors of the agent contract; `python -m ucp.contract.vectors` writes the files.
+"""Test vectors of the agent contract. `python -m ucp.contract.vectors` writes the files.
 
-_hash_vectors.py    events, blocks, inception blocks and chains: bytes and hashes
-_message_vectors.py  every message as a datagram
-drop_vectors.py     datagrams that are dropped, and why
-_secured_vectors.py   secured datagrams, which need the extra `secure`
-_block_vectors.py    after which event a block is full, and its timestamp
-_mission_vectors.py  whole missions in virtual time, input by input
+They cover hashes, messages, dropped datagrams, full blocks, secured datagrams (which need the extra `secure`), and
+whole missions in virtual time.
 """
 
 import base64

@@ -1,14 +1,8 @@
-"""The files of ROS bags, message by message in the order of recording: version 1, and the two storages of version 2.
+"""Read ROS bags message by message, in the order of recording: version 1, and version 2 in MCAP or SQLite.
 
-An index is not asked for, nor `metadata.yaml`: a bag whose recorder was killed, or whose vehicle lost power, has none.
-What is behind a damaged place is used. Sizes that a file claims are believed up to a bound. What the messages mean is
-for the package rosbags to say (harness.field.adapters.rosbag_adapter).
-
-_decompression.py      what is found in a bag: messages, and places that cannot be read
-_version_1.py  version 1
-_mcap_bag.py       version 2 in MCAP
-_sqlite.py     version 2 in SQLite
-_decompression.py     what is packed in any of them
+The readers need neither an index nor `metadata.yaml`, because a bag has neither if its recorder was killed or its
+vehicle lost power. They skip a damaged place and continue behind it. A size that a file claims is trusted up to a
+bound. The package `rosbags` decodes the messages (`harness.field.adapters.rosbag_adapter`).
 """
 
 import mmap

@@ -1,7 +1,6 @@
-"""The page of a consolidated record: one file, which loads nothing and runs no script.
+"""The page of a consolidated record: one file that loads nothing and runs no script.
 
-_depot_page.py      gathers it             page.html.j2, page.css   how it looks, with the parts of a run's report
-_position_map.py     a map    _time_chart.py   when    _holdings.py   who holds what
+`_depot_page` lays it out. It shows a map of the events, a chart over time, and the blocks that each vehicle holds.
 """
 
 from harness.field.depot.page._depot_page import draw

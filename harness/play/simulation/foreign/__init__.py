@@ -1,11 +1,7 @@
-"""Agents that are not ours in virtual time: programs that are given lines and answer with lines.
+"""Agents of other programs in virtual time: they read inputs as lines, and write answers as lines.
 
-_virtual_program.py   one of them as a process: what it is told, what it says, and for how long one waits
-_virtual_program.py  those that wait for their next mission
-_answer.py    what a line of theirs says
-failure.py   how one ends a mission
-_foreigners.py  whose program plays whom
-_foreign_agent.py     one life of such an agent, as the simulation drives it
-_foreign_secured.py   the same with keys
-determinism.py     whether it is the same twice
+`_virtual_program` starts a program and exchanges lines with it, within a limit of wall time. `_answer` parses an
+answer. `_foreign_agent` lets the simulation drive one incarnation as it drives its own agents, and `_foreign_secured`
+does so with keys. `_foreigners` chooses the program of each agent. `determinism` gives every incarnation its inputs
+again in another process, and compares the answers.
 """

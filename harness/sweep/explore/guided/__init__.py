@@ -1,14 +1,8 @@
-"""Exploration that is guided by what runs reach, and that goes on from night to night. See docs/nightly.md.
+"""Exploration guided by coverage, continued from night to night. See docs/nightly.md.
 
-_mutation.py    a scenario changed by chance into another
-_hunt_trial.py     one run, with a liveness phase at its end: what it reached, and what it showed
-_hunt_trial.py      when timers ended in it, and who voted in vain on which way: what comes near a livelock
-_finding_identity.py  what a finding is, whichever run shows it
-_hunt.py      changing, playing, keeping
-_corpus.py    what is kept between nights, in a directory
-_night.py     a night: known findings, the hunt, what is new made small
-_night_page.py      the page of it
-_night_text.py     what is said meanwhile, and at the end
+`_hunt` changes a kept scenario (`_mutation`), plays it (`_hunt_trial`) and keeps it if it reaches a new state, branch
+or livelock. `_corpus` stores scenarios and findings in a directory. `_finding_identity` decides whether two runs show
+the same finding. `_night` plays known findings first, then hunts until its time is over, and writes a page.
 """
 
 from harness.sweep.explore.guided._night import Night, spend

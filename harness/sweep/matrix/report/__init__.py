@@ -1,8 +1,7 @@
-"""report.html of a matrix: one file, which loads nothing and runs no script.
+"""The report of a matrix: one file that loads nothing and runs no script.
 
-_matrix_page.py       gathers it            page.html.j2, page.css   how it looks, with the parts of a run's report
-_heatmap.py    what can be shown     _heatmap.py   of each cell     _trend.py   over the nights
-_drilldown.py  the runs of a cell, and how to play them again
+`_matrix_page` lays it out. It shows a heatmap of a figure, the trend over the nights, and the runs of each cell with
+the command that plays one of them again.
 """
 
 from harness.sweep.matrix.report._matrix_page import to_html
