@@ -136,18 +136,15 @@ def test_a_closed_lab_leaves_nothing(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"lab.log", "o"}
 
 
-def test_a_lab_that_is_given_up_while_it_opens_leaves_nothing(tmp_path: Path) -> None:
-    os.environ["UCP_TEST_MARK"] = str(tmp_path)
-    try:
+def test_a_lab_that_is_given_up_while_it_opens_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UCP_TEST_MARK", str(tmp_path))
 
-        async def run() -> None:
-            opening = asyncio.create_task(Lab.open([1, 2], log=tmp_path / "lab.log"))
-            await until(lambda: processes_of(tmp_path), "the first process runs")
-            opening.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await opening
-            assert not processes_of(tmp_path)
+    async def run() -> None:
+        opening = asyncio.create_task(Lab.open([1, 2], log=tmp_path / "lab.log"))
+        await until(lambda: processes_of(tmp_path), "the first process runs")
+        opening.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
+        assert not processes_of(tmp_path)
 
-        play(run())
-    finally:
-        del os.environ["UCP_TEST_MARK"]
+    play(run())

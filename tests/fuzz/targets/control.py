@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,7 +30,8 @@ def run(data: bytes) -> None:
         node = Node(_mission(), directory)
         with ThreadPoolExecutor(1) as client:
             conversation = client.submit(_converse, directory, lines)
-            status = node.run()
+            with _own_signal_handlers():
+                status = node.run()
         logged = (directory / "1.log").read_text()
         require("Traceback" not in logged, f"it logs {logged[-300:]}")
         conversation.result()
@@ -40,6 +42,17 @@ def run(data: bytes) -> None:
         if trace_file.stat().st_size:
             trace = read_trace(trace_file)
             require(trace is not None and not trace.problem and not trace.cut_off, "its trace cannot be read")
+
+
+@contextmanager
+def _own_signal_handlers() -> Iterator[None]:
+    """Restore the handlers of this process, which the agent replaces."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def _converse(directory: Path, lines: list[bytes]) -> None:
