@@ -8,6 +8,7 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
+from harness.archive.run_record import Cycle, FinalReconcile
 from harness.errors import HarnessError, UnsupportedError
 from harness.scenario import Scenario
 from harness.scenario.changes import RANGE, Change, final_reconcile, timeline_of
@@ -30,10 +31,10 @@ class RunOutcome:
     engine: str | None = None
     network: list[dict[str, Any]] = field(default_factory=list)
     faults: list[dict[str, Any]] = field(default_factory=list)
-    final_reconcile: dict[str, Any] | None = None
+    final_reconcile: FinalReconcile | None = None
     mission_s: float = 0.0
     settled: bool = False
-    cycle: dict[str, Any] | None = None
+    cycle: Cycle | None = None
     counters: dict[str, Any] | None = None
     capture: dict[str, dict[str, int]] | None = None
     agents: dict[str, Any] = field(default_factory=dict)
@@ -164,7 +165,7 @@ async def reconcile_finally(swarm: Swarm, limit_s: float) -> None:
     await swarm.keep_chains()
     swarm.enter("final reconcile")
     began_s = swarm.now()
-    swarm.played.final_reconcile = {"at_s": round(began_s, 3), "rounds": 0, "complete": False}
+    done = swarm.played.final_reconcile = FinalReconcile(at_s=round(began_s, 3), rounds=0, complete=False)
     await swarm.apply(final_reconcile(began_s))
     for number in range(1, MAX_FINAL_ROUNDS + 1):
         before = await swarm.top_chain_hashes()
@@ -172,7 +173,7 @@ async def reconcile_finally(swarm: Swarm, limit_s: float) -> None:
             await swarm.reconcile(agent_id)
             if not await swarm.until_idle(limit_s):
                 return
-        swarm.played.final_reconcile["rounds"] = number
+        done.rounds = number
         if await swarm.top_chain_hashes() == before:
-            swarm.played.final_reconcile["complete"] = True
+            done.complete = True
             return

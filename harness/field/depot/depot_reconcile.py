@@ -82,7 +82,8 @@ async def _put_together(swarm: Restored, with_deques: Iterable[int]) -> int:
 
 async def _reconcile(swarm: Restored) -> int:
     await reconcile_finally(swarm, LIMIT_S)
-    return int((swarm.played.final_reconcile or {}).get("rounds", 0))
+    done = swarm.played.final_reconcile
+    return 0 if done is None else done.rounds
 
 
 def write(reconciliation: Reconciliation, directory: Path) -> None:

@@ -19,8 +19,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
+from harness.archive.run_record import Cycle, CycleStep, CycleWait
 from ucp.agent import ON_TIMER
 from ucp.state import AgentState
 
@@ -61,7 +61,7 @@ class Recurrence:
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        self._steps: list[dict[str, Any]] = []
+        self._steps: list[CycleStep] = []
         self._answered_by: dict[int, set[int]] = defaultdict(set)
         """Agent that asked, in a reconcile -> those who answered, since the state that is kept."""
         self._told_apart = True
@@ -101,7 +101,7 @@ class Recurrence:
             if timer.deadline is not None and timer.deadline <= local_s and len(self._steps) < MAX_STEPS:
                 after_s = round(now - self._kept_at, 3)
                 self._steps.append(
-                    {"agent_id": state.agent_id, "after_s": after_s, "handler": ON_TIMER[timer.name].name}
+                    CycleStep(agent_id=state.agent_id, after_s=after_s, handler=ON_TIMER[timer.name].name)
                 )
         if state.phase_one_timer.active or state.phase_two_timer.active:
             self._answered_by[state.agent_id] |= state.reconcile_responders
@@ -110,22 +110,22 @@ class Recurrence:
         """All timers that end in this instant have; what they sent has not arrived yet."""
         self._as_timers_left_it = _what_messages_may_change(swarm)
 
-    def cycle(self, swarm: Sequence[Waiting]) -> dict[str, Any]:
-        """The cycle that the last look has found; `harness.archive.run_record.Cycle`."""
+    def cycle(self, swarm: Sequence[Waiting]) -> Cycle:
+        """Return the cycle that the last look has found."""
         agents = {agent.state.agent_id for agent in swarm}
-        went_on = {step["agent_id"] for step in self._steps}
-        return {
-            "since_s": round(self._kept_at, 3),
-            "period_s": round(self._next_s - self._kept_at, 3),
-            "proven": True,
-            "agents": sorted(went_on | {agent.state.agent_id for agent in swarm if not agent.state.idle}),
-            "steps": self._steps,
-            "waits": [
-                {"agent_id": agent_id, "for_agents": sorted(silent)}
+        went_on = {step.agent_id for step in self._steps}
+        return Cycle(
+            since_s=round(self._kept_at, 3),
+            period_s=round(self._next_s - self._kept_at, 3),
+            proven=True,
+            agents=sorted(went_on | {agent.state.agent_id for agent in swarm if not agent.state.idle}),
+            steps=self._steps,
+            waits=[
+                CycleWait(agent_id=agent_id, for_agents=sorted(silent))
                 for agent_id, answered in sorted(self._answered_by.items())
                 if (silent := agents - answered - {agent_id})
             ],
-        }
+        )
 
 
 def _what_messages_may_change(swarm: Sequence[Waiting]) -> list[object]:

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from harness.archive.run_record import Cycle
 from harness.errors import AgentFailedError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.agent_control import Status
@@ -240,7 +241,7 @@ class Simulation(Clockwork):
         hanging = [life.agent for life in self.living() if life.waiting is None and not life.idle]
         if hanging and not self._generating:
             agents = [agent.agent_id for agent in hanging]
-            self.played.cycle = {"since_s": round(self._now, 3), "proven": True, "agents": agents}
+            self.played.cycle = Cycle(since_s=round(self._now, 3), proven=True, agents=agents)
         return not hanging and all(life.waiting is None for life in self.living())
 
     def _looks_for_recurrence(self) -> Recurrence | None:

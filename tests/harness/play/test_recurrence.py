@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from harness.archive.run_record import Cycle
 from harness.play.simulation.simulation import Simulation
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
@@ -24,7 +25,7 @@ def in_step(agents: int = 5, blocks: int = 2, **keys: Any) -> Scenario:
     return scenario(agents=agents, duration_s=60, events={"source": "scripted", "script": events}, **keys)
 
 
-def the_cycle(simulated: Simulated) -> dict[str, Any]:
+def the_cycle(simulated: Simulated) -> Cycle:
     cycle = simulated.played.cycle
     assert cycle is not None
     return cycle
@@ -39,11 +40,11 @@ def test_agents_that_reconcile_in_step_do_so_for_ever_and_the_run_stops(network:
     cycle = the_cycle(run)
     assert not run.played.settled
     assert run.played.mission_s < 300, "it does not play the half hour that agents may take to finish"
-    assert (cycle["period_s"], cycle["proven"], cycle["agents"]) == (15.0, True, [1, 2, 3, 4, 5])
-    assert {(step["agent_id"], step["handler"]) for step in cycle["steps"]} == {
+    assert (cycle.period_s, cycle.proven, cycle.agents) == (15.0, True, [1, 2, 3, 4, 5])
+    assert {(step.agent_id, step.handler) for step in cycle.steps} == {
         (agent, handler) for agent in range(1, 6) for handler in (PHASE_1_ENDS, VOTE_ENDS)
     }
-    assert {wait["agent_id"]: wait["for_agents"] for wait in cycle["waits"]} == {
+    assert {wait.agent_id: wait.for_agents for wait in cycle.waits} == {
         agent: [peer for peer in range(1, 6) if peer != agent] for agent in range(1, 6)
     }
 
@@ -72,8 +73,8 @@ def test_a_cycle_goes_on_for_ever_indeed(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_final_reconcile_that_goes_round_stops_as_well() -> None:
     run = simulate(in_step(final_reconcile=True), seed=1)
     assert run.played.final_reconcile is not None
-    assert not run.played.final_reconcile["complete"]
-    assert the_cycle(run)["since_s"] > run.played.final_reconcile["at_s"]
+    assert not run.played.final_reconcile.complete
+    assert the_cycle(run).since_s > run.played.final_reconcile.at_s
 
 
 @pytest.mark.parametrize(
@@ -112,7 +113,7 @@ def test_an_agent_that_hangs_is_a_standstill() -> None:
         cycle = the_cycle(run)
         assert "period_s" not in cycle
         busy = [agent_id for agent_id, export in run.evidence.exports.items() if not export.idle]
-        assert cycle["agents"] == busy
+        assert cycle.agents == busy
 
 
 def test_who_is_looked_at_twice_in_the_same_wait_has_not_come_again() -> None:

@@ -197,7 +197,7 @@ def test_an_agent_that_stays_paused_leaves_the_run_unsettled() -> None:
     simulated = played([{"at_s": 500, "pause": [1]}], final_reconcile=True)
     assert not simulated.played.settled
     assert simulated.played.final_reconcile is not None
-    assert not simulated.played.final_reconcile["complete"]
+    assert not simulated.played.final_reconcile.complete
     assert max(run.t for run in simulated.evidence.traces[1].runs) <= 500
 
 

@@ -59,7 +59,7 @@ def reconciles(run: Simulated, *agents: int) -> int:
     """How often agents, or these, began one in the mission."""
     final = run.played.final_reconcile
     return sum(
-        step.branch == "begun" and (final is None or round(step.t, 3) < final["at_s"])
+        step.branch == "begun" and (final is None or round(step.t, 3) < final.at_s)
         for agent, trace in run.evidence.traces.items()
         for step in trace.runs
         if step.handler == "reconcile_begin" and (not agents or agent in agents)
