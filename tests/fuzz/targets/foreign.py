@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 from harness import checker
 from harness.errors import HarnessError
-from harness.play.simulation.foreign import _foreigners, _virtual_program
+from harness.play.simulation.foreign import _foreigners, _virtual_program, determinism
 from harness.play.simulation.foreign._virtual_program import Program
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
@@ -20,6 +20,7 @@ from tests.fuzz.finding import require, sound
 from tests.harness.virtual import scenario
 from ucp.virtual import VirtualAgent
 
+assert determinism.Program is Program, "it is imported here, so that it never takes the replacement for its own"
 _REPLACED = re.compile(rb'\{"n":(\d{1,3}),"answer":(.*)\}')
 SCENARIO: Scenario = scenario(
     agents=3,
