@@ -1,9 +1,10 @@
 """The generated vectors, and the file that carries them to others.
 
-Other settings make other agents. Of theirs only those count that differ from the agent with default settings.
+An agent with other settings is another agent. Its vectors are included if they differ from those of the default
+settings.
 
-The first line says what the file is. Each further one is one step: an input, and what must come of it. `after` is the
-step that comes before it, so that the steps from a mission on are found by going back. `in` and `out` are lines of
+The first line of the file describes the file. Each further line is one step: an input and the expected output. `after`
+is the number of the preceding step, so a reader finds all steps of a mission by going back. `in` and `out` are lines of
 virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64, and `timer` is the
 instant at which the next timer ends, null if none runs. `says` and `sends` are the same in words.
 
