@@ -2,7 +2,7 @@
 
 3 to 8 agents are parted at random, complete some blocks in their parts, and are then together again: nothing is lost
 any more, one to three more blocks are completed, and they have 20 minutes to become idle. In half of the runs each
-message takes 20 ms, in the others 2 to 50 ms. The same runs with each of the cures of docs/livelocks.md.
+message takes 20 ms, in the others 2 to 50 ms. The same runs with each of the cures of docs/explanation/livelocks.md.
 """
 
 import argparse

@@ -16,7 +16,7 @@ from harness.scenario.load import parse
 from tests.pages import play
 
 REPOSITORY = Path(__file__).parents[1]
-PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_page_and_what_it_links_to_is_on_the_site(site: Path) -> None:
     for page in PAGES[1:]:
-        assert (site / f"{page.stem}.html").exists(), page
+        assert (site / page.relative_to(REPOSITORY / "docs").with_suffix(".html")).exists(), page
     assert (site / "index.html").exists()
     assert (site / "ucp" / "contract" / "CONTRACT.html").exists()
     for page in site.rglob("*.html"):
@@ -46,10 +46,10 @@ def test_every_page_and_what_it_links_to_is_on_the_site(site: Path) -> None:
 
 
 def test_site_has_every_schema_and_a_page_that_links_to_it(site: Path) -> None:
-    page = (site / "schemas.html").read_text()
+    page = (site / "reference/schemas.html").read_text()
     for path, text in texts().items():
         assert (site / path).read_text() == text
-        assert f'href="{path}"' in page
+        assert f'href="../{path}"' in page
 
 
 def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
@@ -63,19 +63,21 @@ def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
 
 
 def test_the_reference_has_every_key_of_a_scenario(site: Path) -> None:
-    text = (site / "scenario-reference.html").read_text()
+    text = (site / "reference/scenario-keys.html").read_text()
     for key in ("final_reconcile", "vote_timeout_s", "hold_until_s", "takeoff_altitude_m", "reboot"):
         assert f"<code>{key}</code>" in text
     assert "Any program that follows ucp/contract/CONTRACT.md" in text  # a docstring in the source
 
 
 def test_the_picture_of_the_rooms_is_drawn_from_the_imports(site: Path) -> None:
-    text = (site / "architecture.html").read_text()
+    text = (site / "explanation/architecture.html").read_text()
     assert re.search(r"<title>\d+ of the files in report/ use archive/</title>", text)
     assert "use commands/</title>" not in text  # nobody does
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.stem != "matrix-nightly"], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.stem != "run-a-matrix-every-night"], ids=lambda page: page.name
+)
 def test_a_scenario_that_a_page_shows_is_one(page: Path) -> None:
     for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
         document = yaml.safe_load(block)
@@ -88,7 +90,7 @@ def test_every_command_of_the_tutorial_prints_what_it_shows(tmp_path: Path) -> N
 
 
 def test_the_public_names_are_on_their_page(site: Path) -> None:
-    page = (site / "api.html").read_text()
+    page = (site / "reference/api.html").read_text()
     for module in ("harness.api", "ucp", "netem", "sitl"):
         for name in importlib.import_module(module).__all__:
             assert f'id="{module}.{name}"' in page, (module, name)
@@ -97,7 +99,7 @@ def test_the_public_names_are_on_their_page(site: Path) -> None:
 def test_python_of_the_notebook_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(
-        r"^```python\n(.*?)^```", (REPOSITORY / "docs/notebook.md").read_text(), re.MULTILINE | re.DOTALL
+        r"^```python\n(.*?)^```", (REPOSITORY / "docs/how-to/use-a-notebook.md").read_text(), re.MULTILINE | re.DOTALL
     )
     names: dict[str, Any] = {}
     for block in blocks:

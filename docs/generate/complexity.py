@@ -1,4 +1,4 @@
-"""`python -m docs.generate.complexity RUN_DIR`: put a matrix's growth into ../complexity.md.
+"""`python -m docs.generate.complexity RUN_DIR`: put a matrix's growth into docs/appendix/growth.md.
 
 The tables and the picture come from RUN_DIR; the words around them are written by hand.
 """
@@ -16,8 +16,8 @@ from ucp.agent_files import write_atomically
 
 __all__ = ["BEGIN", "END", "PAGE", "tables"]
 
-PAGE = Path(__file__).parents[1] / "complexity.md"
-PICTURE = PAGE.with_name("complexity.svg")
+PAGE = Path(__file__).parents[1] / "appendix/growth.md"
+PICTURE = PAGE.with_name("growth.svg")
 
 
 def tables(record: MatrixRecord) -> str:

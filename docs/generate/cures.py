@@ -1,4 +1,4 @@
-"""`python -m docs.generate.cures`: what each cure of docs/livelocks.md costs over the thesis's loss matrix, and gains.
+"""`python -m docs.generate.cures`: measure the cost and the gain of each cure over the loss matrix of the thesis.
 
 Each is played with the same seeds as the thesis's settings are. The tables of the page come from here; the words around
 them are written by hand.
@@ -21,7 +21,7 @@ from harness.sweep.matrix.matrix_table import say_interval, say_mean
 from ucp.agent_files import write_atomically
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs/livelocks.md"
+PAGE = ROOT / "docs/explanation/livelocks.md"
 MATRIX = ROOT / "scenarios/thesis_matrix.yaml"
 BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->\n"
 SHOWN = ("uniform", "mutual_share", "reconciles", "messages_per_block")

@@ -1,5 +1,5 @@
 """`python -m docs.generate.matrix_thesis RUN_DIR`: lay a matrix's figures beside what Section 4.3 observed, in
-../matrix-thesis.md.
+docs/appendix/loss-matrix.md.
 
 The table and the picture come from RUN_DIR; the words around them are written by hand.
 """
@@ -15,8 +15,8 @@ from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import say_interval, say_mean
 from ucp.agent_files import write_atomically
 
-PAGE = Path(__file__).parents[1] / "matrix-thesis.md"
-PICTURE = PAGE.with_name("matrix-thesis.svg")
+PAGE = Path(__file__).parents[1] / "appendix/loss-matrix.md"
+PICTURE = PAGE.with_name("loss-matrix.svg")
 BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->\n"
 
 OBSERVED = {

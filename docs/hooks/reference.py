@@ -1,4 +1,4 @@
-"""All keys of a scenario, from its JSON Schema and the docstrings of its models: `docs/scenario-reference.md`."""
+"""All keys of a scenario, from its JSON Schema and the docstrings of its models: `docs/reference/scenario-keys.md`."""
 
 import ast
 import inspect

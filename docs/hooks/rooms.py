@@ -1,4 +1,4 @@
-"""Which room of the harness uses which, drawn from the imports: `docs/architecture.md`."""
+"""Which room of the harness uses which, drawn from the imports: `docs/explanation/architecture.md`."""
 
 import ast
 import re
@@ -19,7 +19,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     if MARK not in markdown:
         return markdown
     rooms = re.findall(
-        r"^\| \[(\w+)/\]\(\.\./harness/\w+\)", markdown.split("In [harness/](../harness)")[1], re.MULTILINE
+        r"^\| \[(\w+)/\]\(\.\./\.\./harness/\w+\)", markdown.split("In [harness/](../../harness)")[1], re.MULTILINE
     )
     return markdown.replace(MARK, picture(rooms, uses(rooms)))
 

@@ -30,7 +30,10 @@ def import_command(
     sources: Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files and directories of any kind.")],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Output directory; must be new or empty.")],
     adapter: Annotated[
-        str | None, typer.Option(metavar="MODULE:CLASS", help="Adapter for a format of your own; see docs/adapters.md.")
+        str | None,
+        typer.Option(
+            metavar="MODULE:CLASS", help="Adapter for a format of your own; see docs/how-to/import-other-logs.md."
+        ),
     ] = None,
     format_: Annotated[
         Format | None, typer.Option("--format", help="Format of all sources; detected from each if not given.")

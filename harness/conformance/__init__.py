@@ -1,4 +1,4 @@
-"""Conformance: test one agent alone, while the harness plays its peers. See docs/conformance.md.
+"""Conformance: test one agent alone, while the harness plays its peers. See docs/how-to/test-one-agent.md.
 
 The reference (`_reference_model`) is the harness's own agent. `_alphabet` lists the inputs that are possible in a
 state, and `_state_space` walks all states breadth first. `vectors` are the pairs of a state and an input, each with

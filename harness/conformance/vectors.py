@@ -71,7 +71,11 @@ def to_lines(generated: Sequence[Vectors]) -> Iterator[str]:
     """Lines of the file, each with its end; the same for the same vectors."""
     total = sum(len(vectors.wanted) for vectors in generated)
     yield _line(
-        {"schema": SCHEMA, "vectors": total, "about": "ucp-harness conformance --write; see docs/conformance.md"}
+        {
+            "schema": SCHEMA,
+            "vectors": total,
+            "about": "ucp-harness conformance --write; see docs/how-to/test-one-agent.md",
+        }
     )
     number = 0
     for vectors in generated:

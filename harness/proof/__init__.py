@@ -1,4 +1,4 @@
-"""Proof by exhaustion: explore every state that a small swarm can reach within bounds. See docs/proof.md.
+"""Proof by exhaustion: explore every state that a small swarm can reach within bounds. See docs/explanation/proof.md.
 
 The agents in a state are real agents (`ucp.agent`), so a proof is about the code that runs. `bounds` says how large the
 swarm is and what the network may do. The sub-packages answer one question each:

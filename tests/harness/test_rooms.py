@@ -1,4 +1,4 @@
-"""The rooms of docs/architecture.md: imports run one way, pass through doors, and form no circle.
+"""The rooms of docs/explanation/architecture.md: imports run one way, pass through doors, and form no circle.
 
 A room is one folder of `harness/`, or one of the packages `ucp`, `ucp.contract`, `netem` and `sitl`. A module with a
 leading underscore belongs to its room alone. A module without one is a door: another room imports it, a user does, or
@@ -67,10 +67,10 @@ def room_of(module: str) -> str:
 
 
 def rooms_in_order() -> list[str]:
-    """Return the rooms of the harness in the order of the table in docs/architecture.md."""
-    page = (REPOSITORY / "docs/architecture.md").read_text(encoding="utf-8")
-    table = page.split("In [harness/](../harness)")[1]
-    return re.findall(r"^\| \[(\w+)/\]\(\.\./harness/\w+\)", table, re.MULTILINE)
+    """Return the rooms of the harness in the order of the table in docs/explanation/architecture.md."""
+    page = (REPOSITORY / "docs/explanation/architecture.md").read_text(encoding="utf-8")
+    table = page.split("In [harness/](../../harness)")[1]
+    return re.findall(r"^\| \[(\w+)/\]\(\.\./\.\./harness/\w+\)", table, re.MULTILINE)
 
 
 @pytest.mark.parametrize(

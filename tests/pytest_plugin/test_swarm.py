@@ -30,7 +30,7 @@ STORY = """
 """
 
 REPOSITORY = Path(__file__).parents[2]
-PAGE = REPOSITORY / "docs" / "pytest.md"
+PAGE = REPOSITORY / "docs/how-to/test-with-pytest.md"
 FORCED_TIE = {
     **yaml.safe_load((SCENARIOS / "forced_tie.yaml").read_text()),
     "quirks": {"crash_on_tie": True},

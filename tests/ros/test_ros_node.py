@@ -23,7 +23,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("a clone")
     for name in (".ros", "ucp"):
         (directory / name).symlink_to(REPOSITORY / name)
-    assert play(REPOSITORY / "docs" / "ros.md", directory) == 5
+    assert play(REPOSITORY / "docs/how-to/run-a-ros-node.md", directory) == 5
     return directory
 
 

@@ -1,4 +1,4 @@
-"""`python -m docs.generate.threats`: play all threats, and put the table into docs/security.md."""
+"""`python -m docs.generate.threats`: play all threats, and put the table into docs/explanation/security.md."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from docs.generate.matrix_thesis import put_between_markers
 from docs.generate.threats.threat_table import table
 from ucp.agent_files import write_atomically
 
-PAGE = Path(__file__).parents[3] / "docs" / "security.md"
+PAGE = Path(__file__).parents[3] / "docs/explanation/security.md"
 
 if __name__ == "__main__":
     write_atomically(PAGE, put_between_markers(PAGE.read_text(encoding="utf-8"), "".join(table())))

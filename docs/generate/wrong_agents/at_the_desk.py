@@ -1,7 +1,7 @@
 """`python -m docs.generate.wrong_agents.at_the_desk [QUIRK ...]`: wrong agents as processes, their records taken to
 `replay`.
 
-Rows for these quirks, or for all, are put into ../../wrong-agents-field.md; the words around them are written by hand.
+Rows for these quirks, or for all, are put into ../../appendix/wrong-agents-field.md. Its text is written by hand.
 """
 
 import shutil
@@ -27,7 +27,7 @@ from ucp.agent import HANDLERS
 from ucp.agent_files import write_atomically
 from ucp.quirks import QUIRKS
 
-PAGE = Path(__file__).parents[2] / "wrong-agents-field.md"
+PAGE = Path(__file__).parents[2] / "appendix/wrong-agents-field.md"
 MISSION = Path(__file__).parent / "desk.yaml"
 JOBS = 2
 MOST_RUNS = 8

@@ -2,7 +2,7 @@
 
 The vectors are played in virtual time, which sees what is seen over UDP and the instant at which the next timer ends;
 of an agent that passes them the cases by hand are played, over UDP. Rows for these quirks, or for all, are put into
-docs/conformance.md; the words around them are written by hand.
+docs/how-to/test-one-agent.md; the words around them are written by hand.
 """
 
 import sys
@@ -24,7 +24,7 @@ from harness.errors import HarnessError
 from ucp.agent_files import write_atomically
 from ucp.quirks import QUIRKS
 
-PAGE = Path(__file__).parents[3] / "docs" / "conformance.md"
+PAGE = Path(__file__).parents[3] / "docs/how-to/test-one-agent.md"
 HEADER = "| quirk | Algorithm | what the agent does wrong | named | failed | tried |\n|---|--:|---|---|--:|--:|\n"
 NOTHING = "**nothing**"
 ALIKE = {

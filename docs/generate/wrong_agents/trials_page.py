@@ -1,5 +1,5 @@
 """`python -m docs.generate.wrong_agents.trials_page [QUIRK ...]`: play all wrong agents, or some, and put them into
-../../wrong-agents.md.
+../../appendix/wrong-agents.md.
 
 The table comes from many runs of each quirk, of which only what the right agent is not charged with counts; the
 words around it are written by hand.
@@ -21,7 +21,7 @@ from ucp.quirks import QUIRKS
 
 __all__ = ["BEGIN", "END", "NOTHING", "PAGE", "findings_of", "main", "row", "rows_of"]
 
-PAGE = Path(__file__).parents[2] / "wrong-agents.md"
+PAGE = Path(__file__).parents[2] / "appendix/wrong-agents.md"
 SEEDS = range(1, 101)
 NOTHING = "**nothing**"
 HEADER = (

@@ -101,7 +101,7 @@ class Adapter:
         raise NotImplementedError
 
 
-_HOW = "give MODULE:CLASS, as my_logs:MyAdapter or path/to/my_logs.py:MyAdapter (docs/adapters.md)"
+_HOW = "give MODULE:CLASS, as my_logs:MyAdapter or path/to/my_logs.py:MyAdapter (docs/how-to/import-other-logs.md)"
 
 
 def load_adapter(name: str) -> Adapter:
@@ -122,5 +122,7 @@ def load_adapter(name: str) -> Adapter:
     except Exception as error:  # it is anybody's code
         raise FieldError(f"the adapter {name} cannot be loaded: {type(error).__name__}: {error}; {_HOW}") from None
     if not isinstance(adapter, Adapter):
-        raise FieldError(f"{name} is no subclass of harness.field.adapters.Adapter: see docs/adapters.md")
+        raise FieldError(
+            f"{name} is no subclass of harness.field.adapters.Adapter: see docs/how-to/import-other-logs.md"
+        )
     return adapter

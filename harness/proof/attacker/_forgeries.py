@@ -1,7 +1,7 @@
 """All that a captor can say to an agent, up to what the agent can tell apart: of each kind one message.
 
 What handlers ask of a message is whether a hash in it is one that they hold, which of two timestamps is the older, and
-yes or no. docs/proof.md says why these messages are enough; a test holds random ones to them.
+yes or no. docs/explanation/proof.md says why these messages are enough; a test holds random ones to them.
 """
 
 from collections.abc import Iterable, Iterator

@@ -1,4 +1,6 @@
-"""Coverage: the share of the protocol's local states, inputs and branches that runs have reached. See docs/coverage.md.
+"""Coverage: the share of the protocol's local states, inputs and branches that runs have reached.
+
+See docs/explanation/coverage.md.
 
 `reached` collects states, inputs and branches from traces, or while a simulated run is judged. `_share` compares them
 with everything that exists within the bounds of `harness.proof`.

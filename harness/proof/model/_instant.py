@@ -249,7 +249,7 @@ class Instants:
         """If the agent only counts what it hears, each of another sender: in which order makes no difference then.
 
         None if it does more. Whether an answer is counted depends on what is no tally, and on whether its sender is in
-        the tally already (docs/proof.md).
+        the tally already (docs/explanation/proof.md).
         """
         hear, only_counts, lets_be = self._local.hear, self._local.only_counts, self._local.lets_be
         matter, others = [], []

@@ -50,8 +50,8 @@ class Known:
 class KnownStates:
     """All local states that were come upon.
 
-    When `bounds.reduced`, what no handler will read before it is written anew is as at the beginning; docs/proof.md
-    says why that is sound.
+    If `bounds.reduced`, state that no handler reads before it is written again counts as in its initial value.
+    docs/explanation/proof.md says why that is sound.
     """
 
     def __init__(self, bounds: Bounds, blocks: Blocks) -> None:
@@ -130,7 +130,7 @@ class KnownStates:
     def names_in_order(self, local: int, sender: int) -> Names | None:
         """Names by which the others are in order: those in tallies first, then the sender; None if they are.
 
-        Where IDs make no difference, what an agent does is the same but for these names (docs/proof.md).
+        Where IDs make no difference, what an agent does is the same but for these names (docs/explanation/proof.md).
         """
         known = self.known[local]
         if not self._nameless or known.flaw is not None:

@@ -1,4 +1,7 @@
-"""What tallies decide: agents that differ only in what their tallies will never ask again are one (docs/proof.md)."""
+"""What tallies decide: agents that differ only in what their tallies will never ask again are one.
+
+See docs/explanation/proof.md.
+"""
 
 from collections.abc import Callable, Sequence
 

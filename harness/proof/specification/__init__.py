@@ -1,4 +1,6 @@
-"""A second opinion: the specification in TLA+ (ucp/contract/spec), checked by TLC. See docs/spec.md.
+"""A second opinion: the specification in TLA+ (ucp/contract/spec), checked by TLC.
+
+See docs/explanation/specification.md.
 
 `_tlc` runs TLC. `_second_opinion` explores the same bounds with `harness.proof` and with TLC, and compares the states,
 which `_spec_states` writes in one form. `_validate` checks recorded runs against the specification, in the form that

@@ -1,4 +1,4 @@
-"""What the table of wrong agents in docs/conformance.md says of them."""
+"""What the table of wrong agents in docs/how-to/test-one-agent.md says of them."""
 
 import re
 from random import Random

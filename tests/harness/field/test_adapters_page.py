@@ -1,4 +1,4 @@
-"""What docs/adapters.md shows does what it says."""
+"""What docs/how-to/import-other-logs.md shows does what it says."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ from harness.field.adapters.csv_adapter import CommaSeparated
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
 
-PAGE = (Path(__file__).parents[3] / "docs" / "adapters.md").read_text()
+PAGE = (Path(__file__).parents[3] / "docs/how-to/import-other-logs.md").read_text()
 TEXTS = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
 LOG = "".join(line for line in TEXTS[0].splitlines(keepends=True) if " STEP " not in line)
 """Its step is an abridged one."""
@@ -63,7 +63,7 @@ def test_the_rows_of_the_page_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["nothing", "nowhere:SwarmLog", "{}:Nobody", "{}:Path", "no.py:A", ":", "json:loads"])
 def test_an_adapter_that_is_none_is_said_in_a_sentence(swarmlog: Path, name: str) -> None:
-    with pytest.raises(FieldError, match=r"adapters\.md"):
+    with pytest.raises(FieldError, match=r"import-other-logs\.md"):
         load_adapter(name.format(swarmlog))
 
 

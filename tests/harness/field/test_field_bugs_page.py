@@ -1,4 +1,4 @@
-"""docs/field-bugs.md is true: each of its commands runs, and prints what the page shows."""
+"""docs/how-to/find-a-field-bug.md is true: each of its commands runs, and prints what the page shows."""
 
 import shutil
 import tarfile
@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.pages import play
 
 ROOT = Path(__file__).parents[3]
-PAGE = ROOT / "docs/field-bugs.md"
+PAGE = ROOT / "docs/how-to/find-a-field-bug.md"
 LOGS = ROOT / "docs/field_test_2020.tar.xz"
 MAX_BYTES = 1_500_000
 

@@ -1,4 +1,4 @@
-"""The tables of docs/proof.md and docs/livelocks.md say what is found: what takes a moment is looked at again."""
+"""Compare the quick rows of the tables in explanation/proof.md and explanation/livelocks.md with the prover."""
 
 import re
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from harness.proof.model._global_states import Swarm
 from harness.proof.questions._convergence import look
 
 DOCS = Path(__file__).parents[3] / "docs"
-PAGE = DOCS / "proof.md"
+PAGE = DOCS / "explanation/proof.md"
 MOST_S = 0.5
 """Rows that take longer are left to whoever measures them."""
 FEW_STATES = 1_000
@@ -105,8 +105,8 @@ class Cell(NamedTuple):
 
 
 def ways_round() -> Iterator[Cell]:
-    """The cells of docs/livelocks.md that have few states."""
-    table = (DOCS / "livelocks.md").read_text().partition("<!-- ways round -->\n")[2].partition("\n\n")[0]
+    """The cells of docs/explanation/livelocks.md that have few states."""
+    table = (DOCS / "explanation/livelocks.md").read_text().partition("<!-- ways round -->\n")[2].partition("\n\n")[0]
     head, _, *lines = table.splitlines()
     columns = [[part.split()[0] for part in name.split(", ")] for name in cells(head)[1:]]
     for line in lines:

@@ -10,7 +10,7 @@ DURATIONS = (10, 5)
 
 
 def test_zones_are_the_times_that_are_possible() -> None:
-    """Timers are started and end at random; whole units are enough, for all bounds are whole (docs/proof.md)."""
+    """Timers are started and end at random; whole units are enough, for all bounds are whole (explanation/proof.md)."""
     for seed in range(30):
         lots, zones = Random(seed), Zones()
         zone, points = NOTHING_RUNS, {()}

@@ -1,4 +1,4 @@
-"""The thesis's figures have their stories (tests/stories), and docs/stories.md names each."""
+"""The thesis's figures have their stories (tests/stories), and docs/how-to/write-a-story.md names each."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,7 @@ from ucp.handler import EventHandler
 
 REPOSITORY = Path(__file__).parents[3]
 STORIES = REPOSITORY / "tests/stories"
-PAGE = (REPOSITORY / "docs/stories.md").read_text()
+PAGE = (REPOSITORY / "docs/how-to/write-a-story.md").read_text()
 IN_NO_FIGURE = {
     "receive_vote_add_block": {"another round", "counted already"},
     "receive_commit_block": {"held already"},
@@ -39,7 +39,7 @@ def test_each_figure_has_a_story_and_the_page_names_it() -> None:
     figures = ["3_02", *(f"3_{number:02}" for number in range(4, 24)), *(f"4_{number}" for number in range(1, 8))]
     stories = sorted(STORIES.glob("*.story"))
     assert [path.name[len("figure_") :][:4].rstrip("_") for path in stories] == figures
-    rows = re.findall(r"^\| (\d\.\d+) .* \| \[(\w+)\]\(\.\./tests/stories/\2\.story\) \|$", PAGE, re.MULTILINE)
+    rows = re.findall(r"^\| (\d\.\d+) .* \| \[(\w+)\]\(\.\./\.\./tests/stories/\2\.story\) \|$", PAGE, re.MULTILINE)
     assert rows == [
         (figure.replace("_0", ".").replace("_", "."), path.stem) for figure, path in zip(figures, stories, strict=True)
     ]

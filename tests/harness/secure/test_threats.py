@@ -7,7 +7,7 @@ import pytest
 
 from docs.generate.threats import ROWS, Row, table
 
-PAGE = (Path(__file__).parents[3] / "docs/security.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs/explanation/security.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: re.sub(r"\W+", "-", f"{row.who} {row.does}"))

@@ -4,7 +4,7 @@
 (* agents end and some agents complete a block, none of them having heard  *)
 (* yet of what the others do; then everybody hears what was sent, then     *)
 (* what was answered to that, and so on until nobody says anything more.   *)
-(* docs/proof.md says the same of `ucp-harness prove`.                     *)
+(* docs/explanation/proof.md says the same of `ucp-harness prove`.                     *)
 (***************************************************************************)
 EXTENDS Integers, Sequences, FiniteSets
 

@@ -313,7 +313,7 @@ class ForeignAgent:
             return self._failure("crashed", f"ended by itself with status {status} ({words})")
         return self._lacks(
             f"with --virtual it ends with status {status}{words and ', and says: '}{words}; use --backend process, or "
-            "see docs/virtual-time.md"
+            "see docs/how-to/simulate-in-virtual-time.md"
         )
 
 

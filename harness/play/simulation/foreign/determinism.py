@@ -28,7 +28,7 @@ class NotTheSameError(HarnessError):
     exit_status = VIOLATED
 
     def __init__(self, agent_id: int, detail: str) -> None:
-        super().__init__(f"agent {agent_id} {detail} (docs/virtual-time.md)")
+        super().__init__(f"agent {agent_id} {detail} (docs/how-to/simulate-in-virtual-time.md)")
         self.agent_id = agent_id
 
 

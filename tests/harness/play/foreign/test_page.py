@@ -1,4 +1,4 @@
-"""The agent that docs/virtual-time.md shows, with ours as its core, is one."""
+"""The agent that docs/how-to/simulate-in-virtual-time.md shows, with ours as its core, is one."""
 
 import re
 import sys
@@ -7,7 +7,7 @@ from pathlib import Path
 from harness.run.simulate import simulate
 from tests.harness.play.foreign.agents import played_by
 
-PAGE = Path(__file__).parents[4] / "docs" / "virtual-time.md"
+PAGE = Path(__file__).parents[4] / "docs/how-to/simulate-in-virtual-time.md"
 
 CORE = """
 import base64, json

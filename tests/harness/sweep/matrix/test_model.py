@@ -14,7 +14,7 @@ from harness.sweep.matrix._matrix_file import Point
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 THESIS = SCENARIOS / "thesis_matrix.yaml"
-NIGHTLY = Path(__file__).parents[4] / "docs" / "matrix-nightly.md"
+NIGHTLY = Path(__file__).parents[4] / "docs/how-to/run-a-matrix-every-night.md"
 
 
 def written(directory: Path, **keys: Any) -> Path:

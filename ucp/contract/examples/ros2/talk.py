@@ -1,4 +1,4 @@
-"""Talks to a UCP agent that is a ROS 2 node: python talk.py AGENT_ID TEXT (docs/ros.md).
+"""Talks to a UCP agent that is a ROS 2 node: python talk.py AGENT_ID TEXT (docs/how-to/run-a-ros-node.md).
 
 It has the agent log the text, an event a second, until a block with it is in the agent's chain, and shows that block.
 """

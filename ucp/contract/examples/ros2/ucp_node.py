@@ -1,4 +1,4 @@
-"""A UCP agent as a ROS 2 node: python ucp_node.py MISSION_FILE (docs/ros.md).
+"""A UCP agent as a ROS 2 node: python ucp_node.py MISSION_FILE (docs/how-to/run-a-ros-node.md).
 
 It is the harness's own agent in rclpy's main loop: ROS timers and a ROS executor drive it, and its blocks are made of
 events that come as messages. UCP's own datagrams stay UDP broadcasts: they are for other vehicles, and ROS stays on
