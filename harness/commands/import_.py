@@ -31,9 +31,7 @@ def import_command(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Output directory; must be new or empty.")],
     adapter: Annotated[
         str | None,
-        typer.Option(
-            metavar="MODULE:CLASS", help="Adapter for a format of your own; see docs/how-to/import-other-logs.md."
-        ),
+        typer.Option(metavar="MODULE:CLASS", help="Adapter for a format of your own: my_logs:MyAdapter."),
     ] = None,
     format_: Annotated[
         Format | None, typer.Option("--format", help="Format of all sources; detected from each if not given.")
