@@ -1,7 +1,8 @@
-"""`python -m docs.generate.wrong_agents_proof [QUIRK ...]`: what tells each wrong agent from the right one, as a table.
+"""`python -m docs.generate.wrong_agents_proof [QUIRK ...]`: print the table of wrong agents for the page of bounds.
 
-First by its steps: some state that it comes to within small bounds, and some input, of which the right agent would make
-something else. Then by what comes of that, within bounds in which everything holds of right agents.
+The page is docs/appendix/proof-bounds.md. Each quirk is examined twice. First, each step is compared with that of a
+correct agent, within small bounds. Second, the prover searches for a violation within bounds in which all properties
+hold for correct agents.
 """
 
 import sys
@@ -22,7 +23,7 @@ from ucp.quirks import QUIRKS
 MOST_S = 60.0
 MOST_BYTES = 4e9
 SMALL = Bounds(2, 2, "lossy", reduced=False)
-"""Everything holds of right agents (tests/harness/proof)."""
+"""All properties hold for correct agents (tests/harness/proof)."""
 TRIED = (
     SMALL,
     replace(SMALL, faults=("duplicate",)),
@@ -32,13 +33,13 @@ TRIED = (
     replace(SMALL, blocks=3),
     replace(SMALL, agents=4),
 )
-"""Where a wrong step is looked for, one after the other."""
+"""Bounds in which a wrong step is searched for, in this order."""
 
 
-class Told(NamedTuple):
-    """Of a wrong step: which handler's it is, within which bounds, how many instants after the beginning.
+class WrongStep(NamedTuple):
+    """A wrong step: its handler, the bounds in which it occurs, and its distance from the start in instants.
 
-    In the network any, how many inputs of the agent's.
+    In the network `any`, `instants` counts the inputs of one agent.
     """
 
     handler: str
@@ -46,20 +47,20 @@ class Told(NamedTuple):
     instants: int
 
 
-def wrong_step(quirk: str, most_s: float = MOST_S) -> Told | str:
-    """The nearest; or in a few words why there is none."""
+def wrong_step(quirk: str, most_s: float = MOST_S) -> WrongStep | str:
+    """Return the nearest wrong step, or the reason why none is known."""
     undecided = []
     for bounds in TRIED:
         flaw, instants, ended = _first_flaw(_with(quirk, replace(bounds, steps=True)), most_s)
         if flaw is not None and flaw.handler is not None:
-            return Told(flaw.handler, bounds, instants)
+            return WrongStep(flaw.handler, bounds, instants)
         if ended != "complete":
             undecided.append(bounds)
     return "not decided" if undecided else "none"
 
 
 def _first_flaw(bounds: Bounds, most_s: float) -> tuple[Flaw | None, int, Ended]:
-    """The nearest, and how many instants it takes, or in the network any, inputs of one agent."""
+    """Return the nearest flaw and its distance in instants, or in inputs of one agent in the network `any`."""
     if bounds.network == "any":
         collected = collect(bounds, most_bytes=MOST_BYTES, most_s=most_s)
         return collected.flaw, len(collected.way), collected.ended
@@ -68,8 +69,8 @@ def _first_flaw(bounds: Bounds, most_s: float) -> tuple[Flaw | None, int, Ended]
     return graph.flaw, instants, graph.ended
 
 
-def consequence(quirk: str, most_s: float = MOST_S) -> str:
-    """What does not hold within the small bounds, in a few words."""
+def violation(quirk: str, most_s: float = MOST_S) -> str:
+    """Name the first property that does not hold within the small bounds."""
     graph = explore(Swarm(_with(quirk, SMALL)), most_bytes=MOST_BYTES, most_s=most_s)
     if graph.flaw is not None:
         return f"characteristic {graph.flaw.kind}" if graph.flaw.kind.isdecimal() else graph.flaw.kind
@@ -82,7 +83,7 @@ def consequence(quirk: str, most_s: float = MOST_S) -> str:
         return "livelock"
     if not live.decided:
         return "not decided (states)"
-    return "more votes for one chain" if len(live.astray) > 2 else "nothing"
+    return "more votes for one chain" if len(live.astray) > 2 else "none"
 
 
 def _with(quirk: str, bounds: Bounds) -> Bounds:
@@ -90,18 +91,18 @@ def _with(quirk: str, bounds: Bounds) -> Bounds:
 
 
 def row(quirk: str) -> str:
-    """One of the table."""
+    """Return one row of the table."""
     algorithms = ", ".join(map(str, QUIRKS[quirk].algorithms))
     step = wrong_step(quirk)
-    if isinstance(step, Told):
+    if isinstance(step, WrongStep):
         where = f"Algorithm {HANDLERS[step.handler].algorithm} | {step.bounds.in_words()} | {step.instants}"
     else:
         where = f"{step} | | "
-    return f"| `{quirk}` | {algorithms} | {where} | {consequence(quirk)} |"
+    return f"| `{quirk}` | {algorithms} | {where} | {violation(quirk)} |"
 
 
 def main(names: Sequence[str]) -> None:
-    sys.stdout.write("| quirk | Algorithm | a wrong step of | within | instants | what comes of it |\n")
+    sys.stdout.write("| quirk | Algorithm | wrong step in | bounds | instants | violation |\n")
     sys.stdout.write("|---|---|---|---|--:|---|\n")
     for name in names or QUIRKS:
         sys.stdout.write(f"{row(name)}\n")

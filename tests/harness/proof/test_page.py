@@ -1,4 +1,4 @@
-"""Compare the quick rows of the tables in explanation/proof.md and explanation/livelocks.md with the prover."""
+"""Compare the quick rows of the tables in appendix/proof-bounds.md and explanation/livelocks.md with the prover."""
 
 import re
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from harness.proof.model._global_states import Swarm
 from harness.proof.questions._convergence import look
 
 DOCS = Path(__file__).parents[3] / "docs"
-PAGE = DOCS / "explanation/proof.md"
+PAGE = DOCS / "appendix/proof-bounds.md"
 MOST_S = 0.5
 """Rows that take longer are left to whoever measures them."""
 FEW_STATES = 1_000
