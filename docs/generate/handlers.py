@@ -1,8 +1,10 @@
-"""The thesis's event diagram, drawn from what the handlers declare: `python -m docs.generate.handlers` writes
-../../ucp/contract/HANDLERS.md.
+"""Draw the diagram of the event handlers from their declarations, and write ../../ucp/contract/HANDLERS.md.
 
-Chapter 3 has a figure for each of the 20 event handlers (Figures 3.4-3.23, symbols in Figure 3.3) and one of their
-outline (Figure 3.2). This is all of them as one, in Mermaid: from whatever happens to the handlers that run then.
+Run it with `python -m docs.generate.handlers`.
+
+Chapter 3 of the thesis has one figure for each of the 20 handlers (Figures 3.4-3.23, symbols in Figure 3.3) and an
+outline (Figure 3.2). This diagram in Mermaid combines them. Arrows lead from each handler to the handlers that it
+causes.
 """
 
 from collections.abc import Iterator
@@ -17,18 +19,28 @@ from ucp.handler import EventHandler
 PAGE = Path(__file__).parents[2] / "ucp" / "contract" / "HANDLERS.md"
 
 INTRODUCTION = """\
-# The event handlers, and how one leads to another
+# The 20 event handlers
 
-The 20 event handlers of Chapter 3, Algorithms 1-20, are in [commit.py](../commit.py) and
-[reconcile.py](../reconcile.py).
-Each declares what it may send, which timers it may start and which local events it may trigger; [core.py](../core.py)
-holds it to that. The tables in [agent.py](../agent.py) say which handler runs when a message arrives, a timer expires
-or a local event happens. This page is written from both by `python -m docs.generate.handlers`;
-[BRANCHES.md](BRANCHES.md) says when a handler takes which of its branches.
+An event handler is the code that an agent runs for one kind of event. Chapter 3 of the thesis defines 20 handlers,
+Algorithms 1-20. They are in [commit.py](../commit.py) and [reconcile.py](../reconcile.py).
+[The agent contract](CONTRACT.md#the-20-algorithms) lists them in pseudo-code, and [BRANCHES.md](BRANCHES.md) lists
+their branches with the conditions. [How UCP works](../../docs/explanation/protocol.md) explains the protocol.
 
-A thick arrow is a local event, which the same agent handles next; a thin one a timer, which the same agent handles when
-it expires; a dotted one a message, which every agent handles that receives it. Besides, the operator can trigger
-Reconcile Begin, and an agent that boots from its store begins with Reconcile Finalize.
+Each handler declares the messages that it sends, the timers that it starts, and the local events that it triggers.
+[core.py](../core.py) rejects any other action of the handler. The tables in [agent.py](../agent.py) define which
+handler runs when a message arrives, a timer expires, or a local event occurs. `python -m docs.generate.handlers`
+generates this page from these declarations and tables.
+
+The diagram has three kinds of arrows:
+
+| arrow | cause | the next handler runs |
+|---|---|---|
+| thick | local event | in the same agent, directly after the current handlers |
+| thin | timer | in the same agent, when the timer expires |
+| dotted | message | in each agent that receives the message |
+
+Two causes are not in the diagram. The operator can trigger Reconcile Begin. An agent that boots from its store starts
+with Reconcile Finalize.
 
 """
 
@@ -84,7 +96,7 @@ def _row(handler: EventHandler[Any]) -> str:
 
 
 def _causes(handler: EventHandler[Any]) -> Iterator[str]:
-    """What of the three tables makes it run, and from where."""
+    """Yield the causes of the handler in the tables of `ucp.agent`, with the handlers that trigger it."""
     for message, receiver in ON_MESSAGE.items():
         if receiver is handler:
             yield f"{message.NAME} arrives"

@@ -14,7 +14,7 @@ PAGE = Path(__file__).parents[2] / "ucp" / "contract" / "CONTRACT.md"
 
 def table() -> str:
     """Return Markdown with a row for each setting."""
-    lines = [["setting", "range", "default", "feature", "what it does"], ["---"] * 5, *map(_row, DECLARED)]
+    lines = [["setting", "range", "default", "feature", "effect"], ["---"] * 5, *map(_row, DECLARED)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 

@@ -24,127 +24,136 @@ Branch = tuple[str, str]
 PAGE = Path(ucp.__path__[0]) / "contract" / "BRANCHES.md"
 
 INTRODUCTION = """\
-# The branches of the event handlers, and their tests
+# Branches of the event handlers
 
-A handler ends in one of the branches that it declares; a trace names the handler and the branch of each of its runs.
-Here is each branch of Algorithms 1-20, with the tests in [tests/ucp](../../tests/ucp) that take it and pin what it
-does. A test that does not take its branches fails, and a branch without a test fails `make test`.
+Each run of an event handler ends in one *branch*, a named case such as "approved". The handler declares its branches,
+and a trace records the handler and the branch of each run. [The agent contract](CONTRACT.md#the-20-algorithms) has the
+algorithms. [HANDLERS.md](HANDLERS.md) shows which handler runs when.
 
-This page is written by `python -m tests.ucp.branches`.
+This table lists each branch of Algorithms 1-20 with its condition. The last column lists the tests in
+[tests/ucp](../../tests/ucp) that take the branch and check its effect. A test fails if it does not take its branches.
+`make test` fails if a branch has no test.
+
+`python -m tests.ucp.branches` generates this page.
 
 """
 
 TABLE = """\
-| Algorithm | handler | branch | when | tests |
+| Algorithm | handler | branch | condition | tests |
 |---|---|---|---|---|
 """
 
-OF_WRONG_AGENTS = """
-## Of wrong agents
+WRONG_AGENTS = """
+## Branches of wrong agents
 
-An agent with [quirks](../quirks) has wrong handlers in the place of some of these. Besides their branches they take
-two: "ignored by quirk", where `ignore_commit` strikes, and "crashed by quirk", where a handler ended by an exception.
+A [quirk](../quirks) is a deliberate mistake of an agent. An agent with quirks has wrong handlers in place of some of
+the handlers above. They have two additional branches:
+
+| branch | condition |
+|---|---|
+| ignored by quirk | The quirk `ignore_commit` suppresses a commit in Algorithm 6. |
+| crashed by quirk | The handler raised an exception. |
 """
 
 WHEN: dict[str, dict[str, str]] = {
     "build_data_block": {
         "building": "another event of the largest size still fits the current block",
-        "full": "it might not fit any more",
+        "full": "another event of the largest size might not fit",
     },
     "process_next_deque_block": {
         "reconcile in progress": "the agent reconciles",
-        "vote running": "the vote on an earlier proposal is not over",
-        "deque empty": "no block waits",
-        "proposed": "a block waits and nothing stands in its way",
+        "vote running": "a vote of the agent is running",
+        "deque empty": "the deque is empty",
+        "proposed": "the deque has a block, and neither a vote nor a reconcile is running",
     },
     "receive_request_add_block": {
         "reconcile in progress": "the agent reconciles",
         "approve": "the proposer's top chain hash is the agent's own",
-        "disapprove": "it is another",
+        "disapprove": "the proposer's top chain hash differs from the agent's own",
     },
     "receive_vote_add_block": {
         "no vote running": "the agent has no vote running",
         "another block": "the vote is not for the agent's candidate",
-        "another round": "with `vote_names_chain`: the vote is for the candidate, on top of another chain",
+        "another round": "with `vote_names_chain`: the vote is for the candidate on top of another chain",
         "counted already": "the responder has voted in this round",
         "yes": "the responder approves",
         "no": "the responder disapproves",
     },
     "vote_timer_expiration": {
-        "reconcile in progress": "the agent has begun to reconcile since it proposed",
-        "chain changed": "the chain has changed since, and more approve than not (`changed_before_tally`: or fewer)",
-        "approved": "more approve than disapprove, and the chain is the same",
-        "not approved": "anything else",
+        "reconcile in progress": "the agent started a reconcile after its proposal",
+        "chain changed": "the chain changed, and more approve than disapprove (`changed_before_tally`: any result)",
+        "approved": "more approve than disapprove, and the chain did not change",
+        "not approved": "any other case",
     },
     "receive_commit_block": {
         "reconcile in progress": "the agent reconciles",
         "does not succeed": "the block does not go on top of the agent's chain",
-        "held already": "it does, but the agent holds it already",
-        "committed": "it goes on top of the agent's chain",
+        "held already": "the block goes on top of the agent's chain, but the agent holds it already",
+        "committed": "the block goes on top of the agent's chain",
     },
     "reconcile_begin": {
         "already in progress": "the agent reconciles",
-        "begun": "it does not yet",
+        "begun": "the agent does not reconcile",
     },
     "reconcile_phase_1": {"asked": "always"},
     "receive_request_chain_contain": {
         "reconcile in progress": "the agent reconciles",
-        "yes": "its chain contains the chain hash",
-        "no": "its chain does not",
+        "yes": "the agent's chain contains the chain hash",
+        "no": "the agent's chain does not contain it",
     },
     "receive_phase_1_response": {
         "not in phase 1": "the phase 1 timer does not run",
         "another chain": "the response is not about the agent's top chain hash",
         "counted already": "the responder has answered this query",
-        "yes": "the responder contains the chain hash",
-        "no": "the responder does not",
+        "yes": "the responder's chain contains the chain hash",
+        "no": "the responder's chain does not contain it",
     },
     "reconcile_phase_1_timer_expiration": {
-        "no response": "nobody answered",
-        "not contained": "more say no than yes (`phase1_tie: pop`: or as many)",
-        "at inception": "the same, but only the inception block is left",
-        "contained": "anything else: this is the mutual chain",
+        "no response": "no agent answered",
+        "not contained": "more answers are no than yes (`phase1_tie: pop`: or a tie)",
+        "at inception": "as 'not contained', but the chain has only the inception block",
+        "contained": "any other case: the chain is mutual",
     },
     "reconcile_phase_2": {"asked": "always"},
     "receive_request_next_in_sequence": {
         "reconcile in progress": "the agent reconciles",
         "top of chain": "the chain hash is that of the agent's top block",
-        "successor": "it is that of a block further down",
-        "diverged": "the agent's chain does not contain it",
+        "successor": "the chain hash is that of a lower block",
+        "diverged": "the agent's chain does not contain the chain hash",
     },
     "receive_response_next_in_sequence": {
         "not in phase 2": "the phase 2 timer does not run",
         "another chain": "the response is not about the agent's top chain hash",
         "counted already": "the responder has answered this query",
-        "new candidate": "nobody has given this answer before",
-        "counted": "somebody has",
+        "new candidate": "the answer is the first of its kind",
+        "counted": "another responder gave the same answer",
     },
     "reconcile_phase_2_timer_expiration": {
-        "no response": "nobody answered",
-        "top of chain": "most say that the chain ends here (`top_needs_majority`: and a vote would be approved)",
-        "block": "most name one and the same block",
-        "tie: top of chain": "a tie, and the oldest answer is that the chain ends here",
-        "tie: block": "a tie, and the oldest answer is a block (`phase2_tie: block`: some answer is)",
+        "no response": "no agent answered",
+        "top of chain": "most answers are Is Top Of Chain (`top_needs_majority`: and a vote would be approved)",
+        "block": "most answers name the same block",
+        "tie: top of chain": "a tie, and the answer with the oldest timestamp is Is Top Of Chain",
+        "tie: block": "a tie, and the answer with the oldest timestamp names a block (`phase2_tie: block`: any tie)",
     },
     "reconcile_phase_3": {
         "from the stack": "the block is on the reconcile stack",
-        "held already": "it is in the agent's chain or deque",
-        "asked": "the agent does not have it",
+        "held already": "the block is in the agent's chain or deque",
+        "asked": "the agent does not hold the block",
     },
     "receive_request_block_for_hash": {
         "reconcile in progress": "the agent reconciles",
-        "sent": "its chain has the block",
-        "not held": "its chain does not",
+        "sent": "the agent's chain has the block",
+        "not held": "the agent's chain does not have the block",
     },
     "receive_response_block_for_hash": {
         "not in phase 3": "the phase 3 timer does not run",
-        "another block": "the block is not the one that the agent asked for",
-        "committed": "it is",
+        "another block": "the block is not the requested one",
+        "committed": "the block is the requested one",
     },
-    "reconcile_phase_3_timer_expiration": {"gave up": "always: the block did not come"},
+    "reconcile_phase_3_timer_expiration": {"gave up": "always: the block did not arrive"},
     "reconcile_finalize": {
-        "asked who follows": "with `asks_after_commit`: a gap after a commit of its own; it does not reconcile",
-        "recommitted, more to come": "one block is back, more are on the stack, and `finalize_gap_s` is not 0",
+        "asked who follows": "with `asks_after_commit`: the gap after a commit ended, and the agent does not reconcile",
+        "recommitted, more to come": "the agent committed one block, the stack has more, and `finalize_gap_s` is not 0",
         "done": "the stack is empty",
     },
 }
@@ -226,7 +235,7 @@ def page() -> str:
                 yield f"| {cells} | {branch} | {reason} | {named} |\n"
                 cells = " | "
 
-    return INTRODUCTION + TABLE + "".join(rows()) + OF_WRONG_AGENTS
+    return INTRODUCTION + TABLE + "".join(rows()) + WRONG_AGENTS
 
 
 if __name__ == "__main__":
