@@ -167,6 +167,7 @@ def _try_once(
     try:
         with interrupted_by_sigterm(), TemporaryDirectory(prefix="ucp-harness-bisect-") as directory:
             workshops = asked.workshops(Path(directory))
+            of_records = workshops[0].subject.scenario is None
             before = read(expect) if expect is not None else None
             for command, workshop in zip(asked.commands, workshops, strict=True):
                 outcome, _ = workshop.play(code)
@@ -184,21 +185,20 @@ def _try_once(
         _keep(out, outcomes[0])
     if as_json:
         print_json([outcome.model_dump(mode="json") for outcome in outcomes])
-    changes = _changes(before, outcomes)
+    changes = _changes(before, outcomes, of_records)
     for sentence in changes:
         console.print(Text(sentence), soft_wrap=True)
     if changes:
         raise typer.Exit(CHANGED)
 
 
-def _changes(before: Outcome | None, outcomes: Sequence[Outcome]) -> list[str]:
+def _changes(before: Outcome | None, outcomes: Sequence[Outcome], of_records: bool) -> list[str]:
     """Return the differences from the expected outcome, from the record, or from the first outcome."""
-    first, *others = outcomes
     if before is not None:
         return [sentence for outcome in outcomes for sentence in differences(before, outcome)]
-    if first.of_records:
-        others = list(outcomes)
-        first = first.as_recorded()
+    if of_records:
+        return [sentence for outcome in outcomes for sentence in differences(outcome.as_recorded(), outcome)]
+    first, *others = outcomes
     return [sentence for outcome in others for sentence in differences(first, outcome)]
 
 

@@ -17,6 +17,8 @@ from harness.scenario import Scenario
 
 SPEEDUP = 20.0
 """Mission seconds in a second, of a record that is given to a process."""
+RECORD_CORE = "harness.field.bisection._record_core"
+"""The module that runs as a process and gives records to the core under test."""
 CODE = "{code}"
 """In an agent command: the directory of the state of the code."""
 
@@ -131,7 +133,7 @@ class Workshop:
         (only / "ucp").symlink_to(code.resolve() / "ucp", target_is_directory=True)
         whose = [] if self.subject.agent is None else [str(self.subject.agent)]
         played = run_python(
-            ["-m", "harness.field.bisection._record_core", str(self.subject.path), *whose],
+            ["-m", RECORD_CORE, str(self.subject.path), *whose],
             first=[only, ROOT],
             cwd=place,
             limit_s=self._limit_s,
@@ -139,7 +141,8 @@ class Workshop:
         if played.status is None:
             raise CannotBeTriedError(f"it had not ended after {self._limit_s:g} s; --limit-s gives it longer")
         if crashed := played.raised_in(only / "ucp"):
-            if "/bisection/record_core.py" in played.stderr and ", in main" in played.stderr:
+            file = f"/{RECORD_CORE.replace('.', '/')}.py"
+            if f'{file}"' in played.stderr and ", in main" in played.stderr:
                 return Outcome(subject=self.subject.in_words, crashed=crashed)
             raise CannotBeTriedError(f"it does not start: {crashed}")
         try:

@@ -57,13 +57,10 @@ class Outcome(_Model):
     verdicts: dict[str, str] = {}
     crashed: str | None = None
 
-    @property
-    def of_records(self) -> bool:
-        return any(of.differences is not None for of in self.agents.values())
-
     def as_recorded(self) -> "Outcome":
-        """What it would be of a core that does all that is in the records, and nothing else."""
-        return self.model_copy(update={"agents": {agent: OfAgent(differences=[]) for agent in self.agents}})
+        """Return the outcome of a core that does exactly what the records contain."""
+        agents = {agent: OfAgent(differences=[]) for agent in self.agents}
+        return self.model_copy(update={"agents": agents, "crashed": None})
 
     @property
     def sentence(self) -> str:

@@ -100,6 +100,19 @@ def test_what_cannot_be_tried_is_skipped_and_what_is_alike_is_no_finding(reposit
     assert "there is no commit 'last-week'; `git log` lists them" in sentences(unknown.stderr)[0]
 
 
+def test_core_that_crashes_on_a_record_has_a_changed_outcome(repository: Path, records: Path, tmp_path: Path) -> None:
+    shutil.copytree(repository / "ucp", tmp_path / "ucp", ignore=shutil.ignore_patterns("__pycache__"))
+    commit = tmp_path / "ucp/commit.py"
+    line = '    """Algorithm 6, '
+    before, _, after = commit.read_text().partition(line)
+    assert after
+    end = after.index('"""\n') + len('"""\n')
+    commit.write_text(f'{before}{line}{after[:end]}    raise ZeroDivisionError("no votes")\n{after[end:]}')
+    ended = harness("bisect", "--once", records, "--agent", 1, "--repository", tmp_path)
+    assert ended.returncode == 1, ended.stderr
+    assert "it crashes: ZeroDivisionError: no votes (ucp/commit.py:" in ended.stdout
+
+
 def test_git_itself_bisects_with_once(repository: Path, records: Path, tmp_path: Path) -> None:
     clone = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(repository), str(clone))
