@@ -19,7 +19,7 @@ from ucp.short_value import shown, shown_key
 SCHEMA = "ucp-mission/1"
 MAX_MISSION_BYTES = 4 * 1024 * 1024
 MAX_INITIAL_DATA_BYTES = 512 * 1024
-"""The first line of a trace has it whole, and is read up to a mebibyte."""
+"""The first line of a trace contains the initial data in base64. The reader takes lines of at most 16 MiB."""
 MAX_SPEEDUP = 1000.0
 LATEST_EPOCH_US = 2**63 - 1
 """With these no timestamp of the next centuries is more than a block has room for."""

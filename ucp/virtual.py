@@ -99,8 +99,15 @@ class VirtualAgent:
             self._agent.boot(_stored(given["store"], secured=self._secured), now)
 
     def give(self, given: dict[str, Any]) -> None:
-        """One input. Raises InputError."""
-        now = self._advance(given)
+        """Handle one input. Raises InputError for a refused input, which changes nothing, not even the agent's time."""
+        earlier = self._now
+        try:
+            self._give(given, self._advance(given))
+        except InputError:
+            self._now = earlier
+            raise
+
+    def _give(self, given: dict[str, Any], now: float) -> None:
         self._told = None
         if "datagram" in given:
             self._agent.receive_datagram(_decoded(given, "datagram"), now)
