@@ -68,16 +68,19 @@ def collect(
         for makers in divisions(bounds.agents, bounds.blocks, bounds.captured):
             collected.divisions += 1
             division = _Division(collected, makers)
-            for progress in division.collect(began):
-                watch(progress)
-                if memory_bytes() > most_bytes:
-                    collected.ended = "memory"
-                elif progress.seconds > most_s:
-                    collected.ended = "time"
-                elif collected.flaw is not None:
-                    collected.ended = "flaw"
-                if collected.ended != "complete":
-                    break
+            try:
+                for progress in division.collect(began):
+                    watch(progress)
+                    if memory_bytes() > most_bytes:
+                        collected.ended = "memory"
+                    elif progress.seconds > most_s:
+                        collected.ended = "time"
+                    elif collected.flaw is not None:
+                        collected.ended = "flaw"
+                    if collected.ended != "complete":
+                        break
+            finally:
+                division.count()
             keep(division.local)
             if collected.ended != "complete":
                 break
@@ -120,24 +123,26 @@ class _Division:
         """What a captor has heard, who can speak at any moment; the blocks of its vehicle it has from the beginning."""
         self._lied: dict[int, tuple[Material, int]] = {}
         """Of each agent: with what the captor spoke to it last, and to how many of its states."""
+        self._looked_at = 0
+        """States whose own steps have been taken."""
 
     def collect(self, began: float) -> Iterator[Progress]:
         """Until there is no more."""
         collected = self._collected
-        before = collected.states, collected.said, collected.local_states, collected.steps, collected.zones
+        earlier = collected.states
         for agent_id in self._by_agent:
             local = self.local.initial[agent_id]
             self._add((agent_id, local, NOTHING_RUNS, 0), None)
         acted = dict.fromkeys(self._by_agent, 0)
         heard: dict[Said, int] = {}
-        busy, looked_at = True, 0
+        busy = True
         while busy:
             busy = False
             for agent_id, states in self._by_agent.items():
                 while acted[agent_id] < len(states):
                     self._act(states[acted[agent_id]])
                     acted[agent_id] += 1
-                    looked_at += 1
+                    self._looked_at += 1
                     busy = True
                 for said in list(self._said):
                     if said[0] == agent_id:
@@ -148,21 +153,24 @@ class _Division:
                         self._hear(states[position], said)
                     heard[key] = len(states)
                     self._captor_hears(said)
-                    collected.states = before[0] + len(self._came_from)
                     yield Progress(
-                        collected.states,
-                        collected.looked_at + looked_at,
+                        earlier + len(self._came_from),
+                        collected.looked_at + self._looked_at,
                         collected.transitions,
                         collected.divisions,
                         time.monotonic() - began,
                     )
                 busy |= self._lied_to(agent_id, states)
-        collected.states = before[0] + len(self._came_from)
-        collected.looked_at += looked_at
-        collected.said = before[1] + len(self._said)
-        collected.local_states = before[2] + len(self.local.known)
-        collected.steps = before[3] + self.local.steps
-        collected.zones = before[4] + len(self._zones)
+
+    def count(self) -> None:
+        """Add the figures of this division, complete or not, to those of all divisions."""
+        collected = self._collected
+        collected.states += len(self._came_from)
+        collected.looked_at += self._looked_at
+        collected.said += len(self._said)
+        collected.local_states += len(self.local.known)
+        collected.steps += self.local.steps
+        collected.zones += len(self._zones)
 
     def _add(self, state: Alone, came_from: tuple[Alone, str] | None) -> None:
         if state in self._came_from:

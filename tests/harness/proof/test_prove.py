@@ -93,6 +93,8 @@ def test_a_wrong_step_may_take_a_message_that_comes_late() -> None:
     assert collected.flaw is not None
     assert collected.flaw.handler == "receive_response_block_for_hash"
     assert collected.way[-1] == "it hears a Block Response from agent 1"
+    counted = (collected.states, collected.looked_at, collected.said, collected.local_states, collected.steps)
+    assert min(*counted, collected.zones) > 0, "a proof that ends early counts the states that it has seen"
 
 
 def test_what_playing_does_not_show_is_said(tmp_path: Path) -> None:
